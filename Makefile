@@ -1,0 +1,65 @@
+# Dwell: one command for each thing. `make help` lists them.
+
+VENV := .venv
+BIN := $(VENV)/bin
+UV := $(BIN)/uv
+# The folders that hold Python.
+CODE := $(shell find src tests examples benchmarks -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
+
+# uv installs exactly what a lock file says; `sync` also removes what it does not say.
+SYNC := $(UV) pip sync --quiet --python $(BIN)/python --require-hashes
+COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python-version 3.11 \
+	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
+
+.DEFAULT_GOAL := help
+.PHONY: help env demo test check bench lock clean
+
+help: ## Show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-6s %s\n", $$1, $$2}' Makefile
+
+env: $(VENV)/.installed ## Make .venv from the lock files (only when they changed)
+
+# PYTHON names the interpreter; without it, the first of these that is 3.11 or newer is taken.
+$(VENV)/.uv: requirements/uv.txt
+	@for python in $(or $(PYTHON),python3 python3.11 python3.12 python3.13 python3.14); do \
+		if $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+			echo "make env: $(VENV) from $$($$python --version)"; \
+			exec $$python -m venv --clear $(VENV); \
+		fi; \
+	done; \
+	echo "make env: needs Python 3.11 or newer; name one with PYTHON=..." >&2; exit 1
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes \
+		-r requirements/uv.txt
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.uv requirements/dev.txt pyproject.toml
+	$(SYNC) requirements/dev.txt
+	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
+	$(UV) pip check --quiet --python $(BIN)/python
+	@touch $@
+
+demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)
+	$(BIN)/python -m dwell demo $(if $(REAL),--real $(REAL))
+
+test: env ## Run the tests (ARGS="-k name" passes options to pytest)
+	$(BIN)/python -m pytest $(ARGS)
+
+check: env ## Lint, formatting, types and the borders between packages
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy $(CODE)
+	$(BIN)/lint-imports --no-logo
+
+bench: env ## Run the benchmarks
+	$(BIN)/python -m benchmarks $(ARGS)
+
+lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
+	$(COMPILE) --group uv --output-file requirements/uv.txt
+	$(COMPILE) pyproject.toml --output-file requirements/runtime.txt
+	$(COMPILE) pyproject.toml --group dev --constraint requirements/runtime.txt \
+		--output-file requirements/dev.txt
+	@! grep -nE '://|^ *--(index|extra-index|find-links|trusted-host)' requirements/*.txt
+
+clean: ## Remove everything that make made
+	rm -rf $(VENV) build dist demo-out .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	find $(CODE) -name __pycache__ -prune -exec rm -rf {} +

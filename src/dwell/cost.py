@@ -1,0 +1,213 @@
+"""The cost J of a placement and the caps it must respect (paper, eq. 5 to 8).
+
+J weighs the four metrics of a window, each relative to its design target, and the share of tasks
+that moved::
+
+    J = a_L * L95 / L_target + a_V * V_D + a_r * U_r / U_r_target + a_e * U_e / U_e_target
+        [+ a_c * U_c / U_c_target] + a_S * S
+
+U_r and U_e are maxima over the tier's nodes, because a mean hides the one saturated robot. The
+bracketed term exists only where the objective weighs cloud nodes apart; otherwise they count as
+edge nodes.
+
+All arithmetic is in `price`, which takes floats and arrays alike: a window priced alone and a
+window priced among thousands give the same bits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
+
+from dwell.errors import MetricError, PlacementError
+from dwell.model.objective import Objective
+from dwell.model.placement import Placement
+from dwell.model.qos import QoS
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = [
+    "TierNodes",
+    "TierUtilisation",
+    "cost",
+    "excess",
+    "hamming",
+    "price",
+    "tier_nodes",
+    "tier_utilisation",
+]
+
+Metric = TypeVar("Metric", float, "NDArray[np.float64]")
+
+
+class TierNodes(NamedTuple):
+    """Nodes whose maximum is U_r, U_e and U_c; a tier without nodes counts as 0."""
+
+    robot: tuple[str, ...]
+    edge: tuple[str, ...]
+    cloud: tuple[str, ...]
+
+
+class TierUtilisation(NamedTuple):
+    """U_r, U_e and U_c; U_c is 0 where cloud nodes count as edge nodes."""
+
+    robot: float
+    edge: float
+    cloud: float
+
+
+def hamming(current: Placement, previous: Placement) -> float:
+    """Share of tasks that change node between two placements (paper, eq. 6).
+
+    Parameters
+    ----------
+    current, previous : Placement
+        Over the same tasks.
+
+    Returns
+    -------
+    float
+        In [0, 1]; one task of four moved is 0.25.
+
+    Raises
+    ------
+    PlacementError
+        If the two cover different tasks.
+    """
+    if current.keys() != previous.keys():
+        here, there = (", ".join(sorted(tasks)) for tasks in (current, previous))
+        raise PlacementError(
+            f"cannot compare placements of different tasks: {here} against {there}; "
+            "place every task of the pipeline in both"
+        )
+    return sum(previous[task] != node for task, node in current.items()) / len(current)
+
+
+def tier_nodes(objective: Objective) -> TierNodes:
+    """Nodes behind each utilisation term of J, in the objective's order.
+
+    Cloud nodes stand under `edge` unless ``weights.cloud`` is given.
+    """
+    apart = objective.weights.cloud is not None
+    counted = {"robot": "robot", "edge": "edge", "cloud": "cloud" if apart else "edge"}
+    tiers: dict[str, list[str]] = {"robot": [], "edge": [], "cloud": []}
+    for node, tier in objective.tiers.items():
+        tiers[counted[tier]].append(node)
+    return TierNodes(tuple(tiers["robot"]), tuple(tiers["edge"]), tuple(tiers["cloud"]))
+
+
+def tier_utilisation(utilisation: Mapping[str, float], objective: Objective) -> TierUtilisation:
+    """U_r, U_e and U_c of a window: the maximum over each tier's nodes.
+
+    Parameters
+    ----------
+    utilisation : mapping of str to float
+        Busy share of each node's cores; every node of ``objective.tiers``, others are ignored.
+    objective : Objective
+
+    Raises
+    ------
+    MetricError
+        If a node of ``objective.tiers`` is missing.
+    """
+    for node in objective.tiers:
+        if node not in utilisation:
+            known = ", ".join(utilisation) or "none"
+            raise MetricError(
+                f"utilisation of {node} is missing (nodes given: {known}); "
+                "J needs it for every node of objective.tiers"
+            )
+    robot, edge, cloud = (
+        max((utilisation[node] for node in nodes), default=0.0) for nodes in tier_nodes(objective)
+    )
+    return TierUtilisation(robot, edge, cloud)
+
+
+def price(
+    l95_ms: Metric,
+    violation_rate: Metric,
+    robot: Metric,
+    edge: Metric,
+    cloud: Metric | float,
+    switching: Metric | float,
+    objective: Objective,
+) -> Metric:
+    """J from bare metrics, elementwise for floats and arrays alike (paper, eq. 5 and 7).
+
+    The operations and their order are the same for both, so the results are equal bit by bit.
+
+    Parameters
+    ----------
+    l95_ms : float, or array of shape (windows,)
+        Milliseconds.
+    violation_rate : float or array
+        V_D, in [0, 1].
+    robot, edge, cloud : float or array
+        U_r, U_e, U_c; `cloud` is ignored unless ``objective.weights.cloud`` is given.
+    switching : float or array
+        S, the share of tasks moved.
+    objective : Objective
+
+    Returns
+    -------
+    float or array
+        J, without unit.
+    """
+    weights, targets = objective.weights, objective.targets
+    J = (
+        weights.latency * (l95_ms / targets.latency_ms)
+        + weights.violations * violation_rate
+        + weights.robot * (robot / targets.robot)
+        + weights.edge * (edge / targets.edge)
+    )
+    if weights.cloud is not None and targets.cloud is not None:
+        J = J + weights.cloud * (cloud / targets.cloud)
+    return J + weights.switching * switching
+
+
+def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective) -> float:
+    """J of a window under `current`, when `previous` was the placement before it (paper, eq. 7).
+
+    Parameters
+    ----------
+    qos : QoS
+        Observed or estimated metrics of the window.
+    current, previous : Placement
+        Over the same tasks; equal where nothing moved.
+    objective : Objective
+
+    Returns
+    -------
+    float
+        J, finite and at least 0, without unit.
+
+    Raises
+    ------
+    MetricError
+        If the utilisation of a node of ``objective.tiers`` is missing, or J is not finite.
+    PlacementError
+        If the placements cover different tasks.
+    """
+    robot, edge, cloud = tier_utilisation(qos.utilisation, objective)
+    switching = hamming(current, previous)
+    J = float(price(qos.l95_ms, qos.violation_rate, robot, edge, cloud, switching, objective))
+    if not math.isfinite(J):
+        raise MetricError(f"J is {J!r} for {qos}; a metric is too large for its weight and target")
+    return J
+
+
+def excess(qos: QoS, objective: Objective) -> float:
+    """Largest relative excess over the caps L_max and U_max (constraints of paper, eq. 8).
+
+    Returns
+    -------
+    float
+        Maximum of ``value / cap - 1`` over L95 and the utilisation of every node in `qos`; above
+        0 if and only if a cap is exceeded, -1 where there are no caps.
+    """
+    caps = objective.caps
+    busiest = max(qos.utilisation.values(), default=0.0)
+    return max(qos.l95_ms / caps.latency_ms, busiest / caps.utilisation) - 1.0

@@ -1,0 +1,104 @@
+"""The exceptions of Dwell: one root, one class for each kind of thing that can be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+__all__ = [
+    "DwellError",
+    "Fault",
+    "LiveError",
+    "MetricError",
+    "PlacementError",
+    "PolicyError",
+    "ProblemError",
+    "RunError",
+    "SimulationError",
+    "TraceError",
+]
+
+
+class DwellError(Exception):
+    """Root of every error that Dwell raises on purpose; its text is meant for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing wrong with a problem: where it is, what it is, and what to do about it.
+
+    Parameters
+    ----------
+    path : str
+        The field, as ``tasks.perception.on.E.exec_ms``; empty for the whole.
+    message : str
+        The value found, the bound it breaks, and the remedy.
+    line : int, optional
+        Where it stands in the file, from 1.
+    """
+
+    path: str
+    message: str
+    line: int | None = None
+
+    def __str__(self) -> str:
+        """Return ``path: message``."""
+        return f"{self.path}: {self.message}" if self.path else self.message
+
+
+class ProblemError(DwellError, ValueError):
+    """A cell, or a part of one, is not valid; it carries every fault that was found.
+
+    Parameters
+    ----------
+    faults : sequence of Fault, or str
+        What is wrong; a string is one fault without a path.
+    source : str, optional
+        The file the problem was read from.
+    """
+
+    def __init__(self, faults: Sequence[Fault] | str, source: str | None = None) -> None:
+        if isinstance(faults, str):
+            faults = (Fault("", faults),)
+        self.faults: tuple[Fault, ...] = tuple(faults)
+        self.source = source
+        super().__init__("\n".join(self._located(fault) for fault in self.faults))
+
+    def _located(self, fault: Fault) -> str:
+        """Return ``cell.yaml:12: path: message``, as compilers and editors write it."""
+        line = "" if fault.line is None else f"{fault.line}:"
+        if self.source:
+            return f"{self.source}:{line} {fault}"
+        return f"line {line} {fault}" if line else str(fault)
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        """Pickle by the constructor's arguments (errors cross process borders)."""
+        return type(self), (self.faults, self.source)
+
+
+class TraceError(ProblemError):
+    """A trace of measurements is missing, empty, too short, or holds values it may not."""
+
+
+class PlacementError(DwellError, ValueError):
+    """A placement does not cover the tasks it should, or puts one where it may not run."""
+
+
+class MetricError(DwellError, ValueError):
+    """A window's metrics, or an estimate of them, are missing, not finite or negative."""
+
+
+class PolicyError(DwellError, ValueError):
+    """A policy is unknown, or decided something that cannot be done."""
+
+
+class SimulationError(DwellError, RuntimeError):
+    """A simulation was asked for something it cannot do."""
+
+
+class RunError(DwellError, ValueError):
+    """A folder is not the record of a run, or not one that this version can read."""
+
+
+class LiveError(DwellError, RuntimeError):
+    """The live runtime cannot do what it was asked to."""

@@ -1,0 +1,255 @@
+"""Profile: static profiling, the estimate from what is known before the run.
+
+A fixed set of sample cycles is drawn once from the problem's processes, on its own seed and
+without any disturbance, queue or contention. For each candidate the latency of a sample cycle is
+the longest path through the DAG::
+
+    finish(v) = max over inputs (finish(u) + message(u, v)) + exec(v, node)
+    latency   = max over sinks finish(v)
+
+and L95 and V_D are those of the samples. Percentiles of stages are never added: the 95th
+percentile of a sum is not the sum of the 95th percentiles.
+
+All candidates share the draws, and processes that replay columns of one trace share its rows, so
+that candidates differ by where their tasks run and not by luck. Every process has a stream of its
+own, keyed by its name: adding a node, a link or a task shifts nobody else's draws.
+
+What a window adds is the foreign load: utilisation that was seen and is not the cell's own work.
+It is expected to stay where it is, whichever candidate runs. Latencies take no notice of it: a
+stressed robot looks busy here, not slow.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import MetricError
+from dwell.model.fabric import Link, Node
+from dwell.model.frozen import FrozenDict
+from dwell.model.pipeline import Execution, Flow, Task
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.process import Process, Trace, require
+from dwell.model.qos import QoS
+
+__all__ = ["Profile"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+SEED = 20_250_601
+
+
+class Profile:
+    """Estimates QoS from sample cycles drawn once from the problem's processes.
+
+    Parameters
+    ----------
+    problem : Problem
+    samples : int
+        Sample cycles.
+    seed : int
+        Of the sample cycles; the same for every run, so that an estimate is a fixed number.
+
+    Attributes
+    ----------
+    l95_ms : mapping of str to float
+        Estimated L95 of every candidate, milliseconds; never more than ``problem.censor_ms``.
+    violation_rate : mapping of str to float
+        Estimated V_D of every candidate.
+    own : mapping of str to mapping of str to float
+        Share of each node's cores that the cell's own work takes, by candidate and node.
+
+    Raises
+    ------
+    ProblemError
+        If `samples` or `seed` is out of its range.
+    """
+
+    def __init__(self, problem: Problem, samples: int = 4000, seed: int = SEED) -> None:
+        require(1 <= samples <= 10_000_000, "samples", samples, "from 1 to 10000000")
+        require(seed >= 0, "seed", seed, "a whole number of at least 0")
+        cycles = _SampleCycles(problem, samples, seed)
+        l95_ms, violation_rate, own = {}, {}, {}
+        for name, placement in problem.candidates.items():
+            latency_ms = cycles.latency_ms(placement)
+            l95_ms[name] = order_statistic(latency_ms)
+            late = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
+            violation_rate[name] = int(late) / samples
+            own[name] = FrozenDict(cycles.own_work(placement))
+        self.l95_ms: Mapping[str, float] = FrozenDict(l95_ms)
+        self.violation_rate: Mapping[str, float] = FrozenDict(violation_rate)
+        self.own: Mapping[str, Mapping[str, float]] = FrozenDict(own)
+        self._nodes = tuple(problem.fabric.nodes)
+        self._table = tuple(
+            (name, l95_ms[name], violation_rate[name], tuple(own[name][n] for n in self._nodes))
+            for name in problem.candidates
+        )
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> dict[str, QoS]:
+        """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
+        used = observed.utilisation
+        nodes = self._nodes
+        try:
+            foreign = [max(0.0, used[node] - own[node]) for node in nodes]
+        except KeyError as error:
+            what = "own" if error.args[0] in used else "observed.utilisation"
+            raise MetricError(
+                f"{what} has nothing for node {error.args[0]}; "
+                f"it must hold each of {', '.join(nodes)}"
+            ) from None
+        estimates = {}
+        for name, l95_ms, violation_rate, work in self._table:
+            busy = [min(1.0, load + share) for load, share in zip(foreign, work, strict=True)]
+            utilisation = FrozenDict(zip(nodes, busy, strict=True))
+            estimates[name] = QoS(l95_ms, violation_rate, utilisation)
+        return estimates
+
+
+def order_statistic(values: Floats) -> float:
+    """L95: the ceil(0.95 n)-th smallest of n values, never interpolated."""
+    rank = (19 * len(values) + 19) // 20  # in integers: 0.95 * n is not exact
+    return float(np.partition(values, rank - 1)[rank - 1])
+
+
+class _SampleCycles:
+    """Draws of every process that some candidate needs, for the same `samples` cycles."""
+
+    def __init__(self, problem: Problem, samples: int, seed: int) -> None:
+        self.problem = problem
+        self.samples = samples
+        self.seed = seed
+        self._rows: dict[str, NDArray[np.int64]] = {}
+        self._exec: dict[tuple[str, str], Floats] = {}
+        self._message: dict[tuple[Flow, str], Floats] = {}
+
+    def latency_ms(self, placement: Placement) -> Floats:
+        """Latency of every sample cycle, censored; shape (samples,), milliseconds."""
+        pipeline = self.problem.pipeline
+        finish: dict[str, Floats] = {}
+        for name in pipeline.topological():
+            task = pipeline.tasks[name]
+            ready = np.full(self.samples, task.offset_ms)
+            for flow in pipeline.inputs(name):
+                np.maximum(ready, finish[flow.source] + self._sent(flow, placement), out=ready)
+            finish[name] = ready + self._executed(task, placement[name])
+        sinks = [finish[name] for name in pipeline.tasks if not pipeline.outputs(name)]
+        latency: Floats = np.maximum.reduce(sinks)
+        # To whole nanoseconds, as everything is timed: 0.1 + 0.2 must not miss a deadline of 0.3.
+        return np.minimum(np.round(latency, 6), self.problem.censor_ms)
+
+    def own_work(self, placement: Placement) -> dict[str, float]:
+        """Share of each node's cores that one job of every task placed there takes a period."""
+        pipeline, nodes = self.problem.pipeline, self.problem.fabric.nodes
+        work_ms = dict.fromkeys(nodes, 0.0)
+        for name, task in pipeline.tasks.items():
+            node = nodes[placement[name]]
+            execution = task.on[node.name]
+            if execution.accelerator is None:
+                held = min(execution.threads, node.cores)
+                work_ms[node.name] += (
+                    self._mean_ms(task, execution) * _stretch(execution, node) * held
+                )
+        return {
+            name: work / (pipeline.period_ms * nodes[name].cores) for name, work in work_ms.items()
+        }
+
+    def _mean_ms(self, task: Task, execution: Execution) -> float:
+        """Mean execution time, scale included, without sampling error."""
+        process = execution.exec_ms
+        if task.scale is None:
+            return process.expectation
+        scale = self.problem.pipeline.scales[task.scale]
+        if isinstance(process, Trace) and isinstance(scale, Trace) and process.table is scale.table:
+            return float((process.values * scale.values).mean())
+        return process.expectation * scale.expectation
+
+    def _executed(self, task: Task, node_name: str) -> Floats:
+        """Execution times of a task on a node that runs nothing else."""
+        key = (task.name, node_name)
+        if key not in self._exec:
+            node, execution = self.problem.fabric.nodes[node_name], task.on[node_name]
+            times = self._draw(execution.exec_ms, f"exec/{task.name}/{node_name}")
+            if task.scale is not None:
+                scale = self.problem.pipeline.scales[task.scale]
+                times = times * self._draw(scale, f"scale/{task.scale}")
+            if execution.accelerator is None:
+                times = _throttled(times * _stretch(execution, node), execution, node)
+            self._exec[key] = times
+        return self._exec[key]
+
+    def _sent(self, flow: Flow, placement: Placement) -> Floats:
+        """Times between a flow's output and input; infinite where the message is lost."""
+        source, target = placement[flow.source], placement[flow.target]
+        if source == target:
+            return np.zeros(self.samples)
+        link = self.problem.fabric.links[f"{source}->{target}"]
+        key = (flow, link.name)
+        if key not in self._message:
+            hop = f"{flow.source}->{flow.target}/{link.name}"
+            delay = self._draw(link.delay_ms, f"delay/{hop}")
+            self._message[key] = delay + self._transmitted(flow, link, hop)
+        return self._message[key]
+
+    def _transmitted(self, flow: Flow, link: Link, hop: str) -> Floats:
+        """Times on the sending side, repeated attempts included."""
+        once_ms = 8 * flow.payload_bytes / (link.rate_mbps * 1e3)
+        times = np.full(self.samples, once_ms)
+        if link.loss > 0:
+            rng = self._stream(f"loss/{hop}")
+            if link.retransmit_ms is None:
+                times[rng.random(self.samples) < link.loss] = np.inf
+            else:
+                failures = rng.geometric(1 - link.loss, self.samples) - 1
+                times += failures * (once_ms + link.retransmit_ms)
+        return times
+
+    def _draw(self, process: Process, name: str) -> Floats:
+        if not isinstance(process, Trace):
+            return process.marginal(self._stream(name), self.samples)
+        table = process.table
+        if table.file not in self._rows:
+            rng = self._stream(f"trace/{table.file}")
+            self._rows[table.file] = rng.integers(table.rows, size=self.samples)
+        # Two tables of one file may differ in rows (one drops some): the draw is folded then.
+        values: Floats = process.values[self._rows[table.file] % table.rows]
+        return values
+
+    def _stream(self, name: str) -> np.random.Generator:
+        # Its own prefix: the same seed must not repeat the draws of a simulated run.
+        digest = hashlib.blake2b(f"profile/{name}".encode(), digest_size=16).digest()
+        words = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=words))
+
+
+def _stretch(execution: Execution, node: Node) -> float:
+    """Factor by which a CPU job takes longer where the node has fewer cores than it has threads.
+
+    Only a `fair` node shares its cores among threads; the others give the job the whole node.
+    """
+    if node.scheduler != "fair":
+        return 1.0
+    return max(1.0, execution.threads / node.cores)
+
+
+def _throttled(times: Floats, execution: Execution, node: Node) -> Floats:
+    """Time a job takes under the node's quota, from a full bucket at the begin of a period.
+
+    It runs until the bucket is empty, and waits for the next period, as often as it has to.
+    """
+    quota = node.quota
+    if quota is None:
+        return times
+    rate = min(execution.threads, node.cores)
+    full_ms = quota.cpu * quota.period_ms / rate
+    if full_ms >= quota.period_ms:
+        return times
+    # A job that just fills its last bucket must not wait for another one by a rounding error.
+    waits: Floats = np.maximum(np.ceil(np.round(times / full_ms, 9)) - 1, 0)
+    return times + waits * (quota.period_ms - full_ms)

@@ -1,0 +1,87 @@
+"""Read a cell: a YAML file, or the same as plain values, into a Problem.
+
+One pass finds every fault. A part that is wrong is blanked, so that what remains of its element
+can still be built; an element that cannot is kept as a bare name, so that references to it
+resolve. Structure (keys and single values), construction (values against each other), traces and
+meaning (names, links, the DAG) then each add their faults to one list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike, fspath
+from pathlib import Path
+
+from dwell.io.faults import Faults
+from dwell.model import Problem
+
+__all__ = ["from_document", "load"]
+
+
+def load(path: str | PathLike[str]) -> Problem:
+    """Read a cell file.
+
+    Parameters
+    ----------
+    path : str or path
+        A YAML 1.2 (or JSON) file; traces that it names are found relative to its folder.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    ProblemError
+        With every fault found in the file and in its traces, each with its line and field path; a
+        TraceError where the traces alone are at fault.
+    """
+    from dwell.io.yaml_text import read_yaml
+
+    source = fspath(path)
+    faults = Faults(source)
+    text = read_yaml(source, faults)
+    faults.raise_any()
+    return _read(text, faults, Path(source).parent, Path(source).stem or "cell")
+
+
+def from_document(
+    document: Mapping[str, object],
+    *,
+    folder: str | PathLike[str] = ".",
+    source: str | None = None,
+) -> Problem:
+    """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
+
+    Parameters
+    ----------
+    document : mapping
+        What a YAML parser would make of a cell file.
+    folder : str or path
+        Where the traces that it names are.
+    source : str, optional
+        Name of the document in messages.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
+    return _read(document, Faults(source), Path(folder), "cell")
+
+
+def _read(document: object, faults: Faults, folder: Path, name: str) -> Problem:
+    from dwell.io.assembly import Assembly
+    from dwell.io.structure import read_structure
+    from dwell.io.traces import read_traces
+
+    entry = read_structure(document, faults)
+    tables = read_traces(entry, folder, faults)
+    problem = Assembly(entry, tables, faults).problem(name)
+    faults.raise_any()
+    assert problem is not None  # noqa: S101 - it is missing only beside a fault
+    return problem

@@ -1,0 +1,94 @@
+"""Faults: what is wrong with one document, collected on the way through it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from typing import TypeAlias, TypeVar
+
+from dwell.errors import Fault, ProblemError, TraceError
+
+__all__ = ["Faults", "Step", "dotted"]
+
+T = TypeVar("T")
+Step: TypeAlias = str | int
+
+LAST_STEP = re.compile(r"(\.[^.\[]*|\[[^\[]*)\Z")
+
+
+def dotted(steps: Iterable[Step]) -> str:
+    """Return ``links[0].from`` for ("links", 0, "from")."""
+    path = ""
+    for step in steps:
+        if isinstance(step, int):
+            path += f"[{step}]"
+        else:
+            path += f".{step}" if path else step
+    return path
+
+
+class Faults:
+    """Faults of one document, at most one a path and message, in the order of its lines.
+
+    Parameters
+    ----------
+    source : str, optional
+        Name of the document in messages.
+    """
+
+    def __init__(self, source: str | None = None) -> None:
+        self.source = source
+        self.lines: dict[str, int] = {}
+        self._faults: list[Fault] = []
+        self._kinds: set[type[ProblemError]] = set()
+
+    def add(
+        self,
+        path: str,
+        message: str,
+        *,
+        line: int | None = None,
+        kind: type[ProblemError] = ProblemError,
+    ) -> None:
+        """Record a fault at a path; its line is looked up where it is not given."""
+        fault = Fault(path, message, self.line(path) if line is None else line)
+        if fault not in self._faults:
+            self._faults.append(fault)
+            self._kinds.add(kind)
+
+    def attempt(self, path: str, make: Callable[[], T]) -> T | None:
+        """Return what `make` makes, or record the faults it raises, beneath `path`."""
+        try:
+            return make()
+        except ProblemError as error:
+            for fault in error.faults:
+                inner = f"{path}.{fault.path}" if path and fault.path else path or fault.path
+                if not self.at(inner):
+                    self.add(inner, fault.message)
+            return None
+
+    def line(self, path: str) -> int | None:
+        """Line of a path, or of what is nearest around it."""
+        while path and path not in self.lines:
+            shorter = LAST_STEP.sub("", path)
+            path = shorter if shorter != path else ""
+        return self.lines.get(path)
+
+    def at(self, path: str) -> bool:
+        """Whether there is a fault at exactly this path."""
+        return any(fault.path == path for fault in self._faults)
+
+    def touches(self, path: str) -> bool:
+        """Whether there is a fault at this path, around it or beneath it."""
+        return any(_around(fault.path, path) or _around(path, fault.path) for fault in self._faults)
+
+    def raise_any(self) -> None:
+        """Raise every fault recorded so far in one error, if there is one."""
+        if not self._faults:
+            return
+        kind = TraceError if self._kinds == {TraceError} else ProblemError
+        raise kind(sorted(self._faults, key=lambda fault: fault.line or 0), self.source)
+
+
+def _around(outer: str, path: str) -> bool:
+    return path.startswith(outer) and (len(path) == len(outer) or path[len(outer)] in ".[")

@@ -1,0 +1,1 @@
+"""The simulator's inner loop: compiled functions over arrays, and nothing else."""

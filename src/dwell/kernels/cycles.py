@@ -1,0 +1,316 @@
+"""The life of a cycle: release, inputs, workers, completion, loss."""
+
+from __future__ import annotations
+
+from dwell.kernels.compiled import phase
+from dwell.kernels.heaps import push_event
+from dwell.kernels.layout import (
+    ARRIVED,
+    BASE,
+    CANDIDATE_0,
+    CELL_MASK,
+    CELL_SHIFT,
+    COMPUTE,
+    CYCLE,
+    CYCLE_MASK,
+    CYCLE_SHIFT,
+    DEPTH,
+    DIRTY,
+    DONE,
+    DOWN,
+    FAIR,
+    FLOW_LOCAL,
+    HEAD,
+    IDLE,
+    ITEM_MASK,
+    KIND_SHIFT,
+    LIVE,
+    LOCAL,
+    LOG_END,
+    LOG_READY,
+    LOG_START,
+    LOST,
+    N_CYCLES,
+    N_DIRTY,
+    N_IN,
+    N_OUT,
+    N_SINKS,
+    N_TASKS,
+    NEED,
+    NETWORK,
+    NEXT,
+    NEXT_KEY,
+    NODE,
+    NODE_DOWN,
+    OFFSET_NS,
+    OUT_0,
+    RANK,
+    READY,
+    READY_AT,
+    RELEASE,
+    REPLACED,
+    SCHEDULER,
+    SERVER,
+    SINKS_LEFT,
+    SITE,
+    SOURCE,
+    START,
+    STARTED,
+    TAIL,
+    TARGET,
+    TASK_0,
+    WAITING,
+    Tables,
+)
+from dwell.kernels.links import lose, send, slot_row
+from dwell.kernels.nodes import admit, dispatch, job_row, leave, schedule
+
+__all__ = [
+    "arrive",
+    "become_ready",
+    "complete",
+    "drop_job",
+    "drop_waiting",
+    "flush",
+    "release",
+    "retry",
+    "take_next",
+]
+
+
+@phase
+def _job_key(cell: int, cycle: int, task: int) -> int:
+    return (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | task
+
+
+@phase
+def _log(s: Tables, cell: int, cycle: int, row: int, local: int, outcome: int, end: int) -> None:
+    if s.log.shape[0] == 0:
+        return
+    tasks = s.site_of.shape[1]
+    entry = (cell * s.latency_ns.shape[1] + cycle) * tasks + local
+    s.log[entry, LOG_READY] = s.jobs[row, READY]
+    s.log[entry, LOG_START] = s.jobs[row, STARTED]
+    s.log[entry, LOG_END] = end
+    s.log_outcome[entry] = outcome
+
+
+@phase
+def _take(s: Tables, cell: int, cycle: int, task: int, row: int, site: int, now: int) -> None:
+    """An idle worker takes a job."""
+    s.sites[site, IDLE] -= 1
+    work = s.exec_ns[site, cycle]
+    rank = s.tasks[task, RANK]
+    admit(s, s.sites[site, SERVER], _job_key(cell, cycle, task), row, rank, work, now)
+
+
+@phase
+def drop_job(
+    s: Tables, cell: int, cycle: int, local: int, row: int, outcome: int, now: int
+) -> None:
+    """Lose a ready job, and with it its cycle."""
+    _log(s, cell, cycle, row, local, outcome, now)
+    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+    lose(s, cell, cycle, outcome)
+
+
+@phase
+def _append(s: Tables, cell: int, cycle: int, local: int, row: int, site: int) -> None:
+    s.jobs[row, NEXT] = -1
+    if s.sites[site, WAITING] == 0:
+        s.sites[site, HEAD] = cycle
+    else:
+        s.jobs[job_row(s, cell, s.sites[site, TAIL], local), NEXT] = cycle
+    s.sites[site, TAIL] = cycle
+    s.sites[site, WAITING] += 1
+
+
+@phase
+def _pop_input(s: Tables, cell: int, local: int, site: int) -> int:
+    """Remove the oldest waiting job of a site and return its cycle."""
+    cycle = s.sites[site, HEAD]
+    s.sites[site, HEAD] = s.jobs[job_row(s, cell, cycle, local), NEXT]
+    s.sites[site, WAITING] -= 1
+    return int(cycle)
+
+
+@phase
+def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
+    """All inputs of a job are there: hand it to a worker, or let it wait, or lose it."""
+    local = s.tasks[task, LOCAL]
+    row = job_row(s, cell, cycle, local)
+    s.jobs[row, READY] = now
+    site = s.jobs[row, SITE]
+    s.slots[slot_row(s, cell, cycle), LIVE] += 1
+    if s.servers[s.sites[site, SERVER], DOWN] != 0:
+        drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
+        return
+    if s.sites[site, IDLE] > 0 and now >= s.sites[site, READY_AT]:
+        _take(s, cell, cycle, task, row, site, now)
+        return
+    depth = s.tasks[task, DEPTH]
+    if depth > 0 and s.sites[site, WAITING] >= depth:
+        oldest = s.sites[site, HEAD]
+        if cycle < oldest:
+            drop_job(s, cell, cycle, local, row, REPLACED, now)
+            return
+        _pop_input(s, cell, local, site)
+        old_row = job_row(s, cell, oldest, local)
+        drop_job(s, cell, oldest, local, old_row, REPLACED, now)
+    _append(s, cell, cycle, local, row, site)
+
+
+@phase
+def take_next(s: Tables, cell: int, task: int, site: int, now: int) -> None:
+    """Let idle workers of a site take what waits."""
+    local = s.tasks[task, LOCAL]
+    while s.sites[site, WAITING] > 0 and s.sites[site, IDLE] > 0:
+        cycle = _pop_input(s, cell, local, site)
+        _take(s, cell, cycle, task, job_row(s, cell, cycle, local), site, now)
+
+
+@phase
+def drop_waiting(s: Tables, cell: int, task: int, site: int, now: int) -> None:
+    """Lose everything that waits at a site, because its node went down."""
+    local = s.tasks[task, LOCAL]
+    while s.sites[site, WAITING] > 0:
+        cycle = _pop_input(s, cell, local, site)
+        row = job_row(s, cell, cycle, local)
+        drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
+
+
+@phase
+def _input_arrived(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
+    """Count an input in; the last one makes the job ready and names its critical path."""
+    task = s.flows[flow, TARGET]
+    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    s.jobs[row, ARRIVED] += 1
+    if s.jobs[row, ARRIVED] == s.tasks[task, N_IN]:
+        sender = job_row(s, cell, cycle, s.tasks[s.flows[flow, SOURCE], LOCAL])
+        s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
+        s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
+        become_ready(s, cell, cycle, task, now)
+
+
+@phase
+def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
+    """Handle a message that reaches its node."""
+    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+    row = job_row(s, cell, cycle, s.tasks[s.flows[flow, TARGET], LOCAL])
+    if s.servers[s.sites[s.jobs[row, SITE], SERVER], DOWN] != 0:
+        lose(s, cell, cycle, NODE_DOWN)
+        return
+    _input_arrived(s, cell, cycle, flow, now)
+
+
+@phase
+def retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
+    """Send a message again after a lost attempt."""
+    slot = slot_row(s, cell, cycle)
+    s.slots[slot, LIVE] -= 1
+    local = s.flows[flow, FLOW_LOCAL]
+    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
+    send(s, cell, cycle, flow, s.route[candidate, local], s.attempts[slot, local] + 1, now)
+
+
+@phase
+def _deliver(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
+    """Hand a completed job's outputs over, or send them."""
+    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
+    first = s.tasks[task, OUT_0]
+    for i in range(first, first + s.tasks[task, N_OUT]):
+        flow = s.out_flows[i]
+        hop = s.route[candidate, s.flows[flow, FLOW_LOCAL]]
+        if hop < 0:
+            _input_arrived(s, cell, cycle, flow, now)
+        else:
+            send(s, cell, cycle, flow, hop, 0, now)
+
+
+@phase
+def _finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
+    """A sink has completed; the last one completes the cycle."""
+    slot = slot_row(s, cell, cycle)
+    s.slots[slot, SINKS_LEFT] -= 1
+    if s.slots[slot, SINKS_LEFT] == 0:
+        s.outcome[cell, cycle] = DONE
+        s.latency_ns[cell, cycle] = now - s.release_ns[cell, cycle]
+        s.compute_ns[cell, cycle] = s.jobs[row, COMPUTE]
+        s.network_ns[cell, cycle] = s.jobs[row, NETWORK]
+
+
+@phase
+def complete(s: Tables, server: int, now: int) -> None:
+    """The job of a server that finishes first has finished."""
+    key = s.run_key[s.servers[server, BASE]]
+    cell = (key >> CELL_SHIFT) & CELL_MASK
+    cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
+    task = key & ITEM_MASK
+    local = s.tasks[task, LOCAL]
+    row = job_row(s, cell, cycle, local)
+    site = s.jobs[row, SITE]
+    leave(s, server, 0, now)
+    s.servers[server, NEXT_KEY] = -1
+    s.own[cell, s.sites[site, NODE]] += s.sites[site, NEED] * float(s.exec_ns[site, cycle])
+    s.jobs[row, COMPUTE] += now - s.jobs[row, STARTED]
+    _log(s, cell, cycle, row, local, DONE, now)
+    if s.tasks[task, N_OUT] == 0:
+        _finish(s, cell, cycle, row, now)
+    else:
+        s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
+        _deliver(s, cell, cycle, task, now)
+    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+    s.sites[site, IDLE] += 1
+    take_next(s, cell, task, site, now)
+
+
+@phase
+def _open_slot(s: Tables, cell: int, cycle: int) -> None:
+    slot = slot_row(s, cell, cycle)
+    s.slots[slot, CYCLE] = cycle
+    s.slots[slot, LIVE] = 0
+    s.slots[slot, LOST] = 0
+    s.slots[slot, SINKS_LEFT] = s.cells[cell, N_SINKS]
+    row = job_row(s, cell, cycle, 0)
+    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
+    for local in range(s.cells[cell, N_TASKS]):
+        s.jobs[row + local, ARRIVED] = 0
+        s.jobs[row + local, STARTED] = -1
+        s.jobs[row + local, SITE] = s.site_of[candidate, local]
+
+
+@phase
+def release(s: Tables, cell: int, cycle: int, now: int) -> None:
+    """Release a cycle: its sources become ready, and the next release is announced."""
+    _open_slot(s, cell, cycle)
+    first = s.cells[cell, TASK_0]
+    for task in range(first, first + s.cells[cell, N_TASKS]):
+        if s.tasks[task, N_IN] > 0:
+            continue
+        row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+        s.jobs[row, COMPUTE] = 0
+        s.jobs[row, NETWORK] = 0
+        offset = s.tasks[task, OFFSET_NS]
+        if offset == 0:
+            become_ready(s, cell, cycle, task, now)
+        else:
+            s.slots[slot_row(s, cell, cycle), LIVE] += 1
+            key = (START << KIND_SHIFT) | _job_key(cell, cycle, task)
+            push_event(s.clock, s.event_t, s.event_key, now + offset, key)
+    following = cycle + 1
+    if following < s.cells[cell, N_CYCLES]:
+        key = (RELEASE << KIND_SHIFT) | _job_key(cell, following, 0)
+        t = s.release_ns[cell, following]
+        push_event(s.clock, s.event_t, s.event_key, t, key)
+
+
+@phase
+def flush(s: Tables, now: int) -> None:
+    """Give out cores, and announce completions, on every server the event touched."""
+    for i in range(s.clock[N_DIRTY]):
+        server = s.dirty[i]
+        s.servers[server, DIRTY] = 0
+        if s.servers[server, SCHEDULER] != FAIR:
+            dispatch(s, server, now)
+        schedule(s, server, now)
+    s.clock[N_DIRTY] = 0

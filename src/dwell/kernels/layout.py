@@ -1,0 +1,180 @@
+"""Columns of the kernels' tables and the packing of event keys.
+
+Entities (cells, tasks, sites, servers, hops, links) are rows of two-dimensional int64 tables; the
+names below are their columns. A *site* is a task on one feasible node of one cell; a *server* is
+what executes jobs: the CPU of a node, or one kind of its accelerators; a *hop* is a flow on a link.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+# Kinds of events in the order in which equal times are handled.
+COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, CLOSE, RELEASE = range(8)
+
+# An event key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is
+# a task, a flow, a site or nothing, according to the kind.
+ITEM_BITS, CYCLE_BITS, CELL_BITS = 14, 32, 13
+CYCLE_SHIFT = ITEM_BITS
+CELL_SHIFT = ITEM_BITS + CYCLE_BITS
+KIND_SHIFT = ITEM_BITS + CYCLE_BITS + CELL_BITS
+ITEM_MASK = (1 << ITEM_BITS) - 1
+CYCLE_MASK = (1 << CYCLE_BITS) - 1
+CELL_MASK = (1 << CELL_BITS) - 1
+
+# What `advance` returns.
+PAUSED, FINISHED, GROW_EVENTS, GROW_RING = range(4)
+
+# Outcomes of cycles and jobs.
+IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
+
+# Schedulers.
+FAIR, FIFO, PRIORITY = range(3)
+
+# clock: scalars that outlive a call.
+N_EVENTS, N_DIRTY, NEXT_CHANGE, PAUSE, CLOSED_CELL, RING, STRIDE, MARGIN, N_CLOCK = range(9)
+
+# cells
+(
+    TASK_0,
+    N_TASKS,
+    CANDIDATE_0,
+    N_SINKS,
+    N_CYCLES,
+    WINDOW,
+    WINDOW_FIRST,
+    CLOSE_CYCLE,
+    CLOSE_PENDING,
+    WINDOW_CYCLES,
+    GRACE_NS,
+    N_CELL,
+) = range(12)
+
+# tasks
+N_IN, N_OUT, OUT_0, DEPTH, RANK, OFFSET_NS, LOCAL, N_TASK = range(8)
+
+# flows
+SOURCE, TARGET, FLOW_LOCAL, N_FLOW = range(4)
+
+# sites
+(
+    SITE_CELL,
+    SITE_TASK,
+    SERVER,
+    NODE,
+    WORKERS,
+    IDLE,
+    HEAD,
+    TAIL,
+    WAITING,
+    NEED,
+    READY_AT,
+    START_NS,
+    N_SITE,
+) = range(13)
+
+# servers
+(
+    SCHEDULER,
+    CORES,
+    STRESS,
+    USED,
+    N_RUN,
+    N_WAIT,
+    DOWN,
+    LAST,
+    BUSY,
+    NEXT_T,
+    NEXT_KEY,
+    BASE,
+    NODE_OF,
+    DIRTY,
+    IS_CPU,
+    N_SERVER,
+) = range(16)
+
+# servers, float64
+VIRTUAL, SPEED, N_SERVER_F = range(3)
+
+# hops
+LINK, PAYLOAD, N_HOP = range(3)
+
+# links
+FREE, LAST_ARRIVAL, IN_ORDER, RETRANSMIT_NS, SEGMENT, SEGMENT_END, N_LINK = range(7)
+
+# link segments, int64 and float64
+SEGMENT_AT, SEGMENT_DOWN, SEGMENT_LAYERS, N_SEGMENT = range(4)
+SEGMENT_RATE, SEGMENT_LOSS, N_SEGMENT_F = range(3)
+
+# node changes
+CHANGE_AT, CHANGE_NODE, CHANGE_STRESS, CHANGE_DOWN, N_CHANGE = range(5)
+
+# jobs in the ring
+READY, STARTED, COMPUTE, NETWORK, SITE, NEXT, ARRIVED, N_JOB = range(8)
+
+# cycles in the ring
+CYCLE, LIVE, SINKS_LEFT, LOST, N_SLOT = range(5)
+
+# job log
+LOG_READY, LOG_START, LOG_END, N_LOG = range(4)
+
+
+class Tables(NamedTuple):
+    """Every array of a simulation; the order is that of `advance`'s arguments.
+
+    Fixed: what the problem and the realisation say. State: what changes as the clock goes on.
+    Outputs: per cycle, per window, and per job where a log is kept.
+    """
+
+    # fixed
+    tasks: Ints  # (tasks, N_TASK)
+    flows: Ints  # (flows, N_FLOW)
+    out_flows: Ints  # flows out of each task, in the order of the file
+    site_of: Ints  # (candidates, tasks of a cell) -> site
+    route: Ints  # (candidates, flows of a cell) -> hop, or -1 on the same node
+    hops: Ints  # (hops, N_HOP)
+    loss_keys: NDArray[np.uint64]  # (hops,)
+    layer_rows: Ints  # (hops, layers) -> row of extra_ns, or -1
+    segments: Ints  # (segments, N_SEGMENT)
+    segments_f: Floats  # (segments, N_SEGMENT_F)
+    changes: Ints  # (changes, N_CHANGE)
+    release_ns: Ints  # (cells, N + 1)
+    exec_ns: Ints  # (sites, N)
+    delay_ns: Ints  # (hops, N)
+    extra_ns: Ints  # (layers, N)
+    stamps: NDArray[np.int16]  # (cells, N), candidate of each cycle
+    # state
+    clock: Ints  # (N_CLOCK,)
+    cells: Ints  # (cells, N_CELL)
+    sites: Ints  # (sites, N_SITE)
+    servers: Ints  # (servers, N_SERVER)
+    servers_f: Floats  # (servers, N_SERVER_F)
+    links: Ints  # (links, N_LINK)
+    run_v: Floats  # per server a heap of running jobs by virtual finish
+    run_key: Ints
+    wait_rank: Ints  # per server a heap of jobs that wait for cores
+    wait_ready: Ints
+    wait_key: Ints
+    wait_left: Floats
+    dirty: Ints  # servers to dispatch at the end of the event
+    event_t: Ints  # heap of events
+    event_key: Ints
+    jobs: Ints  # (cells * ring * tasks of a cell, N_JOB)
+    slots: Ints  # (cells * ring, N_SLOT)
+    attempts: Ints  # (cells * ring, flows of a cell) attempts lost so far, less one
+    own: Floats  # (cells, nodes) core-nanoseconds of completed own work
+    # outputs
+    latency_ns: Ints  # (cells, N), -1 until done
+    compute_ns: Ints
+    network_ns: Ints
+    outcome: NDArray[np.int8]
+    opened: Floats  # (cells, windows, 2, nodes) busy and own at the window's first release
+    closed: Floats  # (cells, windows, 2, nodes) busy and own at its close
+    log: Ints  # (cells * N * tasks, N_LOG), or empty
+    log_outcome: NDArray[np.int8]

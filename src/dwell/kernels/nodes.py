@@ -1,0 +1,228 @@
+"""Servers: who runs at what speed, and when the next job completes.
+
+All running jobs of a server advance at one common speed, so a virtual clock that advances at that
+speed turns processor sharing into a heap: a job that starts at virtual time v with c nanoseconds of
+work ends at virtual time v + c, whoever comes or goes meanwhile. The virtual clock is set back to 0
+whenever the server runs empty, which keeps its rounding error below a picosecond in practice.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dwell.kernels.compiled import phase
+from dwell.kernels.heaps import (
+    pop_running,
+    pop_waiting,
+    push_event,
+    push_running,
+    push_waiting,
+)
+from dwell.kernels.layout import (
+    BASE,
+    BUSY,
+    CELL_MASK,
+    CELL_SHIFT,
+    CORES,
+    CYCLE_MASK,
+    CYCLE_SHIFT,
+    DIRTY,
+    DOWN,
+    FAIR,
+    FIFO,
+    ITEM_MASK,
+    LAST,
+    LOCAL,
+    N_DIRTY,
+    N_RUN,
+    N_WAIT,
+    NEED,
+    NEXT_KEY,
+    NEXT_T,
+    PRIORITY,
+    RANK,
+    READY,
+    RING,
+    SCHEDULER,
+    SITE,
+    SPEED,
+    STARTED,
+    STRESS,
+    STRIDE,
+    USED,
+    VIRTUAL,
+    Tables,
+)
+
+__all__ = ["admit", "dispatch", "job_row", "leave", "mark", "schedule", "set_speed", "tick"]
+
+# Work left below this many nanoseconds is rounding, not work.
+SLACK = 1e-6
+
+
+@phase
+def job_row(s: Tables, cell: int, cycle: int, local: int) -> int:
+    """Row of a job in the ring of the cycles in flight."""
+    ring = s.clock[RING]
+    return (cell * ring + (cycle & (ring - 1))) * s.clock[STRIDE] + local
+
+
+@phase
+def key_row(s: Tables, key: int) -> int:
+    """Row of the job that a key names."""
+    cell = (key >> CELL_SHIFT) & CELL_MASK
+    cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
+    return job_row(s, cell, cycle, s.tasks[key & ITEM_MASK, LOCAL])
+
+
+@phase
+def mark(s: Tables, server: int) -> None:
+    """Remember that a server must give out cores at the end of the event."""
+    if s.servers[server, DIRTY] == 0:
+        s.servers[server, DIRTY] = 1
+        s.dirty[s.clock[N_DIRTY]] = server
+        s.clock[N_DIRTY] += 1
+
+
+@phase
+def tick(s: Tables, server: int, now: int) -> None:
+    """Bring a server's virtual clock and busy time up to now."""
+    elapsed = now - s.servers[server, LAST]
+    if elapsed > 0:
+        s.servers_f[server, VIRTUAL] += elapsed * s.servers_f[server, SPEED]
+        if s.servers[server, DOWN] == 0:
+            busy = s.servers[server, USED] + s.servers[server, STRESS]
+            s.servers[server, BUSY] += elapsed * min(busy, s.servers[server, CORES])
+        s.servers[server, LAST] = now
+
+
+@phase
+def set_speed(s: Tables, server: int) -> None:
+    """Set the common speed after threads or stress changed; the clock must be up to date.
+
+    fair: min(1, c / (K + s)); fifo and priority: c / (c + s).
+    """
+    cores = s.servers[server, CORES]
+    stress = s.servers[server, STRESS]
+    if s.servers[server, SCHEDULER] == FAIR:
+        load = s.servers[server, USED] + stress
+        s.servers_f[server, SPEED] = 1.0 if load <= cores else cores / load
+    else:
+        s.servers_f[server, SPEED] = 1.0 if stress == 0 else cores / (cores + stress)
+
+
+@phase
+def _start(s: Tables, server: int, key: int, row: int, left: float, now: int) -> None:
+    n = s.servers[server, N_RUN]
+    if n == 0:
+        s.servers_f[server, VIRTUAL] = 0.0
+    if s.jobs[row, STARTED] < 0:
+        s.jobs[row, STARTED] = now
+    finish = s.servers_f[server, VIRTUAL] + left
+    push_running(s.run_v, s.run_key, s.servers[server, BASE], n, finish, key)
+    s.servers[server, N_RUN] = n + 1
+    s.servers[server, USED] += s.sites[s.jobs[row, SITE], NEED]
+
+
+@phase
+def admit(s: Tables, server: int, key: int, row: int, rank: int, work: int, now: int) -> None:
+    """Make a job that a worker has taken runnable."""
+    mark(s, server)
+    if s.servers[server, SCHEDULER] == FAIR:
+        tick(s, server, now)
+        _start(s, server, key, row, float(work), now)
+        set_speed(s, server)
+        return
+    if s.servers[server, SCHEDULER] == FIFO:
+        rank = 0
+    n = s.servers[server, N_WAIT]
+    base = s.servers[server, BASE]
+    ready = s.jobs[row, READY]
+    w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
+    push_waiting(w[0], w[1], w[2], w[3], base, n, rank, ready, key, float(work))
+    s.servers[server, N_WAIT] = n + 1
+
+
+@phase
+def _preempt(s: Tables, server: int) -> bool:
+    """Take the cores of the last running job behind the first waiting one; False if there is none."""
+    base = s.servers[server, BASE]
+    worst = -1
+    rank, ready, key = s.wait_rank[base], s.wait_ready[base], s.wait_key[base]
+    for i in range(s.servers[server, N_RUN]):
+        other = s.run_key[base + i]
+        row = key_row(s, other)
+        other_rank = s.tasks[other & ITEM_MASK, RANK]
+        other_ready = s.jobs[row, READY]
+        if other_rank > rank or (
+            other_rank == rank and (other_ready > ready or (other_ready == ready and other > key))
+        ):
+            worst, rank, ready, key = i, other_rank, other_ready, other
+    if worst < 0:
+        return False
+    row = key_row(s, key)
+    left = s.run_v[base + worst] - s.servers_f[server, VIRTUAL]
+    pop_running(s.run_v, s.run_key, base, s.servers[server, N_RUN], worst)
+    s.servers[server, N_RUN] -= 1
+    s.servers[server, USED] -= s.sites[s.jobs[row, SITE], NEED]
+    n = s.servers[server, N_WAIT]
+    w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
+    push_waiting(w[0], w[1], w[2], w[3], base, n, rank, ready, key, max(left, 0.0))
+    s.servers[server, N_WAIT] = n + 1
+    return True
+
+
+@phase
+def dispatch(s: Tables, server: int, now: int) -> None:
+    """Give out the cores of a fifo or priority server."""
+    if s.servers[server, N_WAIT] == 0:
+        return
+    tick(s, server, now)
+    base = s.servers[server, BASE]
+    preemptive = s.servers[server, SCHEDULER] == PRIORITY
+    while s.servers[server, N_WAIT] > 0:
+        key = s.wait_key[base]
+        row = key_row(s, key)
+        need = s.sites[s.jobs[row, SITE], NEED]
+        if s.servers[server, USED] + need <= s.servers[server, CORES]:
+            left = s.wait_left[base]
+            n = s.servers[server, N_WAIT]
+            pop_waiting(s.wait_rank, s.wait_ready, s.wait_key, s.wait_left, base, n)
+            s.servers[server, N_WAIT] = n - 1
+            _start(s, server, key, row, left, now)
+        elif not preemptive or not _preempt(s, server):
+            break
+
+
+@phase
+def leave(s: Tables, server: int, at: int, now: int) -> None:
+    """Take running entry `at` off a server."""
+    mark(s, server)
+    tick(s, server, now)
+    base = s.servers[server, BASE]
+    n = s.servers[server, N_RUN]
+    row = key_row(s, s.run_key[base + at])
+    pop_running(s.run_v, s.run_key, base, n, at)
+    s.servers[server, N_RUN] = n - 1
+    s.servers[server, USED] -= s.sites[s.jobs[row, SITE], NEED]
+    if s.servers[server, SCHEDULER] == FAIR:
+        set_speed(s, server)
+
+
+@phase
+def schedule(s: Tables, server: int, now: int) -> None:
+    """Announce the completion of the job that finishes first; an older announcement goes stale."""
+    if s.servers[server, N_RUN] == 0 or s.servers[server, DOWN] != 0:
+        s.servers[server, NEXT_KEY] = -1
+        return
+    base = s.servers[server, BASE]
+    left = s.run_v[base] - s.servers_f[server, VIRTUAL]
+    speed = s.servers_f[server, SPEED]
+    if speed != 1.0:
+        left = left / speed
+    t = now + max(int(math.ceil(left - SLACK)), 0)
+    key = s.run_key[base]
+    if key != s.servers[server, NEXT_KEY] or t != s.servers[server, NEXT_T]:
+        s.servers[server, NEXT_KEY] = key
+        s.servers[server, NEXT_T] = t
+        push_event(s.clock, s.event_t, s.event_key, t, key)

@@ -1,0 +1,60 @@
+"""The frozen domain objects: a pipeline on a fabric, its candidates, and what a window shows."""
+
+from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
+from dwell.model.frozen import FrozenDict
+from dwell.model.objective import Caps, Objective, Targets, Tier, Weights
+from dwell.model.pipeline import Execution, Flow, Pipeline, Task
+from dwell.model.placement import Placement
+from dwell.model.problem import ControllerSettings, Problem
+from dwell.model.process import (
+    AR1,
+    Constant,
+    Exponential,
+    Gamma,
+    LogNormal,
+    Normal,
+    Process,
+    Trace,
+    TraceTable,
+    Uniform,
+)
+from dwell.model.qos import Decision, QoS, Reason
+from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance, Scenario
+
+__all__ = [
+    "AR1",
+    "Bursts",
+    "Caps",
+    "Constant",
+    "ControllerSettings",
+    "Decision",
+    "Disturbance",
+    "Execution",
+    "Exponential",
+    "Fabric",
+    "Flow",
+    "FrozenDict",
+    "Gamma",
+    "Link",
+    "LinkDisturbance",
+    "LogNormal",
+    "Node",
+    "NodeDisturbance",
+    "Normal",
+    "Objective",
+    "Pipeline",
+    "Placement",
+    "Problem",
+    "Process",
+    "QoS",
+    "Quota",
+    "Reason",
+    "Scenario",
+    "Targets",
+    "Task",
+    "Tier",
+    "Trace",
+    "TraceTable",
+    "Uniform",
+    "Weights",
+]

@@ -1,0 +1,168 @@
+"""Fabric: the computers and the directed links between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from dwell.model.bounds import (
+    ACCELERATORS,
+    BURST_MEAN,
+    CORES,
+    FOREIGN_THREADS,
+    LOSS,
+    QUOTA_CPU,
+    QUOTA_PERIOD_MS,
+    RATE_MBPS,
+    RETRANSMIT_MS,
+    require,
+)
+from dwell.model.frozen import FrozenDict, require_names
+from dwell.model.objective import TIERS, Tier
+from dwell.model.process import Constant, Process
+
+__all__ = ["SCHEDULERS", "Bursts", "Fabric", "Link", "Node", "Quota", "Scheduler"]
+
+Scheduler: TypeAlias = Literal["fair", "fifo", "priority"]
+SCHEDULERS: tuple[Scheduler, ...] = ("fair", "fifo", "priority")
+
+
+@dataclass(frozen=True, slots=True)
+class Bursts:
+    """An alternating renewal process: quiet for `every_ms`, then disturbed for `for_ms`.
+
+    What the disturbance does belongs to what it is declared on: `threads` of foreign work on a
+    node, `add_delay_ms` to every message on a link.
+    """
+
+    every_ms: Process
+    for_ms: Process
+    threads: int = 0
+    add_delay_ms: Process = field(default_factory=lambda: Constant(0.0))
+
+    def __post_init__(self) -> None:
+        for path, process in (("every_ms", self.every_ms), ("for_ms", self.for_ms)):
+            mean = process.expectation
+            bound = f"a process whose mean is {BURST_MEAN}"
+            require(BURST_MEAN.holds(mean), path, mean, bound)
+        FOREIGN_THREADS.check("threads", self.threads)
+
+
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """CPU bandwidth control: `cpu` cores' worth of run time in every `period_ms`."""
+
+    cpu: float
+    period_ms: float
+
+    def __post_init__(self) -> None:
+        QUOTA_CPU.check("quota.cpu", self.cpu)
+        QUOTA_PERIOD_MS.check("quota.period_ms", self.period_ms)
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A computer.
+
+    Parameters
+    ----------
+    name : str
+    tier : {"robot", "edge", "cloud"}
+    cores : int
+    scheduler : {"fair", "fifo", "priority"}
+        How jobs share the cores.
+    accelerators : mapping of str to int
+        How many of each kind it has.
+    bursts : Bursts, optional
+        Foreign work of other tenants, in every scenario.
+    quota : Quota, optional
+        CPU bandwidth limit on the cell's own work.
+    """
+
+    name: str
+    tier: Tier
+    cores: int = 1
+    scheduler: Scheduler = "fair"
+    accelerators: Mapping[str, int] = field(default_factory=FrozenDict)
+    bursts: Bursts | None = None
+    quota: Quota | None = None
+
+    def __post_init__(self) -> None:
+        require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
+        bound = f"one of {', '.join(SCHEDULERS)}"
+        require(self.scheduler in SCHEDULERS, "scheduler", self.scheduler, bound)
+        CORES.check("cores", self.cores)
+        for kind, count in self.accelerators.items():
+            ACCELERATORS.check(f"accelerators.{kind}", count)
+        if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
+            delay = self.bursts.add_delay_ms
+            require(False, "bursts.add_delay_ms", delay, "left out: only a link adds a delay")
+        object.__setattr__(self, "accelerators", FrozenDict(self.accelerators))
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A directed connection.
+
+    Parameters
+    ----------
+    source, target : str
+        Node names.
+    delay_ms : Process
+        Propagation delay, one value a message.
+    rate_mbps : float
+        Serialisation rate, megabits a second; infinite where messages do not queue.
+    loss : float
+        Probability that an attempt to send a message is lost, in [0, 1).
+    retransmit_ms : float, optional
+        Timeout after which a lost attempt is repeated; None drops the message.
+    in_order : bool
+        Whether a message waits for those sent before it.
+    bursts : Bursts, optional
+        Episodes of extra delay, in every scenario.
+    """
+
+    source: str
+    target: str
+    delay_ms: Process
+    rate_mbps: float = math.inf
+    loss: float = 0.0
+    retransmit_ms: float | None = None
+    in_order: bool = False
+    bursts: Bursts | None = None
+
+    def __post_init__(self) -> None:
+        require(self.source != self.target, "to", self.target, "another node than `from`")
+        RATE_MBPS.check("rate_mbps", self.rate_mbps)
+        LOSS.check("loss", self.loss)
+        if self.retransmit_ms is not None:
+            RETRANSMIT_MS.check("on_loss.retransmit_ms", self.retransmit_ms)
+        if self.bursts is not None:
+            threads = self.bursts.threads
+            require(threads == 0, "bursts.threads", threads, "left out: only a node has threads")
+
+    @property
+    def name(self) -> str:
+        """``R1->E``."""
+        return f"{self.source}->{self.target}"
+
+
+@dataclass(frozen=True, slots=True)
+class Fabric:
+    """Nodes and links."""
+
+    nodes: Mapping[str, Node]
+    links: Mapping[str, Link] = field(default_factory=FrozenDict)
+
+    def __post_init__(self) -> None:
+        require(len(self.nodes) > 0, "nodes", dict(self.nodes), "at least one node")
+        require_names("nodes", self.nodes)
+        require_names("links", self.links)
+        object.__setattr__(self, "nodes", FrozenDict(self.nodes))
+        object.__setattr__(self, "links", FrozenDict(self.links))
+
+    def tier(self, tier: Tier) -> tuple[str, ...]:
+        """Names of a tier's nodes, in the file's order."""
+        return tuple(name for name, node in self.nodes.items() if node.tier == tier)

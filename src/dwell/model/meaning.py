@@ -1,0 +1,277 @@
+"""What a cell must satisfy as a whole: names that resolve, an acyclic DAG, links that exist.
+
+The checks work on parts, so that a file whose structure is broken in one place is still checked
+everywhere else, and every fault is reported at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from dwell.errors import Fault
+from dwell.model.fabric import Link, Node
+from dwell.model.pipeline import Flow, Task
+from dwell.model.scenario import Disturbance, NodeDisturbance
+
+if TYPE_CHECKING:
+    from dwell.model.problem import ControllerSettings
+
+__all__ = ["Parts", "find_faults", "nearest"]
+
+# Names become columns, file names and keys of messages.
+NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
+LONGEST_NAME = 64
+
+
+@dataclass(slots=True)
+class Parts:
+    """Parts of a cell, with the path each has in its file.
+
+    A value of None is a part whose name is known but whose content could not be read (its own
+    fault is reported elsewhere): references to it resolve, and nothing more is asked of it.
+    """
+
+    nodes: Mapping[str, Node | None] = field(default_factory=dict)
+    links: Sequence[tuple[str, Link]] = ()
+    links_complete: bool = True
+    tasks: Mapping[str, Task | None] = field(default_factory=dict)
+    flows: Sequence[tuple[str, Flow]] = ()
+    scales: Iterable[str] = ()
+    candidates: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    broken_candidates: Iterable[str] = ()
+    scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
+    controller: ControllerSettings | None = None
+    tiers: Iterable[str] = ()
+    reserved: Iterable[str] = ()
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return a remedy for an unknown name: the nearest known one, or the list of them."""
+    names = list(known)
+    match = difflib.get_close_matches(word, names, n=1, cutoff=0.6)
+    if match:
+        return f"did you mean {match[0]!r}?"
+    return f"known: {', '.join(names)}" if names else "none is declared"
+
+
+def find_faults(parts: Parts) -> list[Fault]:
+    """Return every fault in the meaning of a cell's parts, in the order of the file."""
+    return [
+        *_names(parts),
+        *_links(parts),
+        *_tasks(parts),
+        *_flows(parts),
+        *_candidates(parts),
+        *_scenarios(parts),
+        *_objective(parts),
+        *_controller(parts),
+    ]
+
+
+def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[Fault]:
+    names = list(known)
+    if word not in names:
+        yield Fault(path, f"unknown {what} {word!r}; {nearest(word, names)}")
+
+
+def _names(parts: Parts) -> Iterator[Fault]:
+    sections: dict[str, Iterable[str]] = {
+        "nodes": parts.nodes,
+        "tasks": parts.tasks,
+        "scales": parts.scales,
+        "candidates": parts.candidates,
+        "scenarios": parts.scenarios,
+    }
+    for section, names in sections.items():
+        for name in names:
+            if NAME.fullmatch(name) is None or len(name) > LONGEST_NAME:
+                yield Fault(
+                    f"{section}.{name}",
+                    f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, "
+                    f"a letter, a digit or _ first, at most {LONGEST_NAME} characters",
+                )
+
+
+def _links(parts: Parts) -> Iterator[Fault]:
+    seen: dict[str, str] = {}
+    for path, link in parts.links:
+        yield from _unknown(f"{path}.from", "node", link.source, parts.nodes)
+        yield from _unknown(f"{path}.to", "node", link.target, parts.nodes)
+        if link.name in seen:
+            yield Fault(
+                path,
+                f"link {link.name} is declared again (first at {seen[link.name]}); "
+                "keep one, or drop `both_ways` from the other",
+            )
+        seen.setdefault(link.name, path)
+
+
+def _tasks(parts: Parts) -> Iterator[Fault]:
+    if not parts.tasks:
+        yield Fault("tasks", "none is declared; a pipeline needs at least one task")
+    targets = {flow.target for _, flow in parts.flows}
+    for name, task in parts.tasks.items():
+        if task is None:
+            continue
+        path = f"tasks.{name}"
+        if task.scale is not None:
+            yield from _unknown(f"{path}.scale", "scale", task.scale, parts.scales)
+        if task.offset_ms and name in targets:
+            yield Fault(
+                f"{path}.offset_ms",
+                f"{task.offset_ms:g} on a task with inputs; only a source has an offset: remove it",
+            )
+        for node_name, execution in task.on.items():
+            yield from _unknown(f"{path}.on.{node_name}", "node", node_name, parts.nodes)
+            node = parts.nodes.get(node_name)
+            kind = execution.accelerator
+            if node is not None and kind is not None:
+                yield from _unknown(
+                    f"{path}.on.{node_name}.accelerator",
+                    f"accelerator of {node_name}",
+                    kind,
+                    node.accelerators,
+                )
+
+
+def _flows(parts: Parts) -> Iterator[Fault]:
+    seen: dict[tuple[str, str], str] = {}
+    for path, flow in parts.flows:
+        yield from _unknown(f"{path}.from", "task", flow.source, parts.tasks)
+        yield from _unknown(f"{path}.to", "task", flow.target, parts.tasks)
+        pair = (flow.source, flow.target)
+        if pair in seen:
+            where = f"(first at {seen[pair]})"
+            yield Fault(path, f"flow {flow.source} -> {flow.target} is declared again {where}")
+        seen.setdefault(pair, path)
+    loop = _cycle(parts.tasks, [flow for _, flow in parts.flows])
+    if loop:
+        walk = " -> ".join((*loop, loop[0]))
+        yield Fault("flows", f"the cycle {walk} never starts; remove one of these flows")
+
+
+def _cycle(tasks: Iterable[str], flows: Sequence[Flow]) -> list[str]:
+    """Return the tasks of one directed cycle, or an empty list (depth-first search)."""
+    after: dict[str, list[str]] = {task: [] for task in tasks}
+    for flow in flows:
+        if flow.source in after and flow.target in after:
+            after[flow.source].append(flow.target)
+    finished: set[str] = set()
+    for root, first in after.items():
+        trail: list[str] = []
+        stack: list[tuple[str, Iterator[str]]] = []
+        if root not in finished:
+            trail.append(root)
+            stack.append((root, iter(first)))
+        while stack:
+            task, rest = stack[-1]
+            following = next(rest, None)
+            if following is None:
+                finished.add(task)
+                trail.pop()
+                stack.pop()
+            elif following in trail:
+                return trail[trail.index(following) :]
+            elif following not in finished:
+                trail.append(following)
+                stack.append((following, iter(after[following])))
+    return []
+
+
+def _candidates(parts: Parts) -> Iterator[Fault]:
+    if not parts.candidates and not list(parts.broken_candidates):
+        yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
+    for name, moves in parts.candidates.items():
+        path = f"candidates.{name}"
+        if name in parts.reserved:
+            yield Fault(path, f"the name {name!r} is a policy's; choose another for the placement")
+        faults = list(_placed(parts, path, moves))
+        yield from faults
+        if not faults:
+            yield from _connected(parts, path, moves)
+
+
+def _placed(parts: Parts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
+    for task_name, node in moves.items():
+        here = f"{path}.{task_name}"
+        if task_name not in parts.tasks:
+            yield from _unknown(here, "task", task_name, parts.tasks)
+            continue
+        task = parts.tasks[task_name]
+        if task is None or node in task.on:
+            continue
+        feasible = ", ".join(task.on)
+        if node not in parts.nodes:
+            yield from _unknown(here, "node", node, parts.nodes)
+        elif task.anchored:
+            yield Fault(here, f"{task_name} is anchored to {feasible}; it cannot move to {node}")
+        else:
+            yield Fault(here, f"{task_name} cannot run on {node!r}; feasible: {feasible}")
+    for task_name, task in parts.tasks.items():
+        if task is not None and not task.anchored and task_name not in moves:
+            where = " or ".join(task.on)
+            yield Fault(path, f"relocatable task {task_name!r} is not placed; put it on {where}")
+
+
+def _connected(parts: Parts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
+    if not parts.links_complete:
+        return
+    links = {link.name for _, link in parts.links}
+    missing: dict[str, list[str]] = {}
+    for _, flow in parts.flows:
+        source = _node_of(parts, moves, flow.source)
+        target = _node_of(parts, moves, flow.target)
+        if source is None or target is None or source == target:
+            continue
+        if f"{source}->{target}" not in links:
+            flows = missing.setdefault(f"{source}->{target}", [])
+            flows.append(f"{flow.source} -> {flow.target}")
+    for name, flows in missing.items():
+        remedy = "declare it under `links`, or drop the candidate"
+        yield Fault(path, f"needs the link {name} for {', '.join(flows)}; {remedy}")
+
+
+def _node_of(parts: Parts, moves: Mapping[str, str], task_name: str) -> str | None:
+    if task_name in moves:
+        return moves[task_name]
+    task = parts.tasks.get(task_name)
+    return next(iter(task.on)) if task is not None else None
+
+
+def _scenarios(parts: Parts) -> Iterator[Fault]:
+    links = [link.name for _, link in parts.links]
+    for name, items in parts.scenarios.items():
+        if name == "baseline" and items:
+            yield Fault(
+                "scenarios.baseline",
+                "must stay empty: it is the cell undisturbed; give the scenario another name",
+            )
+        for path, item in items:
+            if isinstance(item, NodeDisturbance):
+                yield from _unknown(f"{path}.node", "node", item.node, parts.nodes)
+            elif parts.links_complete:
+                yield from _unknown(f"{path}.link", "link", item.link, links)
+
+
+def _objective(parts: Parts) -> Iterator[Fault]:
+    for name in parts.tiers:
+        yield from _unknown(f"objective.tiers.{name}", "node", name, parts.nodes)
+
+
+def _controller(parts: Parts) -> Iterator[Fault]:
+    settings = parts.controller
+    if settings is None:
+        return
+    names = [*parts.candidates, *parts.broken_candidates]
+    if settings.on is not None:
+        yield from _unknown("controller.on", "node", settings.on, parts.nodes)
+    if settings.initial is not None:
+        yield from _unknown("controller.initial", "candidate", settings.initial, names)
+    for index, name in enumerate(settings.fallbacks):
+        yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
+    known = [*parts.reserved, *names]
+    yield from _unknown("controller.policy", "policy", settings.policy, known)

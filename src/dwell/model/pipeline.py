@@ -1,0 +1,164 @@
+"""Pipeline: tasks, the flows between them, a period and a deadline."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from dwell.model.bounds import (
+    BYTES,
+    DEADLINE_MS,
+    DEPTH,
+    PERIOD_MS,
+    PRIORITY,
+    STATE_BYTES,
+    THREADS,
+    TIME_MS,
+    WORKERS,
+    require,
+)
+from dwell.model.frozen import FrozenDict, require_names
+from dwell.model.process import Constant, Process
+
+__all__ = ["Execution", "Flow", "Pipeline", "Task"]
+
+
+@dataclass(frozen=True, slots=True)
+class Execution:
+    """How a task runs on one feasible node.
+
+    Parameters
+    ----------
+    exec_ms : Process
+        Time one job needs there when nothing disturbs it, milliseconds.
+    threads : int
+        Cores the job can use at once; `exec_ms` is the time with all of them.
+    workers : int
+        Jobs of this task that may run there at the same time.
+    accelerator : str, optional
+        Kind of accelerator the job runs on instead of the CPU.
+    """
+
+    exec_ms: Process
+    threads: int = 1
+    workers: int = 1
+    accelerator: str | None = None
+
+    def __post_init__(self) -> None:
+        THREADS.check("threads", self.threads)
+        WORKERS.check("workers", self.workers)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A static stage of the pipeline, a vertex of the DAG.
+
+    Parameters
+    ----------
+    name : str
+    on : mapping of str to Execution
+        Feasible nodes (N_v); one makes the task anchored, more make it relocatable.
+    depth : int
+        How many complete input sets may wait for a worker: 0 is no bound (``input: queue``), 1 is
+        ``input: latest``; beyond it the oldest cycle is replaced.
+    priority : int
+        Larger runs first on a ``priority`` node.
+    scale : str, optional
+        Name of the per-cycle process that multiplies the execution time on every node.
+    offset_ms : float
+        Start of a source after the cycle's release; 0 for any other task.
+    start_ms : float
+        Time a new worker needs before its first job.
+    state_bytes : int
+        State that a cold migration carries over the link.
+    """
+
+    name: str
+    on: Mapping[str, Execution]
+    depth: int = 0
+    priority: int = 0
+    scale: str | None = None
+    offset_ms: float = 0.0
+    start_ms: float = 0.0
+    state_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        require(len(self.on) > 0, "on", dict(self.on), "at least one node")
+        DEPTH.check("input", self.depth)
+        PRIORITY.check("priority", self.priority)
+        TIME_MS.check("offset_ms", self.offset_ms)
+        TIME_MS.check("start_ms", self.start_ms)
+        STATE_BYTES.check("state_bytes", self.state_bytes)
+        object.__setattr__(self, "on", FrozenDict(self.on))
+
+    @property
+    def anchored(self) -> bool:
+        """Whether one node only can run it."""
+        return len(self.on) == 1
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """A precedence edge with the payload that travels along it."""
+
+    source: str
+    target: str
+    payload_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        BYTES.check("bytes", self.payload_bytes)
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """Tasks and flows of a control loop with its timing.
+
+    Parameters
+    ----------
+    tasks : mapping of str to Task
+        In the file's order.
+    flows : tuple of Flow
+        Any directed acyclic graph.
+    period_ms, deadline_ms : float
+        P and D, with D at most P.
+    release_jitter_ms : Process
+        Added to every nominal release instant.
+    scales : mapping of str to Process
+        Per-cycle factors that tasks may name.
+    """
+
+    tasks: Mapping[str, Task]
+    flows: tuple[Flow, ...]
+    period_ms: float
+    deadline_ms: float
+    release_jitter_ms: Process = field(default_factory=lambda: Constant(0.0))
+    scales: Mapping[str, Process] = field(default_factory=FrozenDict)
+
+    def __post_init__(self) -> None:
+        PERIOD_MS.check("period_ms", self.period_ms)
+        DEADLINE_MS.check("deadline_ms", self.deadline_ms)
+        bound = f"at most period_ms = {self.period_ms:g}"
+        require(self.deadline_ms <= self.period_ms, "deadline_ms", self.deadline_ms, bound)
+        require_names("tasks", self.tasks)
+        object.__setattr__(self, "tasks", FrozenDict(self.tasks))
+        object.__setattr__(self, "flows", tuple(self.flows))
+        object.__setattr__(self, "scales", FrozenDict(self.scales))
+
+    def inputs(self, task: str) -> tuple[Flow, ...]:
+        """Flows into a task."""
+        return tuple(flow for flow in self.flows if flow.target == task)
+
+    def outputs(self, task: str) -> tuple[Flow, ...]:
+        """Flows out of a task."""
+        return tuple(flow for flow in self.flows if flow.source == task)
+
+    def topological(self) -> tuple[str, ...]:
+        """Tasks so that every flow points forward; tasks on a cycle are left out."""
+        waiting = {name: len(self.inputs(name)) for name in self.tasks}
+        order: list[str] = [name for name, count in waiting.items() if count == 0]
+        for name in order:
+            for flow in self.outputs(name):
+                waiting[flow.target] -= 1
+                if waiting[flow.target] == 0:
+                    order.append(flow.target)
+        return tuple(order)

@@ -1,0 +1,190 @@
+"""Problem: everything known before a run starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from dwell.errors import Fault, ProblemError
+from dwell.model.bounds import (
+    GUARD_CYCLES,
+    LEAD_CYCLES,
+    MIN_DWELL,
+    MIN_IMPROVEMENT,
+    TIME_MS,
+    WARMUP_WINDOWS,
+    WINDOW_CYCLES,
+    require,
+)
+from dwell.model.fabric import Fabric
+from dwell.model.frozen import FrozenDict
+from dwell.model.meaning import Parts, find_faults, nearest
+from dwell.model.objective import Objective
+from dwell.model.pipeline import Pipeline
+from dwell.model.placement import Placement
+from dwell.model.scenario import Scenario
+
+__all__ = ["ESTIMATORS", "POLICIES", "ControllerSettings", "Problem"]
+
+POLICIES = ("dtp", "atp", "latency-first")
+ESTIMATORS = ("profile",)
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerSettings:
+    """Where the controller sits, which policy it runs, and how its orders travel.
+
+    Parameters
+    ----------
+    on : str, optional
+        Node; the first edge node, else the first node, where None.
+    policy : str
+        A policy's name, or a candidate's for the placement that never moves.
+    initial : str, optional
+        Candidate to start with; the first where None.
+    min_dwell : int
+        N_min, windows.
+    min_improvement : float
+        Delta_min, in units of J.
+    estimator : str
+    guard_cycles : int
+        Periods without a completion after which the guard on the robot moves to a fallback.
+    fallbacks : tuple of str
+        Candidates the guard may move to, best first; none switches the guard off.
+    order_delay_ms : float
+        Time an order travels to the stamper.
+    order_lead_cycles : int
+        Cycles between the close of a window and the first one its order may stamp.
+    close_grace_ms : float
+        Time a window stays open after the release of the first cycle beyond it.
+    """
+
+    on: str | None = None
+    policy: str = "dtp"
+    initial: str | None = None
+    min_dwell: int = 3
+    min_improvement: float = 0.05
+    estimator: str = "profile"
+    guard_cycles: int = 3
+    fallbacks: tuple[str, ...] = ()
+    order_delay_ms: float = 0.0
+    order_lead_cycles: int = 0
+    close_grace_ms: float = 0.0
+
+    def __post_init__(self) -> None:
+        MIN_DWELL.check("min_dwell", self.min_dwell)
+        MIN_IMPROVEMENT.check("min_improvement", self.min_improvement)
+        GUARD_CYCLES.check("guard_cycles", self.guard_cycles)
+        LEAD_CYCLES.check("order_lead_cycles", self.order_lead_cycles)
+        TIME_MS.check("order_delay_ms", self.order_delay_ms)
+        TIME_MS.check("close_grace_ms", self.close_grace_ms)
+        object.__setattr__(self, "fallbacks", tuple(self.fallbacks))
+        bound = f"one of {', '.join(ESTIMATORS)}"
+        require(self.estimator in ESTIMATORS, "estimator", self.estimator, bound)
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A cell, checked as a whole: one that exists is valid.
+
+    Parameters
+    ----------
+    name : str
+    pipeline : Pipeline
+    fabric : Fabric
+    candidates : mapping of str to Placement
+        Pi_cand; each covers every task.
+    objective : Objective
+    scenarios : mapping of str to tuple of disturbances
+        `baseline`, the empty one, is added where it is missing.
+    controller : ControllerSettings
+    window_cycles : int
+        W.
+    warmup_windows : int
+        First windows of a run, recorded but left out of statistics.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
+
+    name: str
+    pipeline: Pipeline
+    fabric: Fabric
+    candidates: Mapping[str, Placement]
+    objective: Objective
+    scenarios: Mapping[str, Scenario] = field(default_factory=FrozenDict)
+    controller: ControllerSettings = field(default_factory=ControllerSettings)
+    window_cycles: int = 50
+    warmup_windows: int = 0
+
+    def __post_init__(self) -> None:
+        WINDOW_CYCLES.check("window_cycles", self.window_cycles)
+        WARMUP_WINDOWS.check("warmup_windows", self.warmup_windows)
+        declared = {name: tuple(items) for name, items in self.scenarios.items()}
+        scenarios = {"baseline": (), **declared}
+        object.__setattr__(self, "scenarios", FrozenDict(scenarios))
+        object.__setattr__(self, "candidates", FrozenDict(self.candidates))
+        faults = [*find_faults(self._parts()), *self._unplaced()]
+        if faults:
+            raise ProblemError(faults)
+
+    def _unplaced(self) -> list[Fault]:
+        """Anchored tasks that a placement leaves out (a cell file's may, a Placement may not)."""
+        return [
+            Fault(f"candidates.{name}.{task}", f"not placed; put it on {next(iter(on))}")
+            for name, placement in self.candidates.items()
+            for task, on in ((task.name, task.on) for task in self.pipeline.tasks.values())
+            if task not in placement and len(on) == 1
+        ]
+
+    def _parts(self) -> Parts:
+        links = self.fabric.links.values()
+        return Parts(
+            nodes=self.fabric.nodes,
+            links=[(f"links[{i}]", link) for i, link in enumerate(links)],
+            tasks=self.pipeline.tasks,
+            flows=[(f"flows[{i}]", flow) for i, flow in enumerate(self.pipeline.flows)],
+            scales=self.pipeline.scales,
+            candidates=self.candidates,
+            scenarios={
+                name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
+                for name, items in self.scenarios.items()
+            },
+            controller=self.controller,
+            tiers=self.objective.tiers,
+            reserved=POLICIES,
+        )
+
+    @property
+    def initial(self) -> str:
+        """Name of the candidate that a run starts with."""
+        return self.controller.initial or next(iter(self.candidates))
+
+    @property
+    def censor_ms(self) -> float:
+        """Latency that stands for any longer one in J, so that J is finite: max(10 D, W P)."""
+        pipeline = self.pipeline
+        return max(10 * pipeline.deadline_ms, self.window_cycles * pipeline.period_ms)
+
+    @property
+    def controller_node(self) -> str:
+        """Node the controller sits on."""
+        if self.controller.on is not None:
+            return self.controller.on
+        return next(iter((*self.fabric.tier("edge"), *self.fabric.nodes)))
+
+    def scenario(self, name: str) -> Scenario:
+        """Disturbances of a scenario.
+
+        Raises
+        ------
+        ProblemError
+            If there is none of that name; the message lists the known ones.
+        """
+        if name not in self.scenarios:
+            known = ", ".join(self.scenarios)
+            hint = nearest(name, self.scenarios)
+            raise ProblemError(f"unknown scenario {name!r}; {hint} (scenarios here: {known})")
+        return self.scenarios[name]

@@ -1,0 +1,401 @@
+"""Random processes of durations: what a number in a cell file may be instead of a number.
+
+Each process is a frozen description with a stationary marginal distribution. ``marginal`` draws
+independent values of it; drawing a *path* (with an ``ar1`` process's memory, or a trace replayed
+in order) is the simulator's business.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import Fault, TraceError
+from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, require
+
+__all__ = [
+    "AR1",
+    "Constant",
+    "Exponential",
+    "Gamma",
+    "LogNormal",
+    "Normal",
+    "Process",
+    "Trace",
+    "TraceTable",
+    "Uniform",
+    "require",
+]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+# One nanosecond, in milliseconds.
+NS = 1e-6
+
+
+@runtime_checkable
+class Process(Protocol):
+    """A stationary random process with non-negative values (milliseconds, or a bare factor)."""
+
+    @property
+    def expectation(self) -> float:
+        """Mean of the marginal distribution."""
+        ...
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values of the marginal distribution."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """Always the same value."""
+
+    value: float
+
+    def __post_init__(self) -> None:
+        VALUE.check("constant", self.value)
+
+    @property
+    def expectation(self) -> float:
+        """The value."""
+        return self.value
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Return `size` copies; draws nothing from `rng`."""
+        return np.full(size, self.value)
+
+
+@dataclass(frozen=True, slots=True)
+class Uniform:
+    """Uniform on [low, high]."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        VALUE.check("uniform.low", self.low)
+        VALUE.check("uniform.high", self.high)
+        require(self.high >= self.low, "uniform.high", self.high, f"at least low = {self.low:g}")
+
+    @property
+    def expectation(self) -> float:
+        """Midpoint of the interval."""
+        return (self.low + self.high) / 2
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values."""
+        return rng.uniform(self.low, self.high, size)
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """Gaussian, clipped from below at `min` (the clipped mass sits on `min`)."""
+
+    mean: float
+    std: float
+    min: float = 0.0
+
+    def __post_init__(self) -> None:
+        REAL.check("normal.mean", self.mean)
+        VALUE.check("normal.std", self.std)
+        VALUE.check("normal.min", self.min)
+
+    @property
+    def expectation(self) -> float:
+        """Mean after clipping."""
+        if self.std == 0:
+            return max(self.mean, self.min)
+        z = (self.min - self.mean) / self.std
+        density = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
+        below = 0.5 * math.erfc(-z / math.sqrt(2))
+        return self.min * below + self.mean * (1 - below) + self.std * density
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values."""
+        values = rng.standard_normal(size)
+        values *= self.std
+        values += self.mean
+        return np.maximum(values, self.min, out=values)
+
+
+@dataclass(frozen=True, slots=True)
+class LogNormal:
+    """Lognormal with the mean and coefficient of variation of the value itself, not of its log."""
+
+    mean: float
+    cv: float
+
+    def __post_init__(self) -> None:
+        MEAN.check("lognormal.mean", self.mean)
+        CV.check("lognormal.cv", self.cv)
+
+    @property
+    def expectation(self) -> float:
+        """The mean."""
+        return self.mean
+
+    @property
+    def log_parameters(self) -> tuple[float, float]:
+        """Mean and standard deviation of the logarithm."""
+        variance = math.log1p(self.cv * self.cv)
+        return math.log(self.mean) - variance / 2, math.sqrt(variance)
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values."""
+        mu, sigma = self.log_parameters
+        values = rng.standard_normal(size)
+        values *= sigma
+        values += mu
+        return np.exp(values, out=values)
+
+
+@dataclass(frozen=True, slots=True)
+class Gamma:
+    """Gamma with the given mean and coefficient of variation."""
+
+    mean: float
+    cv: float
+
+    def __post_init__(self) -> None:
+        MEAN.check("gamma.mean", self.mean)
+        GAMMA_CV.check("gamma.cv", self.cv)
+
+    @property
+    def expectation(self) -> float:
+        """The mean."""
+        return self.mean
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values."""
+        shape = 1 / (self.cv * self.cv)
+        return rng.gamma(shape, self.mean / shape, size)
+
+
+@dataclass(frozen=True, slots=True)
+class Exponential:
+    """Exponential with the given mean."""
+
+    mean: float
+
+    def __post_init__(self) -> None:
+        MEAN.check("exponential.mean", self.mean)
+
+    @property
+    def expectation(self) -> float:
+        """The mean."""
+        return self.mean
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values."""
+        return rng.exponential(self.mean, size)
+
+
+@dataclass(frozen=True, slots=True)
+class AR1:
+    """Positive first-order autoregression: lognormal marginal, lag-1 correlation `rho`.
+
+    The logarithm is a Gaussian AR(1) process. Its own correlation is chosen so that the *value*
+    (not its logarithm) has exactly the mean, coefficient of variation and correlation given:
+    for a lognormal pair, corr = (exp(r s^2) - 1) / (exp(s^2) - 1), hence
+    r = log(1 + rho cv^2) / s^2 with s^2 = log(1 + cv^2).
+    """
+
+    mean: float
+    cv: float
+    rho: float
+
+    def __post_init__(self) -> None:
+        MEAN.check("ar1.mean", self.mean)
+        CV.check("ar1.cv", self.cv)
+        RHO.check("ar1.rho", self.rho)
+        reachable = 1 + self.rho * self.cv**2 > 0 and abs(self.log_correlation) < 1
+        require(
+            reachable, "ar1.rho", self.rho, f"reachable by a positive process of cv {self.cv:g}"
+        )
+
+    @property
+    def expectation(self) -> float:
+        """The mean."""
+        return self.mean
+
+    @property
+    def log_correlation(self) -> float:
+        """Lag-1 correlation of the logarithm."""
+        if self.cv < 1e-8:  # the limit; below it, cv^2 leaves the floating-point numbers
+            return self.rho
+        return math.log1p(self.rho * self.cv**2) / math.log1p(self.cv**2)
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` independent values (without the memory)."""
+        return LogNormal(self.mean, self.cv).marginal(rng, size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TraceTable:
+    """Columns of one file of measurements; every process that names the file shares its rows.
+
+    Parameters
+    ----------
+    file : str
+        As written in the cell file; also the name in messages.
+    columns : mapping of str to array of float64, shape (rows,)
+        The columns that some process of the cell uses.
+    by : {"row", "time"}
+        Whether a cycle takes the next row, or the latest row sent at or before its release.
+    starts : array of int64
+        First row of every group, ascending, from 0; one group where the file is not grouped.
+    time_ms : array of float64, shape (rows,), optional
+        Instant of each row since its group's first, ascending; needed by ``by: time``.
+    wrap : bool
+        Whether replay goes on at the beginning when the rows end.
+    group : str or tuple of str, optional
+        Columns whose values make a group.
+    on_negative, time
+        As written in the cell file.
+    dropped : int
+        Rows left out by ``on_negative: drop``, or clipped by ``clip``.
+    """
+
+    file: str
+    columns: dict[str, Floats]
+    by: Literal["row", "time"] = "row"
+    starts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    time_ms: Floats | None = None
+    wrap: bool = False
+    group: str | tuple[str, ...] | None = None
+    on_negative: Literal["error", "drop", "clip"] = "error"
+    time: str | None = None
+    dropped: int = 0
+
+    def __post_init__(self) -> None:
+        lengths = {len(column) for column in self.columns.values()}
+        if self.time_ms is not None:
+            lengths.add(len(self.time_ms))
+        if len(lengths) != 1 or 0 in lengths:
+            raise TraceError([Fault(self.file, "needs columns of one length, at least one row")])
+        if self.by == "time" and self.time_ms is None:
+            raise TraceError([Fault(self.file, "has no instants; `by: time` needs a time column")])
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(next(iter(self.columns.values())))
+
+    def replay(self, rng: np.random.Generator, release_ms: Floats) -> NDArray[np.int64]:
+        """Rows that cycles released at `release_ms` take, from a random start.
+
+        Without ``wrap`` the start is drawn from those after which enough rows (or enough time)
+        remain in the same group.
+
+        Raises
+        ------
+        TraceError
+            If no group is long enough and the trace does not wrap.
+        """
+        ends = np.append(self.starts[1:], self.rows)
+        if self.by == "row" or self.time_ms is None:
+            return self._replay_rows(rng, len(release_ms), ends)
+        return self._replay_time(rng, release_ms - release_ms[0], self.time_ms, ends)
+
+    def _replay_rows(
+        self, rng: np.random.Generator, cycles: int, ends: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        if self.wrap:
+            # The whole file is one loop, so that every row is used and groups keep their order.
+            return (rng.integers(self.rows) + np.arange(cycles)) % self.rows
+        slack = np.maximum(ends - self.starts - cycles + 1, 0)
+        before = np.cumsum(slack)
+        if before[-1] == 0:
+            longest = int((ends - self.starts).max())
+            raise self._too_short(f"{longest} rows", f"{cycles} cycles")
+        pick = int(rng.integers(before[-1]))
+        group = int(np.searchsorted(before, pick, side="right"))
+        first = int(self.starts[group]) + pick - int(before[group] - slack[group])
+        return np.arange(first, first + cycles)
+
+    def _replay_time(
+        self,
+        rng: np.random.Generator,
+        elapsed_ms: Floats,
+        time_ms: Floats,
+        ends: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        spans = time_ms[ends - 1]
+        if self.wrap:
+            return self._wrap_time(rng, elapsed_ms, time_ms, spans, ends - self.starts)
+        needs = float(elapsed_ms[-1])
+        # Releases are whole nanoseconds: a trace that ends within one of them is long enough.
+        long_enough = spans + NS >= needs
+        if not long_enough.any():
+            raise self._too_short(f"{spans.max() / 1e3:.6g} s", f"{needs / 1e3:.6g} s")
+        slack = np.maximum(spans - needs, 0)
+        before = np.cumsum(slack)
+        if before[-1] > 0:
+            pick = rng.uniform(0, before[-1])
+            last = int(np.flatnonzero(slack)[-1])
+            group = min(int(np.searchsorted(before, pick, side="right")), last)
+            offset = min(max(pick - float(before[group] - slack[group]), 0.0), float(slack[group]))
+        else:
+            group, offset = int(rng.choice(np.flatnonzero(long_enough))), 0.0
+        rows = slice(int(self.starts[group]), int(ends[group]))
+        inside = np.searchsorted(time_ms[rows], offset + elapsed_ms, side="right") - 1
+        return np.asarray(inside + int(self.starts[group]), np.int64)
+
+    def _wrap_time(
+        self,
+        rng: np.random.Generator,
+        elapsed_ms: Floats,
+        time_ms: Floats,
+        spans: Floats,
+        counts: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        # A group lasts one mean row spacing (its own, or that of all) beyond its last row.
+        gaps = counts - 1
+        usual = spans.sum() / max(int(gaps.sum()), 1)
+        lengths = spans + np.where(gaps > 0, spans / np.maximum(gaps, 1), usual)
+        total = float(lengths.sum())
+        if total == 0:  # every row has the same instant: their order is all there is
+            return self._replay_rows(rng, len(elapsed_ms), np.array([self.rows]))
+        begin = np.concatenate(([0.0], np.cumsum(lengths)[:-1]))
+        instants = np.repeat(begin, counts) + time_ms
+        phase = (rng.uniform(0, total) + elapsed_ms) % total
+        return np.asarray(np.searchsorted(instants, phase, side="right") - 1, np.int64)
+
+    def _too_short(self, has: str, needs: str) -> TraceError:
+        where = "longest group" if len(self.starts) > 1 else "trace"
+        return TraceError(
+            [
+                Fault(
+                    self.file,
+                    f"the {where} has {has} but the run needs {needs}, and wrap is false; "
+                    "ask for fewer windows, or set `wrap: true` to go on from its beginning",
+                )
+            ]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """A recorded column, replayed in order."""
+
+    table: TraceTable
+    column: str
+
+    @property
+    def values(self) -> Floats:
+        """The column, milliseconds, one value a row."""
+        return self.table.columns[self.column]
+
+    @property
+    def expectation(self) -> float:
+        """Mean of the recorded values."""
+        return float(self.values.mean())
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Draw `size` recorded values independently."""
+        return self.values[rng.integers(self.table.rows, size=size)]

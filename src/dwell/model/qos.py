@@ -1,0 +1,86 @@
+"""QoS, what a window shows, and Decision, what a policy makes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from dwell.errors import MetricError
+from dwell.model.frozen import FrozenDict
+from dwell.model.placement import Placement
+
+__all__ = ["Decision", "QoS", "Reason"]
+
+Reason: TypeAlias = Literal["dwell", "hold", "migrate", "infeasible", "guard"]
+
+
+@dataclass(frozen=True, slots=True)
+class QoS:
+    """Metrics of one window under one placement, observed or estimated.
+
+    Parameters
+    ----------
+    l95_ms : float
+        95th percentile of end-to-end latency, milliseconds; finite, at least 0.
+    violation_rate : float
+        Share of the window's cycles that missed the deadline, in [0, 1].
+    utilisation : mapping of str to float
+        Busy share of each node's cores; finite, at least 0.
+
+    Raises
+    ------
+    MetricError
+        If a value is missing, NaN, infinite, or out of its range.
+    """
+
+    l95_ms: float
+    violation_rate: float
+    utilisation: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        # Comparisons with NaN are false, so each test is written to pass only for a good value.
+        if not 0 <= self.l95_ms < math.inf:
+            raise MetricError(f"l95_ms is {self.l95_ms!r}; it must be finite and at least 0")
+        if not 0 <= self.violation_rate <= 1:
+            raise MetricError(f"violation_rate is {self.violation_rate!r}; it must lie in [0, 1]")
+        for node, value in self.utilisation.items():
+            if not 0 <= value < math.inf:
+                raise MetricError(
+                    f"utilisation of {node} is {value!r}; it must be finite and at least 0"
+                )
+        if type(self.utilisation) is not FrozenDict:
+            object.__setattr__(self, "utilisation", FrozenDict(self.utilisation))
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The placement for the next window, and why.
+
+    Parameters
+    ----------
+    placement : Placement
+        For the cycles of the next window.
+    name : str
+        Its candidate name.
+    migrated : bool
+        Whether it differs from the incumbent.
+    reason : {"dwell", "hold", "migrate", "infeasible", "guard"}
+        Which rule made it.
+    costs : mapping of str to float
+        Estimated J of every candidate against the incumbent; empty where the policy prices none.
+    dwell : int
+        Windows since the last migration, after this decision (n_d).
+    delta_j : float
+        Measured J of the incumbent less the estimated J of the best candidate; NaN where not
+        computed.
+    """
+
+    placement: Placement
+    name: str
+    migrated: bool
+    reason: Reason
+    costs: Mapping[str, float] = field(default_factory=FrozenDict)
+    dwell: int = 0
+    delta_j: float = math.nan

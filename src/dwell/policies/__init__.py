@@ -1,0 +1,20 @@
+"""Policies: observation and estimates in, the decision for the next window out."""
+
+from dwell.policies.atp import ATP
+from dwell.policies.check import check_policy
+from dwell.policies.dtp import DTP
+from dwell.policies.latency_first import LatencyFirst
+from dwell.policies.protocol import MinimalPolicy, Policy
+from dwell.policies.registry import by_name
+from dwell.policies.static import Static
+
+__all__ = [
+    "ATP",
+    "DTP",
+    "LatencyFirst",
+    "MinimalPolicy",
+    "Policy",
+    "Static",
+    "by_name",
+    "check_policy",
+]

@@ -1,0 +1,157 @@
+"""DTP: window-based dynamic task placement (paper, Algorithm 1).
+
+Window k ran under the incumbent, placement k - 1. The lines of the algorithm, with its corner
+cases decided:
+
+* J of the incumbent is the measured one, with the switching term of its own last decision
+  (placement k - 1 against k - 2); J of every candidate, the incumbent included, is the estimated
+  one against the incumbent.
+* n_d counts windows since the last migration and blocks while n_d < N_min. Two migrations are
+  therefore at least N_min + 1 windows apart, and K windows hold at most
+  floor(K / (N_min + 1)) of them, whatever the metrics do.
+* The minimum goes to the incumbent on a tie, then to the order of the candidates. If it is the
+  incumbent, the window is a hold whatever Delta J says, and n_d grows.
+* A candidate over a cap is not eligible. If none is eligible, those closest to their caps are
+  compared by J as usual, and the reason is ``infeasible``; the hysteresis still applies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from dwell.errors import MetricError
+from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
+from dwell.model.objective import Objective
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.qos import Decision, QoS
+from dwell.policies.incumbent import (
+    NOT_PRICED,
+    Incumbent,
+    check_candidates,
+    check_name,
+    check_parameter,
+)
+from dwell.policies.pricing import Pricing
+
+__all__ = ["DTP"]
+
+
+class DTP:
+    """Moves to the cheapest candidate once it is cheap enough and the dwell is over.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+        Pi_cand, over the same tasks; the order breaks ties.
+    initial : str, optional
+        pi_0; the first candidate where None.
+    objective : Objective
+        Weights, targets, caps and tiers of J.
+    min_dwell : int
+        N_min, windows; 0 lets every window migrate.
+    min_improvement : float
+        Delta_min, in units of J: an improvement must exceed it.
+
+    Raises
+    ------
+    PolicyError
+        If a parameter is out of its range, `initial` is no candidate, or candidates place
+        different tasks.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: Mapping[str, Placement],
+        initial: str | None = None,
+        objective: Objective,
+        min_dwell: int = 3,
+        min_improvement: float = 0.05,
+    ) -> None:
+        self.candidates = check_candidates(candidates)
+        self.initial = check_name("initial", initial, self.candidates)
+        self.objective = objective
+        self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
+        self.min_improvement = check_parameter("min_improvement", min_improvement, MIN_IMPROVEMENT)
+        self._pricing = Pricing(self.candidates, objective)
+        self._incumbent = Incumbent(self.candidates, self.initial)
+
+    def __repr__(self) -> str:
+        return (
+            f"DTP(initial={self.initial!r}, min_dwell={self.min_dwell}, "
+            f"min_improvement={self.min_improvement:g})"
+        )
+
+    @property
+    def incumbent(self) -> str:
+        """Name of the active candidate."""
+        return self._incumbent.name
+
+    def start(self, problem: Problem) -> None:
+        """Begin again: the initial candidate, n_d = 0."""
+        self._incumbent.begin(self.initial)
+
+    def adopt(self, name: str) -> None:
+        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
+        self._incumbent.adopt(name)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
+        """Decide the placement for the next window (one pass of the loop of Algorithm 1).
+
+        Parameters
+        ----------
+        observed : QoS
+            Metrics of the window under the incumbent.
+        estimates : mapping of str to QoS, optional
+            Metrics by candidate, the incumbent's being `observed`; Algorithm 1 does without them
+            in a dwell window, and so may the caller.
+
+        Returns
+        -------
+        Decision
+            `delta_j` is NaN in a dwell window, where it is not computed.
+
+        Raises
+        ------
+        MetricError
+            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        """
+        incumbent, pricing = self._incumbent, self._pricing
+        measured = pricing.observed(observed, incumbent.name, incumbent.previous)
+        costs = NOT_PRICED
+        if estimates is not None:
+            costs = pricing.estimated(estimates, incumbent.name)
+        if incumbent.dwell < self.min_dwell:
+            return incumbent.stay("dwell", costs)
+        if estimates is None:
+            raise MetricError(
+                f"estimates is None after the dwell (n_d = {incumbent.dwell}, min_dwell = "
+                f"{self.min_dwell}); give one for each of {', '.join(self.candidates)}"
+            )
+        eligible, within_caps = pricing.eligible(estimates)
+        best = cheapest(costs, eligible, incumbent.name)
+        delta_j = measured - costs[best]
+        if best != incumbent.name and delta_j > self.min_improvement:
+            return incumbent.move(best, "migrate" if within_caps else "infeasible", costs, delta_j)
+        return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
+
+
+def cheapest(costs: Mapping[str, float], eligible: Iterable[str], incumbent: str) -> str:
+    """Return the eligible candidate with the lowest J.
+
+    Parameters
+    ----------
+    costs : mapping of str to float
+        J by candidate.
+    eligible : iterable of str
+        At least one, in the order that breaks ties.
+    incumbent : str
+        Wins every tie, where it is eligible.
+    """
+    best, lowest = "", float("inf")
+    for name in eligible:
+        value = costs[name]
+        if value < lowest or (name == incumbent and value == lowest):
+            best, lowest = name, value
+    return best

@@ -1,0 +1,135 @@
+"""The candidates of a policy, which of them is active, and for how long."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TypeVar
+
+from dwell.errors import PolicyError
+from dwell.model.bounds import Bound
+from dwell.model.frozen import FrozenDict
+from dwell.model.meaning import nearest
+from dwell.model.placement import Placement
+from dwell.model.qos import Decision, Reason
+
+__all__ = ["Incumbent", "check_candidates", "check_name", "check_parameter"]
+
+Number = TypeVar("Number", int, float)
+
+NOT_PRICED: FrozenDict[str, float] = FrozenDict()
+
+
+def check_candidates(candidates: Mapping[str, Placement]) -> FrozenDict[str, Placement]:
+    """Return the candidates unchangeable, in their order.
+
+    Raises
+    ------
+    PolicyError
+        If there is none, or two of them place different tasks.
+    PlacementError
+        If one is not a placement.
+    """
+    if not candidates:
+        raise PolicyError("candidates is empty; give at least one placement, as {'LOC': ...}")
+    placements = {
+        name: moves if isinstance(moves, Placement) else Placement(moves)
+        for name, moves in candidates.items()
+    }
+    first, reference = next(iter(placements.items()))
+    for name, placement in placements.items():
+        if placement.keys() != reference.keys():
+            raise PolicyError(
+                f"candidates.{name} places {', '.join(placement)} but candidates.{first} places "
+                f"{', '.join(reference)}; every candidate must place the same tasks"
+            )
+    return FrozenDict(placements)
+
+
+def check_name(field: str, name: str | None, candidates: Mapping[str, Placement]) -> str:
+    """Return `name`, or the first candidate's where it is None.
+
+    Raises
+    ------
+    PolicyError
+        If no candidate has that name.
+    """
+    if name is None:
+        return next(iter(candidates))
+    if name not in candidates:
+        raise PolicyError(
+            f"{field} is {name!r}, which is no candidate; {nearest(str(name), candidates)} "
+            f"(candidates here: {', '.join(candidates)})"
+        )
+    return name
+
+
+def check_parameter(field: str, value: Number, bound: Bound) -> Number:
+    """Return `value` if it is within the bound, else raise PolicyError."""
+    if not bound.holds(value):
+        raise PolicyError(f"{field} is {value!r}; it must be {bound}")
+    return value
+
+
+class Incumbent:
+    """Which candidate is active, which one was before the last decision, and since when.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+    name : str
+        The candidate to begin with.
+
+    Attributes
+    ----------
+    name : str
+        The active candidate (pi_{k-1} when window k is decided).
+    previous : str
+        The one active before the last decision (pi_{k-2}).
+    dwell : int
+        Windows since the last migration (n_d).
+    """
+
+    __slots__ = ("candidates", "dwell", "name", "previous")
+
+    def __init__(self, candidates: Mapping[str, Placement], name: str) -> None:
+        self.candidates = candidates
+        self.begin(name)
+
+    def begin(self, name: str) -> None:
+        """Start anew with a candidate that nothing preceded."""
+        self.name = self.previous = name
+        self.dwell = 0
+
+    def adopt(self, name: str) -> None:
+        """Take over a candidate that somebody else moved the cell to.
+
+        Raises
+        ------
+        PolicyError
+            If no candidate has that name.
+        """
+        name = check_name("the adopted placement", name, self.candidates)
+        self.previous, self.name, self.dwell = self.name, name, 0
+
+    def stay(
+        self,
+        reason: Reason,
+        costs: Mapping[str, float] = NOT_PRICED,
+        delta_j: float = math.nan,
+    ) -> Decision:
+        """Decide for the incumbent; n_d grows."""
+        name = self.previous = self.name
+        self.dwell += 1
+        return Decision(self.candidates[name], name, False, reason, costs, self.dwell, delta_j)
+
+    def move(
+        self,
+        name: str,
+        reason: Reason,
+        costs: Mapping[str, float] = NOT_PRICED,
+        delta_j: float = math.nan,
+    ) -> Decision:
+        """Decide for another candidate; n_d restarts."""
+        self.previous, self.name, self.dwell = self.name, name, 0
+        return Decision(self.candidates[name], name, True, reason, costs, 0, delta_j)

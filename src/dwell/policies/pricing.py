@@ -1,0 +1,164 @@
+"""J and the caps for a fixed set of candidates, with everything constant looked up once.
+
+The numbers are those of `dwell.cost`, which they go through. What is saved is finding a tier's
+nodes and comparing placements again in every window.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from operator import itemgetter
+from typing import NoReturn
+
+from dwell.cost import excess, hamming, price, tier_nodes
+from dwell.errors import MetricError, PolicyError
+from dwell.model.frozen import FrozenDict
+from dwell.model.objective import Objective
+from dwell.model.placement import Placement
+from dwell.model.qos import QoS
+
+__all__ = ["EXCESS_TOLERANCE", "Pricing", "check_metrics", "explain_estimate"]
+
+#: Candidates this close to the least relative excess are told apart by J instead.
+EXCESS_TOLERANCE = 1e-6
+
+
+def check_metrics(qos: object, whose: str) -> QoS:
+    """Return `qos`, or raise MetricError if it is anything but a QoS."""
+    if not isinstance(qos, QoS):
+        raise MetricError(f"{whose} is {qos!r}; it must be a QoS")
+    return qos
+
+
+def explain_estimate(estimates: object, name: str, candidates: Mapping[str, Placement]) -> None:
+    """Raise MetricError if `estimates` holds no QoS for candidate `name` (off the fast path)."""
+    if not isinstance(estimates, Mapping):
+        raise MetricError(f"estimates is {estimates!r}; it must map every candidate to a QoS")
+    if name not in estimates:
+        given = ", ".join(map(str, estimates)) or "none"
+        raise MetricError(
+            f"estimates has nothing for candidate {name} (given: {given}); "
+            f"it must hold a QoS for each of {', '.join(candidates)}"
+        )
+    check_metrics(estimates[name], f"the estimate of {name}")
+
+
+def _peak(nodes: tuple[str, ...]) -> Callable[[Mapping[str, float]], float]:
+    """Return the function that finds the largest utilisation among `nodes`."""
+    if not nodes:
+        return lambda utilisation: 0.0
+    if len(nodes) == 1:
+        return itemgetter(nodes[0])
+    values = itemgetter(*nodes)
+    return lambda utilisation: max(values(utilisation))
+
+
+class Pricing:
+    """Prices the candidates of one policy.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+    objective : Objective
+    """
+
+    __slots__ = ("_capped", "_cloud", "_edge", "_robot", "_rows", "candidates", "objective")
+
+    def __init__(self, candidates: Mapping[str, Placement], objective: Objective) -> None:
+        if not isinstance(objective, Objective):
+            raise PolicyError(f"objective is {objective!r}; it must be an Objective")
+        self.candidates = candidates
+        self.objective = objective
+        nodes = tier_nodes(objective)
+        self._robot, self._edge, self._cloud = _peak(nodes.robot), _peak(nodes.edge), None
+        if nodes.cloud:
+            self._cloud = _peak(nodes.cloud)
+        caps = objective.caps
+        self._capped = caps.latency_ms < math.inf or caps.utilisation < math.inf
+        # One row of Hamming distances an incumbent, made when it first is one: n candidates of
+        # which few are ever active do not cost n * n comparisons.
+        self._rows: dict[str, dict[str, float]] = {}
+
+    def switching(self, previous: str) -> Mapping[str, float]:
+        """S of every candidate, when `previous` was active before it."""
+        row = self._rows.get(previous)
+        if row is None:
+            before = self.candidates[previous]
+            row = {name: hamming(placed, before) for name, placed in self.candidates.items()}
+            self._rows[previous] = row
+        return row
+
+    def observed(self, qos: QoS, current: str, previous: str) -> float:
+        """J of the window that `qos` was observed in.
+
+        Raises
+        ------
+        MetricError
+            If a metric is missing, or J is not finite.
+        """
+        try:
+            return self._price(qos, self.switching(previous)[current])
+        except (AttributeError, KeyError, OverflowError, TypeError):
+            self._explain(qos, "observed")
+
+    def estimated(self, estimates: Mapping[str, QoS], incumbent: str) -> FrozenDict[str, float]:
+        """J of every candidate against the incumbent, in the candidates' order.
+
+        Raises
+        ------
+        MetricError
+            If a candidate or one of its metrics is missing, or a J is not finite.
+        """
+        costs = {}
+        name = ""
+        try:
+            for name, switching in self.switching(incumbent).items():
+                costs[name] = self._price(estimates[name], switching)
+        except (AttributeError, KeyError, OverflowError, TypeError):
+            explain_estimate(estimates, name, self.candidates)
+            self._explain(estimates[name], f"the estimate of {name}")
+        return FrozenDict(costs)
+
+    def eligible(self, estimates: Mapping[str, QoS]) -> tuple[Mapping[str, object], bool]:
+        """Candidates to choose from, and whether they respect the caps.
+
+        Where none does, these are the candidates whose largest relative excess is within
+        `EXCESS_TOLERANCE` of the least: on a saturated robot every placement is over its cap, and
+        that must not freeze the policy.
+        """
+        if not self._capped:
+            return self.candidates, True
+        excesses = {name: excess(estimates[name], self.objective) for name in self.candidates}
+        least = min(excesses.values())
+        if least <= 0:
+            return {name: None for name, value in excesses.items() if value <= 0}, True
+        bound = least + EXCESS_TOLERANCE
+        return {name: None for name, value in excesses.items() if value <= bound}, False
+
+    def _price(self, qos: QoS, switching: float) -> float:
+        used = qos.utilisation
+        value = price(
+            qos.l95_ms,
+            qos.violation_rate,
+            self._robot(used),
+            self._edge(used),
+            0.0 if self._cloud is None else self._cloud(used),
+            switching,
+            self.objective,
+        )
+        if not -math.inf < value < math.inf:
+            raise OverflowError
+        return value
+
+    def _explain(self, qos: object, whose: str) -> NoReturn:
+        """Say what is wrong with metrics that could not be priced (off the fast path)."""
+        metrics = check_metrics(qos, whose)
+        for node in self.objective.tiers:
+            if node not in metrics.utilisation:
+                known = ", ".join(metrics.utilisation) or "none"
+                raise MetricError(
+                    f"{whose} has no utilisation of {node} (nodes given: {known}); "
+                    "J needs it for every node of objective.tiers"
+                )
+        raise MetricError(f"{whose}, {metrics}, has no finite J; a metric is too large")

@@ -1,0 +1,50 @@
+"""What a policy is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+from dwell.model.problem import Problem
+from dwell.model.qos import Decision, QoS
+
+__all__ = ["MinimalPolicy", "Policy"]
+
+
+@runtime_checkable
+class MinimalPolicy(Protocol):
+    """The least a policy has to be: something that decides.
+
+    A policy may also have
+
+    * ``start(problem)``, called before every run, which makes it forget the run before; without
+      it every run begins with a fresh copy;
+    * ``initial``, the name of the candidate it starts on, where that is not the problem's;
+    * ``adopt(name)``, called when somebody else (the guard) has moved the cell to a candidate.
+    """
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision | str:
+        """Choose the placement for the next window.
+
+        Parameters
+        ----------
+        observed : QoS
+            What the last window showed under the incumbent.
+        estimates : mapping of str to QoS
+            What the same window would have shown, by candidate; the incumbent's is `observed`.
+
+        Returns
+        -------
+        Decision, or str
+            A candidate's name is enough.
+        """
+        ...
+
+
+@runtime_checkable
+class Policy(MinimalPolicy, Protocol):
+    """Observation and estimates in, decision out; it knows no clock, simulator or socket."""
+
+    def start(self, problem: Problem) -> None:
+        """Forget everything: a run of `problem` begins."""
+        ...

@@ -1,0 +1,350 @@
+"""Lay cells and their realisations out as the arrays that the kernels work on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from dwell.errors import SimulationError
+from dwell.kernels import layout as k
+from dwell.model import Pipeline, Problem, Task
+from dwell.sim.realisation import Realisation
+
+__all__ = ["NEVER_NS", "Arrays", "lay_out"]
+
+# Latency of a cycle that has not completed.
+NEVER_NS = np.int64(1 << 62)
+SCHEDULER_CODE = {"fair": k.FAIR, "fifo": k.FIFO, "priority": k.PRIORITY}
+RING_START = 64
+
+
+class Arrays:
+    """The kernels' tables, with the names of their rows.
+
+    Attributes
+    ----------
+    tables : Tables
+        Arguments of `advance`; replaced as a whole when a part of it grows.
+    nodes : tuple of str
+        Columns of the snapshots, as ``E`` or, in a fleet, ``cell/R1``.
+    """
+
+    def __init__(self, tables: k.Tables, nodes: tuple[str, ...]) -> None:
+        self.tables = tables
+        self.nodes = nodes
+
+    def grow_events(self) -> None:
+        """Double the room of the event heap."""
+        t = self.tables
+        self.tables = t._replace(
+            event_t=np.concatenate((t.event_t, np.zeros_like(t.event_t))),
+            event_key=np.concatenate((t.event_key, np.zeros_like(t.event_key))),
+        )
+
+    def grow_ring(self) -> None:
+        """Double the number of cycles that may be in flight, and move those that are."""
+        t = self.tables
+        ring = int(t.clock[k.RING])
+        cells = len(t.cells)
+        jobs = np.zeros((2 * len(t.jobs), k.N_JOB), np.int64)
+        slots = np.zeros((2 * len(t.slots), k.N_SLOT), np.int64)
+        attempts = np.zeros((2 * len(t.slots), t.attempts.shape[1]), np.int64)
+        stride = int(t.clock[k.STRIDE])
+        old = np.arange(cells * ring)
+        cycle = t.slots[:, k.CYCLE]
+        new = (old // ring) * 2 * ring + (cycle & (2 * ring - 1))
+        slots[new] = t.slots
+        attempts[new] = t.attempts
+        jobs.reshape(-1, stride, k.N_JOB)[new] = t.jobs.reshape(-1, stride, k.N_JOB)
+        t.clock[k.RING] = 2 * ring
+        self.tables = t._replace(jobs=jobs, slots=slots, attempts=attempts)
+
+
+def lay_out(
+    cells: Sequence[tuple[Problem, Realisation]],
+    *,
+    shared: Collection[str] = (),
+    log_jobs: bool = False,
+) -> Arrays:
+    """Build the tables of one or more cells.
+
+    Parameters
+    ----------
+    cells : sequence of (Problem, Realisation)
+    shared : collection of str
+        Names of nodes that all cells have in common; such a node, with its stress and outages, is
+        that of the first cell. Links are never shared.
+    log_jobs : bool
+        Whether every job's instants are kept.
+    """
+    return _Layout(cells, shared, log_jobs).arrays()
+
+
+class _Layout:
+    """Rows being laid out, cell after cell."""
+
+    def __init__(
+        self, cells: Sequence[tuple[Problem, Realisation]], shared: Collection[str], log: bool
+    ) -> None:
+        self.cells, self.shared, self.log = cells, frozenset(shared), log
+        self.single = len(cells) == 1
+        self.cycles = max(real.cycles for _, real in cells)
+        self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
+        self.max_flows = max(len(problem.pipeline.flows) for problem, _ in cells)
+        self.node_row: dict[str, int] = {}
+        self.server_row: dict[tuple[str, str | None], int] = {}
+        self.server_workers: list[int] = []
+        self.cell_rows: list[list[int]] = []
+        self.tasks: list[list[int]] = []
+        self.flows: list[list[int]] = []
+        self.out_flows: list[int] = []
+        self.sites: list[list[int]] = []
+        self.servers: list[list[int]] = []
+        self.hops: list[list[int]] = []
+        self.links: list[list[int]] = []
+        self.layer_rows: list[dict[int, int]] = []
+        self.segments: list[list[int]] = []
+        self.segments_f: list[list[float]] = []
+        self.site_of: list[list[int]] = []
+        self.route: list[list[int]] = []
+        self.changes: list[tuple[int, int, int, int]] = []
+        self.extra_rows = 0
+
+    def arrays(self) -> Arrays:
+        for index, (problem, real) in enumerate(self.cells):
+            self._add_nodes(index, problem)
+            self._add_cell(index, problem, real)
+        self._check_keys()
+        return Arrays(self._tables(), tuple(self.node_row))
+
+    def _node_key(self, index: int, name: str) -> str:
+        return name if self.single or name in self.shared else f"{index}/{name}"
+
+    def _add_nodes(self, index: int, problem: Problem) -> None:
+        for name, node in problem.fabric.nodes.items():
+            key = self._node_key(index, name)
+            if key in self.node_row:
+                continue
+            self.node_row[key] = len(self.node_row)
+            scheduler = SCHEDULER_CODE[node.scheduler]
+            self._add_server(key, None, scheduler, node.cores)
+            for kind, count in node.accelerators.items():
+                self._add_server(key, kind, k.FIFO, count)
+
+    def _add_server(self, node: str, kind: str | None, scheduler: int, cores: int) -> None:
+        row = [0] * k.N_SERVER
+        row[k.SCHEDULER], row[k.CORES] = scheduler, cores
+        row[k.NODE_OF], row[k.IS_CPU], row[k.NEXT_KEY] = self.node_row[node], int(not kind), -1
+        self.server_row[node, kind] = len(self.servers)
+        self.servers.append(row)
+        self.server_workers.append(0)
+
+    def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
+        pipeline = problem.pipeline
+        task_0, flow_0, hop_0 = len(self.tasks), len(self.flows), len(self.hops)
+        names = list(pipeline.tasks)
+        row = [0] * k.N_CELL
+        row[k.TASK_0], row[k.N_TASKS] = task_0, len(names)
+        row[k.CANDIDATE_0] = len(self.site_of)
+        row[k.N_SINKS] = sum(not pipeline.outputs(name) for name in names)
+        row[k.N_CYCLES] = real.cycles
+        row[k.CLOSE_CYCLE] = row[k.WINDOW_CYCLES] = problem.window_cycles
+        row[k.GRACE_NS] = round(problem.controller.close_grace_ms * 1e6)
+        self.cell_rows.append(row)
+        # Flows are ordered by target, so that arrivals at one instant order by task.
+        flows = sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
+        flow_row = {(flow.source, flow.target): flow_0 + i for i, flow in enumerate(flows)}
+        for i, flow in enumerate(flows):
+            ends = names.index(flow.source), names.index(flow.target)
+            self.flows.append([task_0 + ends[0], task_0 + ends[1], i])
+        for name in names:
+            outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
+            self._add_task(pipeline, pipeline.tasks[name], names.index(name), outputs)
+        site_row = self._add_sites(index, problem, real, task_0, names)
+        self._add_links(problem, real, hop_0)
+        hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
+        for placement in problem.candidates.values():
+            on = [site_row[name, placement[name]] for name in names]
+            self.site_of.append(on + [-1] * (self.max_tasks - len(on)))
+            hop_of = [
+                hop_row.get(
+                    (f.source, f.target, f"{placement[f.source]}->{placement[f.target]}"), -1
+                )
+                for f in flows
+            ]
+            self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
+        for change in real.node_changes:
+            if index == 0 or change.node not in self.shared:
+                node = self.node_row[self._node_key(index, change.node)]
+                self.changes.append((change.at_ns, node, change.threads, int(change.down)))
+
+    def _add_task(self, pipeline: Pipeline, task: Task, local: int, outputs: list[int]) -> None:
+        row = [0] * k.N_TASK
+        row[k.N_IN], row[k.N_OUT] = len(pipeline.inputs(task.name)), len(outputs)
+        row[k.OUT_0], row[k.DEPTH], row[k.LOCAL] = len(self.out_flows), task.depth, local
+        # A smaller rank goes first.
+        row[k.RANK] = -task.priority
+        row[k.OFFSET_NS] = round(task.offset_ms * 1e6)
+        self.tasks.append(row)
+        self.out_flows += outputs
+
+    def _add_sites(
+        self, index: int, problem: Problem, real: Realisation, task_0: int, names: list[str]
+    ) -> dict[tuple[str, str], int]:
+        rows: dict[tuple[str, str], int] = {}
+        for task_name, node_name in real.sites:
+            task = problem.pipeline.tasks[task_name]
+            execution = task.on[node_name]
+            node = self._node_key(index, node_name)
+            server = self.server_row[node, execution.accelerator]
+            fair = self.servers[server][k.SCHEDULER] == k.FAIR
+            cores = self.servers[server][k.CORES]
+            row = [0] * k.N_SITE
+            row[k.SITE_CELL], row[k.SITE_TASK] = index, task_0 + names.index(task_name)
+            row[k.SERVER], row[k.NODE] = server, self.node_row[node]
+            row[k.WORKERS] = row[k.IDLE] = execution.workers
+            if execution.accelerator is not None:
+                row[k.NEED] = 1
+            else:
+                row[k.NEED] = execution.threads if fair else min(execution.threads, cores)
+            row[k.START_NS] = round(task.start_ms * 1e6)
+            self.server_workers[server] += execution.workers
+            rows[task_name, node_name] = len(self.sites)
+            self.sites.append(row)
+        return rows
+
+    def _add_links(self, problem: Problem, real: Realisation, hop_0: int) -> None:
+        link_row: dict[str, int] = {}
+        for name, link in problem.fabric.links.items():
+            link_row[name] = len(self.links)
+            row = [0] * k.N_LINK
+            row[k.IN_ORDER] = int(link.in_order)
+            retransmit = link.retransmit_ms
+            row[k.RETRANSMIT_NS] = -1 if retransmit is None else round(retransmit * 1e6)
+            row[k.SEGMENT] = len(self.segments)
+            for segment in real.link_segments:
+                if segment.link == name:
+                    mask = sum(1 << layer for layer in segment.layers)
+                    self.segments.append([segment.at_ns, int(segment.down), mask])
+                    self.segments_f.append([segment.rate_mbps, segment.loss])
+            row[k.SEGMENT_END] = len(self.segments)
+            self.links.append(row)
+        payload = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
+        for source, target, link_name in real.hops:
+            self.hops.append([link_row[link_name], payload[source, target]])
+            self.layer_rows.append({})
+        for i, (hop, layer) in enumerate(real.layers):
+            self.layer_rows[hop_0 + hop][layer] = self.extra_rows + i
+        self.extra_rows += len(real.layers)
+
+    def _check_keys(self) -> None:
+        limits = (
+            ("cells", len(self.cells), k.CELL_MASK),
+            ("tasks", len(self.tasks), k.ITEM_MASK),
+            ("flows", len(self.flows), k.ITEM_MASK),
+            ("feasible (task, node) pairs", len(self.sites), k.ITEM_MASK),
+        )
+        for what, number, limit in limits:
+            if number > limit:
+                raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
+
+    def _tables(self) -> k.Tables:
+        cells, nodes, cycles = len(self.cells), len(self.node_row), self.cycles
+        capacity = [max(workers, 1) for workers in self.server_workers]
+        base = np.concatenate(([0], np.cumsum(capacity)[:-1]))
+        servers = _table(self.servers, k.N_SERVER)
+        servers[:, k.BASE] = base
+        room = int(sum(capacity))
+        margin = 64 + len(self.sites) + len(self.flows) + len(self.tasks) + len(servers)
+        windows = max(real.windows for _, real in self.cells)
+        reals = [real for _, real in self.cells]
+        jobs_logged = cells * cycles * self.max_tasks if self.log else 0
+        n_layers = 1 + max((layer for rows in self.layer_rows for layer in rows), default=0)
+        layer_rows = np.full((len(self.hops), n_layers), -1, np.int64)
+        for hop, rows in enumerate(self.layer_rows):
+            for layer, row in rows.items():
+                layer_rows[hop, layer] = row
+        clock = np.zeros(k.N_CLOCK, np.int64)
+        clock[k.RING], clock[k.STRIDE], clock[k.MARGIN] = RING_START, self.max_tasks, margin
+        changes = sorted(self.changes, key=lambda change: change[0])
+        speed = np.zeros((len(servers), k.N_SERVER_F))
+        speed[:, k.SPEED] = 1.0
+        tables = k.Tables(
+            tasks=_table(self.tasks, k.N_TASK),
+            flows=_table(self.flows, k.N_FLOW),
+            out_flows=np.array(self.out_flows, np.int64),
+            site_of=_table(self.site_of, self.max_tasks),
+            route=_table(self.route, self.max_flows),
+            hops=_table(self.hops, k.N_HOP),
+            loss_keys=np.concatenate([real.loss_keys for real in reals]),
+            layer_rows=layer_rows,
+            segments=_table(self.segments, k.N_SEGMENT),
+            segments_f=np.array(self.segments_f, np.float64).reshape(-1, k.N_SEGMENT_F),
+            changes=_table(changes, k.N_CHANGE),
+            release_ns=_stack([real.release_ns[None] for real in reals], cycles + 1),
+            exec_ns=_stack([real.exec_ns for real in reals], cycles),
+            delay_ns=_stack([real.delay_ns for real in reals], cycles),
+            extra_ns=_stack([real.extra_ns for real in reals], cycles),
+            stamps=np.zeros((cells, cycles), np.int16),
+            clock=clock,
+            cells=_table(self.cell_rows, k.N_CELL),
+            sites=_table(self.sites, k.N_SITE),
+            servers=servers,
+            servers_f=speed,
+            links=_table(self.links, k.N_LINK),
+            run_v=np.zeros(room),
+            run_key=np.zeros(room, np.int64),
+            wait_rank=np.zeros(room, np.int64),
+            wait_ready=np.zeros(room, np.int64),
+            wait_key=np.zeros(room, np.int64),
+            wait_left=np.zeros(room),
+            dirty=np.zeros(len(servers), np.int64),
+            event_t=np.zeros(4 * margin, np.int64),
+            event_key=np.zeros(4 * margin, np.int64),
+            jobs=np.zeros((cells * RING_START * self.max_tasks, k.N_JOB), np.int64),
+            slots=np.zeros((cells * RING_START, k.N_SLOT), np.int64),
+            attempts=np.zeros((cells * RING_START, max(self.max_flows, 1)), np.int64),
+            own=np.zeros((cells, nodes)),
+            latency_ns=np.full((cells, cycles), NEVER_NS),
+            compute_ns=np.zeros((cells, cycles), np.int64),
+            network_ns=np.zeros((cells, cycles), np.int64),
+            outcome=np.zeros((cells, cycles), np.int8),
+            opened=np.zeros((cells, windows, 2, nodes)),
+            closed=np.zeros((cells, windows, 2, nodes)),
+            log=np.full((jobs_logged, k.N_LOG), -1, np.int64),
+            log_outcome=np.zeros(jobs_logged, np.int8),
+        )
+        _announce_first(tables)
+        return tables
+
+
+def _announce_first(tables: k.Tables) -> None:
+    """Put the first release of every cell, and the first change of a node, into the heap."""
+    first = [
+        (int(tables.release_ns[cell, 0]), (k.RELEASE << k.KIND_SHIFT) | (cell << k.CELL_SHIFT))
+        for cell in range(len(tables.cells))
+    ]
+    if len(tables.changes):
+        first.append((int(tables.changes[0, k.CHANGE_AT]), k.CHANGE << k.KIND_SHIFT))
+    # A sorted array is a heap.
+    for i, (at, key) in enumerate(sorted(first)):
+        tables.event_t[i], tables.event_key[i] = at, key
+    tables.clock[k.N_EVENTS] = len(first)
+
+
+def _table(rows: Sequence[Sequence[int]], columns: int) -> k.Ints:
+    return np.array(rows, np.int64).reshape(-1, columns)
+
+
+def _stack(parts: Sequence[k.Ints], columns: int) -> k.Ints:
+    """Stack rows of cells; one cell's array is used as it is, without a copy."""
+    if len(parts) == 1:
+        return np.ascontiguousarray(parts[0])
+    rows = sum(len(part) for part in parts)
+    out = np.zeros((rows, columns), np.int64)
+    at = 0
+    for part in parts:
+        out[at : at + len(part), : part.shape[1]] = part
+        at += len(part)
+    return out

@@ -1,0 +1,359 @@
+"""Draw a realisation: everything random in a scenario, each thing from a stream of its own name."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import SimulationError
+from dwell.kernels.streams import ar1_path
+from dwell.model import (
+    AR1,
+    Bursts,
+    Constant,
+    Link,
+    LinkDisturbance,
+    LogNormal,
+    NodeDisturbance,
+    Problem,
+    Process,
+    Scenario,
+    Trace,
+    TraceTable,
+)
+from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
+
+__all__ = ["draw", "stream"]
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+NS_PER_MS = 1e6
+NS_PER_S = 1e9
+# A duration beyond three years is as good as for ever, and its sums still fit 64 bits.
+LONGEST_NS = 1e17
+# Values drawn at a time: a block and its temporaries stay in the second-level cache.
+BLOCK = 16384
+
+
+def stream(seed: int, name: str) -> np.random.SeedSequence:
+    """Seed of the stream called `name` in the run with this seed.
+
+    The name, hashed, is the spawn key of the run's one SeedSequence, so that adding a node, a link
+    or a task shifts nobody else's draws.
+    """
+    digest = hashlib.blake2b(name.encode(), digest_size=16).digest()
+    words = tuple(int(word) for word in np.frombuffer(digest, dtype="<u4"))
+    return np.random.SeedSequence(seed, spawn_key=words)
+
+
+def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: int) -> Realisation:
+    """Draw a realisation of a scenario.
+
+    Parameters
+    ----------
+    problem : Problem
+    scenario : str
+        Name of one of its scenarios.
+    seed : int
+        At least 0; the same seed gives the same realisation on any machine.
+    windows : int
+        Number of windows, at least 1; the run has ``windows * window_cycles`` cycles.
+
+    Returns
+    -------
+    Realisation
+
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario.
+    TraceError
+        If a trace that does not wrap is shorter than the run.
+    SimulationError
+        If `seed` or `windows` is out of range.
+    """
+    disturbances = problem.scenario(scenario)
+    if isinstance(windows, bool) or windows < 1:
+        raise SimulationError(f"windows is {windows!r}; it must be a whole number of at least 1")
+    if isinstance(seed, bool) or seed < 0:
+        raise SimulationError(f"seed is {seed!r}; it must be a whole number of at least 0")
+    cycles = windows * problem.window_cycles
+    if cycles >= 1 << 32:
+        raise SimulationError(f"windows is {windows}; {cycles} cycles are more than 2^32")
+    return _Draw(problem, scenario, disturbances, seed, windows).realisation()
+
+
+class _Draw:
+    """One drawing in progress: the seed, the releases and the rows that traces share."""
+
+    def __init__(
+        self, problem: Problem, name: str, scenario: Scenario, seed: int, windows: int
+    ) -> None:
+        self.problem, self.name, self.scenario = problem, name, scenario
+        self.seed, self.windows = seed, windows
+        self.cycles = windows * problem.window_cycles
+        self.rows: dict[int, Ints] = {}
+        self.release_ns = self._releases()
+
+    def realisation(self) -> Realisation:
+        tasks = self.problem.pipeline.tasks
+        sites = tuple((task, node) for task in tasks for node in tasks[task].on)
+        hops = _hops(self.problem)
+        layers, extra_ns, of_link = self._layers(hops)
+        return Realisation(
+            scenario=self.name,
+            seed=self.seed,
+            windows=self.windows,
+            release_ns=self.release_ns,
+            sites=sites,
+            exec_ns=self._executions(sites),
+            hops=hops,
+            delay_ns=self._delays(hops),
+            loss_keys=np.array([self._key(f"loss/{_hop_name(hop)}") for hop in hops], np.uint64),
+            layers=layers,
+            extra_ns=extra_ns,
+            node_changes=self._node_changes(),
+            link_segments=self._link_segments(of_link),
+        )
+
+    def _rng(self, name: str) -> np.random.Generator:
+        return np.random.Generator(np.random.SFC64(stream(self.seed, name)))
+
+    def _key(self, name: str) -> int:
+        return int(stream(self.seed, name).generate_state(1, np.uint64)[0])
+
+    def _releases(self) -> Ints:
+        pipeline = self.problem.pipeline
+        nominal = np.arange(self.cycles + 1) * (pipeline.period_ms * NS_PER_MS)
+        release = np.rint(nominal).astype(np.int64)
+        jitter = pipeline.release_jitter_ms
+        if jitter == Constant(0.0):
+            return release
+        if isinstance(jitter, Trace):
+            # Rows of a trace follow the releases; for its own jitter they follow the nominal ones.
+            self.release_ns = release
+        late = np.empty(self.cycles + 1, np.int64)
+        self._fill(late, jitter, "release")
+        # A cycle is never released before the one ahead of it.
+        return np.maximum.accumulate(release + late)
+
+    def _table_rows(self, table: TraceTable) -> Ints:
+        rows = self.rows.get(id(table))
+        if rows is None:
+            rng = self._rng(f"trace/{table.file}/{table.by}/{table.group}")
+            rows = table.replay(rng, self.release_ns / NS_PER_MS)
+            self.rows[id(table)] = rows
+        return rows
+
+    def _fill(self, out: Ints, process: Process, name: str, scale: Floats | None = None) -> None:
+        """Fill `out` with a path of the process in nanoseconds, block by block."""
+        if isinstance(process, Constant) and scale is None:
+            out[:] = round(min(process.value * NS_PER_MS, LONGEST_NS))
+            return
+        rng = self._rng(name)
+        state = math.nan
+        for begin in range(0, len(out), BLOCK):
+            end = min(begin + BLOCK, len(out))
+            values, state = self._block(process, rng, begin, end, state)
+            if scale is not None:
+                values = values * scale[begin:end]
+            values *= NS_PER_MS
+            np.minimum(values, LONGEST_NS, out=values)
+            out[begin:end] = np.rint(values, out=values)
+
+    def _block(
+        self, process: Process, rng: np.random.Generator, begin: int, end: int, state: float
+    ) -> tuple[Floats, float]:
+        if isinstance(process, Trace):
+            return process.values[self._table_rows(process.table)[begin:end]], state
+        if not isinstance(process, AR1):
+            return process.marginal(rng, end - begin), state
+        noise = rng.standard_normal(end - begin)
+        state = ar1_path(noise, process.log_correlation, state, begin == 0)
+        mu, sigma = LogNormal(process.mean, process.cv).log_parameters
+        noise *= sigma
+        noise += mu
+        return np.exp(noise, out=noise), state
+
+    def _executions(self, sites: tuple[tuple[str, str], ...]) -> Ints:
+        pipeline = self.problem.pipeline
+        scales: dict[str, Floats] = {}
+        exec_ns = np.empty((len(sites), self.cycles), np.int64)
+        for row, (task, node) in enumerate(sites):
+            name = pipeline.tasks[task].scale
+            if name is not None and name not in scales:
+                scales[name] = self._factors(pipeline.scales, name)
+            scale = scales[name] if name is not None else None
+            process = pipeline.tasks[task].on[node].exec_ms
+            self._fill(exec_ns[row], process, f"exec/{task}/{node}", scale)
+        return exec_ns
+
+    def _factors(self, scales: Mapping[str, Process], name: str) -> Floats:
+        factors = np.empty(self.cycles)
+        rng = self._rng(f"scale/{name}")
+        state = math.nan
+        for begin in range(0, self.cycles, BLOCK):
+            end = min(begin + BLOCK, self.cycles)
+            factors[begin:end], state = self._block(scales[name], rng, begin, end, state)
+        return factors
+
+    def _delays(self, hops: tuple[tuple[str, str, str], ...]) -> Ints:
+        links = self.problem.fabric.links
+        delay_ns = np.empty((len(hops), self.cycles), np.int64)
+        for row, hop in enumerate(hops):
+            self._fill(delay_ns[row], links[hop[2]].delay_ms, f"delay/{_hop_name(hop)}")
+        return delay_ns
+
+    def _layers(
+        self, hops: tuple[tuple[str, str, str], ...]
+    ) -> tuple[tuple[tuple[int, int], ...], Ints, dict[str, list[Bursts | LinkDisturbance]]]:
+        """Extra-delay layers: per link its bursts first, then the scenario's impairments."""
+        of_link: dict[str, list[Bursts | LinkDisturbance]] = {}
+        for name, link in self.problem.fabric.links.items():
+            if link.bursts is not None:
+                of_link.setdefault(name, []).append(link.bursts)
+        for item in self.scenario:
+            if isinstance(item, LinkDisturbance) and item.add_delay_ms is not None:
+                of_link.setdefault(item.link, []).append(item)
+        layers = tuple(
+            (hop, layer)
+            for hop, (_, _, link) in enumerate(hops)
+            for layer in range(len(of_link.get(link, ())))
+        )
+        extra_ns = np.empty((len(layers), self.cycles), np.int64)
+        for row, (hop, layer) in enumerate(layers):
+            process = of_link[hops[hop][2]][layer].add_delay_ms
+            assert process is not None
+            self._fill(extra_ns[row], process, f"extra/{layer}/{_hop_name(hops[hop])}")
+        return layers, extra_ns, of_link
+
+    def _episodes(self, bursts: Bursts, name: str) -> list[tuple[int, int]]:
+        """Begin and end of every burst up to the end of the run, nanoseconds."""
+        horizon = int(self.release_ns[-1])
+        quiet, active = self._rng(f"bursts/{name}/every"), self._rng(f"bursts/{name}/for")
+        episodes: list[tuple[int, int]] = []
+        begin = 0.0
+        while begin < horizon:
+            for pause, length in zip(
+                bursts.every_ms.marginal(quiet, 256), bursts.for_ms.marginal(active, 256)
+            ):
+                begin += pause * NS_PER_MS
+                if begin >= horizon:
+                    break
+                end = begin + length * NS_PER_MS
+                episodes.append((round(begin), round(min(end, LONGEST_NS))))
+                begin = end
+        return episodes
+
+    def _node_changes(self) -> tuple[NodeChange, ...]:
+        """Fold stress, bursts and outages of each node into the states it goes through."""
+        steps: dict[str, list[tuple[int, int, int]]] = {}
+        for item in self.scenario:
+            if isinstance(item, NodeDisturbance):
+                begin, end = _interval_ns(item.at_s, item.for_s)
+                mine = steps.setdefault(item.node, [])
+                mine.append((begin, item.stress_threads, int(item.down)))
+                mine.append((end, -item.stress_threads, -int(item.down)))
+        for node in self.problem.fabric.nodes.values():
+            if node.bursts is not None and node.bursts.threads:
+                mine = steps.setdefault(node.name, [])
+                for begin, end in self._episodes(node.bursts, node.name):
+                    mine.append((begin, node.bursts.threads, 0))
+                    mine.append((end, -node.bursts.threads, 0))
+        changes: list[NodeChange] = []
+        horizon = int(self.release_ns[-1])
+        for name, mine in steps.items():
+            threads = down = 0
+            mine.sort()
+            for i, (at, more_threads, more_down) in enumerate(mine):
+                threads += more_threads
+                down += more_down
+                last = i + 1 == len(mine) or mine[i + 1][0] != at
+                if last and at <= horizon:
+                    changes.append(NodeChange(at, name, threads, down > 0))
+        changes.sort(key=lambda change: change.at_ns)
+        return tuple(changes)
+
+    def _link_segments(
+        self, of_link: dict[str, list[Bursts | LinkDisturbance]]
+    ) -> tuple[LinkSegment, ...]:
+        segments: list[LinkSegment] = []
+        for link in self.problem.fabric.links.values():
+            active = [
+                (*_interval_ns(item.at_s, item.for_s), item)
+                for item in self.scenario
+                if isinstance(item, LinkDisturbance) and item.link == link.name
+            ]
+            layers = of_link.get(link.name, [])
+            episodes = self._episodes(link.bursts, link.name) if link.bursts is not None else []
+            segments += _fold_link(link, active, layers, episodes)
+        return tuple(segments)
+
+
+def _interval_ns(at_s: float, for_s: float) -> tuple[int, int]:
+    begin = round(at_s * NS_PER_S)
+    return begin, round(min(begin + for_s * NS_PER_S, LONGEST_NS))
+
+
+def _hop_name(hop: tuple[str, str, str]) -> str:
+    source, target, link = hop
+    return f"{link}/{source}->{target}"
+
+
+def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
+    """Flows on the links they cross in some candidate, in the order of flows and links."""
+    hops: dict[tuple[str, str, str], None] = {}
+    for flow in problem.pipeline.flows:
+        crossed = {
+            f"{placement[flow.source]}->{placement[flow.target]}"
+            for placement in problem.candidates.values()
+        }
+        for link in problem.fabric.links:
+            if link in crossed:
+                hops[flow.source, flow.target, link] = None
+    return tuple(hops)
+
+
+def _fold_link(
+    link: Link,
+    active: list[tuple[int, int, LinkDisturbance]],
+    layers: list[Bursts | LinkDisturbance],
+    episodes: list[tuple[int, int]],
+) -> list[LinkSegment]:
+    """Cut a link's time where something begins or ends, and sum up what holds in each piece."""
+    cuts: dict[int, None] = {0: None}
+    for begin, end, _ in active:
+        cuts[begin] = cuts[end] = None
+    for begin, end in episodes:
+        cuts[begin] = cuts[end] = None
+    segments: list[LinkSegment] = []
+    episode = 0
+    for at in sorted(cuts):
+        while episode < len(episodes) and episodes[episode][1] <= at:
+            episode += 1
+        bursting = episode < len(episodes) and episodes[episode][0] <= at
+        now = [item for begin, end, item in active if begin <= at < end]
+        survives = 1 - link.loss
+        for item in now:
+            survives *= 1 - item.loss
+        on = tuple(
+            i
+            for i, layer in enumerate(layers)
+            if (bursting if isinstance(layer, Bursts) else any(item is layer for item in now))
+        )
+        segments.append(
+            LinkSegment(
+                at_ns=at,
+                link=link.name,
+                down=any(item.down for item in now),
+                loss=1 - survives,
+                rate_mbps=min([link.rate_mbps, *(item.rate_mbps for item in now)]),
+                layers=on,
+            )
+        )
+    return segments
