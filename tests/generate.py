@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from random import Random
 from typing import Literal
@@ -59,6 +60,7 @@ def make_problem(
     deadline_ms: float | None = None,
     scenario: Sequence[Disturbance] = (),
     scales: Mapping[str, Process] | None = None,
+    release_jitter_ms: Process | None = None,
     window_cycles: int = 1,
     controller: ControllerSettings | None = None,
 ) -> Problem:
@@ -72,6 +74,7 @@ def make_problem(
             flows=tuple(flows),
             period_ms=period_ms,
             deadline_ms=deadline_ms or period_ms,
+            release_jitter_ms=release_jitter_ms or Constant(0.0),
             scales=scales or {},
         ),
         fabric=Fabric(
@@ -158,172 +161,189 @@ def _nanoseconds(rows: Sequence[Sequence[float]], columns: int) -> NDArray[np.in
 
 
 def random_problem(
-    rng: Random, *, schedulers: Sequence[Scheduler] = ("fair", "fifo", "priority")
+    rng: Random,
+    *,
+    schedulers: Sequence[Scheduler] = ("fair", "fifo", "priority"),
+    whole_ms: bool = False,
 ) -> Problem:
     """Make a valid Problem with a scenario ``disturbed``.
 
-    Periods are long (0.1 to 1 s), so that events seldom come within a microsecond by chance.
+    Parameters
+    ----------
+    rng : Random
+    schedulers : sequence
+        Which of them its nodes may have.
+    whole_ms : bool
+        Whether every duration is a constant number of whole milliseconds, and short, so that many
+        events fall on the same instant. Otherwise periods are long (0.1 to 1 s) and durations
+        continuous, so that events seldom come within a microsecond of each other by chance.
     """
-    period = rng.uniform(100, 1000)
-    windows_hint_s = 30 * period / 1e3
-    nodes = [
-        _random_node(rng, name, period, schedulers)
-        for name in ("N0", "N1", "N2", "N3", "N4")[: rng.randint(1, 5)]
-    ]
-    scales: dict[str, Process] = {}
-    if rng.random() < 0.4:
-        scales["scene"] = AR1(mean=1, cv=rng.uniform(0.05, 0.3), rho=rng.uniform(-0.3, 0.9))
-    order = [f"T{i}" for i in range(rng.randint(1, 7))]
-    rng.shuffle(order)
-    flows = [
-        Flow(source, target, rng.choice([0, 1000, 20_000, 200_000]))
-        for source, target in itertools.combinations(order, 2)
-        if rng.random() < rng.choice([0.3, 0.6])
-    ]
-    rng.shuffle(flows)
-    targets = {flow.target for flow in flows}
-    tasks = [
-        _random_task(rng, name, nodes, period, len(order), name not in targets, scales)
-        for name in sorted(order)
-    ]
-    links = [
-        _random_link(rng, source.name, target.name, period)
-        for source, target in itertools.permutations(nodes, 2)
-    ]
-    candidates = {
-        name: {task.name: rng.choice(list(task.on)) for task in tasks}
-        for name in ("A", "B", "C", "D")[: rng.randint(1, 4)]
-    }
-    return make_problem(
-        nodes,
-        tasks,
-        flows,
-        links=links,
-        candidates=candidates,
-        period_ms=period,
-        deadline_ms=period * rng.uniform(0.3, 1),
-        scenario=[
-            _random_disturbance(rng, nodes, links, windows_hint_s)
-            for _ in range(rng.choice([0, 0, 1, 2, 4, 8]))
-        ],
-        scales=scales,
-        window_cycles=rng.randint(1, 5),
-        controller=ControllerSettings(on=rng.choice(nodes).name),
-    )
-
-
-def _random_process(rng: Random, mean: float) -> Process:
-    processes: list[Process] = [
-        LogNormal(mean, rng.uniform(0.05, 1)),
-        Gamma(mean, rng.uniform(0.2, 1)),
-        Exponential(mean),
-        Uniform(0.5 * mean, 1.5 * mean),
-        Normal(mean, 0.2 * mean, min=0.01 * mean),
-        AR1(mean, 0.3, rng.uniform(0, 0.9)),
-    ]
-    return rng.choice(processes)
-
-
-def _random_node(rng: Random, name: str, period: float, schedulers: Sequence[Scheduler]) -> Node:
-    bursts = None
-    if rng.random() < 0.2:
-        bursts = Bursts(
-            every_ms=Exponential(rng.uniform(0.5, 5) * period),
-            for_ms=_random_process(rng, rng.uniform(0.1, 2) * period),
-            threads=rng.randint(1, 4),
-        )
-    return Node(
-        name,
-        rng.choice(["robot", "edge", "cloud"]),
-        cores=rng.choice([1, 1, 2, 2, 3, 4]),
-        scheduler=rng.choice(list(schedulers)),
-        accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
-        bursts=bursts,
-    )
-
-
-def _random_task(
-    rng: Random,
-    name: str,
-    nodes: Sequence[Node],
-    period: float,
-    tasks: int,
-    source: bool,
-    scales: Mapping[str, Process],
-) -> Task:
-    feasible = rng.sample(list(nodes), min(len(nodes), rng.choice([1, 2, 2, 3])))
-    load = rng.choice([0.2, 0.5, 0.9, 1.5]) / tasks * len(nodes)
-    on = {
-        node.name: Execution(
-            _random_process(rng, period * load * rng.uniform(0.3, 1.5)),
-            threads=rng.choice([1, 1, 1, 2, 3, 5]),
-            workers=rng.choice([1, 1, 1, 2, 3]),
-            accelerator="gpu" if node.accelerators and rng.random() < 0.5 else None,
-        )
-        for node in feasible
-    }
-    return Task(
-        name,
-        on,
-        depth=rng.choice([0, 0, 1, 1, 2, 3]),
-        priority=rng.randint(0, 3),
-        scale=rng.choice([None, *scales]),
-        offset_ms=rng.uniform(0, 1.5) * period if source and rng.random() < 0.4 else 0.0,
-        start_ms=rng.choice([0.0, rng.uniform(0, 2) * period]),
-    )
-
-
-def _random_link(rng: Random, source: str, target: str, period: float) -> Link:
-    # 200 kB take from a hundredth of a period to one and a half.
-    full = 200_000 * 8e-3 / period
-    bursts = None
-    if rng.random() < 0.2:
-        bursts = Bursts(
-            every_ms=Exponential(rng.uniform(0.5, 5) * period),
-            for_ms=_random_process(rng, rng.uniform(0.1, 2) * period),
-            add_delay_ms=_random_process(rng, rng.uniform(0.01, 1) * period),
-        )
-    return Link(
-        source,
-        target,
-        _random_process(rng, period * rng.choice([0.01, 0.1, 1])),
-        rate_mbps=rng.choice([float("inf"), full * 10, full * 100, full / 1.5]),
-        loss=rng.choice([0.0, 0.0, rng.uniform(0.01, 0.3)]),
-        retransmit_ms=rng.choice([None, rng.uniform(0.05, 2) * period]),
-        in_order=rng.random() < 0.4,
-        bursts=bursts,
-    )
-
-
-def _random_disturbance(
-    rng: Random, nodes: Sequence[Node], links: Sequence[Link], run_s: float
-) -> Disturbance:
-    at_s = rng.choice([0.0, rng.uniform(0, 0.8) * run_s, rng.uniform(0, 0.8) * run_s])
-    for_s = rng.choice([float("inf"), *(rng.uniform(0, 0.3) * run_s for _ in range(5))])
-    if not links or rng.random() < 0.5:
-        down = rng.random() < 0.4
-        return NodeDisturbance(
-            rng.choice(list(nodes)).name,
-            at_s,
-            for_s,
-            stress_threads=0 if down and rng.random() < 0.5 else rng.randint(1, 6),
-            down=down,
-        )
-    link = rng.choice(list(links))
-    extra = Constant(rng.uniform(1, 50)) if rng.random() < 0.1 else Exponential(rng.uniform(1, 500))
-    return LinkDisturbance(
-        link.source,
-        link.target,
-        at_s,
-        for_s,
-        add_delay_ms=rng.choice([None, extra]),
-        loss=rng.choice([0.0, rng.uniform(0, 0.8), 1.0]),
-        rate_mbps=rng.choice([float("inf"), rng.uniform(0.5, 20)]),
-        down=rng.random() < 0.3,
-    )
+    return _Maker(rng, schedulers, whole_ms).problem()
 
 
 def random_stamps(rng: Random, problem: Problem, windows: int) -> list[str]:
     """Return a candidate for every window; the first window has the initial one."""
     names = list(problem.candidates)
     return [problem.initial, *(rng.choice(names) for _ in range(windows - 1))]
+
+
+class _Maker:
+    """One problem in the making."""
+
+    def __init__(self, rng: Random, schedulers: Sequence[Scheduler], whole_ms: bool) -> None:
+        self.rng = rng
+        self.schedulers = list(schedulers)
+        self.whole_ms = whole_ms
+        self.period = float(rng.randint(5, 20)) if whole_ms else rng.uniform(100, 1000)
+        self.nodes: list[Node] = []
+        self.links: list[Link] = []
+        self.scales: dict[str, Process] = {}
+
+    def duration(self, low: float, high: float) -> float:
+        """Return a number of milliseconds between two shares of the period."""
+        value = self.rng.uniform(low, high) * self.period
+        return float(round(value)) if self.whole_ms else value
+
+    def process(self, mean: float) -> Process:
+        rng = self.rng
+        if self.whole_ms:
+            return Constant(float(max(1, round(mean))))
+        processes: list[Process] = [
+            LogNormal(mean, rng.uniform(0.05, 1)),
+            Gamma(mean, rng.uniform(0.2, 1)),
+            Exponential(mean),
+            Uniform(0.5 * mean, 1.5 * mean),
+            Normal(mean, 0.2 * mean, min=0.01 * mean),
+            AR1(mean, 0.3, rng.uniform(0, 0.9)),
+        ]
+        return rng.choice(processes)
+
+    def bursts(self, threads: int, add_delay_ms: Process | None = None) -> Bursts | None:
+        if self.rng.random() > 0.2:
+            return None
+        return Bursts(
+            every_ms=self.process(self.rng.uniform(0.5, 5) * self.period),
+            for_ms=self.process(self.rng.uniform(0.1, 2) * self.period),
+            threads=threads,
+            add_delay_ms=add_delay_ms or Constant(0.0),
+        )
+
+    def problem(self) -> Problem:
+        rng, period = self.rng, self.period
+        self.nodes = [
+            self.node(name) for name in ("N0", "N1", "N2", "N3", "N4")[: rng.randint(1, 5)]
+        ]
+        if not self.whole_ms and rng.random() < 0.4:
+            self.scales["scene"] = AR1(
+                mean=1, cv=rng.uniform(0.05, 0.3), rho=rng.uniform(-0.3, 0.9)
+            )
+        order = [f"T{i}" for i in range(rng.randint(1, 7))]
+        rng.shuffle(order)
+        density = rng.choice([0.2, 0.4, 0.7])
+        flows = [
+            Flow(source, target, rng.choice([0, 1000, 20_000, 200_000]))
+            for source, target in itertools.combinations(order, 2)
+            if rng.random() < density
+        ]
+        rng.shuffle(flows)
+        targets = {flow.target for flow in flows}
+        load = rng.choice([0.2, 0.5, 0.9, 1.5]) / len(order) * len(self.nodes)
+        tasks = [self.task(name, load, source=name not in targets) for name in sorted(order)]
+        self.links = [
+            self.link(source.name, target.name)
+            for source, target in itertools.permutations(self.nodes, 2)
+        ]
+        jitter = not self.whole_ms and rng.random() < 0.3
+        candidates = {
+            name: {task.name: rng.choice(list(task.on)) for task in tasks}
+            for name in ("A", "B", "C", "D")[: rng.randint(1, 4)]
+        }
+        return make_problem(
+            self.nodes,
+            tasks,
+            flows,
+            links=self.links,
+            candidates=candidates,
+            period_ms=period,
+            deadline_ms=period * rng.uniform(0.3, 1),
+            scenario=[self.disturbance() for _ in range(rng.choice([0, 0, 1, 2, 4, 8]))],
+            scales=self.scales,
+            release_jitter_ms=Exponential(0.1 * period) if jitter else None,
+            window_cycles=rng.randint(1, 5),
+            controller=ControllerSettings(on=rng.choice(self.nodes).name),
+        )
+
+    def node(self, name: str) -> Node:
+        rng = self.rng
+        return Node(
+            name,
+            rng.choice(["robot", "edge", "cloud"]),
+            cores=rng.choice([1, 1, 2, 2, 3, 4]),
+            scheduler=rng.choice(self.schedulers),
+            accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
+            bursts=self.bursts(rng.randint(1, 4)),
+        )
+
+    def task(self, name: str, load: float, *, source: bool) -> Task:
+        rng = self.rng
+        feasible = rng.sample(self.nodes, min(len(self.nodes), rng.choice([1, 2, 2, 3])))
+        on = {
+            node.name: Execution(
+                self.process(self.period * load * rng.uniform(0.3, 1.5)),
+                threads=rng.choice([1, 1, 1, 2, 3, 5]),
+                workers=rng.choice([1, 1, 1, 2, 3]),
+                accelerator="gpu" if node.accelerators and rng.random() < 0.5 else None,
+            )
+            for node in feasible
+        }
+        return Task(
+            name,
+            on,
+            depth=rng.choice([0, 0, 1, 1, 2, 3]),
+            priority=rng.randint(0, 3),
+            scale=rng.choice([None, *self.scales]),
+            offset_ms=self.duration(0, 1.5) if source and rng.random() < 0.4 else 0.0,
+            start_ms=rng.choice([0.0, self.duration(0, 2)]),
+        )
+
+    def link(self, source: str, target: str) -> Link:
+        rng = self.rng
+        # At this rate 200 kB take a whole period.
+        full = 200_000 * 8e-3 / self.period
+        rates = [math.inf, full * 10, full * 100, full / 1.5]
+        return Link(
+            source,
+            target,
+            self.process(self.period * rng.choice([0.01, 0.1, 1])),
+            rate_mbps=rng.choice([math.inf, 0.8] if self.whole_ms else rates),
+            loss=rng.choice([0.0, 0.0, rng.uniform(0.01, 0.3)]),
+            retransmit_ms=rng.choice([None, max(1.0, self.duration(0.05, 2))]),
+            in_order=rng.random() < 0.4,
+            bursts=self.bursts(0, self.process(rng.uniform(0.01, 1) * self.period)),
+        )
+
+    def disturbance(self) -> Disturbance:
+        rng = self.rng
+        at_s = rng.choice([0.0, self.duration(0, 25), self.duration(0, 25)]) / 1e3
+        lengths = [max(1.0, self.duration(0, 8)) / 1e3 for _ in range(5)]
+        for_s = rng.choice([math.inf, *lengths])
+        if not self.links or rng.random() < 0.5:
+            down = rng.random() < 0.4
+            return NodeDisturbance(
+                rng.choice(self.nodes).name,
+                at_s,
+                for_s,
+                stress_threads=0 if down and rng.random() < 0.5 else rng.randint(1, 6),
+                down=down,
+            )
+        link = rng.choice(self.links)
+        return LinkDisturbance(
+            link.source,
+            link.target,
+            at_s,
+            for_s,
+            add_delay_ms=rng.choice([None, self.process(rng.uniform(0.01, 1) * self.period)]),
+            loss=rng.choice([0.0, rng.uniform(0, 0.8), 1.0]),
+            rate_mbps=rng.choice([math.inf, 0.4 if self.whole_ms else rng.uniform(0.5, 20)]),
+            down=rng.random() < 0.3,
+        )

@@ -86,7 +86,7 @@ class Profile:
         self.own: Mapping[str, Mapping[str, float]] = FrozenDict(own)
         self._nodes = tuple(problem.fabric.nodes)
         self._table = tuple(
-            (name, l95_ms[name], violation_rate[name], tuple(own[name][n] for n in self._nodes))
+            (name, l95_ms[name], violation_rate[name], tuple(own[name].items()))
             for name in problem.candidates
         )
 
@@ -94,21 +94,26 @@ class Profile:
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
+        # Conditions and not min() and max(): this runs at the close of every window.
         used = observed.utilisation
-        nodes = self._nodes
+        foreign = {}
         try:
-            foreign = [max(0.0, used[node] - own[node]) for node in nodes]
+            for node in self._nodes:
+                load = used[node] - own[node]
+                foreign[node] = load if load > 0.0 else 0.0
         except KeyError as error:
             what = "own" if error.args[0] in used else "observed.utilisation"
             raise MetricError(
                 f"{what} has nothing for node {error.args[0]}; "
-                f"it must hold each of {', '.join(nodes)}"
+                f"it must hold each of {', '.join(self._nodes)}"
             ) from None
         estimates = {}
         for name, l95_ms, violation_rate, work in self._table:
-            busy = [min(1.0, load + share) for load, share in zip(foreign, work, strict=True)]
-            utilisation = FrozenDict(zip(nodes, busy, strict=True))
-            estimates[name] = QoS(l95_ms, violation_rate, utilisation)
+            utilisation = {}
+            for node, share in work:
+                busy = foreign[node] + share
+                utilisation[node] = busy if busy < 1.0 else 1.0
+            estimates[name] = QoS(l95_ms, violation_rate, FrozenDict(utilisation))
         return estimates
 
 

@@ -87,7 +87,13 @@ class Faults:
         if not self._faults:
             return
         kind = TraceError if self._kinds == {TraceError} else ProblemError
-        raise kind(sorted(self._faults, key=lambda fault: fault.line or 0), self.source)
+        ordered = sorted(self._faults, key=lambda fault: fault.line or 0)
+        raise kind([Fault(_plain(f.path), _plain(f.message), f.line) for f in ordered], self.source)
+
+
+def _plain(text: str) -> str:
+    """Escape what would break the one line that a fault has, or could not be printed."""
+    return "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in text)
 
 
 def _around(outer: str, path: str) -> bool:

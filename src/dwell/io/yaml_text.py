@@ -88,8 +88,12 @@ def read_yaml(path: str, faults: Faults) -> object:
         faults.add("", message, line=mark.line + 1 if mark else None)
         return None
     except yaml.reader.ReaderError as error:
-        message = f"character U+{ord(str(error.character)):04X} is not allowed in YAML; remove it"
+        code = ord(text[error.position])
+        message = f"character U+{code:04X} is not allowed in YAML; remove it"
         faults.add("", message, line=text.count("\n", 0, error.position) + 1)
+        return None
+    except (ValueError, OverflowError) as error:  # the parser's own, on an escape like \UFFFFFFFF
+        faults.add("", f"not a YAML document: {error}")
         return None
     if root is None:
         faults.add("", "the file is empty; a cell file begins with `dwell: 1`")

@@ -12,10 +12,13 @@ from dwell.kernels.cycles import (
     complete,
     drop_job,
     drop_waiting,
+    finish,
     flush,
+    free_worker,
+    hand_over,
+    hop_of,
+    note_ready,
     release,
-    retry,
-    take_next,
 )
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
@@ -40,6 +43,7 @@ from dwell.kernels.layout import (
     CYCLE_SHIFT,
     DOWN,
     FINISHED,
+    FLOW_LOCAL,
     GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
@@ -53,18 +57,23 @@ from dwell.kernels.layout import (
     N_CYCLES,
     N_EVENTS,
     N_IN,
+    N_OUT,
+    N_READY,
     N_RUN,
     N_TASKS,
     N_WAIT,
     NEED,
+    NETWORK,
     NEXT_CHANGE,
     NEXT_KEY,
     NEXT_T,
     NODE,
     NODE_DOWN,
     NODE_OF,
+    OUT_0,
     PAUSE,
     PAUSED,
+    RANK,
     READY_AT,
     RELEASE,
     RESTART,
@@ -80,6 +89,7 @@ from dwell.kernels.layout import (
     STRIDE,
     TASK_0,
     VIRTUAL,
+    WAITING,
     WINDOW,
     WINDOW_CYCLES,
     WINDOW_FIRST,
@@ -88,8 +98,8 @@ from dwell.kernels.layout import (
     Ints,
     Tables,
 )
-from dwell.kernels.links import lose, slot_row
-from dwell.kernels.nodes import job_row, leave, mark, set_speed, tick
+from dwell.kernels.links import lose, send, slot_row
+from dwell.kernels.nodes import admit, job_row, leave, mark, set_speed, tick
 
 __all__ = ["advance"]
 
@@ -295,10 +305,69 @@ def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
 @phase
 def _completion(s: Tables, cell: int, cycle: int, task: int, key: int, now: int) -> None:
     """Complete a job, unless its announcement has gone stale."""
-    site = s.jobs[job_row(s, cell, cycle, s.tasks[task, LOCAL]), SITE]
+    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    site = s.jobs[row, SITE]
     server = s.sites[site, SERVER]
-    if s.servers[server, NEXT_KEY] == key and s.servers[server, NEXT_T] == now:
-        complete(s, server, now)
+    if s.servers[server, NEXT_KEY] != key or s.servers[server, NEXT_T] != now:
+        return
+    complete(s, server, cell, cycle, row, now)
+    waiting = free_worker(s, cell, task, site)
+    if waiting >= 0:
+        _admit(s, cell, waiting, task, now)
+    n_out = s.tasks[task, N_OUT]
+    if n_out == 0:
+        finish(s, cell, cycle, row, now)
+        return
+    s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
+    first = s.tasks[task, OUT_0]
+    for i in range(first, first + n_out):
+        flow = s.out_flows[i]
+        hop = hop_of(s, cell, cycle, flow)
+        if hop < 0:
+            hand_over(s, cell, cycle, flow, now)
+        else:
+            send(s, cell, cycle, flow, hop, 0, now)
+
+
+@phase
+def _admit(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
+    """A worker takes a job to its server."""
+    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    site = s.jobs[row, SITE]
+    key = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | task
+    rank = s.tasks[task, RANK]
+    admit(s, s.sites[site, SERVER], key, row, rank, s.exec_ns[site, cycle], now)
+
+
+@phase
+def _settle(s: Tables, now: int) -> None:
+    """Deal with the jobs that the event has made ready."""
+    for i in range(s.clock[N_READY]):
+        key = s.ready[i]
+        cell = (key >> CELL_SHIFT) & CELL_MASK
+        cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
+        task = key & ITEM_MASK
+        if become_ready(s, cell, cycle, task, now):
+            _admit(s, cell, cycle, task, now)
+    s.clock[N_READY] = 0
+
+
+@phase
+def _retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
+    """Send a message again after a lost attempt."""
+    slot = slot_row(s, cell, cycle)
+    s.slots[slot, LIVE] -= 1
+    attempt = s.attempts[slot, s.flows[flow, FLOW_LOCAL]] + 1
+    send(s, cell, cycle, flow, hop_of(s, cell, cycle, flow), attempt, now)
+
+
+@phase
+def _restart(s: Tables, cell: int, site: int, now: int) -> None:
+    """Workers of a restarted node take what has come meanwhile."""
+    task = s.sites[site, SITE_TASK]
+    while s.sites[site, WAITING] > 0 and s.sites[site, IDLE] > 0:
+        s.sites[site, IDLE] -= 1
+        _admit(s, cell, free_worker(s, cell, task, site), task, now)
 
 
 @phase
@@ -325,14 +394,14 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         _release(s, cell, cycle, now)
     elif kind == START:
         s.slots[slot_row(s, cell, cycle), LIVE] -= 1
-        become_ready(s, cell, cycle, item, now)
+        note_ready(s, cell, cycle, item)
     elif kind == RETRY:
-        retry(s, cell, cycle, item, now)
+        _retry(s, cell, cycle, item, now)
     elif kind == CHANGE:
         _change(s, now)
         _announce_change(s)
     elif kind == RESTART:
-        take_next(s, cell, s.sites[item, SITE_TASK], item, now)
+        _restart(s, cell, item, now)
 
 
 @kernel
@@ -366,6 +435,7 @@ def advance(
     wait_key: Ints,
     wait_left: Floats,
     dirty: Ints,
+    ready: Ints,
     event_t: Ints,
     event_key: Ints,
     jobs: Ints,
@@ -423,6 +493,7 @@ def advance(
         wait_key,
         wait_left,
         dirty,
+        ready,
         event_t,
         event_key,
         jobs,
@@ -455,5 +526,6 @@ def advance(
             open_cells = _announce_closes(s)
             continue
         _handle(s, kind, cell, (key >> CYCLE_SHIFT) & CYCLE_MASK, key & ITEM_MASK, key, now)
+        _settle(s, now)
         flush(s, now)
     return FINISHED

@@ -20,5 +20,11 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 def phase(function: Callable[P, R]) -> Callable[P, R]:
     """Compile one phase of a kernel into its caller (inlined by LLVM)."""
-    compiled = numba.njit(error_model="numpy", forceinline=True, _nrt=False)(function)
+    compiled = numba.njit(
+        error_model="numpy",
+        forceinline=True,
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        _nrt=False,
+    )(function)
     return cast(Callable[P, R], compiled)

@@ -8,11 +8,9 @@ from dwell.kernels.layout import (
     ARRIVED,
     BASE,
     CANDIDATE_0,
-    CELL_MASK,
     CELL_SHIFT,
     COMPUTE,
     CYCLE,
-    CYCLE_MASK,
     CYCLE_SHIFT,
     DEPTH,
     DIRTY,
@@ -22,6 +20,7 @@ from dwell.kernels.layout import (
     FLOW_LOCAL,
     HEAD,
     IDLE,
+    IS_CPU,
     ITEM_MASK,
     KIND_SHIFT,
     LIVE,
@@ -33,7 +32,7 @@ from dwell.kernels.layout import (
     N_CYCLES,
     N_DIRTY,
     N_IN,
-    N_OUT,
+    N_READY,
     N_SINKS,
     N_TASKS,
     NEED,
@@ -43,8 +42,6 @@ from dwell.kernels.layout import (
     NODE,
     NODE_DOWN,
     OFFSET_NS,
-    OUT_0,
-    RANK,
     READY,
     READY_AT,
     RELEASE,
@@ -62,8 +59,8 @@ from dwell.kernels.layout import (
     WAITING,
     Tables,
 )
-from dwell.kernels.links import lose, send, slot_row
-from dwell.kernels.nodes import admit, dispatch, job_row, leave, schedule
+from dwell.kernels.links import lose, slot_row
+from dwell.kernels.nodes import dispatch, job_row, leave, schedule
 
 __all__ = [
     "arrive",
@@ -71,10 +68,13 @@ __all__ = [
     "complete",
     "drop_job",
     "drop_waiting",
+    "finish",
     "flush",
+    "free_worker",
+    "hand_over",
+    "hop_of",
+    "note_ready",
     "release",
-    "retry",
-    "take_next",
 ]
 
 
@@ -93,15 +93,6 @@ def _log(s: Tables, cell: int, cycle: int, row: int, local: int, outcome: int, e
     s.log[entry, LOG_START] = s.jobs[row, STARTED]
     s.log[entry, LOG_END] = end
     s.log_outcome[entry] = outcome
-
-
-@phase
-def _take(s: Tables, cell: int, cycle: int, task: int, row: int, site: int, now: int) -> None:
-    """An idle worker takes a job."""
-    s.sites[site, IDLE] -= 1
-    work = s.exec_ns[site, cycle]
-    rank = s.tasks[task, RANK]
-    admit(s, s.sites[site, SERVER], _job_key(cell, cycle, task), row, rank, work, now)
 
 
 @phase
@@ -135,8 +126,15 @@ def _pop_input(s: Tables, cell: int, local: int, site: int) -> int:
 
 
 @phase
-def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
-    """All inputs of a job are there: hand it to a worker, or let it wait, or lose it."""
+def note_ready(s: Tables, cell: int, cycle: int, task: int) -> None:
+    """Remember that all inputs of a job are there; the event's end deals with it."""
+    s.ready[s.clock[N_READY]] = _job_key(cell, cycle, task)
+    s.clock[N_READY] += 1
+
+
+@phase
+def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> bool:
+    """Let a ready job wait at its site, or lose it; True if an idle worker takes it at once."""
     local = s.tasks[task, LOCAL]
     row = job_row(s, cell, cycle, local)
     s.jobs[row, READY] = now
@@ -144,29 +142,30 @@ def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
     s.slots[slot_row(s, cell, cycle), LIVE] += 1
     if s.servers[s.sites[site, SERVER], DOWN] != 0:
         drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
-        return
+        return False
     if s.sites[site, IDLE] > 0 and now >= s.sites[site, READY_AT]:
-        _take(s, cell, cycle, task, row, site, now)
-        return
+        s.sites[site, IDLE] -= 1
+        return True
     depth = s.tasks[task, DEPTH]
     if depth > 0 and s.sites[site, WAITING] >= depth:
         oldest = s.sites[site, HEAD]
         if cycle < oldest:
             drop_job(s, cell, cycle, local, row, REPLACED, now)
-            return
+            return False
         _pop_input(s, cell, local, site)
         old_row = job_row(s, cell, oldest, local)
         drop_job(s, cell, oldest, local, old_row, REPLACED, now)
     _append(s, cell, cycle, local, row, site)
+    return False
 
 
 @phase
-def take_next(s: Tables, cell: int, task: int, site: int, now: int) -> None:
-    """Let idle workers of a site take what waits."""
-    local = s.tasks[task, LOCAL]
-    while s.sites[site, WAITING] > 0 and s.sites[site, IDLE] > 0:
-        cycle = _pop_input(s, cell, local, site)
-        _take(s, cell, cycle, task, job_row(s, cell, cycle, local), site, now)
+def free_worker(s: Tables, cell: int, task: int, site: int) -> int:
+    """Let a worker that has become free take what waits; returns the cycle, or -1."""
+    if s.sites[site, WAITING] == 0:
+        s.sites[site, IDLE] += 1
+        return -1
+    return _pop_input(s, cell, s.tasks[task, LOCAL], site)
 
 
 @phase
@@ -180,19 +179,6 @@ def drop_waiting(s: Tables, cell: int, task: int, site: int, now: int) -> None:
 
 
 @phase
-def _input_arrived(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
-    """Count an input in; the last one makes the job ready and names its critical path."""
-    task = s.flows[flow, TARGET]
-    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
-    s.jobs[row, ARRIVED] += 1
-    if s.jobs[row, ARRIVED] == s.tasks[task, N_IN]:
-        sender = job_row(s, cell, cycle, s.tasks[s.flows[flow, SOURCE], LOCAL])
-        s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
-        s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
-        become_ready(s, cell, cycle, task, now)
-
-
-@phase
 def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Handle a message that reaches its node."""
     s.slots[slot_row(s, cell, cycle), LIVE] -= 1
@@ -200,35 +186,11 @@ def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     if s.servers[s.sites[s.jobs[row, SITE], SERVER], DOWN] != 0:
         lose(s, cell, cycle, NODE_DOWN)
         return
-    _input_arrived(s, cell, cycle, flow, now)
+    hand_over(s, cell, cycle, flow, now)
 
 
 @phase
-def retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
-    """Send a message again after a lost attempt."""
-    slot = slot_row(s, cell, cycle)
-    s.slots[slot, LIVE] -= 1
-    local = s.flows[flow, FLOW_LOCAL]
-    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
-    send(s, cell, cycle, flow, s.route[candidate, local], s.attempts[slot, local] + 1, now)
-
-
-@phase
-def _deliver(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
-    """Hand a completed job's outputs over, or send them."""
-    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
-    first = s.tasks[task, OUT_0]
-    for i in range(first, first + s.tasks[task, N_OUT]):
-        flow = s.out_flows[i]
-        hop = s.route[candidate, s.flows[flow, FLOW_LOCAL]]
-        if hop < 0:
-            _input_arrived(s, cell, cycle, flow, now)
-        else:
-            send(s, cell, cycle, flow, hop, 0, now)
-
-
-@phase
-def _finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
+def finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
     """A sink has completed; the last one completes the cycle."""
     slot = slot_row(s, cell, cycle)
     s.slots[slot, SINKS_LEFT] -= 1
@@ -240,28 +202,38 @@ def _finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
 
 
 @phase
-def complete(s: Tables, server: int, now: int) -> None:
-    """The job of a server that finishes first has finished."""
-    key = s.run_key[s.servers[server, BASE]]
-    cell = (key >> CELL_SHIFT) & CELL_MASK
-    cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    task = key & ITEM_MASK
-    local = s.tasks[task, LOCAL]
-    row = job_row(s, cell, cycle, local)
+def complete(s: Tables, server: int, cell: int, cycle: int, row: int, now: int) -> None:
+    """The job of a server that finishes first has finished; its outputs are the caller's."""
+    local = s.tasks[s.run_key[s.servers[server, BASE]] & ITEM_MASK, LOCAL]
     site = s.jobs[row, SITE]
     leave(s, server, 0, now)
     s.servers[server, NEXT_KEY] = -1
-    s.own[cell, s.sites[site, NODE]] += s.sites[site, NEED] * float(s.exec_ns[site, cycle])
+    if s.servers[server, IS_CPU] != 0:
+        work = s.sites[site, NEED] * float(s.exec_ns[site, cycle])
+        s.own[cell, s.sites[site, NODE]] += work
     s.jobs[row, COMPUTE] += now - s.jobs[row, STARTED]
     _log(s, cell, cycle, row, local, DONE, now)
-    if s.tasks[task, N_OUT] == 0:
-        _finish(s, cell, cycle, row, now)
-    else:
-        s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
-        _deliver(s, cell, cycle, task, now)
     s.slots[slot_row(s, cell, cycle), LIVE] -= 1
-    s.sites[site, IDLE] += 1
-    take_next(s, cell, task, site, now)
+
+
+@phase
+def hand_over(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
+    """Count an input in; the last one makes the job ready and names its critical path."""
+    task = s.flows[flow, TARGET]
+    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    s.jobs[row, ARRIVED] += 1
+    if s.jobs[row, ARRIVED] == s.tasks[task, N_IN]:
+        sender = job_row(s, cell, cycle, s.tasks[s.flows[flow, SOURCE], LOCAL])
+        s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
+        s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
+        note_ready(s, cell, cycle, task)
+
+
+@phase
+def hop_of(s: Tables, cell: int, cycle: int, flow: int) -> int:
+    """Hop that a flow takes in a cycle, -1 on the same node."""
+    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
+    return int(s.route[candidate, s.flows[flow, FLOW_LOCAL]])
 
 
 @phase
@@ -292,7 +264,7 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
         s.jobs[row, NETWORK] = 0
         offset = s.tasks[task, OFFSET_NS]
         if offset == 0:
-            become_ready(s, cell, cycle, task, now)
+            note_ready(s, cell, cycle, task)
         else:
             s.slots[slot_row(s, cell, cycle), LIVE] += 1
             key = (START << KIND_SHIFT) | _job_key(cell, cycle, task)

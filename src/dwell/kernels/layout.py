@@ -38,7 +38,9 @@ IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
 FAIR, FIFO, PRIORITY = range(3)
 
 # clock: scalars that outlive a call.
-N_EVENTS, N_DIRTY, NEXT_CHANGE, PAUSE, CLOSED_CELL, RING, STRIDE, MARGIN, N_CLOCK = range(9)
+N_EVENTS, N_DIRTY, NEXT_CHANGE, PAUSE, CLOSED_CELL, RING, STRIDE, MARGIN, N_READY, N_CLOCK = range(
+    10
+)
 
 # cells
 (
@@ -163,6 +165,7 @@ class Tables(NamedTuple):
     wait_key: Ints
     wait_left: Floats
     dirty: Ints  # servers to dispatch at the end of the event
+    ready: Ints  # jobs that the event has made ready
     event_t: Ints  # heap of events
     event_key: Ints
     jobs: Ints  # (cells * ring * tasks of a cell, N_JOB)

@@ -136,6 +136,12 @@ def admit(s: Tables, server: int, key: int, row: int, rank: int, work: int, now:
     if s.servers[server, SCHEDULER] == FIFO:
         rank = 0
     n = s.servers[server, N_WAIT]
+    need = s.sites[s.jobs[row, SITE], NEED]
+    if n == 0 and s.servers[server, USED] + need <= s.servers[server, CORES]:
+        # Nobody else waits, and jobs are admitted in the order of their readiness.
+        tick(s, server, now)
+        _start(s, server, key, row, float(work), now)
+        return
     base = s.servers[server, BASE]
     ready = s.jobs[row, READY]
     w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left

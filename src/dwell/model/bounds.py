@@ -80,7 +80,7 @@ class Bound:
 
 def _short(value: float) -> str:
     """Return a number as people write it: 1e9 and 1000000, not 1e+09."""
-    if value == int(value) and abs(value) <= MAX_COUNT:
+    if abs(value) <= MAX_COUNT and value == int(value):
         return str(int(value))
     return f"{value:g}".replace("e+0", "e").replace("e+", "e").replace("e-0", "e-")
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from dwell.cost import tier_utilisation
 from dwell.errors import PolicyError
 from dwell.model.bounds import MIN_DWELL, Bound
 from dwell.model.objective import Objective, Tier
@@ -32,7 +31,7 @@ from dwell.policies.incumbent import (
     check_name,
     check_parameter,
 )
-from dwell.policies.pricing import Pricing, check_metrics
+from dwell.policies.pricing import Pricing
 
 __all__ = ["ATP", "Pair", "find_pairs"]
 
@@ -185,8 +184,7 @@ class ATP:
             If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
         """
         incumbent = self._incumbent
-        check_metrics(observed, "observed")
-        used = tier_utilisation(observed.utilisation, self.objective)
+        used = self._pricing.used(observed)
         costs = NOT_PRICED
         if estimates is not None:
             costs = self._pricing.estimated(estimates, incumbent.name)

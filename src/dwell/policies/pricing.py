@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from operator import itemgetter
 from typing import NoReturn
 
-from dwell.cost import excess, hamming, price, tier_nodes
+from dwell.cost import TierUtilisation, excess, hamming, price, tier_nodes
 from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
@@ -19,6 +19,8 @@ from dwell.model.placement import Placement
 from dwell.model.qos import QoS
 
 __all__ = ["EXCESS_TOLERANCE", "Pricing", "check_metrics", "explain_estimate"]
+
+INFINITY = math.inf
 
 #: Candidates this close to the least relative excess are told apart by J instead.
 EXCESS_TOLERANCE = 1e-6
@@ -44,14 +46,12 @@ def explain_estimate(estimates: object, name: str, candidates: Mapping[str, Plac
     check_metrics(estimates[name], f"the estimate of {name}")
 
 
-def _peak(nodes: tuple[str, ...]) -> Callable[[Mapping[str, float]], float]:
-    """Return the function that finds the largest utilisation among `nodes`."""
+def _shares(nodes: tuple[str, ...]) -> Callable[[Mapping[str, float]], tuple[float, ...]]:
+    """Return the function that looks up the utilisation of `nodes`: a tuple, never empty."""
     if not nodes:
-        return lambda utilisation: 0.0
-    if len(nodes) == 1:
-        return itemgetter(nodes[0])
-    values = itemgetter(*nodes)
-    return lambda utilisation: max(values(utilisation))
+        return lambda utilisation: (0.0,)
+    # Given one key alone, itemgetter would return a bare value.
+    return itemgetter(*nodes, nodes[0]) if len(nodes) == 1 else itemgetter(*nodes)
 
 
 class Pricing:
@@ -63,7 +63,7 @@ class Pricing:
     objective : Objective
     """
 
-    __slots__ = ("_capped", "_cloud", "_edge", "_robot", "_rows", "candidates", "objective")
+    __slots__ = ("_cloud", "_edge", "_robot", "_rows", "candidates", "objective")
 
     def __init__(self, candidates: Mapping[str, Placement], objective: Objective) -> None:
         if not isinstance(objective, Objective):
@@ -71,11 +71,8 @@ class Pricing:
         self.candidates = candidates
         self.objective = objective
         nodes = tier_nodes(objective)
-        self._robot, self._edge, self._cloud = _peak(nodes.robot), _peak(nodes.edge), None
-        if nodes.cloud:
-            self._cloud = _peak(nodes.cloud)
-        caps = objective.caps
-        self._capped = caps.latency_ms < math.inf or caps.utilisation < math.inf
+        self._robot, self._edge = _shares(nodes.robot), _shares(nodes.edge)
+        self._cloud = _shares(nodes.cloud) if nodes.cloud else None
         # One row of Hamming distances an incumbent, made when it first is one: n candidates of
         # which few are ever active do not cost n * n comparisons.
         self._rows: dict[str, dict[str, float]] = {}
@@ -89,6 +86,21 @@ class Pricing:
             self._rows[previous] = row
         return row
 
+    def used(self, qos: QoS) -> TierUtilisation:
+        """U_r, U_e and U_c of an observed window.
+
+        Raises
+        ------
+        MetricError
+            If a metric is missing.
+        """
+        try:
+            used = qos.utilisation
+            cloud = 0.0 if self._cloud is None else max(self._cloud(used))
+            return TierUtilisation(max(self._robot(used)), max(self._edge(used)), cloud)
+        except (AttributeError, KeyError, TypeError):
+            self._explain(qos, "observed")
+
     def observed(self, qos: QoS, current: str, previous: str) -> float:
         """J of the window that `qos` was observed in.
 
@@ -98,9 +110,12 @@ class Pricing:
             If a metric is missing, or J is not finite.
         """
         try:
-            return self._price(qos, self.switching(previous)[current])
-        except (AttributeError, KeyError, OverflowError, TypeError):
+            value = self._price(qos, self.switching(previous)[current])
+        except (AttributeError, KeyError, TypeError):
             self._explain(qos, "observed")
+        if not value < INFINITY:
+            self._explain(qos, "observed")
+        return value
 
     def estimated(self, estimates: Mapping[str, QoS], incumbent: str) -> FrozenDict[str, float]:
         """J of every candidate against the incumbent, in the candidates' order.
@@ -115,41 +130,46 @@ class Pricing:
         try:
             for name, switching in self.switching(incumbent).items():
                 costs[name] = self._price(estimates[name], switching)
-        except (AttributeError, KeyError, OverflowError, TypeError):
+        except (AttributeError, KeyError, TypeError):
             explain_estimate(estimates, name, self.candidates)
+            self._explain(estimates[name], f"the estimate of {name}")
+        if not sum(costs.values()) < INFINITY:
+            name = max(costs, key=costs.__getitem__)
             self._explain(estimates[name], f"the estimate of {name}")
         return FrozenDict(costs)
 
-    def eligible(self, estimates: Mapping[str, QoS]) -> tuple[Mapping[str, object], bool]:
+    def eligible(self, estimates: Mapping[str, QoS]) -> tuple[list[str], bool]:
         """Candidates to choose from, and whether they respect the caps.
 
         Where none does, these are the candidates whose largest relative excess is within
         `EXCESS_TOLERANCE` of the least: on a saturated robot every placement is over its cap, and
         that must not freeze the policy.
         """
-        if not self._capped:
-            return self.candidates, True
+        caps = self.objective.caps
+        latency_ms, utilisation = caps.latency_ms, caps.utilisation
+        within = []
+        for name in self.candidates:
+            qos = estimates[name]
+            used = qos.utilisation.values()
+            if qos.l95_ms <= latency_ms and (not used or max(used) <= utilisation):
+                within.append(name)
+        if within:
+            return within, True
         excesses = {name: excess(estimates[name], self.objective) for name in self.candidates}
-        least = min(excesses.values())
-        if least <= 0:
-            return {name: None for name, value in excesses.items() if value <= 0}, True
-        bound = least + EXCESS_TOLERANCE
-        return {name: None for name, value in excesses.items() if value <= bound}, False
+        bound = min(excesses.values()) + EXCESS_TOLERANCE
+        return [name for name, value in excesses.items() if value <= bound], False
 
     def _price(self, qos: QoS, switching: float) -> float:
         used = qos.utilisation
-        value = price(
+        return price(
             qos.l95_ms,
             qos.violation_rate,
-            self._robot(used),
-            self._edge(used),
-            0.0 if self._cloud is None else self._cloud(used),
+            max(self._robot(used)),
+            max(self._edge(used)),
+            0.0 if self._cloud is None else max(self._cloud(used)),
             switching,
             self.objective,
         )
-        if not -math.inf < value < math.inf:
-            raise OverflowError
-        return value
 
     def _explain(self, qos: object, whose: str) -> NoReturn:
         """Say what is wrong with metrics that could not be priced (off the fast path)."""

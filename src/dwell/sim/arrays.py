@@ -300,6 +300,7 @@ class _Layout:
             wait_key=np.zeros(room, np.int64),
             wait_left=np.zeros(room),
             dirty=np.zeros(len(servers), np.int64),
+            ready=np.zeros(margin, np.int64),
             event_t=np.zeros(4 * margin, np.int64),
             event_key=np.zeros(4 * margin, np.int64),
             jobs=np.zeros((cells * RING_START * self.max_tasks, k.N_JOB), np.int64),

@@ -1,0 +1,228 @@
+"""Check the structure of a document and return what of it can be used.
+
+pydantic finds every fault of structure in one pass. What is at fault is then blanked (set to None,
+which every optional part may be, or to a harmless stand-in), again and again until the document
+validates, so that the checks of meaning see all the rest of it.
+"""
+
+from __future__ import annotations
+
+import copy
+import types
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from dwell.errors import ProblemError
+from dwell.io.entries import CellEntry, Entry
+from dwell.io.faults import Faults, Step, dotted
+from dwell.io.wording import as_read
+from dwell.model import bounds
+from dwell.model.meaning import nearest
+
+__all__ = ["VERSION", "read_structure"]
+
+VERSION = 1
+MAX_DEPTH = 40
+
+# Stand-ins for what an entry cannot be without: by path for sections, by key for parts of elements.
+SECTIONS: dict[str, object] = {
+    "dwell": VERSION,
+    "period_ms": bounds.LARGEST,
+    "nodes": {},
+    "tasks": {},
+    "candidates": {},
+}
+PARTS: dict[str, object] = {"tier": "robot", "exec_ms": 1, "delay_ms": 1}
+
+
+def read_structure(document: object, faults: Faults) -> CellEntry:
+    """Return the document as an entry, less what is at fault in it.
+
+    Parameters
+    ----------
+    document : object
+        Plain values; not changed.
+    faults : Faults
+        Takes every fault of structure.
+
+    Returns
+    -------
+    CellEntry
+        Valid; None stands for elements that could not be read.
+
+    Raises
+    ------
+    ProblemError
+        At once where the document is no cell of this version at all.
+    """
+    if not isinstance(document, Mapping):
+        has = as_read(document)
+        faults.add("", f"a cell file is a mapping that begins with `dwell: 1`; this is {has}")
+        faults.raise_any()
+    values = _plain(document, (), faults)
+    assert isinstance(values, dict)  # noqa: S101 - a copy of the mapping
+    _check_version(values, faults)
+    known = faults.at
+    while True:
+        try:
+            return CellEntry.model_validate(values)
+        except ValidationError as error:
+            details = error.errors(include_url=False, include_context=False)
+        # Reported first, all of them: blanking one may take others away.
+        for detail in details:
+            path = dotted(detail["loc"])
+            if not known(path):
+                faults.add(path, _message(detail))
+        for detail in details:
+            _blank(values, detail["loc"], detail["type"])
+        # From now on, what surfaces beside a known fault may be an effect of blanking it.
+        known = faults.touches
+
+
+def _check_version(values: Mapping[str, object], faults: Faults) -> None:
+    version = values.get("dwell")
+    if isinstance(version, int) and not isinstance(version, bool) and version > VERSION:
+        faults.add(
+            "dwell",
+            f"schema version {bounds.shown(version)} is newer than this Dwell, which reads "
+            f"{VERSION}; upgrade dwell",
+        )
+        # Whatever else looks wrong may be right in that version.
+        raise _only(faults, "dwell")
+
+
+def _only(faults: Faults, path: str) -> ProblemError:
+    try:
+        faults.raise_any()
+    except ProblemError as error:
+        kept = [fault for fault in error.faults if fault.path == path]
+        return ProblemError(kept, error.source)
+    raise AssertionError(path)
+
+
+def _plain(value: object, steps: tuple[Step, ...], faults: Faults) -> object:
+    """Return a deep copy in dicts and lists that can be blanked; nothing in it is empty."""
+    if len(steps) > MAX_DEPTH:
+        faults.add(dotted(steps), f"nested deeper than {MAX_DEPTH} levels")
+        return None
+    if isinstance(value, Mapping):
+        copy: dict[str, object] = {}
+        for key, item in value.items():
+            path = (*steps, str(key))
+            if not isinstance(key, str):
+                faults.add(dotted(path), f"the key {as_read(key)} is not a text")
+                continue
+            copy[key] = _plain(item, path, faults)
+        return copy
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_plain(item, (*steps, i), faults) for i, item in enumerate(value)]
+    if value is None and not faults.at(dotted(steps)):
+        key = f"the key {steps[-1]!r}" if isinstance(steps[-1], str) else "the item"
+        faults.add(dotted(steps), f"nothing is given; give a value, or remove {key}")
+    return value
+
+
+def _blank(values: dict[str, Any], loc: Sequence[Step], kind: str) -> None:
+    """Take what is at fault out of the document, so that the rest of it validates."""
+    if loc[0] == "candidates" and len(loc) > 2:
+        loc = loc[:2]  # half a placement would look as if tasks were missing
+    if loc[0] == "nodes" and "accelerators" in loc[2:3]:
+        loc = loc[:2]  # a node without its accelerators, as if tasks named unknown ones
+    parent: Any = values
+    for step in loc[:-1]:
+        parent = parent[step] if _has(parent, step) else None
+    last = loc[-1]
+    stand_ins: dict[Any, object] = SECTIONS if len(loc) == 1 else PARTS if len(loc) > 2 else {}
+    if parent is None:
+        return  # went with another fault's part
+    if kind == "extra_forbidden":
+        parent.pop(last, None)
+    elif last in stand_ins and not (_has(parent, last) and parent[last] == stand_ins[last]):
+        parent[last] = copy.copy(stand_ins[last])
+    elif _has(parent, last) and parent[last] is not None:
+        parent[last] = None
+    else:
+        _blank(values, loc[:-1], "")
+
+
+def _has(container: object, step: Step) -> bool:
+    if isinstance(container, dict):
+        return step in container
+    return isinstance(container, list) and isinstance(step, int) and step < len(container)
+
+
+def _message(detail: ErrorDetails) -> str:
+    """Return what is wrong, and what to do, in the words of the file."""
+    kind, value, loc = detail["type"], detail["input"], detail["loc"]
+    if kind == "wrong":
+        return detail["msg"]
+    owner, field = _declaration(loc[:-1])[0], _declaration(loc)[1]
+    if kind == "extra_forbidden":
+        return f"unknown key {loc[-1]!r}; {nearest(str(loc[-1]), _keys(owner))}"
+    if kind == "missing":
+        return f"missing; add it: {_lower(field.description) if field else 'it is required'}"
+    if kind == "literal_error":
+        choices = [str(choice) for choice in _choices(_declaration(loc)[0])]
+        if choices == [str(VERSION)]:
+            return f"{as_read(value)} is not allowed; write `dwell: {VERSION}`"
+        hint = nearest(value, choices) if isinstance(value, str) else ""
+        only = f"{as_read(value)} is not allowed; it must be one of {', '.join(choices)}"
+        return f"{only}; {hint}" if hint.startswith("did you mean") else only
+    remedies = {
+        "model_type": f"a mapping of {', '.join(_keys(_declaration(loc)[0]))}",
+        "dict_type": "a mapping",
+        "list_type": "a list; for none, write []",
+        "string_type": "a text; put it in quotes",
+        "string_too_short": "a text that is not empty",
+        "bool_type": "true or false",
+        "string_pattern_mismatch": "64 hexadecimal digits, as they were recorded",
+    }
+    if kind in remedies:
+        remedy = remedies[kind]
+        if kind == "string_type" and isinstance(value, dict | list):
+            remedy = "a text"
+        return f"{as_read(value)} is not allowed; it must be {remedy}"
+    return detail["msg"]
+
+
+def _lower(text: str | None) -> str:
+    return text[:1].lower() + text[1:].rstrip(".") if text else "it is required"
+
+
+def _declaration(loc: Sequence[Step]) -> tuple[object, FieldInfo | None]:
+    """Return the type declared at a place of the file, and the field it is declared by."""
+    here: object = CellEntry
+    field = None
+    for step in loc:
+        here, field = _bare(here), None
+        if isinstance(here, type) and issubclass(here, Entry):
+            field = here.model_fields.get(_field_names(here).get(str(step), ""))
+            here = field.annotation if field is not None else None
+        elif get_origin(here) in (dict, list):
+            here = get_args(here)[-1]
+    return _bare(here), field
+
+
+def _bare(annotation: object) -> object:
+    """Return a type without ``| None`` and its annotations."""
+    while get_origin(annotation) in (Annotated, Union, types.UnionType):
+        annotation = get_args(annotation)[0]
+    return annotation
+
+
+def _field_names(entry: type[Entry]) -> dict[str, str]:
+    return {field.alias or name: name for name, field in entry.model_fields.items()}
+
+
+def _keys(owner: object) -> list[str]:
+    if isinstance(owner, type) and issubclass(owner, Entry):
+        return list(_field_names(owner))
+    return []
+
+
+def _choices(annotation: object) -> tuple[object, ...]:
+    return get_args(annotation) if get_origin(annotation) is Literal else ()

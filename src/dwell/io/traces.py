@@ -1,0 +1,352 @@
+"""Traces: recorded columns that a cell names, read from Parquet or CSV files.
+
+Processes that name the same file in the same way share one table, so that a row dropped for one
+column is dropped for all and the columns of a cycle come from one row.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import TraceError
+from dwell.io.entries import CellEntry, Entry, TraceEntry
+from dwell.io.faults import Faults, Step, dotted
+from dwell.model import Trace, TraceTable
+from dwell.model.bounds import VALUE
+from dwell.model.document import digest
+from dwell.model.meaning import nearest
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["Source", "Tables", "read_traces"]
+
+Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+SUFFIXES = (".parquet", ".csv")
+DEFAULT_TIME = "sent_ms"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A file and a way to read it; the processes that share it share their rows."""
+
+    file: str
+    by: Literal["row", "time"]
+    group: str | tuple[str, ...] | None
+    time: str | None
+    on_negative: Literal["error", "drop", "clip"]
+    wrap: bool
+
+    @classmethod
+    def of(cls, entry: TraceEntry) -> Source:
+        """Return the source that a declaration names, defaults filled in."""
+        by = entry.by or "row"
+        time = entry.time or DEFAULT_TIME if by == "time" else None
+        on_negative = entry.on_negative or "error"
+        return cls(entry.file, by, entry.group, time, on_negative, bool(entry.wrap))
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Columns whose values make a group."""
+        if self.group is None:
+            return ()
+        return (self.group,) if isinstance(self.group, str) else self.group
+
+
+Tables: TypeAlias = dict[Source, TraceTable]
+
+
+def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
+    """Read every trace that a cell names.
+
+    Parameters
+    ----------
+    entry : CellEntry
+    folder : Path
+        Where relative file names start.
+    faults : Faults
+        Takes what is wrong with the files.
+
+    Returns
+    -------
+    dict of Source to TraceTable
+        Less the sources at fault.
+    """
+    uses: dict[Source, list[tuple[str, TraceEntry]]] = {}
+    for steps, trace in _declared(entry, ()):
+        path = dotted(steps)
+        if trace.time is not None and trace.by != "time":
+            faults.add(f"{path}.time", "has no effect without `by: time`; add that, or remove it")
+        uses.setdefault(Source.of(trace), []).append((path, trace))
+    tables: Tables = {}
+    for source, declarations in uses.items():
+        table = _Reading(source, declarations, folder, faults).table()
+        if table is not None:
+            tables[source] = table
+    return tables
+
+
+def _declared(value: object, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], TraceEntry]]:
+    """Yield every trace declared in an entry, with its place in the file."""
+    if isinstance(value, TraceEntry):
+        yield steps, value
+    elif isinstance(value, Entry):
+        for name, info in type(value).model_fields.items():
+            yield from _declared(getattr(value, name), (*steps, info.alias or name))
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _declared(item, (*steps, key))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from _declared(item, (*steps, index))
+
+
+@dataclass(slots=True)
+class _Reading:
+    """One source being read."""
+
+    source: Source
+    uses: Sequence[tuple[str, TraceEntry]]
+    folder: Path
+    faults: Faults
+    failed: bool = field(default=False, init=False)
+
+    def table(self) -> TraceTable | None:
+        """Return the table, or None beside at least one fault."""
+        frame = self._frame()
+        if frame is None:
+            return None
+        values = {name: _floats(frame[name]) for name in dict.fromkeys(self._columns())}
+        starts = self._starts(frame)
+        time = None
+        if self.source.time is not None:
+            time = _floats(frame[self.source.time])
+        keep, clipped = self._judge(values, time)
+        if not self.failed and not keep.any():
+            self._fail("file", f"none of its {frame.height} rows is left after `on_negative: drop`")
+        if self.failed:
+            return None
+        if self.source.on_negative == "clip":
+            values = {name: np.maximum(column, 0.0) for name, column in values.items()}
+        starts = _kept_starts(starts, keep)
+        values = {name: _frozen(column[keep]) for name, column in values.items()}
+        if time is not None:
+            time = self._instants(time[keep], starts, np.flatnonzero(keep))
+        if self.failed:
+            return None
+        table = TraceTable(
+            file=self.source.file,
+            columns=values,
+            by=self.source.by,
+            starts=starts,
+            time_ms=time,
+            wrap=self.source.wrap,
+            group=self.source.group,
+            on_negative=self.source.on_negative,
+            time=self.source.time,
+            dropped=int(np.count_nonzero(~keep)) + clipped,
+        )
+        self._verify(table)
+        return None if self.failed else table
+
+    def _fail(self, key: str, message: str, path: str | None = None) -> None:
+        self.failed = True
+        self.faults.add(f"{path or self.uses[0][0]}.{key}", message, kind=TraceError)
+
+    def _columns(self) -> Iterator[str]:
+        return (entry.column for _, entry in self.uses)
+
+    def _frame(self) -> pl.DataFrame | None:
+        """Return the columns that the cell uses, of the right types, at least one row."""
+        import polars as pl
+
+        path = self.folder / self.source.file
+        suffix = path.suffix.lower()
+        if suffix not in SUFFIXES:
+            given = repr(self.source.file)
+            self._fail("file", f"{given} must end in {' or '.join(SUFFIXES)}, by what it contains")
+            return None
+        if not path.is_file():
+            what = "is a folder" if path.is_dir() else "does not exist"
+            self._fail("file", f"{path} {what}; {_beside(path)}")
+            return None
+        try:
+            lazy = (
+                pl.scan_parquet(path)
+                if suffix == ".parquet"
+                else pl.scan_csv(path, infer_schema_length=None)
+            )
+            types = dict(lazy.collect_schema())
+            if not self._has_columns(types):
+                return None
+            wanted = [*self._columns(), *self.source.groups, self.source.time]
+            frame = lazy.select(dict.fromkeys(filter(None, wanted))).collect()
+        except pl.exceptions.NoDataError:
+            self._fail("file", f"{path} is empty; record it again, or name another")
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+            reason = str(error).partition("\n")[0]
+            self._fail("file", f"{path} cannot be read as {suffix[1:]}: {reason}")
+        else:
+            if frame.height > 0:
+                return frame
+            self._fail("file", f"{path} has no rows; record it again, or name another")
+        return None
+
+    def _has_columns(self, types: dict[str, pl.DataType]) -> bool:
+        for path, entry in self.uses:
+            self._has_column(types, f"{path}.column", entry.column, number=True)
+        if self.source.time is not None:
+            self._has_column(types, f"{self.uses[0][0]}.time", self.source.time, number=True)
+        for name in self.source.groups:
+            self._has_column(types, f"{self.uses[0][0]}.group", name, number=False)
+        return not self.failed
+
+    def _has_column(
+        self, types: dict[str, pl.DataType], path: str, name: str, *, number: bool
+    ) -> None:
+        place, _, key = path.rpartition(".")
+        if name not in types:
+            hint = nearest(name, types)
+            known = "" if hint.startswith("known") else f" (known: {', '.join(types)})"
+            self._fail(key, f"{self.source.file} has no column {name!r}; {hint}{known}", place)
+        elif number and not types[name].is_numeric():
+            numeric = [other for other, kind in types.items() if kind.is_numeric()]
+            self._fail(
+                key,
+                f"column {name!r} holds {types[name]}, not numbers; "
+                f"columns with numbers: {', '.join(numeric) or 'none'}",
+                place,
+            )
+
+    def _starts(self, frame: pl.DataFrame) -> NDArray[np.int64]:
+        """Return the first row of every group; each must stand in one piece."""
+        import polars as pl
+
+        if not self.source.groups:
+            return np.zeros(1, np.int64)
+        names = list(self.source.groups)
+        begins = frame.select(pl.struct(names).rle_id()).to_series().to_numpy()
+        starts = np.flatnonzero(np.diff(begins, prepend=-1)).astype(np.int64)
+        again = frame.select(names)[starts].is_duplicated() & ~_first(frame.select(names)[starts])
+        if again.any():
+            row = int(starts[int(again.arg_max() or 0)])
+            values = ", ".join(str(value) for value in frame.select(names).row(row))
+            self._fail(
+                "group",
+                f"group {values} begins again at row {row + 1} after another group; sort the file "
+                "so that the rows of each group stand together",
+            )
+        return starts
+
+    def _judge(self, values: dict[str, Floats], time: Floats | None) -> tuple[Mask, int]:
+        """Return which rows stay, and how many were clipped; what may not be is a fault."""
+        rows = len(next(iter(values.values())))
+        keep, clip = np.ones(rows, np.bool_), np.zeros(rows, np.bool_)
+        mode = self.source.on_negative
+        for path, entry in self.uses:
+            column = values[entry.column]
+            negative = column < 0
+            # Comparisons with NaN are false.
+            bad = ~(column <= VALUE.high) if mode == "clip" else ~((column >= 0) & (column <= VALUE.high))
+            if mode == "drop":
+                keep &= ~bad
+                continue
+            if mode == "clip":
+                clip |= negative
+            if bad.any():
+                self._fail("column", self._complaint(column, bad, mode), path)
+        if time is not None:
+            lost = ~np.isfinite(time)
+            if mode == "drop":
+                keep &= ~lost
+            elif lost.any():
+                self._fail("time", self._complaint(time, lost, "clip"))
+        return keep, int(np.count_nonzero(clip))
+
+    def _complaint(self, column: Floats, bad: Mask, mode: str) -> str:
+        first = int(np.flatnonzero(bad)[0])
+        value = float(column[first])
+        shown = "missing or NaN" if np.isnan(value) else f"{value:g}"
+        count = int(np.count_nonzero(bad))
+        what = f"{count} of {len(column)} rows"
+        where = f"(first: row {first + 1}, {shown})"
+        drop = "set `on_negative: drop` to leave those rows out of all columns"
+        if mode == "clip":
+            return f"{what} hold no finite number of at most 1e9 {where}; no 0 can stand for it: {drop}"
+        return (
+            f"{what} are negative, missing or above 1e9 {where}; {drop}, "
+            "or `on_negative: clip` to make negative values 0"
+        )
+
+    def _instants(self, time: Floats, starts: NDArray[np.int64], rows: NDArray[np.int64]) -> Floats:
+        """Return each row's instant since its group's first; they must not go back."""
+        steps = np.diff(time)
+        steps[starts[1:] - 1] = 0
+        if (steps < 0).any():
+            at = int(np.flatnonzero(steps < 0)[0])
+            self._fail(
+                "time",
+                f"{self.source.time!r} goes back from {time[at]:g} to {time[at + 1]:g} at row "
+                f"{int(rows[at + 1]) + 1}; sort the file by it, or name the columns that tell "
+                "recordings apart with `group`",
+            )
+        lengths = np.diff(np.append(starts, len(time)))
+        return _frozen(time - np.repeat(time[starts], lengths))
+
+    def _verify(self, table: TraceTable) -> None:
+        for path, entry in self.uses:
+            if entry.sha256 is not None and digest(Trace(table, entry.column)) != entry.sha256:
+                self._fail(
+                    "sha256",
+                    f"{self.source.file} does not hold the data that were recorded; find the file "
+                    "that does, or remove the key to go on with this one",
+                    path,
+                )
+
+
+def _floats(series: pl.Series) -> Floats:
+    """Return a column as float64, NaN where a value is missing."""
+    import polars as pl
+
+    return series.cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+
+def _first(frame: pl.DataFrame) -> pl.Series:
+    import polars as pl
+
+    return frame.select(pl.struct(frame.columns).is_first_distinct()).to_series()
+
+
+def _kept_starts(starts: NDArray[np.int64], keep: Mask) -> NDArray[np.int64]:
+    """Return the first row of every group that has one left, counted among the rows that stay."""
+    before = np.concatenate(([0], np.cumsum(keep)))
+    first = before[starts]
+    last = before[np.append(starts[1:], len(keep))]
+    return np.asarray(first[last > first], np.int64)
+
+
+def _frozen(column: Floats) -> Floats:
+    column = np.ascontiguousarray(column, np.float64)
+    column.setflags(write=False)
+    return column
+
+
+def _beside(path: Path) -> str:
+    """Return a remedy for a file that is not there."""
+    try:
+        names = [item.name for item in path.parent.iterdir() if item.suffix.lower() in SUFFIXES]
+    except OSError:
+        return f"there is no folder {path.parent}; file names are relative to the cell file"
+    match = difflib.get_close_matches(path.name, names, n=1)
+    if match:
+        return f"did you mean {match[0]!r}?"
+    return "file names are relative to the cell file's folder"

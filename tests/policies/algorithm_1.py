@@ -1,0 +1,94 @@
+"""Algorithm 1 once more, line by line and as slowly as it reads, to test DTP against.
+
+It shares no code with the package: J, the Hamming distance and the caps are written out again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dwell.model import Objective, QoS
+
+Nodes = Mapping[str, str]
+
+
+@dataclass
+class Row:
+    """What was decided for the window after this one."""
+
+    placement: str
+    migrated: bool
+    reason: str
+    dwell: int
+    delta_j: float
+    costs: dict[str, float]
+
+
+def S(now: Nodes, before: Nodes) -> float:
+    """Equation 6."""
+    return len([v for v in now if now[v] != before[v]]) / len(now)
+
+
+def J(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:
+    """Equation 7."""
+
+    def U(*tiers: str) -> float:
+        return max([q.utilisation[n] for n, t in objective.tiers.items() if t in tiers] + [0.0])
+
+    a, bar = objective.weights, objective.targets
+    total = a.latency * (q.l95_ms / bar.latency_ms)
+    total += a.violations * q.violation_rate
+    total += a.robot * (U("robot") / bar.robot)
+    total += a.edge * (U("edge", "cloud") / bar.edge)
+    return total + a.switching * S(now, before)
+
+
+def worst(q: QoS, objective: Objective) -> float:
+    """Largest value / cap - 1."""
+    shares = [u / objective.caps.utilisation for u in q.utilisation.values()]
+    return max([q.l95_ms / objective.caps.latency_ms, *shares]) - 1
+
+
+def algorithm_1(
+    windows: Sequence[Mapping[str, QoS]],
+    candidates: Mapping[str, Nodes],
+    initial: str,
+    objective: Objective,
+    N_min: int,
+    Delta_min: float,
+) -> list[Row]:
+    """Return the decision after every window; its metrics are given for every candidate."""
+    pi = [initial, initial]  # placements k - 2 and k - 1
+    n_d = 0
+    rows = []
+    for shown in windows:
+        before, now = pi[-2:]
+        collected = shown[now]
+        J_measured = J(collected, candidates[now], candidates[before], objective)
+        J_of = {c: J(shown[c], candidates[c], candidates[now], objective) for c in candidates}
+        if n_d < N_min:
+            n_d += 1
+            pi.append(now)
+            rows.append(Row(now, False, "dwell", n_d, math.nan, J_of))
+            continue
+        allowed = [c for c in candidates if worst(shown[c], objective) <= 0]
+        infeasible = not allowed
+        if infeasible:
+            least = min(worst(shown[c], objective) for c in candidates)
+            allowed = [c for c in candidates if worst(shown[c], objective) <= least + 1e-6]
+        lowest = min(J_of[c] for c in allowed)
+        ties = [c for c in allowed if J_of[c] == lowest]
+        star = now if now in ties else ties[0]
+        Delta = J_measured - J_of[star]
+        if star != now and Delta > Delta_min:
+            n_d = 0
+            pi.append(star)
+            reason = "infeasible" if infeasible else "migrate"
+        else:
+            n_d += 1
+            pi.append(now)
+            reason = "infeasible" if infeasible else "hold"
+        rows.append(Row(pi[-1], star != now and Delta > Delta_min, reason, n_d, Delta, J_of))
+    return rows
