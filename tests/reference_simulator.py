@@ -44,7 +44,10 @@ class CycleResult:
 
 @dataclass(frozen=True)
 class JobResult:
-    """One execution of a task: it exists from the instant at which all its inputs are there."""
+    """One execution of a task: it exists from the instant at which all its inputs are there.
+
+    `end_ns` is its completion, or the instant at which it was lost.
+    """
 
     node: str
     ready_ns: int
@@ -438,6 +441,7 @@ class Simulation:
 
     def lose_job(self, job: Job, outcome: str) -> None:
         job.outcome = outcome
+        job.end = self.now
         self.lose(job.cycle, outcome)
 
     def cycle_result(self, cycle: int) -> CycleResult:

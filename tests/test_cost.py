@@ -37,7 +37,7 @@ metrics = st.builds(
     QoS,
     l95_ms=latencies,
     violation_rate=shares,
-    utilisation=st.fixed_dictionaries({node: shares for node in OBJECTIVE.tiers}),
+    utilisation=st.fixed_dictionaries(dict.fromkeys(OBJECTIVE.tiers, shares)),
 )
 
 

@@ -26,23 +26,23 @@ class Row:
     costs: dict[str, float]
 
 
-def S(now: Nodes, before: Nodes) -> float:
+def switching(now: Nodes, before: Nodes) -> float:
     """Equation 6."""
     return len([v for v in now if now[v] != before[v]]) / len(now)
 
 
-def J(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:
+def price(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:
     """Equation 7."""
 
-    def U(*tiers: str) -> float:
+    def used(*tiers: str) -> float:
         return max([q.utilisation[n] for n, t in objective.tiers.items() if t in tiers] + [0.0])
 
     a, bar = objective.weights, objective.targets
     total = a.latency * (q.l95_ms / bar.latency_ms)
     total += a.violations * q.violation_rate
-    total += a.robot * (U("robot") / bar.robot)
-    total += a.edge * (U("edge", "cloud") / bar.edge)
-    return total + a.switching * S(now, before)
+    total += a.robot * (used("robot") / bar.robot)
+    total += a.edge * (used("edge", "cloud") / bar.edge)
+    return total + a.switching * switching(now, before)
 
 
 def worst(q: QoS, objective: Objective) -> float:
@@ -66,8 +66,8 @@ def algorithm_1(
     for shown in windows:
         before, now = pi[-2:]
         collected = shown[now]
-        J_measured = J(collected, candidates[now], candidates[before], objective)
-        J_of = {c: J(shown[c], candidates[c], candidates[now], objective) for c in candidates}
+        J_measured = price(collected, candidates[now], candidates[before], objective)
+        J_of = {c: price(shown[c], candidates[c], candidates[now], objective) for c in candidates}
         if n_d < N_min:
             n_d += 1
             pi.append(now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
 from dwell.model import (
@@ -86,7 +87,7 @@ def problem(
                 name: Task(name, {node: Execution(Constant(ms)) for node, ms in on.items()})
                 for name, on in tasks.items()
             },
-            flows=tuple(Flow(a, b, 1000) for a, b in zip(chain, chain[1:], strict=False)),
+            flows=tuple(Flow(a, b, 1000) for a, b in itertools.pairwise(chain)),
             period_ms=40.0,
             deadline_ms=40.0,
         ),

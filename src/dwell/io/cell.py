@@ -41,7 +41,8 @@ def load(path: str | PathLike[str]) -> Problem:
     source = fspath(path)
     faults = Faults(source)
     text = read_yaml(source, faults)
-    faults.raise_any()
+    if faults.at(""):
+        faults.raise_any()  # with the file as such; there is nothing to read on
     return _read(text, faults, Path(source).parent, Path(source).stem or "cell")
 
 

@@ -9,10 +9,17 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic import ModelWrapValidatorHandler, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    ModelWrapValidatorHandler,
+    model_validator,
+)
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dwell.io.wording import as_read
@@ -91,11 +98,12 @@ class Columns:
 
     def read(self, value: object) -> str | tuple[str, ...]:
         """Return the name, or the names as a tuple."""
-        names = value if isinstance(value, list) else [value]
-        if not names or not all(isinstance(name, str) for name in names):
-            given = as_read(value)
-            raise wrong(f"{given} is not allowed; it must be a column name, or a list of them")
-        return tuple(names) if isinstance(value, list) else names[0]
+        if isinstance(value, str):
+            return value
+        if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+            return tuple(value)
+        given = as_read(value)
+        raise wrong(f"{given} is not allowed; it must be a column name, or a list of them")
 
     def __get_pydantic_core_schema__(
         self, source: object, handler: GetCoreSchemaHandler
@@ -240,7 +248,9 @@ class ProcessEntry(Entry):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _number_or_one(cls, value: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _number_or_one(
+        cls, value: object, handler: ModelWrapValidatorHandler[ProcessEntry]
+    ) -> ProcessEntry:
         names = ", ".join(cls.model_fields)
         if isinstance(value, dict):
             entry = handler(value)
@@ -311,7 +321,9 @@ class LinkBurstsEntry(BurstsEntry):
 class NodeEntry(Entry):
     """A computer."""
 
-    tier: Literal["robot", "edge", "cloud"] = Field(description="Which kind of computer it is.")
+    tier: Literal["robot", "edge", "cloud"] = Field(
+        description="Kind of computer: robot, edge or cloud."
+    )
     cores: Annotated[int, Number(bounds.CORES)] | None = Field(
         None, description="Cores of its CPU; default 1."
     )
@@ -336,7 +348,9 @@ class RetransmitEntry(Entry):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _drop(cls, value: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _drop(
+        cls, value: object, handler: ModelWrapValidatorHandler[RetransmitEntry]
+    ) -> RetransmitEntry:
         if value == "drop":
             return cls.model_construct(retransmit_ms=None)
         if not isinstance(value, dict):
@@ -407,7 +421,7 @@ class InputEntry(Entry):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _words(cls, value: object, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _words(cls, value: object, handler: ModelWrapValidatorHandler[InputEntry]) -> InputEntry:
         if value == "queue":
             return cls.model_construct(depth=0)
         if value == "latest":

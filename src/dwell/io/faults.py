@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from typing import TypeAlias, TypeVar
+from typing import ParamSpec, TypeAlias, TypeVar
 
 from dwell.errors import Fault, ProblemError, TraceError
 
 __all__ = ["Faults", "Step", "dotted"]
 
+P = ParamSpec("P")
 T = TypeVar("T")
 Step: TypeAlias = str | int
 
@@ -56,16 +57,22 @@ class Faults:
             self._faults.append(fault)
             self._kinds.add(kind)
 
-    def attempt(self, path: str, make: Callable[[], T]) -> T | None:
-        """Return what `make` makes, or record the faults it raises, beneath `path`."""
+    def attempt(
+        self, path: str, make: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
+    ) -> T | None:
+        """Return what `make` makes of the arguments, or record its faults beneath `path`."""
         try:
-            return make()
+            return make(*args, **kwargs)
         except ProblemError as error:
             for fault in error.faults:
                 inner = f"{path}.{fault.path}" if path and fault.path else path or fault.path
                 if not self.at(inner):
                     self.add(inner, fault.message)
             return None
+
+    def __len__(self) -> int:
+        """Number of faults so far."""
+        return len(self._faults)
 
     def line(self, path: str) -> int | None:
         """Line of a path, or of what is nearest around it."""

@@ -45,6 +45,6 @@ def _pruned(value: Any) -> Any:
     return {
         key: _pruned(item)
         for key, item in value.items()
-        if not (key == "title" and isinstance(item, str))
-        and not (key == "default" and item is None)
+        # A property may have these names; what describes it is then a mapping.
+        if not (key == "title" and isinstance(item, str)) and (key, item) != ("default", None)
     }

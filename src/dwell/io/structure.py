@@ -21,11 +21,11 @@ from dwell.io.entries import CellEntry, Entry
 from dwell.io.faults import Faults, Step, dotted
 from dwell.io.wording import as_read
 from dwell.model import bounds
+from dwell.model.document import VERSION
 from dwell.model.meaning import nearest
 
-__all__ = ["VERSION", "read_structure"]
+__all__ = ["read_structure"]
 
-VERSION = 1
 MAX_DEPTH = 40
 
 # Stand-ins for what an entry cannot be without: by path for sections, by key for parts of elements.

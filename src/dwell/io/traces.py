@@ -7,7 +7,7 @@ column is dropped for all and the columns of a cycle come from one row.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -30,6 +30,7 @@ __all__ = ["Source", "Tables", "read_traces"]
 
 Floats: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
+Steps: TypeAlias = tuple[Step, ...]
 
 SUFFIXES = (".parquet", ".csv")
 DEFAULT_TIME = "sent_ms"
@@ -82,20 +83,29 @@ def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
         Less the sources at fault.
     """
     uses: dict[Source, list[tuple[str, TraceEntry]]] = {}
+    doubtful: set[Source] = set()
     for steps, trace in _declared(entry, ()):
-        path = dotted(steps)
+        path, source = dotted(steps), Source.of(trace)
+        uses.setdefault(source, []).append((path, trace))
+        if faults.touches(path):
+            doubtful.add(source)
         if trace.time is not None and trace.by != "time":
             faults.add(f"{path}.time", "has no effect without `by: time`; add that, or remove it")
-        uses.setdefault(Source.of(trace), []).append((path, trace))
     tables: Tables = {}
     for source, declarations in uses.items():
-        table = _Reading(source, declarations, folder, faults).table()
-        if table is not None:
-            tables[source] = table
+        reading = _Reading(source, declarations, folder, faults)
+        frame = reading.frame()
+        # How a declaration at fault would have its data read is not known.
+        if frame is not None and source not in doubtful:
+            table = reading.table(frame)
+            if table is not None:
+                tables[source] = table
     return tables
 
 
-def _declared(value: object, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], TraceEntry]]:
+def _declared(
+    value: object, steps: tuple[Step, ...]
+) -> Iterator[tuple[tuple[Step, ...], TraceEntry]]:
     """Yield every trace declared in an entry, with its place in the file."""
     if isinstance(value, TraceEntry):
         yield steps, value
@@ -120,11 +130,8 @@ class _Reading:
     faults: Faults
     failed: bool = field(default=False, init=False)
 
-    def table(self) -> TraceTable | None:
-        """Return the table, or None beside at least one fault."""
-        frame = self._frame()
-        if frame is None:
-            return None
+    def table(self, frame: pl.DataFrame) -> TraceTable | None:
+        """Return the table of the columns read, or None beside at least one fault."""
         values = {name: _floats(frame[name]) for name in dict.fromkeys(self._columns())}
         starts = self._starts(frame)
         time = None
@@ -165,15 +172,17 @@ class _Reading:
     def _columns(self) -> Iterator[str]:
         return (entry.column for _, entry in self.uses)
 
-    def _frame(self) -> pl.DataFrame | None:
+    def frame(self) -> pl.DataFrame | None:
         """Return the columns that the cell uses, of the right types, at least one row."""
         import polars as pl
+        from polars.selectors import by_name
 
         path = self.folder / self.source.file
         suffix = path.suffix.lower()
         if suffix not in SUFFIXES:
-            given = repr(self.source.file)
-            self._fail("file", f"{given} must end in {' or '.join(SUFFIXES)}, by what it contains")
+            endings = " or ".join(SUFFIXES)
+            message = f"{self.source.file!r} must end in {endings}, which says how to read it"
+            self._fail("file", message)
             return None
         if not path.is_file():
             what = "is a folder" if path.is_dir() else "does not exist"
@@ -185,11 +194,11 @@ class _Reading:
                 if suffix == ".parquet"
                 else pl.scan_csv(path, infer_schema_length=None)
             )
-            types = dict(lazy.collect_schema())
-            if not self._has_columns(types):
+            if not self._has_columns(lazy.collect_schema().names()):
                 return None
             wanted = [*self._columns(), *self.source.groups, self.source.time]
-            frame = lazy.select(dict.fromkeys(filter(None, wanted))).collect()
+            # By exact name: elsewhere polars takes ^x$ and * for patterns.
+            frame = lazy.select(by_name(*dict.fromkeys(filter(None, wanted)))).collect()
         except pl.exceptions.NoDataError:
             self._fail("file", f"{path} is empty; record it again, or name another")
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
@@ -197,35 +206,33 @@ class _Reading:
             self._fail("file", f"{path} cannot be read as {suffix[1:]}: {reason}")
         else:
             if frame.height > 0:
-                return frame
+                return frame if self._has_numbers(frame.schema) else None
             self._fail("file", f"{path} has no rows; record it again, or name another")
         return None
 
-    def _has_columns(self, types: dict[str, pl.DataType]) -> bool:
+    def _named(self) -> Iterator[tuple[str, str, str]]:
+        """Yield place, key and value of every column with numbers that is named."""
         for path, entry in self.uses:
-            self._has_column(types, f"{path}.column", entry.column, number=True)
+            yield path, "column", entry.column
         if self.source.time is not None:
-            self._has_column(types, f"{self.uses[0][0]}.time", self.source.time, number=True)
-        for name in self.source.groups:
-            self._has_column(types, f"{self.uses[0][0]}.group", name, number=False)
+            yield self.uses[0][0], "time", self.source.time
+
+    def _has_columns(self, names: Sequence[str]) -> bool:
+        groups = ((self.uses[0][0], "group", name) for name in self.source.groups)
+        for path, key, name in (*self._named(), *groups):
+            if name not in names:
+                hint = nearest(name, names)
+                known = "" if hint.startswith("known") else f" (known: {', '.join(names)})"
+                message = f"{self.source.file} has no column {name!r}; {hint}{known}"
+                self._fail(key, message, path)
         return not self.failed
 
-    def _has_column(
-        self, types: dict[str, pl.DataType], path: str, name: str, *, number: bool
-    ) -> None:
-        place, _, key = path.rpartition(".")
-        if name not in types:
-            hint = nearest(name, types)
-            known = "" if hint.startswith("known") else f" (known: {', '.join(types)})"
-            self._fail(key, f"{self.source.file} has no column {name!r}; {hint}{known}", place)
-        elif number and not types[name].is_numeric():
-            numeric = [other for other, kind in types.items() if kind.is_numeric()]
-            self._fail(
-                key,
-                f"column {name!r} holds {types[name]}, not numbers; "
-                f"columns with numbers: {', '.join(numeric) or 'none'}",
-                place,
-            )
+    def _has_numbers(self, types: Mapping[str, pl.DataType]) -> bool:
+        for path, key, name in self._named():
+            if not types[name].is_numeric():
+                message = f"column {name!r} holds {types[name]}; it must hold numbers"
+                self._fail(key, f"{message}: name another, or record it again", path)
+        return not self.failed
 
     def _starts(self, frame: pl.DataFrame) -> NDArray[np.int64]:
         """Return the first row of every group; each must stand in one piece."""
@@ -233,13 +240,13 @@ class _Reading:
 
         if not self.source.groups:
             return np.zeros(1, np.int64)
-        names = list(self.source.groups)
-        begins = frame.select(pl.struct(names).rle_id()).to_series().to_numpy()
-        starts = np.flatnonzero(np.diff(begins, prepend=-1)).astype(np.int64)
-        again = frame.select(names)[starts].is_duplicated() & ~_first(frame.select(names)[starts])
-        if again.any():
-            row = int(starts[int(again.arg_max() or 0)])
-            values = ", ".join(str(value) for value in frame.select(names).row(row))
+        groups = frame[list(dict.fromkeys(self.source.groups))]
+        runs = groups.select(pl.struct(pl.all()).rle_id()).to_series().to_numpy()
+        starts = np.flatnonzero(np.diff(runs, prepend=-1)).astype(np.int64)
+        first = groups[starts].select(pl.struct(pl.all()).is_first_distinct()).to_series()
+        if not first.all():
+            row = int(starts[int((~first).arg_max() or 0)])
+            values = ", ".join(str(value) for value in groups.row(row))
             self._fail(
                 "group",
                 f"group {values} begins again at row {row + 1} after another group; sort the file "
@@ -256,7 +263,11 @@ class _Reading:
             column = values[entry.column]
             negative = column < 0
             # Comparisons with NaN are false.
-            bad = ~(column <= VALUE.high) if mode == "clip" else ~((column >= 0) & (column <= VALUE.high))
+            bad = (
+                ~(column <= VALUE.high)
+                if mode == "clip"
+                else ~((column >= 0) & (column <= VALUE.high))
+            )
             if mode == "drop":
                 keep &= ~bad
                 continue
@@ -273,19 +284,18 @@ class _Reading:
         return keep, int(np.count_nonzero(clip))
 
     def _complaint(self, column: Floats, bad: Mask, mode: str) -> str:
-        first = int(np.flatnonzero(bad)[0])
-        value = float(column[first])
-        shown = "missing or NaN" if np.isnan(value) else f"{value:g}"
-        count = int(np.count_nonzero(bad))
-        what = f"{count} of {len(column)} rows"
-        where = f"(first: row {first + 1}, {shown})"
-        drop = "set `on_negative: drop` to leave those rows out of all columns"
-        if mode == "clip":
-            return f"{what} hold no finite number of at most 1e9 {where}; no 0 can stand for it: {drop}"
-        return (
-            f"{what} are negative, missing or above 1e9 {where}; {drop}, "
-            "or `on_negative: clip` to make negative values 0"
-        )
+        kinds = {
+            "negative": bad & (column < 0),
+            "missing or NaN": bad & np.isnan(column),
+            "above 1e9": bad & (column > VALUE.high),
+        }
+        counts = {kind: int(np.count_nonzero(rows)) for kind, rows in kinds.items()}
+        has = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+        row = int(np.flatnonzero(bad)[0])
+        value = "" if np.isnan(column[row]) else f", {column[row]:g}"
+        drop = "set `on_negative: drop` to leave such rows out of all columns"
+        clip = "0 cannot stand for that" if mode == "clip" else "or `clip` to make negative ones 0"
+        return f"of {len(column)} rows {has} (first: row {row + 1}{value}); {drop}, {clip}"
 
     def _instants(self, time: Floats, starts: NDArray[np.int64], rows: NDArray[np.int64]) -> Floats:
         """Return each row's instant since its group's first; they must not go back."""
@@ -318,12 +328,6 @@ def _floats(series: pl.Series) -> Floats:
     import polars as pl
 
     return series.cast(pl.Float64).fill_null(np.nan).to_numpy()
-
-
-def _first(frame: pl.DataFrame) -> pl.Series:
-    import polars as pl
-
-    return frame.select(pl.struct(frame.columns).is_first_distinct()).to_series()
 
 
 def _kept_starts(starts: NDArray[np.int64], keep: Mask) -> NDArray[np.int64]:

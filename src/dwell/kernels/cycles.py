@@ -19,6 +19,7 @@ from dwell.kernels.layout import (
     FAIR,
     FLOW_LOCAL,
     HEAD,
+    IN_FLIGHT,
     IDLE,
     IS_CPU,
     ITEM_MASK,
@@ -138,6 +139,7 @@ def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> bool:
     local = s.tasks[task, LOCAL]
     row = job_row(s, cell, cycle, local)
     s.jobs[row, READY] = now
+    _log(s, cell, cycle, row, local, IN_FLIGHT, -1)
     site = s.jobs[row, SITE]
     s.slots[slot_row(s, cell, cycle), LIVE] += 1
     if s.servers[s.sites[site, SERVER], DOWN] != 0:

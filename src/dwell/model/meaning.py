@@ -97,6 +97,8 @@ def _names(parts: Parts) -> Iterator[Fault]:
 
 
 def _links(parts: Parts) -> Iterator[Fault]:
+    if not parts.nodes:
+        yield Fault("nodes", "none is declared; a cell needs at least one node")
     seen: dict[str, str] = {}
     for path, link in parts.links:
         yield from _unknown(f"{path}.from", "node", link.source, parts.nodes)

@@ -13,8 +13,6 @@ from dwell.model.placement import Placement
 
 __all__ = ["Decision", "QoS", "Reason"]
 
-INFINITY = math.inf
-
 Reason: TypeAlias = Literal["dwell", "hold", "migrate", "infeasible", "guard"]
 
 
@@ -43,19 +41,17 @@ class QoS:
 
     def __post_init__(self) -> None:
         # Comparisons with NaN are false, so each test is written to pass only for a good value.
-        if not 0 <= self.l95_ms < INFINITY:
+        if not 0 <= self.l95_ms < math.inf:
             raise MetricError(f"l95_ms is {self.l95_ms!r}; it must be finite and at least 0")
         if not 0 <= self.violation_rate <= 1:
             raise MetricError(f"violation_rate is {self.violation_rate!r}; it must lie in [0, 1]")
-        used = self.utilisation
-        for value in used.values():
-            if not 0 <= value < INFINITY:
-                node = next(node for node in used if used[node] is value)
+        for node, value in self.utilisation.items():
+            if not 0 <= value < math.inf:
                 raise MetricError(
                     f"utilisation of {node} is {value!r}; it must be finite and at least 0"
                 )
-        if type(used) is not FrozenDict:
-            object.__setattr__(self, "utilisation", FrozenDict(used))
+        if type(self.utilisation) is not FrozenDict:
+            object.__setattr__(self, "utilisation", FrozenDict(self.utilisation))
 
 
 @dataclass(frozen=True, slots=True)

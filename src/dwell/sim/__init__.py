@@ -1,0 +1,14 @@
+"""The simulator: scenario to realisation, realisation through the kernels, kernels to a Run."""
+
+from dwell.sim.draw import draw
+from dwell.sim.engine import simulate, simulate_realisation
+from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
+
+__all__ = [
+    "LinkSegment",
+    "NodeChange",
+    "Realisation",
+    "draw",
+    "simulate",
+    "simulate_realisation",
+]

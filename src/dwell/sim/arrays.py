@@ -6,15 +6,14 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
+from dwell.control import NEVER_NS
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Pipeline, Problem, Task
 from dwell.sim.realisation import Realisation
 
-__all__ = ["NEVER_NS", "Arrays", "lay_out"]
+__all__ = ["Arrays", "lay_out"]
 
-# Latency of a cycle that has not completed.
-NEVER_NS = np.int64(1 << 62)
 SCHEDULER_CODE = {"fair": k.FAIR, "fifo": k.FIFO, "priority": k.PRIORITY}
 RING_START = 64
 
@@ -230,7 +229,9 @@ class _Layout:
                     self.segments_f.append([segment.rate_mbps, segment.loss])
             row[k.SEGMENT_END] = len(self.segments)
             self.links.append(row)
-        payload = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
+        payload = {
+            (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
+        }
         for source, target, link_name in real.hops:
             self.hops.append([link_row[link_name], payload[source, target]])
             self.layer_rows.append({})

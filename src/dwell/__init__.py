@@ -1,0 +1,44 @@
+"""Dwell: on which computer each stage of a robot control pipeline runs, decided while it runs."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dwell.io import load
+    from dwell.record import Run, open_run
+    from dwell.sim import Realisation, draw, simulate, simulate_realisation
+
+__all__ = [
+    "Realisation",
+    "Run",
+    "draw",
+    "load",
+    "open_run",
+    "simulate",
+    "simulate_realisation",
+]
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "load": "dwell.io",
+    "Run": "dwell.record",
+    "open_run": "dwell.record",
+    "Realisation": "dwell.sim",
+    "draw": "dwell.sim",
+    "simulate": "dwell.sim",
+    "simulate_realisation": "dwell.sim",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, and nothing else (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'dwell' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})

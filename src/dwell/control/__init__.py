@@ -1,0 +1,6 @@
+"""The Controller: windows, estimator, policy and order, the same in both engines."""
+
+from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
+from dwell.control.windows import NEVER_NS, final_l95_ms
+
+__all__ = ["NEVER_NS", "ClosedWindow", "Controller", "Log", "final_l95_ms", "static_columns"]

@@ -1,0 +1,253 @@
+"""A problem as a document: plain values that a cell file could hold, from which it can be read."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import fields
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from dwell.errors import Fault, ProblemError
+from dwell.model.fabric import Bursts, Link, Node
+from dwell.model.pipeline import Execution, Task
+from dwell.model.problem import ControllerSettings, Problem
+from dwell.model.process import (
+    AR1,
+    Constant,
+    Exponential,
+    Gamma,
+    LogNormal,
+    Normal,
+    Process,
+    Trace,
+    Uniform,
+)
+from dwell.model.scenario import Disturbance, NodeDisturbance
+
+__all__ = ["VERSION", "digest", "to_document"]
+
+# Version of the cell file.
+VERSION = 1
+
+Document: TypeAlias = dict[str, Any]
+
+NAMES: dict[type, str] = {
+    Uniform: "uniform",
+    Normal: "normal",
+    LogNormal: "lognormal",
+    Gamma: "gamma",
+    Exponential: "exponential",
+    AR1: "ar1",
+}
+
+
+def to_document(problem: Problem) -> Document:
+    """Return the document of a problem.
+
+    `dwell.io.from_document` makes an equal problem of it. A trace is named, not copied: its
+    declaration carries a digest of the data, so that other data are not taken for it.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Returns
+    -------
+    dict
+        Of dicts, lists, strings, finite numbers and truth values: ready for JSON or YAML.
+
+    Raises
+    ------
+    ProblemError
+        If it holds a process that a cell file has no word for.
+    """
+    pipeline, fabric = problem.pipeline, problem.fabric
+    return _filled(
+        {
+            "dwell": VERSION,
+            "name": problem.name,
+            "period_ms": pipeline.period_ms,
+            "deadline_ms": pipeline.deadline_ms,
+            "release_jitter_ms": _process("release_jitter_ms", pipeline.release_jitter_ms),
+            "window_cycles": problem.window_cycles,
+            "warmup_windows": problem.warmup_windows,
+            "nodes": {name: _node(node) for name, node in fabric.nodes.items()},
+            "links": [_link(i, link) for i, link in enumerate(fabric.links.values())],
+            "tasks": {name: _task(task) for name, task in pipeline.tasks.items()},
+            "flows": [
+                {"from": flow.source, "to": flow.target, "bytes": flow.payload_bytes}
+                for flow in pipeline.flows
+            ],
+            "scales": {
+                name: _process(f"scales.{name}", scale) for name, scale in pipeline.scales.items()
+            },
+            "candidates": {name: dict(placement) for name, placement in problem.candidates.items()},
+            "scenarios": {
+                name: [_disturbance(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
+                for name, items in problem.scenarios.items()
+            },
+            "objective": _objective(problem),
+            "controller": _controller(problem.controller),
+        }
+    )
+
+
+def digest(trace: Trace) -> str:
+    """Return the SHA-256 of what a trace replays: values, groups and instants, in hexadecimal.
+
+    Parameters
+    ----------
+    trace : Trace
+
+    Returns
+    -------
+    str
+        The same for the same numbers on any machine, whatever the file's format.
+    """
+    table = trace.table
+    state = hashlib.sha256(np.ascontiguousarray(trace.values, "<f8").tobytes())
+    state.update(np.ascontiguousarray(table.starts, "<i8").tobytes())
+    if table.time_ms is not None:
+        state.update(np.ascontiguousarray(table.time_ms, "<f8").tobytes())
+    return state.hexdigest()
+
+
+def _filled(values: Document) -> Document:
+    """Leave out what a cell file would: what is not there, and infinite limits."""
+    return {key: value for key, value in values.items() if value not in (None, math.inf)}
+
+
+def _process(path: str, process: Process) -> float | Document:
+    if isinstance(process, Constant):
+        return process.value
+    if isinstance(process, Trace):
+        return {"trace": _trace(process)}
+    name = NAMES.get(type(process))
+    if name is None:
+        known = ", ".join(("constant", *NAMES.values(), "trace"))
+        message = f"a cell file has no word for {type(process).__name__}; it knows {known}"
+        raise ProblemError([Fault(path, message)])
+    return {name: _dataclass(process)}
+
+
+def _trace(trace: Trace) -> Document:
+    table = trace.table
+    group = list(table.group) if isinstance(table.group, tuple) else table.group
+    return _filled(
+        {
+            "file": table.file,
+            "column": trace.column,
+            "by": table.by,
+            "time": table.time,
+            "group": group,
+            "on_negative": table.on_negative,
+            "wrap": table.wrap,
+            "sha256": digest(trace),
+        }
+    )
+
+
+def _bursts(path: str, bursts: Bursts | None, **more: object) -> Document | None:
+    if bursts is None:
+        return None
+    every_ms = _process(f"{path}.every_ms", bursts.every_ms)
+    return {"every_ms": every_ms, "for_ms": _process(f"{path}.for_ms", bursts.for_ms), **more}
+
+
+def _node(node: Node) -> Document:
+    quota, bursts = node.quota, node.bursts
+    return _filled(
+        {
+            "tier": node.tier,
+            "cores": node.cores,
+            "scheduler": node.scheduler,
+            "accelerators": dict(node.accelerators),
+            "quota": {"cpu": quota.cpu, "period_ms": quota.period_ms} if quota else None,
+            "bursts": _bursts(
+                f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
+            ),
+        }
+    )
+
+
+def _link(index: int, link: Link) -> Document:
+    path, bursts = f"links[{index}]", link.bursts
+    extra = _process(f"{path}.bursts.add_delay_ms", bursts.add_delay_ms) if bursts else 0
+    retransmit_ms = link.retransmit_ms
+    return _filled(
+        {
+            "from": link.source,
+            "to": link.target,
+            "delay_ms": _process(f"{path}.delay_ms", link.delay_ms),
+            "rate_mbps": link.rate_mbps,
+            "loss": link.loss,
+            "on_loss": "drop" if retransmit_ms is None else {"retransmit_ms": retransmit_ms},
+            "in_order": link.in_order,
+            "bursts": _bursts(f"{path}.bursts", bursts, add_delay_ms=extra),
+        }
+    )
+
+
+def _task(task: Task) -> Document:
+    words: dict[int, str | Document] = {0: "queue", 1: "latest"}
+    return _filled(
+        {
+            "on": {node: _execution(task, node, execution) for node, execution in task.on.items()},
+            "input": words.get(task.depth, {"queue": task.depth}),
+            "priority": task.priority,
+            "scale": task.scale,
+            "offset_ms": task.offset_ms,
+            "start_ms": task.start_ms,
+            "state_bytes": task.state_bytes,
+        }
+    )
+
+
+def _execution(task: Task, node: str, execution: Execution) -> Document:
+    return _filled(
+        {
+            "exec_ms": _process(f"tasks.{task.name}.on.{node}.exec_ms", execution.exec_ms),
+            "threads": execution.threads,
+            "workers": execution.workers,
+            "accelerator": execution.accelerator,
+        }
+    )
+
+
+def _disturbance(path: str, item: Disturbance) -> Document:
+    interval = {"at_s": item.at_s, "for_s": item.for_s, "down": item.down}
+    if isinstance(item, NodeDisturbance):
+        return _filled({"node": item.node, "stress_threads": item.stress_threads, **interval})
+    extra = item.add_delay_ms
+    return _filled(
+        {
+            "link": item.link,
+            "add_delay_ms": None if extra is None else _process(f"{path}.add_delay_ms", extra),
+            "loss": item.loss,
+            "rate_mbps": item.rate_mbps,
+            **interval,
+        }
+    )
+
+
+def _objective(problem: Problem) -> Document:
+    objective = problem.objective
+    usual = {name: node.tier for name, node in problem.fabric.nodes.items()}
+    return _filled(
+        {
+            "weights": _dataclass(objective.weights),
+            "targets": _dataclass(objective.targets),
+            "caps": _dataclass(objective.caps),
+            "tiers": None if objective.tiers == usual else dict(objective.tiers),
+        }
+    )
+
+
+def _controller(settings: ControllerSettings) -> Document:
+    return {**_dataclass(settings), "fallbacks": list(settings.fallbacks)}
+
+
+def _dataclass(part: Any) -> Document:
+    return _filled({item.name: getattr(part, item.name) for item in fields(part)})

@@ -1,0 +1,5 @@
+"""The Run: tables, open, save."""
+
+from dwell.record.run import OUTCOMES, SCHEMA_VERSION, Run, open_run
+
+__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run"]

@@ -1,0 +1,171 @@
+"""Run: the record of a policy on a realisation, or of a live system; one schema for both."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from dwell.errors import RunError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run"]
+
+SCHEMA_VERSION = 1
+OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down")
+TABLES = ("cycles", "windows", "decisions")
+
+Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
+
+
+class Run:
+    """Tables of one run and what they are the record of.
+
+    Parameters
+    ----------
+    meta : mapping
+        JSON-able: problem, scenario, policy, seed, versions, schema version.
+    tables : mapping of str to DataFrame, or to a function that makes it
+        ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs``; made when first asked for.
+    """
+
+    def __init__(self, meta: Mapping[str, Any], tables: Mapping[str, Table]) -> None:
+        self.meta: dict[str, Any] = {**meta, "schema_version": SCHEMA_VERSION}
+        self._tables: dict[str, Table] = dict(tables)
+
+    def _table(self, name: str) -> pl.DataFrame:
+        table = self._tables[name]
+        if callable(table):
+            table = table()
+            self._tables[name] = table
+        return table
+
+    @property
+    def cycles(self) -> pl.DataFrame:
+        """One row a cycle: release, placement, latency and its parts, outcome."""
+        return self._table("cycles")
+
+    @property
+    def windows(self) -> pl.DataFrame:
+        """One row a window: what it showed, and what the controller saw of it."""
+        return self._table("windows")
+
+    @property
+    def decisions(self) -> pl.DataFrame:
+        """One row a decision: incumbent, choice, reason, costs and estimates."""
+        return self._table("decisions")
+
+    @property
+    def jobs(self) -> pl.DataFrame:
+        """One row a job that became ready: task, node, instants, outcome.
+
+        Raises
+        ------
+        RunError
+            If the run was made without them.
+        """
+        if "jobs" not in self._tables:
+            raise RunError("this run kept no jobs; simulate with jobs=True (`dwell run --jobs`)")
+        return self._table("jobs")
+
+    @property
+    def has_jobs(self) -> bool:
+        """Whether the run kept its jobs."""
+        return "jobs" in self._tables
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the run's folder; it appears complete, or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            Folder to make. One that holds a run already is replaced; anything else is refused.
+
+        Raises
+        ------
+        RunError
+            If the folder holds something that is not a run, or cannot be written.
+        """
+        target = Path(path)
+        if target.exists() and not (target / "run.json").is_file() and _occupied(target):
+            raise RunError(f"{target} exists and is not a run; choose another folder")
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            draft = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+        except OSError as error:
+            raise RunError(f"{target.parent}: cannot be written ({error.strerror})") from None
+        try:
+            for name in self._tables:
+                self._table(name).write_parquet(draft / f"{name}.parquet")
+            text = json.dumps(self.meta, indent=2, allow_nan=False)
+            (draft / "run.json").write_text(text + "\n", encoding="utf-8")
+            draft.chmod(0o755)
+            _replace(draft, target)
+        except OSError as error:
+            raise RunError(f"{target}: cannot be written ({error.strerror or error})") from None
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
+        return target
+
+
+def _occupied(target: Path) -> bool:
+    return not target.is_dir() or any(target.iterdir())
+
+
+def _replace(draft: Path, target: Path) -> None:
+    """Put a finished folder in its place; an older run there survives until that moment."""
+    if target.exists():
+        old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
+        target.replace(old / target.name)
+        draft.replace(target)
+        shutil.rmtree(old, ignore_errors=True)
+    else:
+        draft.replace(target)
+
+
+def open_run(path: str | os.PathLike[str]) -> Run:
+    """Open a run's folder; tables are read when first asked for.
+
+    Raises
+    ------
+    RunError
+        If the folder is missing, is not a run, lacks a table, or has a newer schema.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise RunError(f"{folder}: no such folder")
+    file = folder / "run.json"
+    try:
+        meta = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(f"{folder}: not a run (it has no run.json)") from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"{file}: cannot be read ({error})") from None
+    version = meta.get("schema_version") if isinstance(meta, dict) else None
+    if not isinstance(version, int) or version > SCHEMA_VERSION:
+        raise RunError(
+            f"{file}: schema_version is {version!r}; this version reads up to {SCHEMA_VERSION}"
+        )
+    missing = [name for name in TABLES if not (folder / f"{name}.parquet").is_file()]
+    if missing:
+        raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
+    names = [*TABLES, *(["jobs"] if (folder / "jobs.parquet").is_file() else [])]
+    return Run(meta, {name: _reader(folder / f"{name}.parquet") for name in names})
+
+
+def _reader(file: Path) -> Callable[[], pl.DataFrame]:
+    def read() -> pl.DataFrame:
+        import polars as pl
+
+        try:
+            return pl.read_parquet(file)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise RunError(f"{file}: cannot be read ({error})") from None
+
+    return read

@@ -1,0 +1,281 @@
+"""Tables of a Run from what the kernels left in their arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import (
+    NEVER_NS,
+    ClosedWindow,
+    Controller,
+    final_l95_ms,
+    static_columns,
+)
+from dwell.kernels import layout as k
+from dwell.model import Problem
+from dwell.record import OUTCOMES
+from dwell.sim.arrays import Arrays
+from dwell.sim.realisation import Realisation
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["Played", "make_tables"]
+
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Played:
+    """A realisation that has been played to its end.
+
+    Parameters
+    ----------
+    problem, realisation, controller, arrays
+        As they were used.
+    first : int64 array, shape (windows,)
+        First cycle of every window.
+    """
+
+    problem: Problem
+    realisation: Realisation
+    controller: Controller
+    arrays: Arrays
+    first: Ints
+
+    @property
+    def rows(self) -> Ints:
+        """Cycles of every window, shape (windows, W)."""
+        return self.first[:, None] + np.arange(self.problem.window_cycles)
+
+    @property
+    def close_ns(self) -> Ints:
+        """Instant of every close, shape (windows,)."""
+        boundary = self.first + self.problem.window_cycles
+        grace_ns = round(self.problem.controller.close_grace_ms * 1e6)
+        close: Ints = self.realisation.release_ns[boundary] + grace_ns
+        return close
+
+    def closed_windows(self) -> ClosedWindow:
+        """All windows as rows."""
+        tables, count = self.arrays.tables, len(self.first)
+        used = tables.closed[0, :count] - tables.opened[0, :count]
+        return ClosedWindow(
+            latency_ns=tables.latency_ns[0][self.rows],
+            release_ns=self.realisation.release_ns[self.rows],
+            close_ns=self.close_ns[:, None],
+            open_ns=self.realisation.release_ns[self.first][:, None],
+            busy_ns=used[:, 0],
+            own_ns=used[:, 1],
+        )
+
+    def missed(self) -> NDArray[np.bool_]:
+        """Whether each cycle missed: later than D, or unfinished when its window closed."""
+        latency_ns = self.arrays.tables.latency_ns[0]
+        missed = latency_ns > round(self.problem.pipeline.deadline_ms * 1e6)
+        rows = self.rows
+        age_ns = self.close_ns[:, None] - self.realisation.release_ns[rows]
+        missed[rows] |= latency_ns[rows] > age_ns
+        return missed
+
+
+def make_tables(played: Played) -> dict[str, Callable[[], pl.DataFrame]]:
+    """Functions that make each table when it is first asked for."""
+    controller = played.controller
+    static = not controller.log.incumbent
+    seen: tuple[dict[str, Floats], dict[str, dict[str, Floats]]] | None = None
+
+    def columns() -> tuple[dict[str, Floats], dict[str, dict[str, Floats]]]:
+        nonlocal seen
+        if seen is None:
+            seen = static_columns(controller, played.closed_windows())
+        return seen
+
+    tables = {
+        "cycles": lambda: _cycles(played),
+        "windows": lambda: _windows(played, columns()[0] if static else _seen(controller)),
+        "decisions": lambda: (
+            _static_decisions(played, columns()[1]) if static else _decisions(controller)
+        ),
+    }
+    if len(played.arrays.tables.log):
+        tables["jobs"] = lambda: _jobs(played)
+    return tables
+
+
+def _names(codes: NDArray[np.integer], names: tuple[str, ...]) -> pl.Series:
+    import polars as pl
+
+    return pl.Series(codes.astype(np.uint32)).cat.to(pl.Enum(names))
+
+
+def _cycles(played: Played) -> pl.DataFrame:
+    import polars as pl
+
+    tables = played.arrays.tables
+    latency, compute, network = (
+        table[0] for table in (tables.latency_ns, tables.compute_ns, tables.network_ns)
+    )
+    frame = pl.DataFrame(
+        {
+            "cycle": np.arange(played.realisation.cycles),
+            "release_ns": played.realisation.release_ns[:-1],
+            "placement": _names(tables.stamps[0], tuple(played.problem.candidates)),
+            "latency_ns": latency,
+            "missed": played.missed(),
+            "outcome": _names(tables.outcome[0], OUTCOMES),
+            "compute_ns": compute,
+            "queue_ns": latency - compute - network,
+            "network_ns": network,
+        }
+    )
+    parts = ("latency_ns", "compute_ns", "queue_ns", "network_ns")
+    done = pl.col("latency_ns") < NEVER_NS
+    return frame.with_columns(pl.when(done).then(pl.col(*parts)))
+
+
+def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
+    import polars as pl
+
+    problem = played.problem
+    stamps = played.arrays.tables.stamps[0][played.rows]
+    count = len(played.first)
+    return pl.DataFrame(
+        {
+            "window": np.arange(count),
+            "first_cycle": played.first,
+            "warmup": np.arange(count) < problem.warmup_windows,
+            "placement": _names(stamps[:, 0], tuple(problem.candidates)),
+            "mixed": (stamps != stamps[:, :1]).any(axis=1),
+            "l95_ms": final_l95_ms(played.arrays.tables.latency_ns[0][played.rows]),
+            "violation_rate": played.missed()[played.rows].mean(axis=1),
+            "seen_l95_ms": seen["l95_ms"],
+            "seen_violation_rate": seen["violation_rate"],
+            **{name: values for name, values in seen.items() if name.startswith("u_")},
+            "cost": seen["cost"],
+        },
+        nan_to_null=True,
+    )
+
+
+def _seen(controller: Controller) -> dict[str, Floats]:
+    log = controller.log
+    used = np.array(log.utilisation, np.float64).reshape(-1, len(controller.nodes))
+    return {
+        "l95_ms": np.array(log.seen_l95_ms, np.float64),
+        "violation_rate": np.array(log.seen_violation_rate, np.float64),
+        "cost": np.array(log.cost, np.float64),
+        **{f"u_{node}": used[:, i] for i, node in enumerate(controller.nodes)},
+    }
+
+
+REASONS = ("dwell", "hold", "migrate", "infeasible", "guard")
+
+
+def _decision_frame(columns: dict[str, object], candidates: tuple[str, ...]) -> pl.DataFrame:
+    import polars as pl
+
+    frame = pl.DataFrame(columns, nan_to_null=True)
+    return frame.with_columns(
+        pl.col("incumbent", "placement").cast(pl.Enum(candidates)),
+        pl.col("reason").cast(pl.Enum(REASONS)),
+        pl.col("window", "dwell").cast(pl.Int64),
+        pl.col("delta_j", "^j_.*$", "^est_.*$").cast(pl.Float64),
+    )
+
+
+def _decisions(controller: Controller) -> pl.DataFrame:
+    log = controller.log
+    candidates = tuple(controller.problem.candidates)
+    made = [
+        (window, incumbent, decision, estimates)
+        for window, (incumbent, decision, estimates) in enumerate(
+            zip(log.incumbent, log.decisions, log.estimates, strict=True)
+        )
+        if decision is not None
+    ]
+    columns: dict[str, object] = {
+        "window": [window for window, _, _, _ in made],
+        "incumbent": [incumbent for _, incumbent, _, _ in made],
+        "placement": [decision.name for _, _, decision, _ in made],
+        "migrated": [decision.migrated for _, _, decision, _ in made],
+        "reason": [decision.reason for _, _, decision, _ in made],
+        "dwell": [decision.dwell for _, _, decision, _ in made],
+        "delta_j": [decision.delta_j for _, _, decision, _ in made],
+    }
+    for name in candidates:
+        columns[f"j_{name}"] = [decision.costs.get(name) for _, _, decision, _ in made]
+    for name in candidates:
+        columns[f"est_l95_ms_{name}"] = [est[name].l95_ms for _, _, _, est in made]
+        rates = [est[name].violation_rate for _, _, _, est in made]
+        columns[f"est_violation_rate_{name}"] = rates
+    return _decision_frame(columns, candidates)
+
+
+def _static_decisions(played: Played, estimated: dict[str, dict[str, Floats]]) -> pl.DataFrame:
+    controller = played.controller
+    candidates = tuple(controller.problem.candidates)
+    count = len(played.first)
+    priced = getattr(controller.policy, "objective", None) is not None
+    columns: dict[str, object] = {
+        "window": np.arange(count),
+        "incumbent": [controller.incumbent] * count,
+        "placement": [controller.incumbent] * count,
+        "migrated": np.zeros(count, np.bool_),
+        "reason": ["hold"] * count,
+        "dwell": np.arange(1, count + 1),
+        "delta_j": np.full(count, np.nan),
+    }
+    for name in candidates:
+        columns[f"j_{name}"] = estimated[name]["j"] if priced else np.full(count, np.nan)
+    for name in candidates:
+        columns[f"est_l95_ms_{name}"] = estimated[name]["l95_ms"]
+        columns[f"est_violation_rate_{name}"] = estimated[name]["violation_rate"]
+    return _decision_frame(columns, candidates)
+
+
+def _log_running(played: Played, log: Ints) -> None:
+    """Note the start of jobs that were running when the run ended; they have no end."""
+    tables = played.arrays.tables
+    jobs = tables.jobs.reshape(len(tables.slots), -1, k.N_JOB)
+    for slot in np.nonzero(tables.slots[:, k.LIVE] > 0)[0]:
+        mine = log[tables.slots[slot, k.CYCLE]]
+        running = (mine[:, k.LOG_READY] >= 0) & (mine[:, k.LOG_END] < 0)
+        mine[running, k.LOG_START] = jobs[slot, : len(mine), k.STARTED][running]
+
+
+def _jobs(played: Played) -> pl.DataFrame:
+    import polars as pl
+
+    problem, tables = played.problem, played.arrays.tables
+    tasks = tuple(problem.pipeline.tasks)
+    nodes = tuple(problem.fabric.nodes)
+    cycles = played.realisation.cycles
+    log = tables.log.reshape(cycles, len(tasks), k.N_LOG)
+    _log_running(played, log)
+    outcome = tables.log_outcome.reshape(cycles, len(tasks))
+    site_node = np.array([nodes.index(node) for _, node in played.realisation.sites])
+    node = site_node[tables.site_of[tables.stamps[0].astype(np.int64)]]
+    cycle, task = np.nonzero(log[:, :, k.LOG_READY] >= 0)
+    picked = log[cycle, task]
+    ended = picked[:, k.LOG_END] >= 0
+    return pl.DataFrame(
+        {
+            "cycle": cycle,
+            "task": _names(task, tasks),
+            "node": _names(node[cycle, task], nodes),
+            "ready_ns": picked[:, k.LOG_READY],
+            "start_ns": pl.Series(picked[:, k.LOG_START]),
+            "end_ns": pl.Series(picked[:, k.LOG_END]),
+            "outcome": _names(np.where(ended, outcome[cycle, task], 0), OUTCOMES),
+        }
+    ).with_columns(
+        pl.when(pl.col("start_ns") >= 0).then(pl.col("start_ns")),
+        pl.when(pl.col("end_ns") >= 0).then(pl.col("end_ns")),
+    )
