@@ -429,11 +429,13 @@ class Simulation:
         return release
 
     def start_source(self, cycle: int, task: str) -> None:
-        # Reading: a source with an offset is released when its offset is over.
-        if self.nodes[self.placed[cycle][task]].down:
-            self.lose(cycle, "node_down")
+        # Reading: a source with an offset is released when its offset is over. On a node that is
+        # down its job is lost as soon as it is ready.
+        job = self.make_job(cycle, task, None)
+        if self.nodes[job.node].down:
+            self.lose_job(job, "node_down")
         else:
-            self.become_ready(cycle, task, None)
+            self.queue_up(job)
 
     def lose(self, cycle: int, outcome: str) -> None:
         """Something of a cycle is lost; the first such loss names its outcome."""
@@ -480,9 +482,10 @@ class Simulation:
         self.inputs[key] = self.inputs.get(key, 0) + 1
         if self.inputs[key] == len(self.pipeline.inputs(task)):
             del self.inputs[key]
-            self.become_ready(cycle, task, sender)
+            self.queue_up(self.make_job(cycle, task, sender))
 
-    def become_ready(self, cycle: int, name: str, sender: Job | None) -> None:
+    def make_job(self, cycle: int, name: str, sender: Job | None) -> Job:
+        """Return the job that is ready now."""
         task = self.pipeline.tasks[name]
         node = self.placed[cycle][name]
         site = self.real.sites.index((name, node))
@@ -497,10 +500,13 @@ class Simulation:
             sender=sender,
         )
         self.jobs[cycle, name] = job
-        pool = self.pools[name, node]
+        return job
+
+    def queue_up(self, job: Job) -> None:
+        pool = self.pools[job.task.name, job.node]
         pool.waiting.append(job)
-        self.take(pool, node)
-        if task.depth and len(pool.waiting) > task.depth:
+        self.take(pool, job.node)
+        if job.task.depth and len(pool.waiting) > job.task.depth:
             # Reading: the oldest is the one that has waited longest, not the lowest cycle.
             lost = min(pool.waiting[0], job, key=lambda waiting: waiting.cycle)
             pool.waiting.remove(lost)

@@ -215,11 +215,6 @@ class Assembly:
                 if entry.both_ways:
                     yield path, replace(link, source=link.target, target=link.source)
 
-    def _links_complete(self, links: Iterable[tuple[str, Link]]) -> bool:
-        """Whether every link of the file is there, so that one can be said to be missing."""
-        whole = len(dict(links)) == len(self.entry.links or ())
-        return whole and not self.faults.at("links")
-
     def _link(self, path: str, entry: LinkEntry) -> Link | None:
         delay_ms = self._process(entry.delay_ms, f"{path}.delay_ms")
         burst, bursts = entry.bursts, None
@@ -390,6 +385,12 @@ class Assembly:
     def _judge(self, parts: Parts) -> None:
         """Add the faults of meaning, but for those that other faults cause."""
         self._assume(parts)
+        known = all(
+            link.source in parts.nodes and link.target in parts.nodes for _, link in parts.links
+        )
+        # Only where every link is good can one be said to be missing.
+        parts.links_complete = parts.links_complete and known and not self.faults.at("links")
+        parts.links = _forward(parts.links, parts.nodes)
         for fault in find_faults(parts):
             if not self.faults.at(fault.path):
                 self.faults.add(fault.path, fault.message)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
-from typing import ParamSpec, TypeAlias, TypeVar
+from typing import NoReturn, ParamSpec, TypeAlias, TypeVar
 
 from dwell.errors import Fault, ProblemError, TraceError
 
@@ -88,6 +88,10 @@ class Faults:
     def touches(self, path: str) -> bool:
         """Whether there is a fault at this path, around it or beneath it."""
         return any(_around(fault.path, path) or _around(path, fault.path) for fault in self._faults)
+
+    def refuse(self, path: str, message: str) -> NoReturn:
+        """Raise this one fault, whatever else there is: it makes the rest void."""
+        raise ProblemError([Fault(path, message, self.line(path))], self.source)
 
     def raise_any(self) -> None:
         """Raise every fault recorded so far in one error, if there is one."""

@@ -16,7 +16,6 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from dwell.errors import ProblemError
 from dwell.io.entries import CellEntry, Entry
 from dwell.io.faults import Faults, Step, dotted
 from dwell.io.wording import as_read
@@ -61,8 +60,7 @@ def read_structure(document: object, faults: Faults) -> CellEntry:
     """
     if not isinstance(document, Mapping):
         has = as_read(document)
-        faults.add("", f"a cell file is a mapping that begins with `dwell: 1`; this is {has}")
-        faults.raise_any()
+        faults.refuse("", f"a cell file is a mapping that begins with `dwell: 1`; this is {has}")
     values = _plain(document, (), faults)
     assert isinstance(values, dict)  # noqa: S101 - a copy of the mapping
     _check_version(values, faults)
@@ -83,25 +81,19 @@ def read_structure(document: object, faults: Faults) -> CellEntry:
         known = faults.touches
 
 
-def _check_version(values: Mapping[str, object], faults: Faults) -> None:
+def _check_version(values: dict[str, object], faults: Faults) -> None:
     version = values.get("dwell")
-    if isinstance(version, int) and not isinstance(version, bool) and version > VERSION:
-        faults.add(
+    if version is None or (type(version) is int and version == VERSION):
+        return
+    values["dwell"] = VERSION  # true and 1.0 equal 1, and pydantic would take them
+    if type(version) is int and version > VERSION:
+        # Whatever else looks wrong may be right in that version.
+        faults.refuse(
             "dwell",
             f"schema version {bounds.shown(version)} is newer than this Dwell, which reads "
             f"{VERSION}; upgrade dwell",
         )
-        # Whatever else looks wrong may be right in that version.
-        raise _only(faults, "dwell")
-
-
-def _only(faults: Faults, path: str) -> ProblemError:
-    try:
-        faults.raise_any()
-    except ProblemError as error:
-        kept = [fault for fault in error.faults if fault.path == path]
-        return ProblemError(kept, error.source)
-    raise AssertionError(path)
+    faults.add("dwell", f"{as_read(version)} is not allowed; write `dwell: {VERSION}`")
 
 
 def _plain(value: object, steps: tuple[Step, ...], faults: Faults) -> object:
@@ -113,17 +105,25 @@ def _plain(value: object, steps: tuple[Step, ...], faults: Faults) -> object:
         copy: dict[str, object] = {}
         for key, item in value.items():
             path = (*steps, str(key))
-            if not isinstance(key, str):
+            if not isinstance(key, str) or _is_torn(key):
                 faults.add(dotted(path), f"the key {as_read(key)} is not a text")
                 continue
             copy[key] = _plain(item, path, faults)
         return copy
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [_plain(item, (*steps, i), faults) for i, item in enumerate(value)]
+    if isinstance(value, str) and _is_torn(value):
+        faults.add(dotted(steps), f"{as_read(value)} holds half of a character; remove it")
+        return None
     if value is None and not faults.at(dotted(steps)):
         key = f"the key {steps[-1]!r}" if isinstance(steps[-1], str) else "the item"
         faults.add(dotted(steps), f"nothing is given; give a value, or remove {key}")
     return value
+
+
+def _is_torn(text: str) -> bool:
+    """Whether a text holds a lone surrogate, which no file can."""
+    return any("\ud800" <= sign <= "\udfff" for sign in text)
 
 
 def _blank(values: dict[str, Any], loc: Sequence[Step], kind: str) -> None:
@@ -167,8 +167,6 @@ def _message(detail: ErrorDetails) -> str:
         return f"missing; add it: {_lower(field.description) if field else 'it is required'}"
     if kind == "literal_error":
         choices = [str(choice) for choice in _choices(_declaration(loc)[0])]
-        if choices == [str(VERSION)]:
-            return f"{as_read(value)} is not allowed; write `dwell: {VERSION}`"
         hint = nearest(value, choices) if isinstance(value, str) else ""
         only = f"{as_read(value)} is not allowed; it must be one of {', '.join(choices)}"
         return f"{only}; {hint}" if hint.startswith("did you mean") else only

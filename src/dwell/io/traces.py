@@ -203,7 +203,7 @@ class _Reading:
             self._fail("file", f"{path} is empty; record it again, or name another")
         except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
             reason = str(error).partition("\n")[0]
-            self._fail("file", f"{path} cannot be read as {suffix[1:]}: {reason}")
+            self._fail("file", f"{path} cannot be read: {reason}")
         else:
             if frame.height > 0:
                 return frame if self._has_numbers(frame.schema) else None
@@ -262,18 +262,14 @@ class _Reading:
         for path, entry in self.uses:
             column = values[entry.column]
             negative = column < 0
-            # Comparisons with NaN are false.
-            bad = (
-                ~(column <= VALUE.high)
-                if mode == "clip"
-                else ~((column >= 0) & (column <= VALUE.high))
-            )
-            if mode == "drop":
-                keep &= ~bad
-                continue
+            bad = ~(column <= VALUE.high)  # and so is NaN
             if mode == "clip":
                 clip |= negative
-            if bad.any():
+            else:
+                bad |= negative
+            if mode == "drop":
+                keep &= ~bad
+            elif bad.any():
                 self._fail("column", self._complaint(column, bad, mode), path)
         if time is not None:
             lost = ~np.isfinite(time)
@@ -295,7 +291,7 @@ class _Reading:
         value = "" if np.isnan(column[row]) else f", {column[row]:g}"
         drop = "set `on_negative: drop` to leave such rows out of all columns"
         clip = "0 cannot stand for that" if mode == "clip" else "or `clip` to make negative ones 0"
-        return f"of {len(column)} rows {has} (first: row {row + 1}{value}); {drop}, {clip}"
+        return f"{has} of {len(column)} rows (first: row {row + 1}{value}); {drop}, {clip}"
 
     def _instants(self, time: Floats, starts: NDArray[np.int64], rows: NDArray[np.int64]) -> Floats:
         """Return each row's instant since its group's first; they must not go back."""

@@ -183,7 +183,8 @@ class _Builder:
         kind, text = node.tag.removeprefix(TAG), node.value
         try:
             if kind == "str":
-                return str(text)
+                # JSON writes a character beyond U+FFFF as two escapes, which YAML keeps apart.
+                return str(text).encode("utf-16", "surrogatepass").decode("utf-16")
             if kind == "null":
                 return None
             if kind == "bool":
@@ -192,6 +193,8 @@ class _Builder:
                 return _whole(text)
             if kind == "float":
                 return _real(text)
+        except UnicodeDecodeError:
+            self.faults.add(path, "half of a character (a lone \\uD800 to \\uDFFF); remove it")
         except (KeyError, ValueError):
             self.faults.add(path, f"{text!r} is not a value of the tag {_tag(node)}; remove it")
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.kernels.compiled import kernel, phase
+from dwell.kernels.compiled import fixed_columns, index, kernel, phase
 from dwell.kernels.cycles import (
     arrive,
     become_ready,
@@ -54,12 +54,25 @@ from dwell.kernels.layout import (
     LIVE,
     LOCAL,
     MARGIN,
+    N_CELL,
+    N_CHANGE,
     N_CYCLES,
     N_EVENTS,
+    N_FLOW,
+    N_HOP,
     N_IN,
+    N_JOB,
+    N_LINK,
     N_OUT,
     N_READY,
     N_RUN,
+    N_SEGMENT,
+    N_SEGMENT_F,
+    N_SERVER,
+    N_SERVER_F,
+    N_SITE,
+    N_SLOT,
+    N_TASK,
     N_TASKS,
     N_WAIT,
     NEED,
@@ -306,8 +319,8 @@ def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
 def _completion(s: Tables, cell: int, cycle: int, task: int, key: int, now: int) -> None:
     """Complete a job, unless its announcement has gone stale."""
     row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
-    site = s.jobs[row, SITE]
-    server = s.sites[site, SERVER]
+    site = index(s.jobs[row, SITE])
+    server = index(s.sites[site, SERVER])
     if s.servers[server, NEXT_KEY] != key or s.servers[server, NEXT_T] != now:
         return
     complete(s, server, cell, cycle, row, now)
@@ -321,7 +334,7 @@ def _completion(s: Tables, cell: int, cycle: int, task: int, key: int, now: int)
     s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
     first = s.tasks[task, OUT_0]
     for i in range(first, first + n_out):
-        flow = s.out_flows[i]
+        flow = s.out_flows[index(i)]
         hop = hop_of(s, cell, cycle, flow)
         if hop < 0:
             hand_over(s, cell, cycle, flow, now)
@@ -333,10 +346,10 @@ def _completion(s: Tables, cell: int, cycle: int, task: int, key: int, now: int)
 def _admit(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
     """A worker takes a job to its server."""
     row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
-    site = s.jobs[row, SITE]
+    site = index(s.jobs[row, SITE])
     key = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | task
     rank = s.tasks[task, RANK]
-    admit(s, s.sites[site, SERVER], key, row, rank, s.exec_ns[site, cycle], now)
+    admit(s, index(s.sites[site, SERVER]), key, row, rank, s.exec_ns[site, cycle], now)
 
 
 @phase
@@ -357,7 +370,7 @@ def _retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Send a message again after a lost attempt."""
     slot = slot_row(s, cell, cycle)
     s.slots[slot, LIVE] -= 1
-    attempt = s.attempts[slot, s.flows[flow, FLOW_LOCAL]] + 1
+    attempt = s.attempts[slot, s.flows[index(flow), FLOW_LOCAL]] + 1
     send(s, cell, cycle, flow, hop_of(s, cell, cycle, flow), attempt, now)
 
 
@@ -464,28 +477,28 @@ def advance(
         or the ring of cycles in flight, and call again; nothing was lost.
     """
     s = Tables(
-        tasks,
-        flows,
+        fixed_columns(tasks, N_TASK),
+        fixed_columns(flows, N_FLOW),
         out_flows,
         site_of,
         route,
-        hops,
+        fixed_columns(hops, N_HOP),
         loss_keys,
         layer_rows,
-        segments,
-        segments_f,
-        changes,
+        fixed_columns(segments, N_SEGMENT),
+        fixed_columns(segments_f, N_SEGMENT_F),
+        fixed_columns(changes, N_CHANGE),
         release_ns,
         exec_ns,
         delay_ns,
         extra_ns,
         stamps,
         clock,
-        cells,
-        sites,
-        servers,
-        servers_f,
-        links,
+        fixed_columns(cells, N_CELL),
+        fixed_columns(sites, N_SITE),
+        fixed_columns(servers, N_SERVER),
+        fixed_columns(servers_f, N_SERVER_F),
+        fixed_columns(links, N_LINK),
         run_v,
         run_key,
         wait_rank,
@@ -496,8 +509,8 @@ def advance(
         ready,
         event_t,
         event_key,
-        jobs,
-        slots,
+        fixed_columns(jobs, N_JOB),
+        fixed_columns(slots, N_SLOT),
         attempts,
         own,
         latency_ns,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dwell.kernels.compiled import phase
+from dwell.kernels.compiled import index, phase
 from dwell.kernels.heaps import push_event
 from dwell.kernels.layout import (
     ARRIVED,
@@ -19,8 +19,8 @@ from dwell.kernels.layout import (
     FAIR,
     FLOW_LOCAL,
     HEAD,
-    IN_FLIGHT,
     IDLE,
+    IN_FLIGHT,
     IS_CPU,
     ITEM_MASK,
     KIND_SHIFT,
@@ -140,9 +140,9 @@ def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> bool:
     row = job_row(s, cell, cycle, local)
     s.jobs[row, READY] = now
     _log(s, cell, cycle, row, local, IN_FLIGHT, -1)
-    site = s.jobs[row, SITE]
+    site = index(s.jobs[row, SITE])
     s.slots[slot_row(s, cell, cycle), LIVE] += 1
-    if s.servers[s.sites[site, SERVER], DOWN] != 0:
+    if s.servers[index(s.sites[site, SERVER]), DOWN] != 0:
         drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
         return False
     if s.sites[site, IDLE] > 0 and now >= s.sites[site, READY_AT]:
@@ -184,8 +184,8 @@ def drop_waiting(s: Tables, cell: int, task: int, site: int, now: int) -> None:
 def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Handle a message that reaches its node."""
     s.slots[slot_row(s, cell, cycle), LIVE] -= 1
-    row = job_row(s, cell, cycle, s.tasks[s.flows[flow, TARGET], LOCAL])
-    if s.servers[s.sites[s.jobs[row, SITE], SERVER], DOWN] != 0:
+    row = job_row(s, cell, cycle, s.tasks[index(s.flows[index(flow), TARGET]), LOCAL])
+    if s.servers[index(s.sites[index(s.jobs[row, SITE]), SERVER]), DOWN] != 0:
         lose(s, cell, cycle, NODE_DOWN)
         return
     hand_over(s, cell, cycle, flow, now)
@@ -206,13 +206,13 @@ def finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
 @phase
 def complete(s: Tables, server: int, cell: int, cycle: int, row: int, now: int) -> None:
     """The job of a server that finishes first has finished; its outputs are the caller's."""
-    local = s.tasks[s.run_key[s.servers[server, BASE]] & ITEM_MASK, LOCAL]
-    site = s.jobs[row, SITE]
+    local = s.tasks[s.run_key[index(s.servers[server, BASE])] & ITEM_MASK, LOCAL]
+    site = index(s.jobs[row, SITE])
     leave(s, server, 0, now)
     s.servers[server, NEXT_KEY] = -1
     if s.servers[server, IS_CPU] != 0:
         work = s.sites[site, NEED] * float(s.exec_ns[site, cycle])
-        s.own[cell, s.sites[site, NODE]] += work
+        s.own[cell, index(s.sites[site, NODE])] += work
     s.jobs[row, COMPUTE] += now - s.jobs[row, STARTED]
     _log(s, cell, cycle, row, local, DONE, now)
     s.slots[slot_row(s, cell, cycle), LIVE] -= 1
@@ -221,11 +221,11 @@ def complete(s: Tables, server: int, cell: int, cycle: int, row: int, now: int) 
 @phase
 def hand_over(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Count an input in; the last one makes the job ready and names its critical path."""
-    task = s.flows[flow, TARGET]
-    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    task = s.flows[index(flow), TARGET]
+    row = job_row(s, cell, cycle, s.tasks[index(task), LOCAL])
     s.jobs[row, ARRIVED] += 1
-    if s.jobs[row, ARRIVED] == s.tasks[task, N_IN]:
-        sender = job_row(s, cell, cycle, s.tasks[s.flows[flow, SOURCE], LOCAL])
+    if s.jobs[row, ARRIVED] == s.tasks[index(task), N_IN]:
+        sender = job_row(s, cell, cycle, s.tasks[index(s.flows[index(flow), SOURCE]), LOCAL])
         s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
         s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
         note_ready(s, cell, cycle, task)
@@ -235,7 +235,7 @@ def hand_over(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
 def hop_of(s: Tables, cell: int, cycle: int, flow: int) -> int:
     """Hop that a flow takes in a cycle, -1 on the same node."""
     candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
-    return int(s.route[candidate, s.flows[flow, FLOW_LOCAL]])
+    return int(s.route[index(candidate), index(s.flows[index(flow), FLOW_LOCAL])])
 
 
 @phase
@@ -245,12 +245,12 @@ def _open_slot(s: Tables, cell: int, cycle: int) -> None:
     s.slots[slot, LIVE] = 0
     s.slots[slot, LOST] = 0
     s.slots[slot, SINKS_LEFT] = s.cells[cell, N_SINKS]
-    row = job_row(s, cell, cycle, 0)
     candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
     for local in range(s.cells[cell, N_TASKS]):
-        s.jobs[row + local, ARRIVED] = 0
-        s.jobs[row + local, STARTED] = -1
-        s.jobs[row + local, SITE] = s.site_of[candidate, local]
+        row = job_row(s, cell, cycle, local)
+        s.jobs[row, ARRIVED] = 0
+        s.jobs[row, STARTED] = -1
+        s.jobs[row, SITE] = s.site_of[index(candidate), local]
 
 
 @phase
@@ -282,7 +282,7 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
 def flush(s: Tables, now: int) -> None:
     """Give out cores, and announce completions, on every server the event touched."""
     for i in range(s.clock[N_DIRTY]):
-        server = s.dirty[i]
+        server = index(s.dirty[i])
         s.servers[server, DIRTY] = 0
         if s.servers[server, SCHEDULER] != FAIR:
             dispatch(s, server, now)

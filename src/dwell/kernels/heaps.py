@@ -5,7 +5,7 @@ The arrays belong to the caller; a heap is a part of them from `base` with `n` e
 
 from __future__ import annotations
 
-from dwell.kernels.compiled import phase
+from dwell.kernels.compiled import index, phase
 from dwell.kernels.layout import N_EVENTS, Floats, Ints
 
 __all__ = [
@@ -25,14 +25,14 @@ def push_event(clock: Ints, event_t: Ints, event_key: Ints, t: int, key: int) ->
     clock[N_EVENTS] = i + 1
     while i > 0:
         parent = (i - 1) >> 1
-        pt = event_t[parent]
-        if pt < t or (pt == t and event_key[parent] < key):
+        pt = event_t[index(parent)]
+        if pt < t or (pt == t and event_key[index(parent)] < key):
             break
-        event_t[i] = pt
-        event_key[i] = event_key[parent]
+        event_t[index(i)] = pt
+        event_key[index(i)] = event_key[index(parent)]
         i = parent
-    event_t[i] = t
-    event_key[i] = key
+    event_t[index(i)] = t
+    event_key[index(i)] = key
 
 
 @phase
@@ -40,27 +40,27 @@ def pop_event(clock: Ints, event_t: Ints, event_key: Ints) -> None:
     """Remove the first event."""
     n = clock[N_EVENTS] - 1
     clock[N_EVENTS] = n
-    t = event_t[n]
-    key = event_key[n]
+    t = event_t[index(n)]
+    key = event_key[index(n)]
     i = 0
     child = 1
     while child < n:
         right = child + 1
-        ct = event_t[child]
-        ck = event_key[child]
+        ct = event_t[index(child)]
+        ck = event_key[index(child)]
         if right < n:
-            rt = event_t[right]
-            rk = event_key[right]
+            rt = event_t[index(right)]
+            rk = event_key[index(right)]
             if rt < ct or (rt == ct and rk < ck):
                 child, ct, ck = right, rt, rk
         if t < ct or (t == ct and key <= ck):
             break
-        event_t[i] = ct
-        event_key[i] = ck
+        event_t[index(i)] = ct
+        event_key[index(i)] = ck
         i = child
         child = 2 * i + 1
-    event_t[i] = t
-    event_key[i] = key
+    event_t[index(i)] = t
+    event_key[index(i)] = key
 
 
 @phase
@@ -69,48 +69,48 @@ def push_running(run_v: Floats, run_key: Ints, base: int, n: int, v: float, key:
     i = n
     while i > 0:
         parent = (i - 1) >> 1
-        pv = run_v[base + parent]
-        if pv < v or (pv == v and run_key[base + parent] < key):
+        pv = run_v[index(base + parent)]
+        if pv < v or (pv == v and run_key[index(base + parent)] < key):
             break
-        run_v[base + i] = pv
-        run_key[base + i] = run_key[base + parent]
+        run_v[index(base + i)] = pv
+        run_key[index(base + i)] = run_key[index(base + parent)]
         i = parent
-    run_v[base + i] = v
-    run_key[base + i] = key
+    run_v[index(base + i)] = v
+    run_key[index(base + i)] = key
 
 
 @phase
 def pop_running(run_v: Floats, run_key: Ints, base: int, n: int, at: int) -> None:
     """Remove entry `at` (0 is the first to finish) from a heap of n running jobs."""
-    v = run_v[base + n - 1]
-    key = run_key[base + n - 1]
+    v = run_v[index(base + n - 1)]
+    key = run_key[index(base + n - 1)]
     i = at
     # Towards the root, needed only where the entry comes from the middle.
     while i > 0:
         parent = (i - 1) >> 1
-        pv = run_v[base + parent]
-        if pv < v or (pv == v and run_key[base + parent] < key):
+        pv = run_v[index(base + parent)]
+        if pv < v or (pv == v and run_key[index(base + parent)] < key):
             break
-        run_v[base + i] = pv
-        run_key[base + i] = run_key[base + parent]
+        run_v[index(base + i)] = pv
+        run_key[index(base + i)] = run_key[index(base + parent)]
         i = parent
     child = 2 * i + 1
     while child < n - 1:
         right = child + 1
         if right < n - 1:
-            rv = run_v[base + right]
-            cv = run_v[base + child]
-            if rv < cv or (rv == cv and run_key[base + right] < run_key[base + child]):
+            rv = run_v[index(base + right)]
+            cv = run_v[index(base + child)]
+            if rv < cv or (rv == cv and run_key[index(base + right)] < run_key[index(base + child)]):
                 child = right
-        cv = run_v[base + child]
-        if v < cv or (v == cv and key <= run_key[base + child]):
+        cv = run_v[index(base + child)]
+        if v < cv or (v == cv and key <= run_key[index(base + child)]):
             break
-        run_v[base + i] = cv
-        run_key[base + i] = run_key[base + child]
+        run_v[index(base + i)] = cv
+        run_key[index(base + i)] = run_key[index(base + child)]
         i = child
         child = 2 * i + 1
-    run_v[base + i] = v
-    run_key[base + i] = key
+    run_v[index(base + i)] = v
+    run_key[index(base + i)] = key
 
 
 @phase

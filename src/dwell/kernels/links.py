@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dwell.kernels.compiled import phase
+from dwell.kernels.compiled import index, phase
 from dwell.kernels.heaps import push_event
 from dwell.kernels.layout import (
     ARRIVAL,
@@ -44,7 +44,7 @@ __all__ = ["lose", "send", "slot_row"]
 def slot_row(s: Tables, cell: int, cycle: int) -> int:
     """Row of a cycle in the ring of the cycles in flight."""
     ring = s.clock[RING]
-    return cell * ring + (cycle & (ring - 1))
+    return index(cell * ring + (cycle & (ring - 1)))
 
 
 @phase
@@ -66,46 +66,46 @@ def _begin(s: Tables, link: int, now: int) -> int:
     while True:
         segment = s.links[link, SEGMENT]
         last = s.links[link, SEGMENT_END] - 1
-        while segment < last and s.segments[segment + 1, SEGMENT_AT] <= start:
+        while segment < last and s.segments[index(segment + 1), SEGMENT_AT] <= start:
             segment += 1
         s.links[link, SEGMENT] = segment
-        if s.segments[segment, SEGMENT_DOWN] == 0:
+        if s.segments[index(segment), SEGMENT_DOWN] == 0:
             return start
         if s.links[link, RETRANSMIT_NS] < 0:
             return -1
         if segment == last:
             return -2
-        start = s.segments[segment + 1, SEGMENT_AT]
+        start = s.segments[index(segment + 1), SEGMENT_AT]
 
 
 @phase
 def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, now: int) -> None:
     """Send one message of a flow for the first time (attempt 0) or once more."""
-    link = s.hops[hop, LINK]
+    link = index(s.hops[index(hop), LINK])
     start = _begin(s, link, now)
     if start < 0:
         lose(s, cell, cycle, DROPPED if start == -1 else IN_FLIGHT)
         return
-    segment = s.links[link, SEGMENT]
+    segment = index(s.links[link, SEGMENT])
     rate = s.segments_f[segment, SEGMENT_RATE]
     transmission = 0
     if rate < math.inf:
-        transmission = int(np.rint(s.hops[hop, PAYLOAD] * 8000.0 / rate))
+        transmission = int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
     sent = start + transmission
     s.links[link, FREE] = sent
     loss = s.segments_f[segment, SEGMENT_LOSS]
     name = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | flow
     slot = slot_row(s, cell, cycle)
-    if loss > 0.0 and attempt_uniform(s.loss_keys[hop], cycle, attempt) < loss:
+    if loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss:
         timeout = s.links[link, RETRANSMIT_NS]
         if timeout < 0:
             lose(s, cell, cycle, DROPPED)
             return
-        s.attempts[slot, s.flows[flow, FLOW_LOCAL]] = attempt
+        s.attempts[slot, s.flows[index(flow), FLOW_LOCAL]] = attempt
         s.slots[slot, LIVE] += 1
         push_event(s.clock, s.event_t, s.event_key, sent + timeout, (RETRY << KIND_SHIFT) | name)
         return
-    delay = s.delay_ns[hop, cycle]
+    delay = s.delay_ns[index(hop), cycle]
     layers = s.segments[segment, SEGMENT_LAYERS]
     layer = 0
     while layers != 0:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from dwell.kernels.compiled import phase
+from dwell.kernels.compiled import index, phase
 from dwell.kernels.heaps import (
     pop_running,
     pop_waiting,
@@ -64,7 +64,7 @@ SLACK = 1e-6
 def job_row(s: Tables, cell: int, cycle: int, local: int) -> int:
     """Row of a job in the ring of the cycles in flight."""
     ring = s.clock[RING]
-    return (cell * ring + (cycle & (ring - 1))) * s.clock[STRIDE] + local
+    return index((cell * ring + (cycle & (ring - 1))) * s.clock[STRIDE] + local)
 
 
 @phase
@@ -121,7 +121,7 @@ def _start(s: Tables, server: int, key: int, row: int, left: float, now: int) ->
     finish = s.servers_f[server, VIRTUAL] + left
     push_running(s.run_v, s.run_key, s.servers[server, BASE], n, finish, key)
     s.servers[server, N_RUN] = n + 1
-    s.servers[server, USED] += s.sites[s.jobs[row, SITE], NEED]
+    s.servers[server, USED] += s.sites[index(s.jobs[row, SITE]), NEED]
 
 
 @phase
@@ -136,7 +136,7 @@ def admit(s: Tables, server: int, key: int, row: int, rank: int, work: int, now:
     if s.servers[server, SCHEDULER] == FIFO:
         rank = 0
     n = s.servers[server, N_WAIT]
-    need = s.sites[s.jobs[row, SITE], NEED]
+    need = s.sites[index(s.jobs[row, SITE]), NEED]
     if n == 0 and s.servers[server, USED] + need <= s.servers[server, CORES]:
         # Nobody else waits, and jobs are admitted in the order of their readiness.
         tick(s, server, now)
@@ -170,7 +170,7 @@ def _preempt(s: Tables, server: int) -> bool:
     left = s.run_v[base + worst] - s.servers_f[server, VIRTUAL]
     pop_running(s.run_v, s.run_key, base, s.servers[server, N_RUN], worst)
     s.servers[server, N_RUN] -= 1
-    s.servers[server, USED] -= s.sites[s.jobs[row, SITE], NEED]
+    s.servers[server, USED] -= s.sites[index(s.jobs[row, SITE]), NEED]
     n = s.servers[server, N_WAIT]
     w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
     push_waiting(w[0], w[1], w[2], w[3], base, n, rank, ready, key, max(left, 0.0))
@@ -189,7 +189,7 @@ def dispatch(s: Tables, server: int, now: int) -> None:
     while s.servers[server, N_WAIT] > 0:
         key = s.wait_key[base]
         row = key_row(s, key)
-        need = s.sites[s.jobs[row, SITE], NEED]
+        need = s.sites[index(s.jobs[row, SITE]), NEED]
         if s.servers[server, USED] + need <= s.servers[server, CORES]:
             left = s.wait_left[base]
             n = s.servers[server, N_WAIT]
@@ -207,10 +207,10 @@ def leave(s: Tables, server: int, at: int, now: int) -> None:
     tick(s, server, now)
     base = s.servers[server, BASE]
     n = s.servers[server, N_RUN]
-    row = key_row(s, s.run_key[base + at])
+    row = key_row(s, s.run_key[index(base + at)])
     pop_running(s.run_v, s.run_key, base, n, at)
     s.servers[server, N_RUN] = n - 1
-    s.servers[server, USED] -= s.sites[s.jobs[row, SITE], NEED]
+    s.servers[server, USED] -= s.sites[index(s.jobs[row, SITE]), NEED]
     if s.servers[server, SCHEDULER] == FAIR:
         set_speed(s, server)
 
@@ -222,12 +222,12 @@ def schedule(s: Tables, server: int, now: int) -> None:
         s.servers[server, NEXT_KEY] = -1
         return
     base = s.servers[server, BASE]
-    left = s.run_v[base] - s.servers_f[server, VIRTUAL]
+    left = s.run_v[index(base)] - s.servers_f[server, VIRTUAL]
     speed = s.servers_f[server, SPEED]
     if speed != 1.0:
         left = left / speed
     t = now + max(int(math.ceil(left - SLACK)), 0)
-    key = s.run_key[base]
+    key = s.run_key[index(base)]
     if key != s.servers[server, NEXT_KEY] or t != s.servers[server, NEXT_T]:
         s.servers[server, NEXT_KEY] = key
         s.servers[server, NEXT_T] = t
