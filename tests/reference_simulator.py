@@ -21,7 +21,15 @@ import simpy
 from dwell.model import Execution, Flow, Node, Placement, Problem, Task
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
-__all__ = ["CycleResult", "JobResult", "Result", "attempt_uniform", "simulate", "transmission_ns"]
+__all__ = [
+    "CycleResult",
+    "JobResult",
+    "Result",
+    "Split",
+    "attempt_uniform",
+    "simulate",
+    "transmission_ns",
+]
 
 COMPLETION, ARRIVAL, DISTURBANCE, CLOSE, RELEASE = 1, 2, 3, 4, 5
 MASK = 2**64 - 1
@@ -32,14 +40,25 @@ NEAR_NS = 1000
 
 
 @dataclass(frozen=True)
+class Split:
+    """Parts of a latency, along one path from a release to the last sink."""
+
+    compute_ns: int
+    queue_ns: int
+    network_ns: int
+
+
+@dataclass(frozen=True)
 class CycleResult:
-    """What became of a cycle; the four durations are None unless it is done."""
+    """What became of a cycle; it has a latency and its parts only if it is done.
+
+    There is more than one way to split a latency where inputs of a job arrive at the same instant,
+    or sinks complete at the same instant: either may be called the last.
+    """
 
     outcome: str
     latency_ns: int | None = None
-    compute_ns: int | None = None
-    queue_ns: int | None = None
-    network_ns: int | None = None
+    splits: frozenset[Split] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -109,7 +128,7 @@ class Job:
     node: str
     ready: int
     left: Fraction
-    sender: Job | None
+    senders: tuple[Job, ...]
     start: int | None = None
     started_by: int = -1
     end: int | None = None
@@ -295,7 +314,7 @@ class Simulation:
         for segment in real.link_segments:
             self.segments[segment.link].append(segment)
 
-        self.inputs: dict[tuple[int, str], int] = {}
+        self.inputs: dict[tuple[int, str], list[tuple[int, Job]]] = {}
         self.lost_joins: set[tuple[int, str]] = set()
         self.losses: dict[int, str] = {}
         self.jobs: dict[tuple[int, str], Job] = {}
@@ -431,7 +450,7 @@ class Simulation:
     def start_source(self, cycle: int, task: str) -> None:
         # Reading: a source with an offset is released when its offset is over. On a node that is
         # down its job is lost as soon as it is ready.
-        job = self.make_job(cycle, task, None)
+        job = self.make_job(cycle, task, ())
         if self.nodes[job.node].down:
             self.lose_job(job, "node_down")
         else:
@@ -452,22 +471,29 @@ class Simulation:
         sinks = [job for job in self.completed[cycle] if job.task.name in self.sinks]
         if len(sinks) < len(self.sinks):
             return CycleResult("in_flight")
-        compute = queue = network = 0
-        job, sender = sinks[-1], sinks[-1].sender
+        end = max(self.end_of(job) for job in sinks)
+        splits = {
+            split for job in sinks if job.end == end for split in self.splits(job, Split(0, 0, 0))
+        }
+        return CycleResult("done", end - self.release[cycle], frozenset(splits))
+
+    def end_of(self, job: Job) -> int:
         assert job.end is not None
-        latency = job.end - self.release[cycle]
-        while True:
-            assert job.start is not None
-            assert job.end is not None
-            compute += job.end - job.start
-            queue += job.start - job.ready
-            if sender is None:
-                break
-            assert sender.end is not None
-            network += job.ready - sender.end
-            job, sender = sender, sender.sender
-        queue += job.ready - self.release[cycle]
-        return CycleResult("done", latency, compute, queue, network)
+        return job.end
+
+    def splits(self, job: Job, after: Split) -> set[Split]:
+        """Split the time from the release to the end of a job; `after` is what came after that."""
+        assert job.start is not None
+        compute = after.compute_ns + self.end_of(job) - job.start
+        queue = after.queue_ns + job.start - job.ready
+        if not job.senders:
+            queue += job.ready - self.release[job.cycle]
+            return {Split(compute, queue, after.network_ns)}
+        found = set()
+        for sender in job.senders:
+            network = after.network_ns + job.ready - self.end_of(sender)
+            found |= self.splits(sender, Split(compute, queue, network))
+        return found
 
     # ----------------------------------------------------------------------- inputs and workers
 
@@ -479,12 +505,14 @@ class Simulation:
             self.lose(cycle, "node_down")
         if key in self.lost_joins:
             return
-        self.inputs[key] = self.inputs.get(key, 0) + 1
-        if self.inputs[key] == len(self.pipeline.inputs(task)):
+        there = self.inputs.setdefault(key, [])
+        there.append((self.now, sender))
+        if len(there) == len(self.pipeline.inputs(task)):
             del self.inputs[key]
-            self.queue_up(self.make_job(cycle, task, sender))
+            last = tuple(job for arrival, job in there if arrival == self.now)
+            self.queue_up(self.make_job(cycle, task, last))
 
-    def make_job(self, cycle: int, name: str, sender: Job | None) -> Job:
+    def make_job(self, cycle: int, name: str, senders: tuple[Job, ...]) -> Job:
         """Return the job that is ready now."""
         task = self.pipeline.tasks[name]
         node = self.placed[cycle][name]
@@ -497,7 +525,7 @@ class Simulation:
             node=node,
             ready=self.now,
             left=Fraction(int(self.real.exec_ns[site, cycle])),
-            sender=sender,
+            senders=senders,
         )
         self.jobs[cycle, name] = job
         return job

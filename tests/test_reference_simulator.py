@@ -20,7 +20,7 @@ from dwell.model import (
 )
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from tests.generate import MS, make_problem, make_realisation
-from tests.reference_simulator import Result, attempt_uniform, simulate, transmission_ns
+from tests.reference_simulator import Result, Split, attempt_uniform, simulate, transmission_ns
 
 R, E = Node("R", "robot"), Node("E", "edge")
 
@@ -253,7 +253,7 @@ def test_a_join_waits_for_its_last_input_and_the_sink_that_is_last_counts() -> N
     assert times(result, "F") == (4, 4, 12)
     cycle = result.cycles[0]
     assert cycle.latency_ns == 17 * MS
-    assert (cycle.compute_ns, cycle.queue_ns, cycle.network_ns) == (15 * MS, 0, 2 * MS)
+    assert cycle.splits == {Split(15 * MS, 0, 2 * MS)}
 
 
 def test_latency_splits_into_compute_queue_and_network() -> None:
@@ -267,10 +267,25 @@ def test_latency_splits_into_compute_queue_and_network() -> None:
         windows=5,
     )
     first, second = result.cycles[0], result.cycles[1]
-    assert (first.latency_ns, first.queue_ns) == (20 * MS, 3 * MS)
+    assert first.latency_ns == 20 * MS
+    assert first.splits == {Split(16 * MS, 3 * MS, 1 * MS)}
     assert second.latency_ns == 22 * MS
-    parts = (second.compute_ns, second.queue_ns, second.network_ns)
-    assert parts == (16 * MS, 5 * MS, 1 * MS)
+    assert second.splits == {Split(16 * MS, 5 * MS, 1 * MS)}
+
+
+def test_inputs_that_arrive_at_the_same_instant_split_a_latency_in_two_ways() -> None:
+    # C comes over a link that clamps it to the arrival of B: either path is the last one.
+    result = run(
+        [R, E],
+        [task("A", 1), task("B", 3), task("C", 5), task("D", 1, node="E")],
+        [Flow("B", "D"), Flow("C", "D"), Flow("A", "B"), Flow("A", "C")],
+        links=[Link("R", "E", Constant(0), in_order=True)],
+        delay_ms={("B", "D", "R->E"): [20], ("C", "D", "R->E"): [2]},
+    )
+    cycle = result.cycles[0]
+    # B has its 3 by 7, and C its 5 by 9; both arrive at 27.
+    assert cycle.latency_ns == 28 * MS
+    assert cycle.splits == {Split(8 * MS, 0, 20 * MS), Split(10 * MS, 0, 18 * MS)}
 
 
 def test_completion_hands_over_before_the_worker_takes_the_next() -> None:
@@ -460,7 +475,7 @@ def test_a_lost_attempt_is_sent_again_behind_what_is_queued() -> None:
     result = chain(link, segments=segments)
     # Lost at 1-2, sent again at 11.5 behind cycle 1, which is sent at 11 and takes until 12.
     assert latencies(result) == [14, 3, 3]
-    assert result.cycles[0].network_ns == 13 * MS
+    assert result.cycles[0].splits == {Split(1 * MS, 0, 13 * MS)}
 
 
 def test_loss_is_a_function_of_stream_cycle_and_attempt() -> None:

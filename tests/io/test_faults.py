@@ -102,7 +102,7 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
         ("unknown key", "threads"),
     ),
     (("nodes", "bad/name"), {"tier": "edge"}, "nodes.bad/name", ("'bad/name'", "letters")),
-    (("nodes", ""), {"tier": "edge"}, "nodes.", ("''", "letters")),
+    (("nodes", ""), {"tier": "edge"}, "nodes.''", ("''", "letters")),
     (("links",), None, "links", ("nothing is given",)),
     (("links",), {}, "links", ("a mapping", "a list", "[]")),
     (("links", 0), None, "links[0]", ("nothing is given",)),

@@ -46,7 +46,7 @@ def _problem(exec_ms: Process) -> Problem:
     )
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
+@settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
 @given(problems())
 def test_a_document_gives_an_equal_problem(problem: Problem) -> None:
     text = json.dumps(to_document(problem), allow_nan=False)

@@ -32,6 +32,7 @@ from tests.generate import MS, make_problem, make_realisation
 
 Floats = NDArray[np.float64]
 BATCHES = 40
+WINDOWS = 20_040  # of 100 cycles each
 
 
 def latencies_ms(run: dwell.Run) -> Floats:
@@ -51,12 +52,12 @@ def assert_mean(values: Floats, expected: float) -> None:
     factor = float(student.ppf(1 - 0.5e-7, BATCHES - 1))
     assert abs(batches.mean() - expected) < factor * error
     # The interval says something: it is narrow.
-    assert factor * error < 0.15 * expected
+    assert factor * error < 0.1 * expected
 
 
-def settled(run: dwell.Run, cycles: int) -> Floats:
-    """Latencies of a long run, less its first cycles and the last ones that may be unfinished."""
-    values = latencies_ms(run)[2000 : 2000 + cycles]
+def settled(run: dwell.Run) -> Floats:
+    """Latencies of a run, less its first cycles and the last ones, which may be unfinished."""
+    values = latencies_ms(run)[2000:2_002_000]
     assert not np.isnan(values).any()
     return values
 
@@ -88,24 +89,24 @@ def test_d_m_1_sojourn_is_exponential() -> None:
     sigma = brentq(lambda x: x - math.exp(-mu * (1 - x) * period), 0, 1 - 1e-6)
     rate = mu * (1 - sigma)
     problem = one_server(Exponential(mean), period)
-    run = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=1, windows=1230)
-    sojourn = settled(run, 120_000)
+    run = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=1, windows=WINDOWS)
+    sojourn = settled(run)
     assert_mean(sojourn, 1 / rate)
-    for share in (0.5, 0.9, 0.95, 0.99):
+    for share in (0.5, 0.9, 0.95):
         quantile = -math.log(1 - share) / rate
         assert_mean((sojourn > quantile).astype(np.float64), 1 - share)
 
 
 def test_utilisation_is_the_offered_load() -> None:
     problem = one_server(Exponential(7.0), 10.0)
-    run = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=2, windows=1000)
-    assert_mean(run.windows["u_R"].to_numpy()[40:], 0.7)
+    run = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=2, windows=WINDOWS)
+    assert_mean(run.windows["u_R"].to_numpy(), 0.7)
 
 
 def test_m_m_1_sojourn_is_exponential() -> None:
     problem = one_server(Exponential(6.0), 10.0)
-    real = poisson(problem, seed=3, windows=1230)
-    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"), 120_000)
+    real = poisson(problem, seed=3, windows=WINDOWS)
+    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"))
     rate = 1 / 6 - 1 / 10
     assert_mean(sojourn, 1 / rate)
     assert_mean((sojourn > math.log(20) / rate).astype(np.float64), 0.05)
@@ -114,8 +115,8 @@ def test_m_m_1_sojourn_is_exponential() -> None:
 def test_m_g_1_follows_pollaczek_and_khinchine() -> None:
     mean, cv, period = 6.0, 0.5, 10.0
     problem = one_server(Gamma(mean, cv), period)
-    real = poisson(problem, seed=4, windows=1230)
-    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"), 120_000)
+    real = poisson(problem, seed=4, windows=WINDOWS)
+    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"))
     load = mean / period
     wait = load * mean * (1 + cv**2) / (2 * (1 - load))
     assert_mean(sojourn, mean + wait)
@@ -125,8 +126,8 @@ def test_m_m_2_follows_erlang_c() -> None:
     mean, period = 12.0, 10.0
     node = Node("R", "robot", cores=2, scheduler="fifo")
     problem = one_server(Exponential(mean), period, node=node, workers=2)
-    real = poisson(problem, seed=5, windows=1230)
-    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"), 120_000)
+    real = poisson(problem, seed=5, windows=WINDOWS)
+    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"))
     # With two servers the mean sojourn is S / (1 - rho^2).
     assert_mean(sojourn, mean / (1 - (mean / period / 2) ** 2))
 
@@ -135,8 +136,8 @@ def test_m_m_2_follows_erlang_c() -> None:
 def test_processor_sharing_is_insensitive_to_the_distribution(service: Process) -> None:
     # M/G/1-PS: the mean sojourn is S / (1 - rho) whatever the distribution (Kleinrock, II, 4.4).
     problem = one_server(service, 10.0, node=Node("R", "robot"), workers=1000)
-    real = poisson(problem, seed=6, windows=1230)
-    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"), 120_000)
+    real = poisson(problem, seed=6, windows=WINDOWS)
+    sojourn = settled(dwell.simulate_realisation(problem, real, policy="LOC"))
     assert_mean(sojourn, 6 / (1 - 0.6))
 
 

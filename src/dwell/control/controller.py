@@ -62,7 +62,6 @@ class Log:
     seen_l95_ms: list[float] = field(default_factory=list)
     seen_violation_rate: list[float] = field(default_factory=list)
     cost: list[float] = field(default_factory=list)
-    utilisation: list[list[float]] = field(default_factory=list)
     decisions: list[Decision | None] = field(default_factory=list)
     estimates: list[Mapping[str, QoS]] = field(default_factory=list)
 
@@ -129,13 +128,17 @@ class Controller:
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms = int(seen_l95_ns(window.latency_ns, age_ns, self._censor_ns)) / 1e6
+        used = self.utilisation(window).tolist()
         span_ns = window.close_ns - window.open_ns
-        used = utilisation(window.busy_ns, self._cores, span_ns).tolist()
         own = utilisation(window.own_ns, self._cores, span_ns).tolist()
         return self.decide(
             QoS(l95_ms, missed / len(age_ns), FrozenDict(zip(self.nodes, used, strict=True))),
             dict(zip(self.nodes, own, strict=True)),
         )
+
+    def utilisation(self, window: ClosedWindow) -> Floats:
+        """Busy share of every node's cores, shape (..., nodes)."""
+        return utilisation(window.busy_ns, self._cores, window.close_ns - window.open_ns)
 
     def decide(self, observed: QoS, own: Mapping[str, float]) -> str:
         """Decide on metrics that are already aggregated (see `close`)."""
@@ -151,7 +154,6 @@ class Controller:
         log.incumbent.append(incumbent)
         log.seen_l95_ms.append(observed.l95_ms)
         log.seen_violation_rate.append(observed.violation_rate)
-        log.utilisation.append(list(observed.utilisation.values()))
         log.cost.append(measured)
         log.decisions.append(decision)
         log.estimates.append(estimates)
@@ -166,7 +168,6 @@ class Controller:
         log.incumbent.append(self.incumbent)
         log.seen_l95_ms.append(math.nan)
         log.seen_violation_rate.append(math.nan)
-        log.utilisation.append([math.nan] * len(self.nodes))
         log.cost.append(math.nan)
         log.decisions.append(None)
         log.estimates.append({})
@@ -243,7 +244,7 @@ def static_columns(
     age_ns = window.close_ns - window.release_ns
     missed = missed_cycles(window.latency_ns, age_ns, controller._deadline_ns)
     span_ns = window.close_ns - window.open_ns
-    used = utilisation(window.busy_ns, controller._cores, span_ns)
+    used = controller.utilisation(window)
     own = utilisation(window.own_ns, controller._cores, span_ns)
     seen = {
         "l95_ms": seen_l95_ns(window.latency_ns, age_ns, controller._censor_ns) / 1e6,

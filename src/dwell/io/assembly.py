@@ -118,9 +118,8 @@ class Assembly:
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
         parts = Parts(
             nodes=nodes,
-            links=_forward(links, nodes),
-            links_complete=len(dict(links)) == len(entry.links or ())
-            and not self.faults.at("links"),
+            links=links,
+            links_complete=len(dict(links)) == len(entry.links or ()),
             tasks=tasks,
             flows=flows,
             scales=dict(entry.scales or {}),

@@ -42,7 +42,7 @@ def load(path: str | PathLike[str]) -> Problem:
     faults = Faults(source)
     text = read_yaml(source, faults)
     if faults.at(""):
-        faults.raise_any()  # with the file as such; there is nothing to read on
+        raise faults.error()  # the file as such; there is nothing to read on
     return _read(text, faults, Path(source).parent, Path(source).stem or "cell")
 
 
@@ -83,6 +83,6 @@ def _read(document: object, faults: Faults, folder: Path, name: str) -> Problem:
     entry = read_structure(document, faults)
     tables = read_traces(entry, folder, faults)
     problem = Assembly(entry, tables, faults).problem(name)
-    faults.raise_any()
-    assert problem is not None  # noqa: S101 - it is missing only beside a fault
+    if problem is None or faults:
+        raise faults.error()
     return problem

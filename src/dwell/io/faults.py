@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable
 from typing import NoReturn, ParamSpec, TypeAlias, TypeVar
 
@@ -14,8 +13,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Step: TypeAlias = str | int
 
-LAST_STEP = re.compile(r"(\.[^.\[]*|\[[^\[]*)\Z")
-
 
 def dotted(steps: Iterable[Step]) -> str:
     """Return ``links[0].from`` for ("links", 0, "from")."""
@@ -24,7 +21,8 @@ def dotted(steps: Iterable[Step]) -> str:
         if isinstance(step, int):
             path += f"[{step}]"
         else:
-            path += f".{step}" if path else step
+            key = step or "''"
+            path += f".{key}" if path else key
     return path
 
 
@@ -40,8 +38,9 @@ class Faults:
     def __init__(self, source: str | None = None) -> None:
         self.source = source
         self.lines: dict[str, int] = {}
-        self._faults: list[Fault] = []
-        self._kinds: set[type[ProblemError]] = set()
+        # A mapping keeps their order and finds one again, however many an alias multiplies.
+        self._faults: dict[Fault, type[ProblemError]] = {}
+        self._paths: set[str] = set()
 
     def add(
         self,
@@ -53,9 +52,8 @@ class Faults:
     ) -> None:
         """Record a fault at a path; its line is looked up where it is not given."""
         fault = Fault(path, message, self.line(path) if line is None else line)
-        if fault not in self._faults:
-            self._faults.append(fault)
-            self._kinds.add(kind)
+        self._faults.setdefault(fault, kind)
+        self._paths.add(path)
 
     def attempt(
         self, path: str, make: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs
@@ -77,29 +75,27 @@ class Faults:
     def line(self, path: str) -> int | None:
         """Line of a path, or of what is nearest around it."""
         while path and path not in self.lines:
-            shorter = LAST_STEP.sub("", path)
-            path = shorter if shorter != path else ""
+            path = path[: max(path.rfind("."), path.rfind("["), 0)]
         return self.lines.get(path)
 
     def at(self, path: str) -> bool:
         """Whether there is a fault at exactly this path."""
-        return any(fault.path == path for fault in self._faults)
+        return path in self._paths
 
     def touches(self, path: str) -> bool:
         """Whether there is a fault at this path, around it or beneath it."""
-        return any(_around(fault.path, path) or _around(path, fault.path) for fault in self._faults)
+        return any(_around(known, path) or _around(path, known) for known in self._paths)
 
     def refuse(self, path: str, message: str) -> NoReturn:
         """Raise this one fault, whatever else there is: it makes the rest void."""
         raise ProblemError([Fault(path, message, self.line(path))], self.source)
 
-    def raise_any(self) -> None:
-        """Raise every fault recorded so far in one error, if there is one."""
-        if not self._faults:
-            return
-        kind = TraceError if self._kinds == {TraceError} else ProblemError
+    def error(self) -> ProblemError:
+        """Return one error with every fault; a TraceError where only traces are at fault."""
+        kind = TraceError if set(self._faults.values()) == {TraceError} else ProblemError
         ordered = sorted(self._faults, key=lambda fault: fault.line or 0)
-        raise kind([Fault(_plain(f.path), _plain(f.message), f.line) for f in ordered], self.source)
+        shown = [Fault(_plain(f.path), _plain(f.message), f.line) for f in ordered]
+        return kind(shown, self.source)
 
 
 def _plain(text: str) -> str:

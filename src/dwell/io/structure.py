@@ -61,8 +61,7 @@ def read_structure(document: object, faults: Faults) -> CellEntry:
     if not isinstance(document, Mapping):
         has = as_read(document)
         faults.refuse("", f"a cell file is a mapping that begins with `dwell: 1`; this is {has}")
-    values = _plain(document, (), faults)
-    assert isinstance(values, dict)  # noqa: S101 - a copy of the mapping
+    values = _plain_mapping(document, (), faults)
     _check_version(values, faults)
     known = faults.at
     while True:
@@ -96,28 +95,35 @@ def _check_version(values: dict[str, object], faults: Faults) -> None:
     faults.add("dwell", f"{as_read(version)} is not allowed; write `dwell: {VERSION}`")
 
 
+def _plain_mapping(
+    document: Mapping[Any, object], steps: tuple[Step, ...], faults: Faults
+) -> dict[str, object]:
+    """Return a deep copy in dicts and lists, which can be blanked; what is no document is None."""
+    values: dict[str, object] = {}
+    for key, item in document.items():
+        path = (*steps, str(key))
+        if isinstance(key, str) and not _is_torn(key):
+            values[key] = _plain(item, path, faults)
+        else:
+            faults.add(dotted(path), f"the key {as_read(key)} is not a text")
+    return values
+
+
 def _plain(value: object, steps: tuple[Step, ...], faults: Faults) -> object:
-    """Return a deep copy in dicts and lists that can be blanked; nothing in it is empty."""
+    path = dotted(steps)
     if len(steps) > MAX_DEPTH:
-        faults.add(dotted(steps), f"nested deeper than {MAX_DEPTH} levels")
+        faults.add(path, f"nested deeper than {MAX_DEPTH} levels")
         return None
     if isinstance(value, Mapping):
-        copy: dict[str, object] = {}
-        for key, item in value.items():
-            path = (*steps, str(key))
-            if not isinstance(key, str) or _is_torn(key):
-                faults.add(dotted(path), f"the key {as_read(key)} is not a text")
-                continue
-            copy[key] = _plain(item, path, faults)
-        return copy
+        return _plain_mapping(value, steps, faults)
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [_plain(item, (*steps, i), faults) for i, item in enumerate(value)]
     if isinstance(value, str) and _is_torn(value):
-        faults.add(dotted(steps), f"{as_read(value)} holds half of a character; remove it")
+        faults.add(path, f"{as_read(value)} holds half of a character; remove it")
         return None
-    if value is None and not faults.at(dotted(steps)):
-        key = f"the key {steps[-1]!r}" if isinstance(steps[-1], str) else "the item"
-        faults.add(dotted(steps), f"nothing is given; give a value, or remove {key}")
+    if value is None and not faults.at(path):
+        what = f"the key {steps[-1]!r}" if isinstance(steps[-1], str) else "the item"
+        faults.add(path, f"nothing is given; give a value, or remove {what}")
     return value
 
 

@@ -17,13 +17,13 @@ from dwell.kernels.cycles import (
     free_worker,
     hand_over,
     hop_of,
+    job_key,
     note_ready,
     release,
 )
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
     ARRIVAL,
-    ARRIVED,
     BASE,
     BUSY,
     CELL_MASK,
@@ -43,7 +43,6 @@ from dwell.kernels.layout import (
     CYCLE_SHIFT,
     DOWN,
     FINISHED,
-    FLOW_LOCAL,
     GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
@@ -52,8 +51,7 @@ from dwell.kernels.layout import (
     ITEM_MASK,
     KIND_SHIFT,
     LIVE,
-    LOCAL,
-    MARGIN,
+    MISSING,
     N_CELL,
     N_CHANGE,
     N_CYCLES,
@@ -86,12 +84,10 @@ from dwell.kernels.layout import (
     OUT_0,
     PAUSE,
     PAUSED,
-    RANK,
     READY_AT,
     RELEASE,
     RESTART,
     RETRY,
-    RING,
     SERVER,
     SITE,
     SITE_CELL,
@@ -99,7 +95,7 @@ from dwell.kernels.layout import (
     START,
     START_NS,
     STRESS,
-    STRIDE,
+    TAKEN,
     TASK_0,
     VIRTUAL,
     WAITING,
@@ -112,54 +108,12 @@ from dwell.kernels.layout import (
     Tables,
 )
 from dwell.kernels.links import lose, send, slot_row
-from dwell.kernels.nodes import admit, job_row, leave, mark, set_speed, tick
+from dwell.kernels.nodes import admit, job_row, key_row, leave, mark, set_speed, tick
 
 __all__ = ["advance"]
 
 # More inputs than any task has: a join that can never be complete.
-NEVER = -(1 << 30)
-
-
-@phase
-def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
-    """Write busy and own core-nanoseconds of every node, up to now."""
-    for server in range(s.servers.shape[0]):
-        if s.servers[server, IS_CPU] == 0:
-            continue
-        tick(s, server, now)
-        node = s.servers[server, NODE_OF]
-        out[cell, row, 0, node] = float(s.servers[server, BUSY])
-        own = s.own[cell, node]
-        base = s.servers[server, BASE]
-        for i in range(s.servers[server, N_RUN]):
-            key = s.run_key[base + i]
-            if (key >> CELL_SHIFT) & CELL_MASK == cell:
-                cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-                local = s.tasks[key & ITEM_MASK, LOCAL]
-                site = s.jobs[job_row(s, cell, cycle, local), SITE]
-                left = s.run_v[base + i] - s.servers_f[server, VIRTUAL]
-                own += s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
-        out[cell, row, 1, node] = own
-
-
-@phase
-def _announce_close(s: Tables, cell: int) -> None:
-    boundary = s.cells[cell, CLOSE_CYCLE]
-    if s.cells[cell, CLOSE_PENDING] != 0 or boundary > s.cells[cell, N_CYCLES]:
-        return
-    s.cells[cell, CLOSE_PENDING] = 1
-    t = s.release_ns[cell, boundary] + s.cells[cell, GRACE_NS]
-    push_event(s.clock, s.event_t, s.event_key, t, (CLOSE << KIND_SHIFT) | (cell << CELL_SHIFT))
-
-
-@phase
-def _close(s: Tables, cell: int, now: int) -> None:
-    """Close a window; the next one follows without a gap unless the caller says otherwise."""
-    _snapshot(s, s.closed, cell, s.cells[cell, WINDOW], now)
-    s.cells[cell, CLOSE_PENDING] = 0
-    s.cells[cell, WINDOW] += 1
-    s.cells[cell, WINDOW_FIRST] = s.cells[cell, CLOSE_CYCLE]
-    s.cells[cell, CLOSE_CYCLE] += s.cells[cell, WINDOW_CYCLES]
+NEVER = 1 << 30
 
 
 @phase
@@ -168,7 +122,7 @@ def _progress(s: Tables, server: int, at: int) -> float:
     key = s.run_key[s.servers[server, BASE] + at]
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    site = s.jobs[job_row(s, cell, cycle, s.tasks[key & ITEM_MASK, LOCAL]), SITE]
+    site = s.jobs[job_row(s, cell, cycle, key & ITEM_MASK), SITE]
     left = s.run_v[s.servers[server, BASE] + at] - s.servers_f[server, VIRTUAL]
     received: float = s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
     return received
@@ -221,7 +175,7 @@ def _close(s: Tables, cell: int, now: int) -> None:
 def _lose_key(s: Tables, key: int, now: int) -> None:
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    local = s.tasks[key & ITEM_MASK, LOCAL]
+    local = key & ITEM_MASK
     drop_job(s, cell, cycle, local, job_row(s, cell, cycle, local), NODE_DOWN, now)
 
 
@@ -235,7 +189,7 @@ def _crash(s: Tables, server: int, now: int) -> None:
         if s.servers[server, IS_CPU] != 0:
             s.own[cell, s.servers[server, NODE_OF]] += _progress(s, server, 0)
         _lose_key(s, key, now)
-        leave(s, server, 0, now)
+        leave(s, server, s.jobs[key_row(s, key), SITE], 0, now)
     for i in range(s.servers[server, N_WAIT]):
         _lose_key(s, s.wait_key[base + i], now)
     s.servers[server, N_WAIT] = 0
@@ -247,14 +201,14 @@ def _lose_joins(s: Tables, node: int) -> None:
     for slot in range(s.slots.shape[0]):
         if s.slots[slot, LIVE] == 0:
             continue
-        cell = slot // s.clock[RING]
-        first = s.cells[cell, TASK_0]
-        for task in range(first, first + s.cells[cell, N_TASKS]):
-            row = slot * s.clock[STRIDE] + s.tasks[task, LOCAL]
-            partial = 0 < s.jobs[row, ARRIVED] < s.tasks[task, N_IN]
+        cell = slot // s.ring
+        for local in range(s.cells[cell, N_TASKS]):
+            row = slot * s.stride + local
+            inputs = s.tasks[s.cells[cell, TASK_0] + local, N_IN]
+            partial = 0 < s.jobs[row, MISSING] < inputs
             if partial and s.sites[s.jobs[row, SITE], NODE] == node:
                 lose(s, cell, s.slots[slot, CYCLE], NODE_DOWN)
-                s.jobs[row, ARRIVED] = NEVER
+                s.jobs[row, MISSING] = NEVER
 
 
 @phase
@@ -316,22 +270,23 @@ def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
 
 
 @phase
-def _completion(s: Tables, cell: int, cycle: int, task: int, key: int, now: int) -> None:
+def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int) -> None:
     """Complete a job, unless its announcement has gone stale."""
-    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    row = job_row(s, cell, cycle, local)
     site = index(s.jobs[row, SITE])
     server = index(s.sites[site, SERVER])
     if s.servers[server, NEXT_KEY] != key or s.servers[server, NEXT_T] != now:
         return
-    complete(s, server, cell, cycle, row, now)
-    waiting = free_worker(s, cell, task, site)
-    if waiting >= 0:
-        _admit(s, cell, waiting, task, now)
+    complete(s, server, site, cell, cycle, local, row, now)
+    free_worker(s, cell, local, site)
+    task = index(s.cells[cell, TASK_0] + local)
     n_out = s.tasks[task, N_OUT]
     if n_out == 0:
         finish(s, cell, cycle, row, now)
         return
     s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
+    if n_out > 1:
+        s.slots[slot_row(s, cell, cycle), LIVE] += n_out - 1
     first = s.tasks[task, OUT_0]
     for i in range(first, first + n_out):
         flow = s.out_flows[index(i)]
@@ -343,13 +298,12 @@ def _completion(s: Tables, cell: int, cycle: int, task: int, key: int, now: int)
 
 
 @phase
-def _admit(s: Tables, cell: int, cycle: int, task: int, now: int) -> None:
+def _admit(s: Tables, cell: int, cycle: int, local: int, now: int) -> None:
     """A worker takes a job to its server."""
-    row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
+    row = job_row(s, cell, cycle, local)
     site = index(s.jobs[row, SITE])
-    key = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | task
-    rank = s.tasks[task, RANK]
-    admit(s, index(s.sites[site, SERVER]), key, row, rank, s.exec_ns[site, cycle], now)
+    key = job_key(cell, cycle, local)
+    admit(s, site, key, row, s.exec_ns[site, cycle], now)
 
 
 @phase
@@ -359,9 +313,9 @@ def _settle(s: Tables, now: int) -> None:
         key = s.ready[i]
         cell = (key >> CELL_SHIFT) & CELL_MASK
         cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-        task = key & ITEM_MASK
-        if become_ready(s, cell, cycle, task, now):
-            _admit(s, cell, cycle, task, now)
+        local = key & ITEM_MASK
+        if key & TAKEN or become_ready(s, cell, cycle, local, now):
+            _admit(s, cell, cycle, local, now)
     s.clock[N_READY] = 0
 
 
@@ -369,24 +323,23 @@ def _settle(s: Tables, now: int) -> None:
 def _retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Send a message again after a lost attempt."""
     slot = slot_row(s, cell, cycle)
-    s.slots[slot, LIVE] -= 1
-    attempt = s.attempts[slot, s.flows[index(flow), FLOW_LOCAL]] + 1
+    attempt = s.attempts[slot, flow] + 1
     send(s, cell, cycle, flow, hop_of(s, cell, cycle, flow), attempt, now)
 
 
 @phase
-def _restart(s: Tables, cell: int, site: int, now: int) -> None:
+def _restart(s: Tables, cell: int, site: int) -> None:
     """Workers of a restarted node take what has come meanwhile."""
-    task = s.sites[site, SITE_TASK]
-    while s.sites[site, WAITING] > 0 and s.sites[site, IDLE] > 0:
-        s.sites[site, IDLE] -= 1
-        _admit(s, cell, free_worker(s, cell, task, site), task, now)
+    waiting = min(s.sites[site, WAITING], s.sites[site, IDLE])
+    s.sites[site, IDLE] -= waiting
+    for _ in range(waiting):
+        free_worker(s, cell, s.sites[site, SITE_TASK], site)
 
 
 @phase
 def _room(s: Tables) -> int:
     """Whether the next event finds room for all it may add; otherwise what must grow."""
-    if s.clock[N_EVENTS] + s.clock[MARGIN] > s.event_t.size:
+    if s.clock[N_EVENTS] + s.margin > s.event_t.size:
         return GROW_EVENTS
     key = s.event_key[0]
     if key >> KIND_SHIFT == RELEASE:
@@ -406,7 +359,6 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
     elif kind == RELEASE:
         _release(s, cell, cycle, now)
     elif kind == START:
-        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
         note_ready(s, cell, cycle, item)
     elif kind == RETRY:
         _retry(s, cell, cycle, item, now)
@@ -414,11 +366,14 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         _change(s, now)
         _announce_change(s)
     elif kind == RESTART:
-        _restart(s, cell, item, now)
+        _restart(s, cell, item)
 
 
 @kernel
 def advance(
+    ring: int,
+    stride: int,
+    margin: int,
     tasks: Ints,
     flows: Ints,
     out_flows: Ints,
@@ -477,6 +432,9 @@ def advance(
         or the ring of cycles in flight, and call again; nothing was lost.
     """
     s = Tables(
+        ring,
+        stride,
+        margin,
         fixed_columns(tasks, N_TASK),
         fixed_columns(flows, N_FLOW),
         out_flows,

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dwell.kernels.compiled import index, phase
 from dwell.kernels.heaps import push_event
 from dwell.kernels.layout import (
-    ARRIVED,
-    BASE,
+    CANDIDATE,
     CANDIDATE_0,
     CELL_SHIFT,
     COMPUTE,
@@ -17,19 +16,18 @@ from dwell.kernels.layout import (
     DONE,
     DOWN,
     FAIR,
-    FLOW_LOCAL,
+    FLOW_0,
     HEAD,
     IDLE,
     IN_FLIGHT,
     IS_CPU,
-    ITEM_MASK,
     KIND_SHIFT,
     LIVE,
-    LOCAL,
     LOG_END,
     LOG_READY,
     LOG_START,
     LOST,
+    MISSING,
     N_CYCLES,
     N_DIRTY,
     N_IN,
@@ -39,7 +37,6 @@ from dwell.kernels.layout import (
     NEED,
     NETWORK,
     NEXT,
-    NEXT_KEY,
     NODE,
     NODE_DOWN,
     OFFSET_NS,
@@ -55,6 +52,7 @@ from dwell.kernels.layout import (
     START,
     STARTED,
     TAIL,
+    TAKEN,
     TARGET,
     TASK_0,
     WAITING,
@@ -74,14 +72,16 @@ __all__ = [
     "free_worker",
     "hand_over",
     "hop_of",
+    "job_key",
     "note_ready",
     "release",
 ]
 
 
 @phase
-def _job_key(cell: int, cycle: int, task: int) -> int:
-    return (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | task
+def job_key(cell: int, cycle: int, local: int) -> int:
+    """Pack the name of a job; `local` counts the tasks of its cell."""
+    return (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | local
 
 
 @phase
@@ -127,28 +127,26 @@ def _pop_input(s: Tables, cell: int, local: int, site: int) -> int:
 
 
 @phase
-def note_ready(s: Tables, cell: int, cycle: int, task: int) -> None:
+def note_ready(s: Tables, cell: int, cycle: int, local: int) -> None:
     """Remember that all inputs of a job are there; the event's end deals with it."""
-    s.ready[s.clock[N_READY]] = _job_key(cell, cycle, task)
+    s.ready[s.clock[N_READY]] = job_key(cell, cycle, local)
     s.clock[N_READY] += 1
 
 
 @phase
-def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> bool:
+def become_ready(s: Tables, cell: int, cycle: int, local: int, now: int) -> bool:
     """Let a ready job wait at its site, or lose it; True if an idle worker takes it at once."""
-    local = s.tasks[task, LOCAL]
     row = job_row(s, cell, cycle, local)
     s.jobs[row, READY] = now
     _log(s, cell, cycle, row, local, IN_FLIGHT, -1)
     site = index(s.jobs[row, SITE])
-    s.slots[slot_row(s, cell, cycle), LIVE] += 1
     if s.servers[index(s.sites[site, SERVER]), DOWN] != 0:
         drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
         return False
     if s.sites[site, IDLE] > 0 and now >= s.sites[site, READY_AT]:
         s.sites[site, IDLE] -= 1
         return True
-    depth = s.tasks[task, DEPTH]
+    depth = s.sites[site, DEPTH]
     if depth > 0 and s.sites[site, WAITING] >= depth:
         oldest = s.sites[site, HEAD]
         if cycle < oldest:
@@ -162,18 +160,19 @@ def become_ready(s: Tables, cell: int, cycle: int, task: int, now: int) -> bool:
 
 
 @phase
-def free_worker(s: Tables, cell: int, task: int, site: int) -> int:
-    """Let a worker that has become free take what waits; returns the cycle, or -1."""
+def free_worker(s: Tables, cell: int, local: int, site: int) -> None:
+    """Let a worker that has become free take what waits, or be idle."""
     if s.sites[site, WAITING] == 0:
         s.sites[site, IDLE] += 1
-        return -1
-    return _pop_input(s, cell, s.tasks[task, LOCAL], site)
+        return
+    cycle = _pop_input(s, cell, local, site)
+    s.ready[s.clock[N_READY]] = job_key(cell, cycle, local) | TAKEN
+    s.clock[N_READY] += 1
 
 
 @phase
-def drop_waiting(s: Tables, cell: int, task: int, site: int, now: int) -> None:
+def drop_waiting(s: Tables, cell: int, local: int, site: int, now: int) -> None:
     """Lose everything that waits at a site, because its node went down."""
-    local = s.tasks[task, LOCAL]
     while s.sites[site, WAITING] > 0:
         cycle = _pop_input(s, cell, local, site)
         row = job_row(s, cell, cycle, local)
@@ -183,9 +182,9 @@ def drop_waiting(s: Tables, cell: int, task: int, site: int, now: int) -> None:
 @phase
 def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Handle a message that reaches its node."""
-    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
-    row = job_row(s, cell, cycle, s.tasks[index(s.flows[index(flow), TARGET]), LOCAL])
+    row = job_row(s, cell, cycle, s.flows[_flow_row(s, cell, flow), TARGET])
     if s.servers[index(s.sites[index(s.jobs[row, SITE]), SERVER]), DOWN] != 0:
+        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
         lose(s, cell, cycle, NODE_DOWN)
         return
     hand_over(s, cell, cycle, flow, now)
@@ -195,6 +194,7 @@ def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
 def finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
     """A sink has completed; the last one completes the cycle."""
     slot = slot_row(s, cell, cycle)
+    s.slots[slot, LIVE] -= 1
     s.slots[slot, SINKS_LEFT] -= 1
     if s.slots[slot, SINKS_LEFT] == 0:
         s.outcome[cell, cycle] = DONE
@@ -204,76 +204,79 @@ def finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
 
 
 @phase
-def complete(s: Tables, server: int, cell: int, cycle: int, row: int, now: int) -> None:
+def complete(
+    s: Tables, server: int, site: int, cell: int, cycle: int, local: int, row: int, now: int
+) -> None:
     """The job of a server that finishes first has finished; its outputs are the caller's."""
-    local = s.tasks[s.run_key[index(s.servers[server, BASE])] & ITEM_MASK, LOCAL]
-    site = index(s.jobs[row, SITE])
-    leave(s, server, 0, now)
-    s.servers[server, NEXT_KEY] = -1
+    leave(s, server, site, 0, now)
     if s.servers[server, IS_CPU] != 0:
         work = s.sites[site, NEED] * float(s.exec_ns[site, cycle])
         s.own[cell, index(s.sites[site, NODE])] += work
     s.jobs[row, COMPUTE] += now - s.jobs[row, STARTED]
     _log(s, cell, cycle, row, local, DONE, now)
-    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+
+
+@phase
+def _flow_row(s: Tables, cell: int, flow: int) -> int:
+    return index(s.cells[cell, FLOW_0] + flow)
 
 
 @phase
 def hand_over(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Count an input in; the last one makes the job ready and names its critical path."""
-    task = s.flows[index(flow), TARGET]
-    row = job_row(s, cell, cycle, s.tasks[index(task), LOCAL])
-    s.jobs[row, ARRIVED] += 1
-    if s.jobs[row, ARRIVED] == s.tasks[index(task), N_IN]:
-        sender = job_row(s, cell, cycle, s.tasks[index(s.flows[index(flow), SOURCE]), LOCAL])
+    ends = _flow_row(s, cell, flow)
+    local = s.flows[ends, TARGET]
+    row = job_row(s, cell, cycle, local)
+    missing = s.jobs[row, MISSING] - 1
+    s.jobs[row, MISSING] = missing
+    if missing == 0:
+        sender = job_row(s, cell, cycle, s.flows[ends, SOURCE])
         s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
         s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
-        note_ready(s, cell, cycle, task)
+        note_ready(s, cell, cycle, local)
+    else:
+        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
 
 
 @phase
 def hop_of(s: Tables, cell: int, cycle: int, flow: int) -> int:
     """Hop that a flow takes in a cycle, -1 on the same node."""
-    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
-    return int(s.route[index(candidate), index(s.flows[index(flow), FLOW_LOCAL])])
-
-
-@phase
-def _open_slot(s: Tables, cell: int, cycle: int) -> None:
-    slot = slot_row(s, cell, cycle)
-    s.slots[slot, CYCLE] = cycle
-    s.slots[slot, LIVE] = 0
-    s.slots[slot, LOST] = 0
-    s.slots[slot, SINKS_LEFT] = s.cells[cell, N_SINKS]
-    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
-    for local in range(s.cells[cell, N_TASKS]):
-        row = job_row(s, cell, cycle, local)
-        s.jobs[row, ARRIVED] = 0
-        s.jobs[row, STARTED] = -1
-        s.jobs[row, SITE] = s.site_of[index(candidate), local]
+    return int(s.route[index(s.slots[slot_row(s, cell, cycle), CANDIDATE]), index(flow)])
 
 
 @phase
 def release(s: Tables, cell: int, cycle: int, now: int) -> None:
     """Release a cycle: its sources become ready, and the next release is announced."""
-    _open_slot(s, cell, cycle)
+    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
     first = s.cells[cell, TASK_0]
-    for task in range(first, first + s.cells[cell, N_TASKS]):
-        if s.tasks[task, N_IN] > 0:
+    sources = 0
+    for local in range(s.cells[cell, N_TASKS]):
+        task = index(first + local)
+        row = job_row(s, cell, cycle, local)
+        n_in = s.tasks[task, N_IN]
+        s.jobs[row, MISSING] = n_in
+        s.jobs[row, STARTED] = -1
+        s.jobs[row, SITE] = s.site_of[index(candidate), local]
+        if n_in > 0:
             continue
-        row = job_row(s, cell, cycle, s.tasks[task, LOCAL])
         s.jobs[row, COMPUTE] = 0
         s.jobs[row, NETWORK] = 0
+        sources += 1
         offset = s.tasks[task, OFFSET_NS]
         if offset == 0:
-            note_ready(s, cell, cycle, task)
+            note_ready(s, cell, cycle, local)
         else:
-            s.slots[slot_row(s, cell, cycle), LIVE] += 1
-            key = (START << KIND_SHIFT) | _job_key(cell, cycle, task)
+            key = (START << KIND_SHIFT) | job_key(cell, cycle, local)
             push_event(s.clock, s.event_t, s.event_key, now + offset, key)
+    slot = slot_row(s, cell, cycle)
+    s.slots[slot, CYCLE] = cycle
+    s.slots[slot, CANDIDATE] = candidate
+    s.slots[slot, LIVE] = sources
+    s.slots[slot, LOST] = 0
+    s.slots[slot, SINKS_LEFT] = s.cells[cell, N_SINKS]
     following = cycle + 1
     if following < s.cells[cell, N_CYCLES]:
-        key = (RELEASE << KIND_SHIFT) | _job_key(cell, following, 0)
+        key = (RELEASE << KIND_SHIFT) | job_key(cell, following, 0)
         t = s.release_ns[cell, following]
         push_event(s.clock, s.event_t, s.event_key, t, key)
 

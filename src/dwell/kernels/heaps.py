@@ -82,6 +82,8 @@ def push_running(run_v: Floats, run_key: Ints, base: int, n: int, v: float, key:
 @phase
 def pop_running(run_v: Floats, run_key: Ints, base: int, n: int, at: int) -> None:
     """Remove entry `at` (0 is the first to finish) from a heap of n running jobs."""
+    if at == n - 1:
+        return
     v = run_v[index(base + n - 1)]
     key = run_key[index(base + n - 1)]
     i = at
@@ -100,7 +102,9 @@ def pop_running(run_v: Floats, run_key: Ints, base: int, n: int, at: int) -> Non
         if right < n - 1:
             rv = run_v[index(base + right)]
             cv = run_v[index(base + child)]
-            if rv < cv or (rv == cv and run_key[index(base + right)] < run_key[index(base + child)]):
+            if rv < cv or (
+                rv == cv and run_key[index(base + right)] < run_key[index(base + child)]
+            ):
                 child = right
         cv = run_v[index(base + child)]
         if v < cv or (v == cv and key <= run_key[index(base + child)]):

@@ -19,11 +19,13 @@ Floats = NDArray[np.float64]
 COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, CLOSE, RELEASE = range(8)
 
 # An event key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is
-# a task, a flow, a site or nothing, according to the kind.
+# a task or a flow of the cell, a site, or nothing, according to the kind.
 ITEM_BITS, CYCLE_BITS, CELL_BITS = 14, 32, 13
 CYCLE_SHIFT = ITEM_BITS
 CELL_SHIFT = ITEM_BITS + CYCLE_BITS
 KIND_SHIFT = ITEM_BITS + CYCLE_BITS + CELL_BITS
+# Marks a job on the ready list that a worker has taken already; the kind's place is free there.
+TAKEN = 1 << KIND_SHIFT
 ITEM_MASK = (1 << ITEM_BITS) - 1
 CYCLE_MASK = (1 << CYCLE_BITS) - 1
 CELL_MASK = (1 << CELL_BITS) - 1
@@ -46,6 +48,7 @@ N_EVENTS, N_DIRTY, NEXT_CHANGE, PAUSE, CLOSED_CELL, RING, STRIDE, MARGIN, N_READ
 (
     TASK_0,
     N_TASKS,
+    FLOW_0,
     CANDIDATE_0,
     N_SINKS,
     N_CYCLES,
@@ -56,13 +59,13 @@ N_EVENTS, N_DIRTY, NEXT_CHANGE, PAUSE, CLOSED_CELL, RING, STRIDE, MARGIN, N_READ
     WINDOW_CYCLES,
     GRACE_NS,
     N_CELL,
-) = range(12)
+) = range(13)
 
 # tasks
-N_IN, N_OUT, OUT_0, DEPTH, RANK, OFFSET_NS, LOCAL, N_TASK = range(8)
+N_IN, N_OUT, OUT_0, OFFSET_NS, N_TASK = range(5)
 
 # flows
-SOURCE, TARGET, FLOW_LOCAL, N_FLOW = range(4)
+SOURCE, TARGET, N_FLOW = range(3)
 
 # sites
 (
@@ -78,8 +81,10 @@ SOURCE, TARGET, FLOW_LOCAL, N_FLOW = range(4)
     NEED,
     READY_AT,
     START_NS,
+    DEPTH,
+    RANK,
     N_SITE,
-) = range(13)
+) = range(15)
 
 # servers
 (
@@ -118,10 +123,12 @@ SEGMENT_RATE, SEGMENT_LOSS, N_SEGMENT_F = range(3)
 CHANGE_AT, CHANGE_NODE, CHANGE_STRESS, CHANGE_DOWN, N_CHANGE = range(5)
 
 # jobs in the ring
-READY, STARTED, COMPUTE, NETWORK, SITE, NEXT, ARRIVED, N_JOB = range(8)
+# MISSING counts the inputs that have not arrived.
+READY, STARTED, COMPUTE, NETWORK, SITE, NEXT, MISSING, N_JOB = range(8)
 
 # cycles in the ring
-CYCLE, LIVE, SINKS_LEFT, LOST, N_SLOT = range(5)
+# LIVE counts the jobs and messages of the cycle that are still under way.
+CYCLE, CANDIDATE, LIVE, SINKS_LEFT, LOST, N_SLOT = range(6)
 
 # job log
 LOG_READY, LOG_START, LOG_END, N_LOG = range(4)
@@ -134,6 +141,11 @@ class Tables(NamedTuple):
     Outputs: per cycle, per window, and per job where a log is kept.
     """
 
+    # scalars: cycles of a cell that may be in flight (a power of two), jobs of a cycle, and the
+    # events that one event may add
+    ring: int
+    stride: int
+    margin: int
     # fixed
     tasks: Ints  # (tasks, N_TASK)
     flows: Ints  # (flows, N_FLOW)

@@ -13,7 +13,6 @@ from dwell.kernels.layout import (
     CELL_SHIFT,
     CYCLE_SHIFT,
     DROPPED,
-    FLOW_LOCAL,
     FREE,
     IN_FLIGHT,
     IN_ORDER,
@@ -25,7 +24,6 @@ from dwell.kernels.layout import (
     PAYLOAD,
     RETRANSMIT_NS,
     RETRY,
-    RING,
     SEGMENT,
     SEGMENT_AT,
     SEGMENT_DOWN,
@@ -43,7 +41,7 @@ __all__ = ["lose", "send", "slot_row"]
 @phase
 def slot_row(s: Tables, cell: int, cycle: int) -> int:
     """Row of a cycle in the ring of the cycles in flight."""
-    ring = s.clock[RING]
+    ring = s.ring
     return index(cell * ring + (cycle & (ring - 1)))
 
 
@@ -84,6 +82,7 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     link = index(s.hops[index(hop), LINK])
     start = _begin(s, link, now)
     if start < 0:
+        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
         lose(s, cell, cycle, DROPPED if start == -1 else IN_FLIGHT)
         return
     segment = index(s.links[link, SEGMENT])
@@ -99,10 +98,10 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     if loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss:
         timeout = s.links[link, RETRANSMIT_NS]
         if timeout < 0:
+            s.slots[slot, LIVE] -= 1
             lose(s, cell, cycle, DROPPED)
             return
-        s.attempts[slot, s.flows[index(flow), FLOW_LOCAL]] = attempt
-        s.slots[slot, LIVE] += 1
+        s.attempts[slot, flow] = attempt
         push_event(s.clock, s.event_t, s.event_key, sent + timeout, (RETRY << KIND_SHIFT) | name)
         return
     delay = s.delay_ns[index(hop), cycle]
@@ -117,5 +116,4 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     if s.links[link, IN_ORDER] != 0:
         arrival = max(arrival, s.links[link, LAST_ARRIVAL])
         s.links[link, LAST_ARRIVAL] = arrival
-    s.slots[slot, LIVE] += 1
     push_event(s.clock, s.event_t, s.event_key, arrival, (ARRIVAL << KIND_SHIFT) | name)

@@ -32,8 +32,8 @@ from dwell.kernels.layout import (
     FIFO,
     ITEM_MASK,
     LAST,
-    LOCAL,
     N_DIRTY,
+    N_READY,
     N_RUN,
     N_WAIT,
     NEED,
@@ -42,13 +42,12 @@ from dwell.kernels.layout import (
     PRIORITY,
     RANK,
     READY,
-    RING,
     SCHEDULER,
+    SERVER,
     SITE,
     SPEED,
     STARTED,
     STRESS,
-    STRIDE,
     USED,
     VIRTUAL,
     Tables,
@@ -63,8 +62,8 @@ SLACK = 1e-6
 @phase
 def job_row(s: Tables, cell: int, cycle: int, local: int) -> int:
     """Row of a job in the ring of the cycles in flight."""
-    ring = s.clock[RING]
-    return index((cell * ring + (cycle & (ring - 1))) * s.clock[STRIDE] + local)
+    ring = s.ring
+    return index((cell * ring + (cycle & (ring - 1))) * s.stride + local)
 
 
 @phase
@@ -72,7 +71,7 @@ def key_row(s: Tables, key: int) -> int:
     """Row of the job that a key names."""
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    return job_row(s, cell, cycle, s.tasks[key & ITEM_MASK, LOCAL])
+    return job_row(s, cell, cycle, key & ITEM_MASK)
 
 
 @phase
@@ -112,7 +111,7 @@ def set_speed(s: Tables, server: int) -> None:
 
 
 @phase
-def _start(s: Tables, server: int, key: int, row: int, left: float, now: int) -> None:
+def _start(s: Tables, server: int, site: int, key: int, row: int, left: float, now: int) -> None:
     n = s.servers[server, N_RUN]
     if n == 0:
         s.servers_f[server, VIRTUAL] = 0.0
@@ -121,27 +120,29 @@ def _start(s: Tables, server: int, key: int, row: int, left: float, now: int) ->
     finish = s.servers_f[server, VIRTUAL] + left
     push_running(s.run_v, s.run_key, s.servers[server, BASE], n, finish, key)
     s.servers[server, N_RUN] = n + 1
-    s.servers[server, USED] += s.sites[index(s.jobs[row, SITE]), NEED]
+    s.servers[server, USED] += s.sites[site, NEED]
 
 
 @phase
-def admit(s: Tables, server: int, key: int, row: int, rank: int, work: int, now: int) -> None:
+def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None:
     """Make a job that a worker has taken runnable."""
-    mark(s, server)
-    if s.servers[server, SCHEDULER] == FAIR:
-        tick(s, server, now)
-        _start(s, server, key, row, float(work), now)
-        set_speed(s, server)
-        return
-    if s.servers[server, SCHEDULER] == FIFO:
-        rank = 0
+    server = index(s.sites[site, SERVER])
+    scheduler = s.servers[server, SCHEDULER]
     n = s.servers[server, N_WAIT]
-    need = s.sites[index(s.jobs[row, SITE]), NEED]
-    if n == 0 and s.servers[server, USED] + need <= s.servers[server, CORES]:
-        # Nobody else waits, and jobs are admitted in the order of their readiness.
+    need = s.sites[site, NEED]
+    # Where nobody else can want the cores now, the job needs no queue.
+    alone = n == 0 and s.clock[N_READY] == 1
+    fits = alone and s.servers[server, USED] + need <= s.servers[server, CORES]
+    if scheduler == FAIR or fits:
         tick(s, server, now)
-        _start(s, server, key, row, float(work), now)
+        _start(s, server, site, key, row, float(work), now)
+        if scheduler == FAIR:
+            set_speed(s, server)
+        if s.servers[server, DIRTY] == 0:
+            schedule(s, server, now)
         return
+    mark(s, server)
+    rank = 0 if scheduler == FIFO else s.sites[site, RANK]
     base = s.servers[server, BASE]
     ready = s.jobs[row, READY]
     w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
@@ -158,7 +159,7 @@ def _preempt(s: Tables, server: int) -> bool:
     for i in range(s.servers[server, N_RUN]):
         other = s.run_key[base + i]
         row = key_row(s, other)
-        other_rank = s.tasks[other & ITEM_MASK, RANK]
+        other_rank = s.sites[index(s.jobs[row, SITE]), RANK]
         other_ready = s.jobs[row, READY]
         if other_rank > rank or (
             other_rank == rank and (other_ready > ready or (other_ready == ready and other > key))
@@ -189,28 +190,30 @@ def dispatch(s: Tables, server: int, now: int) -> None:
     while s.servers[server, N_WAIT] > 0:
         key = s.wait_key[base]
         row = key_row(s, key)
-        need = s.sites[index(s.jobs[row, SITE]), NEED]
+        site = index(s.jobs[row, SITE])
+        need = s.sites[site, NEED]
         if s.servers[server, USED] + need <= s.servers[server, CORES]:
             left = s.wait_left[base]
             n = s.servers[server, N_WAIT]
             pop_waiting(s.wait_rank, s.wait_ready, s.wait_key, s.wait_left, base, n)
             s.servers[server, N_WAIT] = n - 1
-            _start(s, server, key, row, left, now)
+            _start(s, server, site, key, row, left, now)
         elif not preemptive or not _preempt(s, server):
             break
 
 
 @phase
-def leave(s: Tables, server: int, at: int, now: int) -> None:
+def leave(s: Tables, server: int, site: int, at: int, now: int) -> None:
     """Take running entry `at` off a server."""
-    mark(s, server)
     tick(s, server, now)
     base = s.servers[server, BASE]
     n = s.servers[server, N_RUN]
-    row = key_row(s, s.run_key[index(base + at)])
     pop_running(s.run_v, s.run_key, base, n, at)
     s.servers[server, N_RUN] = n - 1
-    s.servers[server, USED] -= s.sites[index(s.jobs[row, SITE]), NEED]
+    s.servers[server, USED] -= s.sites[site, NEED]
+    s.servers[server, NEXT_KEY] = -1
+    if n > 1 or s.servers[server, N_WAIT] > 0:
+        mark(s, server)
     if s.servers[server, SCHEDULER] == FAIR:
         set_speed(s, server)
 

@@ -90,7 +90,7 @@ def _names(parts: Parts) -> Iterator[Fault]:
         for name in names:
             if NAME.fullmatch(name) is None or len(name) > LONGEST_NAME:
                 yield Fault(
-                    f"{section}.{name}",
+                    f"{section}.{name or repr(name)}",
                     f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, "
                     f"a letter, a digit or _ first, at most {LONGEST_NAME} characters",
                 )

@@ -44,20 +44,19 @@ class Arrays:
     def grow_ring(self) -> None:
         """Double the number of cycles that may be in flight, and move those that are."""
         t = self.tables
-        ring = int(t.clock[k.RING])
+        ring = t.ring
         cells = len(t.cells)
         jobs = np.zeros((2 * len(t.jobs), k.N_JOB), np.int64)
         slots = np.zeros((2 * len(t.slots), k.N_SLOT), np.int64)
         attempts = np.zeros((2 * len(t.slots), t.attempts.shape[1]), np.int64)
-        stride = int(t.clock[k.STRIDE])
+        stride = t.stride
         old = np.arange(cells * ring)
         cycle = t.slots[:, k.CYCLE]
         new = (old // ring) * 2 * ring + (cycle & (2 * ring - 1))
         slots[new] = t.slots
         attempts[new] = t.attempts
         jobs.reshape(-1, stride, k.N_JOB)[new] = t.jobs.reshape(-1, stride, k.N_JOB)
-        t.clock[k.RING] = 2 * ring
-        self.tables = t._replace(jobs=jobs, slots=slots, attempts=attempts)
+        self.tables = t._replace(ring=2 * ring, jobs=jobs, slots=slots, attempts=attempts)
 
 
 def lay_out(
@@ -145,7 +144,7 @@ class _Layout:
         names = list(pipeline.tasks)
         row = [0] * k.N_CELL
         row[k.TASK_0], row[k.N_TASKS] = task_0, len(names)
-        row[k.CANDIDATE_0] = len(self.site_of)
+        row[k.FLOW_0], row[k.CANDIDATE_0] = flow_0, len(self.site_of)
         row[k.N_SINKS] = sum(not pipeline.outputs(name) for name in names)
         row[k.N_CYCLES] = real.cycles
         row[k.CLOSE_CYCLE] = row[k.WINDOW_CYCLES] = problem.window_cycles
@@ -153,14 +152,13 @@ class _Layout:
         self.cell_rows.append(row)
         # Flows are ordered by target, so that arrivals at one instant order by task.
         flows = sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
-        flow_row = {(flow.source, flow.target): flow_0 + i for i, flow in enumerate(flows)}
-        for i, flow in enumerate(flows):
-            ends = names.index(flow.source), names.index(flow.target)
-            self.flows.append([task_0 + ends[0], task_0 + ends[1], i])
+        flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
+        for flow in flows:
+            self.flows.append([names.index(flow.source), names.index(flow.target)])
         for name in names:
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
-            self._add_task(pipeline, pipeline.tasks[name], names.index(name), outputs)
-        site_row = self._add_sites(index, problem, real, task_0, names)
+            self._add_task(pipeline, pipeline.tasks[name], outputs)
+        site_row = self._add_sites(index, problem, real, names)
         self._add_links(problem, real, hop_0)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         for placement in problem.candidates.values():
@@ -178,18 +176,16 @@ class _Layout:
                 node = self.node_row[self._node_key(index, change.node)]
                 self.changes.append((change.at_ns, node, change.threads, int(change.down)))
 
-    def _add_task(self, pipeline: Pipeline, task: Task, local: int, outputs: list[int]) -> None:
+    def _add_task(self, pipeline: Pipeline, task: Task, outputs: list[int]) -> None:
         row = [0] * k.N_TASK
         row[k.N_IN], row[k.N_OUT] = len(pipeline.inputs(task.name)), len(outputs)
-        row[k.OUT_0], row[k.DEPTH], row[k.LOCAL] = len(self.out_flows), task.depth, local
-        # A smaller rank goes first.
-        row[k.RANK] = -task.priority
+        row[k.OUT_0] = len(self.out_flows)
         row[k.OFFSET_NS] = round(task.offset_ms * 1e6)
         self.tasks.append(row)
         self.out_flows += outputs
 
     def _add_sites(
-        self, index: int, problem: Problem, real: Realisation, task_0: int, names: list[str]
+        self, index: int, problem: Problem, real: Realisation, names: list[str]
     ) -> dict[tuple[str, str], int]:
         rows: dict[tuple[str, str], int] = {}
         for task_name, node_name in real.sites:
@@ -200,7 +196,9 @@ class _Layout:
             fair = self.servers[server][k.SCHEDULER] == k.FAIR
             cores = self.servers[server][k.CORES]
             row = [0] * k.N_SITE
-            row[k.SITE_CELL], row[k.SITE_TASK] = index, task_0 + names.index(task_name)
+            row[k.SITE_CELL], row[k.SITE_TASK] = index, names.index(task_name)
+            # A smaller rank goes first.
+            row[k.DEPTH], row[k.RANK] = task.depth, -task.priority
             row[k.SERVER], row[k.NODE] = server, self.node_row[node]
             row[k.WORKERS] = row[k.IDLE] = execution.workers
             if execution.accelerator is not None:
@@ -267,11 +265,14 @@ class _Layout:
             for layer, row in rows.items():
                 layer_rows[hop, layer] = row
         clock = np.zeros(k.N_CLOCK, np.int64)
-        clock[k.RING], clock[k.STRIDE], clock[k.MARGIN] = RING_START, self.max_tasks, margin
+
         changes = sorted(self.changes, key=lambda change: change[0])
         speed = np.zeros((len(servers), k.N_SERVER_F))
         speed[:, k.SPEED] = 1.0
         tables = k.Tables(
+            ring=RING_START,
+            stride=self.max_tasks,
+            margin=margin,
             tasks=_table(self.tasks, k.N_TASK),
             flows=_table(self.flows, k.N_FLOW),
             out_flows=np.array(self.out_flows, np.int64),
@@ -336,7 +337,7 @@ def _announce_first(tables: k.Tables) -> None:
 
 
 def _table(rows: Sequence[Sequence[int]], columns: int) -> k.Ints:
-    return np.array(rows, np.int64).reshape(-1, columns)
+    return np.array(rows, np.int64).reshape(len(rows), columns)
 
 
 def _stack(parts: Sequence[k.Ints], columns: int) -> k.Ints:

@@ -99,7 +99,7 @@ def make_tables(played: Played) -> dict[str, Callable[[], pl.DataFrame]]:
 
     tables = {
         "cycles": lambda: _cycles(played),
-        "windows": lambda: _windows(played, columns()[0] if static else _seen(controller)),
+        "windows": lambda: _windows(played, columns()[0] if static else _seen(played)),
         "decisions": lambda: (
             _static_decisions(played, columns()[1]) if static else _decisions(controller)
         ),
@@ -164,9 +164,11 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
     )
 
 
-def _seen(controller: Controller) -> dict[str, Floats]:
+def _seen(played: Played) -> dict[str, Floats]:
+    controller = played.controller
     log = controller.log
-    used = np.array(log.utilisation, np.float64).reshape(-1, len(controller.nodes))
+    window = played.closed_windows()
+    used = controller.utilisation(window)
     return {
         "l95_ms": np.array(log.seen_l95_ms, np.float64),
         "violation_rate": np.array(log.seen_violation_rate, np.float64),

@@ -1,0 +1,298 @@
+"""Figures of a comparison: small multiples, one panel a scenario, one row a policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from dwell.report.palette import INK, MUTED, PAPER, PARTS, Palette
+from dwell.report.svg import inline, new_figure
+from dwell.report.wording import Measure, shown_policy, shown_scenario, write_number
+from dwell.study import AIM, Comparison
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["distributions", "intervals", "latency_split", "node_use", "placement_shares"]
+
+Draw: TypeAlias = "Callable[[Axes, str], None]"
+
+PANELS_A_ROW = 5
+ROW_INCHES = 0.235
+NODE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+# Where a ratio of values asks for a logarithmic axis.
+WIDE = 6.0
+LOG_TICKS = (1, 2, 5)
+
+
+def intervals(
+    comparison: Comparison,
+    palette: Palette,
+    measure: Measure,
+    *,
+    limit: float,
+    limit_name: str,
+) -> str:
+    """One column of every policy and scenario: mean over seeds, and its interval as a bar.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    palette : Palette
+    measure : Measure
+    limit : float
+        A line to be under, in the column's unit.
+    limit_name : str
+    """
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    policies = comparison.policies
+    found = {
+        (scenario, policy): comparison.interval(scenario, policy, measure.column)
+        for scenario in comparison.scenarios
+        for policy in policies
+    }
+    shown = [over.value * measure.factor for over in found.values()]
+    positive = [value for value in [*shown, limit * measure.factor] if 0 < value < math.inf]
+    low, high = min(positive), max(positive)
+    wide = high > WIDE * low
+    # Room below the smallest value, where zeros stand as open marks.
+    edge = low / 2.5 if wide else 0.0
+
+    def draw(ax: Axes, scenario: str) -> None:
+        for row, policy in enumerate(policies):
+            style = palette.policies[policy]
+            value, left, right = (end * measure.factor for end in found[scenario, policy])
+            if not math.isfinite(value):
+                continue
+            if value <= edge:
+                ax.plot([edge], [row], style.marker, mfc=PAPER, mec=style.colour, clip_on=False)
+                continue
+            if not math.isnan(left):
+                ends = [max(left, edge), min(right, high * 2)]
+                ax.plot(ends, [row, row], "-", color=style.colour, lw=2.2, alpha=0.45)
+            ax.plot([value], [row], style.marker, color=style.colour)
+        ax.axvline(limit * measure.factor, color=INK, lw=0.9, ls=(0, (4, 2)))
+        if wide:
+            ax.set_xscale("log")
+            ax.set_xlim(edge, high * 1.6)
+            ticks = _log_ticks(edge, high * 1.6)
+            ax.xaxis.set_major_locator(FixedLocator(ticks))
+            ax.xaxis.set_minor_locator(NullLocator())
+            ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        else:
+            ax.set_xlim(0, high * 1.08)
+        ax.grid(axis="y", visible=False)
+
+    label = f"{measure.heading}; dashed: {limit_name}"
+    return _panels(comparison, policies, f"{measure.column}-{comparison.problem.name}", draw, label)
+
+
+def placement_shares(comparison: Comparison, palette: Palette, policies: Sequence[str]) -> str:
+    """Share of windows per placement of the policies that move, as stacked bars."""
+    candidates = tuple(comparison.problem.candidates)
+
+    def draw(ax: Axes, scenario: str) -> None:
+        for row, policy in enumerate(policies):
+            left = 0.0
+            for name in candidates:
+                share = comparison.interval(scenario, policy, f"share_{name}").value * 100
+                colour = palette.placements[name]
+                ax.barh(row, share, left=left, color=colour, height=0.66, ec=PAPER, lw=0.6)
+                if share >= 16:
+                    text = f"{share:.0f}"
+                    middle = left + share / 2
+                    ax.text(middle, row, text, color="#ffffff", ha="center", va="center", size=8.5)
+                left += share
+        ax.set_xlim(0, 100)
+        ax.set_xticks([0, 50, 100])
+        ax.grid(visible=False)
+
+    legend = [(name, palette.placements[name]) for name in candidates]
+    name = f"shares-{comparison.problem.name}"
+    return _panels(comparison, policies, name, draw, "share of the windows (%)", legend=legend)
+
+
+def latency_split(comparison: Comparison) -> str:
+    """Where the time of a finished cycle goes along its critical path, as stacked bars."""
+    deadline_ms = comparison.problem.pipeline.deadline_ms
+    policies = comparison.policies
+
+    def draw(ax: Axes, scenario: str) -> None:
+        for row, policy in enumerate(policies):
+            left = 0.0
+            for part, colour in PARTS.items():
+                width = comparison.interval(scenario, policy, f"{part}_ms").value
+                if math.isfinite(width):
+                    ax.barh(row, width, left=left, color=colour, height=0.66, ec=PAPER, lw=0.6)
+                    left += width
+        ax.axvline(deadline_ms, color=INK, lw=0.9, ls=(0, (4, 2)))
+        ax.set_xlim(left=0)
+        ax.grid(axis="y", visible=False)
+
+    legend = list(PARTS.items())
+    name = f"split-{comparison.problem.name}"
+    label = "mean latency of finished cycles (ms); dashed: deadline"
+    return _panels(comparison, policies, name, draw, label, legend=legend, same_x=True)
+
+
+def node_use(comparison: Comparison) -> str:
+    """Mean utilisation of every node, a mark each."""
+    nodes = tuple(comparison.problem.fabric.nodes)
+    cap = comparison.problem.objective.caps.utilisation
+    policies = comparison.policies
+    shades = (INK, MUTED)
+
+    def draw(ax: Axes, scenario: str) -> None:
+        for row, policy in enumerate(policies):
+            for i, node in enumerate(nodes):
+                used = comparison.interval(scenario, policy, f"node_{node}").value * 100
+                marker, shade = NODE_MARKERS[i % len(NODE_MARKERS)], shades[i % 2]
+                face = PAPER if i % 2 else shade
+                ax.plot([used], [row], marker, mfc=face, mec=shade, ms=5.5, clip_on=False)
+        if math.isfinite(cap):
+            ax.axvline(cap * 100, color=INK, lw=0.9, ls=(0, (4, 2)))
+        ax.set_xlim(0, 100)
+        ax.set_xticks([0, 50, 100])
+
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D(
+            [],
+            [],
+            ls="",
+            marker=NODE_MARKERS[i % len(NODE_MARKERS)],
+            mfc=PAPER if i % 2 else shades[i % 2],
+            mec=shades[i % 2],
+            label=node,
+        )
+        for i, node in enumerate(nodes)
+    ]
+    name = f"nodes-{comparison.problem.name}"
+    label = "utilisation of the node (%)" + ("; dashed: cap" if math.isfinite(cap) else "")
+    return _panels(comparison, policies, name, draw, label, handles=handles)
+
+
+def distributions(comparison: Comparison, palette: Palette) -> str:
+    """Distribution of the final latency of all cycles, one line a policy."""
+    import polars as pl
+    from matplotlib.lines import Line2D
+
+    deadline_ms = comparison.problem.pipeline.deadline_ms
+    scenarios, columns = comparison.scenarios, min(3, len(comparison.scenarios))
+    rows = math.ceil(len(scenarios) / columns)
+    with new_figure(1.95 * rows + 0.5) as figure:
+        axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+        for ax, scenario in zip(axes, scenarios, strict=False):
+            for policy in comparison.policies:
+                style = palette.policies[policy]
+                line = comparison.latencies.filter(
+                    (pl.col("scenario") == scenario) & (pl.col("policy") == policy)
+                )
+                ax.plot(
+                    line["latency_ms"].to_numpy(),
+                    line["share"].to_numpy() * 100,
+                    color=style.colour,
+                    ls=style.dashes,
+                    lw=style.width,
+                )
+            ax.axvline(deadline_ms, color=INK, lw=0.9, ls=(0, (4, 2)))
+            ax.axhline(100 * (1 - AIM), color=MUTED, lw=0.7, ls=(0, (1, 2)))
+            ax.set_title(shown_scenario(scenario))
+            ax.set_ylim(0, 102)
+            ax.set_xlim(0, 3 * deadline_ms)
+            ax.set_yticks([0, 50, 95])
+        for ax in list(axes)[len(scenarios) :]:
+            ax.set_axis_off()
+        figure.supxlabel("latency (ms); dashed: deadline", size=9, color=MUTED)
+        figure.supylabel("cycles done within it (%)", size=9, color=MUTED)
+        handles = [
+            Line2D(
+                [],
+                [],
+                color=palette.policies[policy].colour,
+                ls=palette.policies[policy].dashes,
+                lw=palette.policies[policy].width,
+                label=shown_policy(policy),
+            )
+            for policy in comparison.policies
+        ]
+        figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
+        name = f"latencies-{comparison.problem.name}"
+        return inline(figure, name, "Distribution of latency by scenario and policy")
+
+
+def _panels(
+    comparison: Comparison,
+    policies: Sequence[str],
+    name: str,
+    draw: Draw,
+    label: str,
+    *,
+    legend: Sequence[tuple[str, str]] = (),
+    handles: Sequence[object] = (),
+    same_x: bool = False,
+) -> str:
+    """Draw one panel a scenario, side by side, the policies named at the left."""
+    from matplotlib.patches import Patch
+
+    scenarios = comparison.scenarios
+    columns = min(PANELS_A_ROW, len(scenarios))
+    rows = math.ceil(len(scenarios) / columns)
+    patches = handles or [Patch(color=colour, label=text) for text, colour in legend]
+    height = rows * (len(policies) * ROW_INCHES + 0.45) + 0.3 + (0.3 if patches else 0)
+    with new_figure(height) as figure:
+        grid = figure.subplots(rows, columns, sharey=True, sharex=same_x, squeeze=False)
+        for i, ax in enumerate(grid.flat):
+            if i >= len(scenarios):
+                ax.set_axis_off()
+                continue
+            draw(ax, scenarios[i])
+            ax.set_title(_folded(shown_scenario(scenarios[i])))
+            ax.tick_params(axis="y", length=0)
+            ax.spines["left"].set_visible(False)
+        first = grid[0, 0]
+        first.set_ylim(len(policies) - 0.4, -0.6)
+        first.set_yticks(range(len(policies)))
+        _name_rows(grid[:, 0], policies)
+        figure.supxlabel(label, size=9, color=MUTED)
+        if patches:
+            figure.legend(handles=patches, loc="outside upper left", ncols=len(patches))
+        return inline(figure, name, label)
+
+
+def _name_rows(axes: Iterable[Axes], policies: Sequence[str]) -> None:
+    for ax in axes:
+        ax.set_yticks(range(len(policies)), [_folded(shown_policy(name), 14) for name in policies])
+        for text in ax.get_yticklabels():
+            text.set_color(INK)
+            text.set_linespacing(0.95)
+
+
+def _folded(text: str, width: int = 22) -> str:
+    """Break a long name into two lines at the blank nearest to its middle."""
+    if len(text) <= width or " " not in text:
+        return text
+    blanks = [i for i, letter in enumerate(text) if letter == " "]
+    middle = min(blanks, key=lambda i: abs(i - len(text) / 2))
+    return f"{text[:middle]}\n{text[middle + 1 :]}"
+
+
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Return 1, 2 and 5 times powers of ten between the two, thinned out where they are many."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [step * 10.0**power for power in powers for step in LOG_TICKS]
+    ticks = [tick for tick in ticks if low <= tick <= high]
+    if len(ticks) > 5:
+        ticks = [tick for tick in ticks if np.isclose(math.log10(tick) % 1, [0, 1]).any()]
+    return ticks
+
+
+def percent(value: float) -> str:
+    """Write a share in percent."""
+    return f"{write_number(100 * value)} %"

@@ -1,0 +1,174 @@
+"""The demo: the scenarios of a cell, its static placements and the policies, on twenty seeds.
+
+Either on the canonical cell, or on the cells that replay measurements. The cells are files in the
+repository's folder of examples; the measurements are not part of it.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+from dwell.errors import TraceError
+from dwell.model import Problem
+from dwell.study.comparison import Comparison, compare
+
+__all__ = [
+    "CANONICAL",
+    "POLICIES",
+    "REAL",
+    "SEEDS",
+    "WINDOWS",
+    "canonical_demo",
+    "longest_run",
+    "real_demo",
+]
+
+#: Policies beside every candidate as a static placement.
+POLICIES = ("atp", "dtp", "latency-first")
+SEEDS = 20
+WINDOWS = 150
+
+#: Cells by the names of their files in the folder of examples.
+CANONICAL = "canonical.yaml"
+REAL = ("real.yaml", "real-5g.yaml")
+
+Progress: TypeAlias = Callable[[int, int], None]
+Folder: TypeAlias = "str | os.PathLike[str]"
+
+
+def canonical_demo(
+    examples: Folder,
+    *,
+    seeds: int = SEEDS,
+    windows: int = WINDOWS,
+    processes: int | None = None,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Compare the policies on the canonical cell, in all of its scenarios.
+
+    Parameters
+    ----------
+    examples : path-like
+        Folder with `CANONICAL`.
+    seeds : int
+        Number of seeds: 1 to this.
+    windows, processes, progress
+        See `dwell.study.compare`.
+
+    Raises
+    ------
+    ProblemError
+        If the cell is missing or wrong.
+    """
+    from dwell.io import load
+
+    problem = load(Path(examples) / CANONICAL)
+    (comparison,) = _compare_all([problem], seeds, windows, processes, progress)
+    return comparison
+
+
+def real_demo(
+    examples: Folder,
+    traces: Folder,
+    *,
+    seeds: int = SEEDS,
+    windows: int = WINDOWS,
+    processes: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[Comparison, ...]:
+    """Compare the policies on the cells that replay measurements.
+
+    Parameters
+    ----------
+    examples : path-like
+        Folder with the cells of `REAL`.
+    traces : path-like
+        Folder with the measurements that they name.
+    seeds : int
+        Number of seeds: 1 to this; a seed chooses where in the measurements replay starts.
+    windows : int
+        Fewer are played where a trace that does not wrap is too short for them.
+    processes, progress
+        See `dwell.study.compare`; progress counts the runs of all cells.
+
+    Returns
+    -------
+    tuple of Comparison
+        One a cell of `REAL`.
+
+    Raises
+    ------
+    ProblemError
+        If a cell is missing or wrong; a TraceError where a trace is.
+    """
+    from dwell.io import load
+
+    problems = [load(Path(examples) / name, traces=traces) for name in REAL]
+    return _compare_all(problems, seeds, windows, processes, progress)
+
+
+def longest_run(problem: Problem, windows: int) -> int:
+    """Return `windows`, or how many the problem's traces last for where those are fewer.
+
+    Raises
+    ------
+    TraceError
+        If they do not last for a single window after the warm-up.
+    """
+    enough, too_many = problem.warmup_windows, windows + 1
+    fault: TraceError | None = None
+    while too_many - enough > 1:
+        # All of them at first, then halves.
+        middle = windows if too_many > windows else (enough + too_many) // 2
+        fault = _too_short(problem, middle)
+        enough, too_many = (middle, too_many) if fault is None else (enough, middle)
+    if fault is not None and enough == problem.warmup_windows:
+        raise fault
+    return enough
+
+
+def _too_short(problem: Problem, windows: int) -> TraceError | None:
+    """Say which trace is too short for a run of so many windows."""
+    from dwell.sim import draw
+
+    try:
+        for scenario in problem.scenarios:
+            draw(problem, scenario=scenario, seed=0, windows=windows)
+    except TraceError as fault:
+        return fault
+    return None
+
+
+def _compare_all(
+    problems: Sequence[Problem],
+    seeds: int,
+    windows: int,
+    processes: int | None,
+    progress: Progress | None,
+) -> tuple[Comparison, ...]:
+    """Compare on one problem after another, counting the runs of all together."""
+    sizes = [
+        len(problem.scenarios) * (len(problem.candidates) + len(POLICIES)) * seeds
+        for problem in problems
+    ]
+    comparisons = []
+    for index, problem in enumerate(problems):
+
+        def count(done: int, _: int, before: int = sum(sizes[:index])) -> None:
+            if progress is not None:
+                progress(before + done, sum(sizes))
+
+        comparisons.append(
+            compare(
+                problem,
+                policies=[*problem.candidates, *POLICIES],
+                seeds=range(1, seeds + 1),
+                windows=longest_run(problem, windows),
+                processes=processes,
+                progress=count,
+            )
+        )
+    return tuple(comparisons)

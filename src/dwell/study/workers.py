@@ -1,0 +1,122 @@
+"""The same task on many units, spread over processes.
+
+Results come back in the order of the units, so that nothing depends on how many processes there
+are or which one was faster. Processes are spawned, never forked (a fork of a process with threads
+may lock up), and share nothing but the task, which is sent to each of them once.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import TypeVar, cast
+
+from dwell.errors import SimulationError
+
+__all__ = ["available_processes", "spread"]
+
+Unit = TypeVar("Unit")
+Result = TypeVar("Result")
+
+
+def available_processes() -> int:
+    """CPUs that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def spread(
+    task: Callable[[Unit], Result],
+    units: Sequence[Unit],
+    *,
+    processes: int,
+    done: Callable[[], None],
+) -> list[Result]:
+    """Do a task on every unit.
+
+    Parameters
+    ----------
+    task : callable
+        It, the units and the results must pickle.
+    units : sequence
+    processes : int
+        How many to use; 1 stays in this one. A script that asks for more has to begin its work
+        under ``if __name__ == "__main__":``, as every process imports it again.
+    done : callable
+        Called in this process after each unit.
+
+    Returns
+    -------
+    list
+        One result a unit, in their order.
+
+    Raises
+    ------
+    SimulationError
+        If a process ended before its work was done.
+    """
+    if min(processes, len(units)) <= 1:
+        results = []
+        for unit in units:
+            results.append(task(unit))
+            done()
+        return results
+    pool = ProcessPoolExecutor(
+        max_workers=min(processes, len(units)),
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_begin,
+        initargs=(task,),
+    )
+    try:
+        with _interrupts_ignored():
+            futures = [pool.submit(_work, unit) for unit in units]
+        for future in as_completed(futures):
+            future.result()
+            done()
+        return [cast("Result", future.result()) for future in futures]
+    except BrokenProcessPool:
+        raise SimulationError(
+            "a worker process ended before its work was done: out of memory, killed, or a script "
+            'without `if __name__ == "__main__":`; ask for 1 process to work without them'
+        ) from None
+    finally:
+        # On an interrupt or an error: drop what waits, let what runs end, leave no process behind.
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+class _Worker:
+    """What a worker process was sent when it began; its types end at the pickle."""
+
+    task: Callable[..., object]
+
+
+def _begin(task: Callable[..., object]) -> None:
+    """Prepare a worker process."""
+    # One process a CPU: threads inside would only get into each other's way.
+    os.environ["POLARS_MAX_THREADS"] = "1"
+    _Worker.task = task
+
+
+def _work(unit: object) -> object:
+    """Do the task on a unit, in a worker process."""
+    return _Worker.task(unit)
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Let processes that begin here ignore Ctrl-C; this one, which it reaches too, ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,196 @@
+"""Problems made in Python: what a constructor refuses, and where it says the fault is."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from dwell.errors import Fault, ProblemError
+from dwell.model import (
+    Bursts,
+    Constant,
+    ControllerSettings,
+    Execution,
+    Fabric,
+    Flow,
+    FrozenDict,
+    Link,
+    LinkDisturbance,
+    Node,
+    NodeDisturbance,
+    Objective,
+    Pipeline,
+    Placement,
+    Problem,
+    Targets,
+    Task,
+    Weights,
+)
+from tests.model.cells import problems
+
+EXECUTION = Execution(Constant(1.0))
+
+
+def _problem() -> Problem:
+    """Return two tasks on two nodes: the first anchored, the second relocatable."""
+    tasks = {
+        "a": Task("a", {"R": EXECUTION}),
+        "b": Task("b", {"R": EXECUTION, "E": EXECUTION}),
+    }
+    nodes = {"R": Node("R", "robot"), "E": Node("E", "edge")}
+    links = {"R->E": Link("R", "E", Constant(1.0))}
+    return Problem(
+        name="cell",
+        pipeline=Pipeline(tasks, (Flow("a", "b"),), 10.0, 10.0),
+        fabric=Fabric(nodes, links),
+        candidates={
+            "LOC": Placement({"a": "R", "b": "R"}),
+            "SO": Placement({"a": "R", "b": "E"}),
+        },
+        objective=Objective(Weights(), Targets(10.0), tiers={"R": "robot", "E": "edge"}),
+    )
+
+
+def _faults(make: Callable[[], object]) -> list[Fault]:
+    with pytest.raises(ProblemError) as caught:
+        make()
+    return list(caught.value.faults)
+
+
+BURSTS = Bursts(Constant(1.0), Constant(1.0), threads=1, add_delay_ms=Constant(1.0))
+PLACED = {"a": "R", "b": "R"}
+
+
+@pytest.mark.parametrize(
+    ("make", "path", "words"),
+    [
+        (lambda: Fabric({}), "nodes", "at least one"),
+        (lambda: Fabric({"R": Node("E", "edge")}), "nodes.R", "named as its key, 'R'"),
+        (
+            lambda: Fabric({"R": Node("R", "edge")}, {"x": Link("R", "E", Constant(1))}),
+            "links.x",
+            "'R->E' is not allowed",
+        ),
+        (lambda: Node("R", "rover"), "tier", "robot, edge, cloud"),  # type: ignore[arg-type]
+        (lambda: Node("R", "robot", cores=1.5), "cores", "a whole number"),  # type: ignore[arg-type]
+        (lambda: Node("R", "robot", bursts=BURSTS), "bursts.add_delay_ms", "only a link"),
+        (lambda: Link("R", "E", Constant(1), bursts=BURSTS), "bursts.threads", "only a node"),
+        (lambda: Link("R", "R", Constant(1)), "to", "another node"),
+        (lambda: Link("R", "E", Constant(1), rate_mbps=1e-9), "rate_mbps", "at least 0.0001"),
+        (lambda: Bursts(Constant(0), Constant(1)), "every_ms", "0 is not allowed"),
+        (lambda: Task("a", {}), "on", "at least one node"),
+        (lambda: Task("a", {"R": EXECUTION}, depth=-1), "input", "a whole number from 0"),
+        (lambda: Flow("a", "b", -1), "bytes", "from 0 to 1e12"),
+        (lambda: Pipeline({"b": Task("a", {"R": EXECUTION})}, (), 1, 1), "tasks.b", "its key"),
+        (lambda: Pipeline({}, (), 1, 2), "deadline_ms", "at most period_ms = 1"),
+        (lambda: NodeDisturbance("R", for_s=0), "for_s", "above 0"),
+        (lambda: LinkDisturbance("R", "E", loss=2), "loss", "from 0 to 1"),
+        (lambda: Weights(0, 0, 0, 0, 0), "weights", "all weights are 0"),
+        (lambda: Weights(latency=1e300), "weights.latency", "from 0 to 1e9"),
+        (lambda: Targets(0), "targets.latency_ms", "from 1e-9"),
+        (lambda: Objective(Weights(cloud=1), Targets(1)), "targets.cloud", "missing"),
+        (lambda: ControllerSettings(guard_cycles=1), "guard_cycles", "from 2"),
+        (lambda: ControllerSettings(estimator="x"), "estimator", "profile"),
+        (lambda: replace(_problem(), window_cycles=0), "window_cycles", "from 1"),
+        (lambda: replace(_problem(), warmup_windows=-1), "warmup_windows", "from 0"),
+        (
+            lambda: replace(_problem(), candidates={"LOC": Placement({"b": "R"})}),
+            "candidates.LOC.a",
+            "put it on R",
+        ),
+        (
+            lambda: replace(_problem(), candidates={"a/b": Placement(PLACED)}),
+            "candidates.a/b",
+            "is not a name",
+        ),
+        (
+            lambda: replace(_problem(), candidates={"a" * 65: Placement(PLACED)}),
+            f"candidates.{'a' * 65}",
+            "at most 64 characters",
+        ),
+        (lambda: replace(_problem(), candidates={}), "candidates", "none is declared"),
+        (
+            lambda: replace(_problem(), scenarios={"s": (LinkDisturbance("E", "R"),)}),
+            "scenarios.s[0].link",
+            "unknown link 'E->R'",
+        ),
+        (
+            lambda: replace(
+                _problem(), objective=Objective(Weights(), Targets(1), tiers={"X": "edge"})
+            ),
+            "objective.tiers.X",
+            "unknown node 'X'",
+        ),
+        (lambda: _problem().scenario("baselin"), "", "did you mean 'baseline'?"),
+    ],
+)
+def test_what_a_constructor_refuses(make: Callable[[], object], path: str, words: str) -> None:
+    (fault,) = _faults(make)
+    assert fault.path == path
+    assert words in fault.message
+
+
+def test_every_fault_of_meaning_is_reported_at_once() -> None:
+    good = _problem()
+    loop = replace(good.pipeline, flows=(Flow("a", "b"), Flow("b", "a"), Flow("a", "x")))
+    faults = _faults(
+        lambda: replace(
+            good,
+            pipeline=loop,
+            candidates={"dtp": Placement({"a": "E", "b": "R"})},
+            controller=ControllerSettings(on="X", initial="Y", fallbacks=("Z",), policy="W"),
+        )
+    )
+    assert [fault.path for fault in faults] == [
+        "flows[2].to",
+        "flows",
+        "candidates.dtp",
+        "candidates.dtp.a",
+        "controller.on",
+        "controller.initial",
+        "controller.fallbacks[0]",
+        "controller.policy",
+    ]
+
+
+def test_the_baseline_exists_always_and_first() -> None:
+    problem = replace(_problem(), scenarios={"crash": (NodeDisturbance("E", down=True),)})
+    assert list(problem.scenarios) == ["baseline", "crash"]
+    assert problem.scenario("baseline") == ()
+
+
+def test_the_controller_sits_on_the_first_edge_node() -> None:
+    problem = _problem()
+    assert problem.controller_node == "E"
+    assert replace(problem, controller=ControllerSettings(on="R")).controller_node == "R"
+    assert problem.initial == "LOC"
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(problems())
+def test_problems_can_be_copied_pickled_and_hashed(problem: Problem) -> None:
+    assert pickle.loads(pickle.dumps(problem)) == problem
+    assert copy.deepcopy(problem) == problem
+    assert hash(copy.copy(problem)) == hash(problem)
+
+
+def test_what_a_problem_holds_cannot_be_changed() -> None:
+    problem = _problem()
+    with pytest.raises(TypeError, match="cannot be changed"):
+        problem.candidates["X"] = Placement(PLACED)  # type: ignore[index]
+    with pytest.raises(TypeError, match="cannot be changed"):
+        FrozenDict({"a": 1}).update(b=2)
+
+
+def test_faults_are_printed_with_their_lines() -> None:
+    error = ProblemError([Fault("a.b", "wrong", 3), Fault("", "worse")], "cell.yaml")
+    assert str(error) == "cell.yaml:3: a.b: wrong\ncell.yaml: worse"
+    assert str(ProblemError([Fault("a", "wrong", 3)])) == "line 3: a: wrong"
+    assert str(ProblemError("no")) == "no"
+    again = pickle.loads(pickle.dumps(error))
+    assert (again.faults, again.source) == (error.faults, error.source)
