@@ -359,7 +359,7 @@ BY_HAND = {
     ),
     "an offset of a whole number": by_hand(
         [FIFO, EDGE],
-        [task("A", 2, offset_ms=3), task("B", 3, "E")],
+        [task("A", 2, offset_ms=3), task("B", 3, "E", offset_ms=0)],
         [Flow("A", "B")],
         links=[UP],
     ),

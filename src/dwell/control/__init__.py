@@ -2,5 +2,16 @@
 
 from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
 from dwell.control.windows import NEVER_NS, final_l95_ms
+from dwell.estimators import Estimator
+from dwell.policies import MinimalPolicy
 
-__all__ = ["NEVER_NS", "ClosedWindow", "Controller", "Log", "final_l95_ms", "static_columns"]
+__all__ = [
+    "NEVER_NS",
+    "ClosedWindow",
+    "Controller",
+    "Estimator",
+    "Log",
+    "MinimalPolicy",
+    "final_l95_ms",
+    "static_columns",
+]

@@ -10,7 +10,7 @@ from dwell.control import NEVER_NS
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Pipeline, Problem, Task
-from dwell.sim.realisation import Realisation
+from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 __all__ = ["Arrays", "lay_out"]
 
@@ -102,11 +102,12 @@ class _Layout:
         self.hops: list[list[int]] = []
         self.links: list[list[int]] = []
         self.layer_rows: list[dict[int, int]] = []
-        self.segments: list[list[int]] = []
-        self.segments_f: list[list[float]] = []
+        self.n_segments = 0
+        self.segments = [np.empty((0, k.N_SEGMENT), np.int64)]
+        self.segments_f = [np.empty((0, k.N_SEGMENT_F))]
         self.site_of: list[list[int]] = []
         self.route: list[list[int]] = []
-        self.changes: list[tuple[int, int, int, int]] = []
+        self.changes = [np.empty((0, k.N_CHANGE), np.int64)]
         self.extra_rows = 0
 
     def arrays(self) -> Arrays:
@@ -171,10 +172,16 @@ class _Layout:
                 for f in flows
             ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
-        for change in real.node_changes:
-            if index == 0 or change.node not in self.shared:
-                node = self.node_row[self._node_key(index, change.node)]
-                self.changes.append((change.at_ns, node, change.threads, int(change.down)))
+        self._add_changes(index, NodeChanges.of(real.node_changes))
+
+    def _add_changes(self, index: int, changes: NodeChanges) -> None:
+        """Add the changes of a cell's nodes; those of a shared node are the first cell's."""
+        own = [index == 0 or name not in self.shared for name in changes.nodes]
+        row = [self.node_row[self._node_key(index, name)] for name in changes.nodes]
+        if row:
+            table = changes.table[np.array(own)[changes.table[:, 1]]].copy()
+            table[:, 1] = np.array(row)[table[:, 1]]
+            self.changes.append(table)
 
     def _add_task(self, pipeline: Pipeline, task: Task, outputs: list[int]) -> None:
         row = [0] * k.N_TASK
@@ -212,6 +219,7 @@ class _Layout:
         return rows
 
     def _add_links(self, problem: Problem, real: Realisation, hop_0: int) -> None:
+        pieces = LinkSegments.of(real.link_segments)
         link_row: dict[str, int] = {}
         for name, link in problem.fabric.links.items():
             link_row[name] = len(self.links)
@@ -219,13 +227,13 @@ class _Layout:
             row[k.IN_ORDER] = int(link.in_order)
             retransmit = link.retransmit_ms
             row[k.RETRANSMIT_NS] = -1 if retransmit is None else round(retransmit * 1e6)
-            row[k.SEGMENT] = len(self.segments)
-            for segment in real.link_segments:
-                if segment.link == name:
-                    mask = sum(1 << layer for layer in segment.layers)
-                    self.segments.append([segment.at_ns, int(segment.down), mask])
-                    self.segments_f.append([segment.rate_mbps, segment.loss])
-            row[k.SEGMENT_END] = len(self.segments)
+            row[k.SEGMENT] = self.n_segments
+            if name in pieces.links:
+                mine = pieces.table[:, 1] == pieces.links.index(name)
+                self.segments.append(pieces.table[mine][:, [0, 2, 3]])
+                self.segments_f.append(pieces.table_f[mine])
+                self.n_segments += int(mine.sum())
+            row[k.SEGMENT_END] = self.n_segments
             self.links.append(row)
         payload = {
             (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
@@ -266,7 +274,8 @@ class _Layout:
                 layer_rows[hop, layer] = row
         clock = np.zeros(k.N_CLOCK, np.int64)
 
-        changes = sorted(self.changes, key=lambda change: change[0])
+        changes = np.concatenate(self.changes)
+        changes = changes[np.argsort(changes[:, 0], kind="stable")]
         speed = np.zeros((len(servers), k.N_SERVER_F))
         speed[:, k.SPEED] = 1.0
         tables = k.Tables(
@@ -281,9 +290,9 @@ class _Layout:
             hops=_table(self.hops, k.N_HOP),
             loss_keys=np.concatenate([real.loss_keys for real in reals]),
             layer_rows=layer_rows,
-            segments=_table(self.segments, k.N_SEGMENT),
-            segments_f=np.array(self.segments_f, np.float64).reshape(-1, k.N_SEGMENT_F),
-            changes=_table(changes, k.N_CHANGE),
+            segments=np.concatenate(self.segments),
+            segments_f=np.concatenate(self.segments_f),
+            changes=changes,
             release_ns=_stack([real.release_ns[None] for real in reals], cycles + 1),
             exec_ns=_stack([real.exec_ns for real in reals], cycles),
             delay_ns=_stack([real.delay_ns for real in reals], cycles),

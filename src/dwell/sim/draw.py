@@ -15,7 +15,6 @@ from dwell.model import (
     AR1,
     Bursts,
     Constant,
-    Link,
     LinkDisturbance,
     LogNormal,
     NodeDisturbance,
@@ -25,7 +24,7 @@ from dwell.model import (
     Trace,
     TraceTable,
 )
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
+from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 __all__ = ["draw", "stream"]
 
@@ -137,8 +136,8 @@ class _Draw:
         if isinstance(jitter, Trace):
             # Rows of a trace follow the releases; for its own jitter they follow the nominal ones.
             self.release_ns = release
-        late = np.empty(self.cycles + 1, np.int64)
-        self._fill(late, jitter, "release")
+        late = np.zeros(self.cycles + 1, np.int64)
+        self._fill(late[:-1], jitter, "release")
         # A cycle is never released before the one ahead of it.
         return np.maximum.accumulate(release + late)
 
@@ -146,7 +145,8 @@ class _Draw:
         rows = self.rows.get(id(table))
         if rows is None:
             rng = self._rng(f"trace/{table.file}/{table.by}/{table.group}")
-            rows = table.replay(rng, self.release_ns / NS_PER_MS)
+            # The last release only closes the last window; no cycle needs a row for it.
+            rows = table.replay(rng, self.release_ns[:-1] / NS_PER_MS)
             self.rows[id(table)] = rows
         return rows
 
@@ -232,67 +232,101 @@ class _Draw:
             self._fill(extra_ns[row], process, f"extra/{layer}/{_hop_name(hops[hop])}")
         return layers, extra_ns, of_link
 
-    def _episodes(self, bursts: Bursts, name: str) -> list[tuple[int, int]]:
-        """Begin and end of every burst up to the end of the run, nanoseconds."""
-        horizon = int(self.release_ns[-1])
+    def _episodes(self, bursts: Bursts, name: str) -> tuple[Ints, Ints]:
+        """Begins and ends of all bursts up to the end of the run, nanoseconds, ascending."""
+        horizon = float(self.release_ns[-1])
         quiet, active = self._rng(f"bursts/{name}/every"), self._rng(f"bursts/{name}/for")
-        episodes: list[tuple[int, int]] = []
-        begin = 0.0
-        while begin < horizon:
-            for pause, length in zip(
-                bursts.every_ms.marginal(quiet, 256), bursts.for_ms.marginal(active, 256)
-            ):
-                begin += pause * NS_PER_MS
-                if begin >= horizon:
-                    break
-                end = begin + length * NS_PER_MS
-                episodes.append((round(begin), round(min(end, LONGEST_NS))))
-                begin = end
-        return episodes
+        mean_ms = bursts.every_ms.expectation + bursts.for_ms.expectation
+        count = 64 + round(1.1 * horizon / (mean_ms * NS_PER_MS))
+        begins, ends = [np.empty(0)], [np.empty(0)]
+        now = 0.0
+        while now < horizon:
+            pause = bursts.every_ms.marginal(quiet, count) * NS_PER_MS
+            length = bursts.for_ms.marginal(active, count) * NS_PER_MS
+            end = now + np.cumsum(pause + length)
+            begins.append(end - length)
+            ends.append(end)
+            now = float(end[-1])
+        begin, end = np.concatenate(begins), np.concatenate(ends)
+        begin, end = begin[begin < horizon], end[begin < horizon]
+        return np.rint(begin).astype(np.int64), np.rint(np.minimum(end, LONGEST_NS)).astype(
+            np.int64
+        )
 
-    def _node_changes(self) -> tuple[NodeChange, ...]:
+    def _node_changes(self) -> NodeChanges:
         """Fold stress, bursts and outages of each node into the states it goes through."""
-        steps: dict[str, list[tuple[int, int, int]]] = {}
-        for item in self.scenario:
-            if isinstance(item, NodeDisturbance):
-                begin, end = _interval_ns(item.at_s, item.for_s)
-                mine = steps.setdefault(item.node, [])
-                mine.append((begin, item.stress_threads, int(item.down)))
-                mine.append((end, -item.stress_threads, -int(item.down)))
-        for node in self.problem.fabric.nodes.values():
-            if node.bursts is not None and node.bursts.threads:
-                mine = steps.setdefault(node.name, [])
-                for begin, end in self._episodes(node.bursts, node.name):
-                    mine.append((begin, node.bursts.threads, 0))
-                    mine.append((end, -node.bursts.threads, 0))
-        changes: list[NodeChange] = []
+        nodes = tuple(self.problem.fabric.nodes)
         horizon = int(self.release_ns[-1])
-        for name, mine in steps.items():
-            threads = down = 0
-            mine.sort()
-            for i, (at, more_threads, more_down) in enumerate(mine):
-                threads += more_threads
-                down += more_down
-                last = i + 1 == len(mine) or mine[i + 1][0] != at
-                if last and at <= horizon:
-                    changes.append(NodeChange(at, name, threads, down > 0))
-        changes.sort(key=lambda change: change.at_ns)
-        return tuple(changes)
+        tables = [np.empty((0, 4), np.int64)]
+        for row, node in enumerate(self.problem.fabric.nodes.values()):
+            steps = [np.empty((0, 3), np.int64)]
+            for item in self.scenario:
+                if isinstance(item, NodeDisturbance) and item.node == node.name:
+                    begin, end = _interval_ns(item.at_s, item.for_s)
+                    threads, down = item.stress_threads, int(item.down)
+                    steps.append(np.array([[begin, threads, down], [end, -threads, -down]]))
+            if node.bursts is not None and node.bursts.threads:
+                begins, ends = self._episodes(node.bursts, node.name)
+                for at, threads in ((begins, node.bursts.threads), (ends, -node.bursts.threads)):
+                    change = np.zeros((len(at), 3), np.int64)
+                    change[:, 0], change[:, 1] = at, threads
+                    steps.append(change)
+            at, level = _accumulate(np.concatenate(steps))
+            table = np.empty((len(at), 4), np.int64)
+            table[:, 0], table[:, 1] = at, row
+            table[:, 2], table[:, 3] = level[:, 0], level[:, 1] > 0
+            tables.append(table[at <= horizon])
+        table = np.concatenate(tables)
+        return NodeChanges(nodes, table[np.argsort(table[:, 0], kind="stable")])
 
-    def _link_segments(
-        self, of_link: dict[str, list[Bursts | LinkDisturbance]]
-    ) -> tuple[LinkSegment, ...]:
-        segments: list[LinkSegment] = []
-        for link in self.problem.fabric.links.values():
+    def _link_segments(self, of_link: dict[str, list[Bursts | LinkDisturbance]]) -> LinkSegments:
+        """Cut each link's time where something begins or ends, and sum up what holds in between."""
+        links = tuple(self.problem.fabric.links)
+        tables = [np.empty((0, 4), np.int64)]
+        tables_f = [np.empty((0, 2))]
+        for row, link in enumerate(self.problem.fabric.links.values()):
             active = [
                 (*_interval_ns(item.at_s, item.for_s), item)
                 for item in self.scenario
                 if isinstance(item, LinkDisturbance) and item.link == link.name
             ]
+            none = np.empty(0, np.int64)
+            begins, ends = (
+                self._episodes(link.bursts, link.name) if link.bursts is not None else (none, none)
+            )
+            edges = [edge for begin, end, _ in active for edge in (begin, end)]
+            cuts = np.unique(np.concatenate(([0], edges, begins, ends))).astype(np.int64)
+            table = np.zeros((len(cuts), 4), np.int64)
+            table_f = np.empty((len(cuts), 2))
+            table[:, 0], table[:, 1] = cuts, row
+            survives = np.full(len(cuts), 1 - link.loss)
+            rate = np.full(len(cuts), link.rate_mbps)
             layers = of_link.get(link.name, [])
-            episodes = self._episodes(link.bursts, link.name) if link.bursts is not None else []
-            segments += _fold_link(link, active, layers, episodes)
-        return tuple(segments)
+            if link.bursts is not None:
+                # Bursts of one link never overlap: more of them begun than ended means one is on.
+                begun = np.searchsorted(begins, cuts, side="right")
+                table[:, 3] |= begun > np.searchsorted(ends, cuts, side="right")
+            for begin, end, item in active:
+                on = (begin <= cuts) & (cuts < end)
+                table[on, 2] |= int(item.down)
+                survives[on] *= 1 - item.loss
+                rate[on] = np.minimum(rate[on], item.rate_mbps)
+                if item.add_delay_ms is not None:
+                    layer = next(i for i, other in enumerate(layers) if other is item)
+                    table[on, 3] |= 1 << layer
+            table_f[:, 0], table_f[:, 1] = rate, 1 - survives
+            tables.append(table)
+            tables_f.append(table_f)
+        return LinkSegments(links, np.concatenate(tables), np.concatenate(tables_f))
+
+
+def _accumulate(steps: Ints) -> tuple[Ints, Ints]:
+    """Sum steps (at, change, change) up into the levels that hold from each instant on."""
+    steps = steps[np.argsort(steps[:, 0], kind="stable")]
+    level = np.cumsum(steps[:, 1:], axis=0)
+    last = np.ones(len(steps), np.bool_)
+    last[:-1] = steps[1:, 0] != steps[:-1, 0]
+    return steps[last, 0], level[last]
 
 
 def _interval_ns(at_s: float, for_s: float) -> tuple[int, int]:
@@ -317,43 +351,3 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
             if link in crossed:
                 hops[flow.source, flow.target, link] = None
     return tuple(hops)
-
-
-def _fold_link(
-    link: Link,
-    active: list[tuple[int, int, LinkDisturbance]],
-    layers: list[Bursts | LinkDisturbance],
-    episodes: list[tuple[int, int]],
-) -> list[LinkSegment]:
-    """Cut a link's time where something begins or ends, and sum up what holds in each piece."""
-    cuts: dict[int, None] = {0: None}
-    for begin, end, _ in active:
-        cuts[begin] = cuts[end] = None
-    for begin, end in episodes:
-        cuts[begin] = cuts[end] = None
-    segments: list[LinkSegment] = []
-    episode = 0
-    for at in sorted(cuts):
-        while episode < len(episodes) and episodes[episode][1] <= at:
-            episode += 1
-        bursting = episode < len(episodes) and episodes[episode][0] <= at
-        now = [item for begin, end, item in active if begin <= at < end]
-        survives = 1 - link.loss
-        for item in now:
-            survives *= 1 - item.loss
-        on = tuple(
-            i
-            for i, layer in enumerate(layers)
-            if (bursting if isinstance(layer, Bursts) else any(item is layer for item in now))
-        )
-        segments.append(
-            LinkSegment(
-                at_ns=at,
-                link=link.name,
-                down=any(item.down for item in now),
-                loss=1 - survives,
-                rate_mbps=min([link.rate_mbps, *(item.rate_mbps for item in now)]),
-                layers=on,
-            )
-        )
-    return segments

@@ -11,18 +11,16 @@ import numba
 import numpy as np
 
 from dwell import __version__
-from dwell.control import ClosedWindow, Controller
+from dwell.control import ClosedWindow, Controller, Estimator, MinimalPolicy
 from dwell.errors import SimulationError
-from dwell.estimators import Estimator
 from dwell.kernels import layout as k
 from dwell.kernels.advance import advance
 from dwell.model import Problem
 from dwell.model.document import to_document
-from dwell.policies import MinimalPolicy
 from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out
 from dwell.sim.draw import draw
-from dwell.sim.realisation import Realisation
+from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.tables import Played, make_tables
 
 __all__ = ["play", "simulate", "simulate_realisation"]
@@ -174,8 +172,10 @@ class _Stamper:
         self.delay_ns = round(settings.order_delay_ms * 1e6)
         self.grace_ns = round(settings.close_grace_ms * 1e6)
         host = problem.controller_node
-        self.outages = [c for c in realisation.node_changes if c.node == host]
-        self.outage_at = [change.at_ns for change in self.outages]
+        changes = NodeChanges.of(realisation.node_changes)
+        mine = [i for i, name in enumerate(changes.nodes) if name == host]
+        table = changes.table[np.isin(changes.table[:, 1], mine)]
+        self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
         self.stamped = self._reach(self.window_cycles)
         self.placement = controller.incumbent
@@ -233,8 +233,8 @@ class _Stamper:
         return max(boundary + self.lead, int(arrived))
 
     def _host_down(self, at_ns: int) -> bool:
-        i = bisect.bisect_right(self.outage_at, at_ns) - 1
-        return i >= 0 and self.outages[i].down
+        i = bisect.bisect_right(self.host_at_ns, at_ns) - 1
+        return i >= 0 and bool(self.host_down[i])
 
 
 def _meta(problem: Problem, realisation: Realisation, controller: Controller) -> dict[str, Any]:

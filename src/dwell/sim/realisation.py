@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LinkSegment", "NodeChange", "Realisation"]
+__all__ = ["LinkSegment", "LinkSegments", "NodeChange", "NodeChanges", "Realisation"]
 
 
 class NodeChange(NamedTuple):
@@ -46,6 +47,95 @@ class LinkSegment(NamedTuple):
     layers: tuple[int, ...]
 
 
+class NodeChanges(Sequence[NodeChange]):
+    """The changes of all nodes, ascending in time: rows of arrays that read as `NodeChange`.
+
+    Attributes
+    ----------
+    nodes : tuple of str
+        What the column `node` counts.
+    table : int64 array, shape (changes, 4)
+        Columns at_ns, node, threads, down.
+    """
+
+    def __init__(self, nodes: tuple[str, ...], table: NDArray[np.int64]) -> None:
+        self.nodes, self.table = nodes, table
+
+    @classmethod
+    def of(cls, changes: Iterable[NodeChange]) -> NodeChanges:
+        """Make them from single changes."""
+        if isinstance(changes, NodeChanges):
+            return changes
+        rows = list(changes)
+        nodes = tuple(dict.fromkeys(change.node for change in rows))
+        table = [[c.at_ns, nodes.index(c.node), c.threads, c.down] for c in rows]
+        return cls(nodes, np.array(table, np.int64).reshape(len(rows), 4))
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @overload
+    def __getitem__(self, index: int) -> NodeChange: ...
+    @overload
+    def __getitem__(self, index: slice) -> NodeChanges: ...
+    def __getitem__(self, index: Any) -> NodeChange | NodeChanges:
+        if isinstance(index, slice):
+            return NodeChanges(self.nodes, self.table[index])
+        at_ns, node, threads, down = self.table[index].tolist()
+        return NodeChange(at_ns, self.nodes[node], threads, bool(down))
+
+
+class LinkSegments(Sequence[LinkSegment]):
+    """The segments of all links, per link ascending in time, that read as `LinkSegment`.
+
+    Attributes
+    ----------
+    links : tuple of str
+        What the column `link` counts.
+    table : int64 array, shape (segments, 4)
+        Columns at_ns, link, down, and the layers as bits.
+    table_f : float64 array, shape (segments, 2)
+        Columns rate_mbps and loss.
+    """
+
+    def __init__(
+        self, links: tuple[str, ...], table: NDArray[np.int64], table_f: NDArray[np.float64]
+    ) -> None:
+        self.links, self.table, self.table_f = links, table, table_f
+
+    @classmethod
+    def of(cls, segments: Iterable[LinkSegment]) -> LinkSegments:
+        """Make them from single segments."""
+        if isinstance(segments, LinkSegments):
+            return segments
+        rows = list(segments)
+        links = tuple(dict.fromkeys(segment.link for segment in rows))
+        table = [
+            [s.at_ns, links.index(s.link), s.down, sum(1 << layer for layer in s.layers)]
+            for s in rows
+        ]
+        return cls(
+            links,
+            np.array(table, np.int64).reshape(len(rows), 4),
+            np.array([[s.rate_mbps, s.loss] for s in rows], np.float64).reshape(len(rows), 2),
+        )
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    @overload
+    def __getitem__(self, index: int) -> LinkSegment: ...
+    @overload
+    def __getitem__(self, index: slice) -> LinkSegments: ...
+    def __getitem__(self, index: Any) -> LinkSegment | LinkSegments:
+        if isinstance(index, slice):
+            return LinkSegments(self.links, self.table[index], self.table_f[index])
+        at_ns, link, down, mask = self.table[index].tolist()
+        rate_mbps, loss = self.table_f[index].tolist()
+        layers = tuple(i for i in range(mask.bit_length()) if mask >> i & 1)
+        return LinkSegment(at_ns, self.links[link], bool(down), loss, rate_mbps, layers)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Realisation:
     """All that is random in a run of N cycles, for every feasible (task, node) and every link.
@@ -73,10 +163,10 @@ class Realisation:
         Rows of `extra_ns`; `layer` counts per link.
     extra_ns : int64 array, shape (layers, N)
         Extra delay of each cycle's message while the layer is active.
-    node_changes : tuple of NodeChange
-        Ascending in time.
-    link_segments : tuple of LinkSegment
-        Per link ascending in time.
+    node_changes : sequence of NodeChange
+        Ascending in time; kept as `NodeChanges`.
+    link_segments : sequence of LinkSegment
+        Per link ascending in time; kept as `LinkSegments`.
     """
 
     scenario: str
@@ -90,8 +180,12 @@ class Realisation:
     loss_keys: NDArray[np.uint64]
     layers: tuple[tuple[int, int], ...]
     extra_ns: NDArray[np.int64]
-    node_changes: tuple[NodeChange, ...]
-    link_segments: tuple[LinkSegment, ...]
+    node_changes: Sequence[NodeChange]
+    link_segments: Sequence[LinkSegment]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))
+        object.__setattr__(self, "link_segments", LinkSegments.of(self.link_segments))
 
     @property
     def cycles(self) -> int:
