@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ns, utilisation
-from dwell.cost import cost, hamming, price, tier_nodes
+from dwell.cost import hamming, price, tier_nodes
 from dwell.errors import PolicyError
 from dwell.estimators import Estimator, Profile
 from dwell.estimators import by_name as estimator_by_name
@@ -38,32 +37,47 @@ class ClosedWindow:
         Instant of the close.
     open_ns : int, or int64 array of shape (windows, 1)
         Release of its first cycle.
-    busy_ns, own_ns : float64 array, shape (nodes,) or (windows, nodes)
-        Core-nanoseconds in the window: all work, and that of the cell's own jobs.
+    core_ns : float64 array, shape (2, nodes) or (windows, 2, nodes)
+        Core-nanoseconds in the window: of all work, and of the cell's own jobs.
     """
 
     latency_ns: Ints
     release_ns: Ints
     close_ns: Ints | int
     open_ns: Ints | int
-    busy_ns: Floats
-    own_ns: Floats
+    core_ns: Floats
 
 
 @dataclass(slots=True)
 class Log:
-    """What the controller saw and decided, column by column; one entry a window.
+    """What the controller saw and decided: one row of plain values a window.
 
-    A window whose close the controller did not see (its node was down) has NaN metrics and no
-    decision.
+    Rows are tuples of numbers and names, not the objects they came from: a run has many windows,
+    and the garbage collector need not look at such tuples again.
+
+    Attributes
+    ----------
+    seen : list of tuple
+        ``(l95_ms, violation_rate, cost)`` of every window; None thrice where the controller did
+        not see the close, because its node was down.
+    decisions : list of tuple
+        ``(window, incumbent, placement, migrated, reason, dwell, delta_j)``, then J of every
+        candidate (None where not priced), then the estimated L95 (ms) and violation rate of every
+        candidate.
     """
 
-    incumbent: list[str] = field(default_factory=list)
-    seen_l95_ms: list[float] = field(default_factory=list)
-    seen_violation_rate: list[float] = field(default_factory=list)
-    cost: list[float] = field(default_factory=list)
-    decisions: list[Decision | None] = field(default_factory=list)
-    estimates: list[Mapping[str, QoS]] = field(default_factory=list)
+    seen: list[tuple[float | None, ...]] = field(default_factory=list)
+    decisions: list[tuple[object, ...]] = field(default_factory=list)
+
+    def columns(self, candidates: Iterable[str]) -> tuple[str, ...]:
+        """Names of the decisions' columns."""
+        names = tuple(candidates)
+        return (
+            *("window", "incumbent", "placement", "migrated", "reason", "dwell", "delta_j"),
+            *(f"j_{name}" for name in names),
+            *(f"est_l95_ms_{name}" for name in names),
+            *(f"est_violation_rate_{name}" for name in names),
+        )
 
 
 class Controller:
@@ -102,8 +116,15 @@ class Controller:
         self.previous = self.incumbent
         self.dwell = 0
         self.nodes = tuple(problem.fabric.nodes)
+        self._names = tuple(problem.candidates)
         self.log = Log()
         self._cores = np.array([node.cores for node in problem.fabric.nodes.values()], float)
+        self._tiers = tier_nodes(problem.objective)
+        self._moved = {
+            (one, other): hamming(problem.candidates[one], problem.candidates[other])
+            for one in problem.candidates
+            for other in problem.candidates
+        }
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ns = round(problem.censor_ms * 1e6)
 
@@ -128,49 +149,71 @@ class Controller:
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms = int(seen_l95_ns(window.latency_ns, age_ns, self._censor_ns)) / 1e6
-        used = self.utilisation(window).tolist()
-        span_ns = window.close_ns - window.open_ns
-        own = utilisation(window.own_ns, self._cores, span_ns).tolist()
+        used, own = self.utilisation(window).tolist()
         return self.decide(
             QoS(l95_ms, missed / len(age_ns), FrozenDict(zip(self.nodes, used, strict=True))),
             dict(zip(self.nodes, own, strict=True)),
         )
 
     def utilisation(self, window: ClosedWindow) -> Floats:
-        """Busy share of every node's cores, shape (..., nodes)."""
-        return utilisation(window.busy_ns, self._cores, window.close_ns - window.open_ns)
+        """Busy and own share of every node's cores, shape (..., 2, nodes)."""
+        span_ns = window.close_ns - window.open_ns
+        if isinstance(span_ns, np.ndarray):
+            span_ns = span_ns[..., None]
+        return utilisation(window.core_ns, self._cores, span_ns)
 
     def decide(self, observed: QoS, own: Mapping[str, float]) -> str:
         """Decide on metrics that are already aggregated (see `close`)."""
         incumbent = self.incumbent
-        candidates = self.problem.candidates
-        measured = cost(
-            observed, candidates[incumbent], candidates[self.previous], self.problem.objective
-        )
+        measured = self._price(observed, incumbent)
         estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
         estimates[incumbent] = observed
         decision = self._checked(self.policy.decide(observed=observed, estimates=estimates))
-        log = self.log
-        log.incumbent.append(incumbent)
-        log.seen_l95_ms.append(observed.l95_ms)
-        log.seen_violation_rate.append(observed.violation_rate)
-        log.cost.append(measured)
-        log.decisions.append(decision)
-        log.estimates.append(estimates)
+        self._record(observed, measured, decision, estimates)
         self.previous = incumbent
         self.incumbent = decision.name
         self.dwell = decision.dwell
         return decision.name
 
+    def _price(self, observed: QoS, incumbent: str) -> float:
+        """J of what was observed, with the switching term of the decision that led to it."""
+        used = observed.utilisation
+        tiers = [max([used[node] for node in nodes], default=0.0) for nodes in self._tiers]
+        switching = self._moved[incumbent, self.previous]
+        l95_ms, violation_rate = observed.l95_ms, observed.violation_rate
+        return price(l95_ms, violation_rate, *tiers, switching, self.problem.objective)
+
+    def _record(
+        self,
+        observed: QoS,
+        measured: float,
+        decision: Decision,
+        estimates: Mapping[str, QoS],
+    ) -> None:
+        log, names, costs = self.log, self._names, decision.costs
+        fixed = (
+            len(log.seen),
+            self.incumbent,
+            decision.name,
+            decision.migrated,
+            decision.reason,
+            decision.dwell,
+            decision.delta_j,
+        )
+        log.seen.append((observed.l95_ms, observed.violation_rate, measured))
+        known = [estimates[name] for name in names]
+        log.decisions.append(
+            (
+                *fixed,
+                *[costs.get(name) for name in names],
+                *[estimate.l95_ms for estimate in known],
+                *[estimate.violation_rate for estimate in known],
+            )
+        )
+
     def miss(self) -> None:
         """Record a window whose close the controller did not see, because its node was down."""
-        log = self.log
-        log.incumbent.append(self.incumbent)
-        log.seen_l95_ms.append(math.nan)
-        log.seen_violation_rate.append(math.nan)
-        log.cost.append(math.nan)
-        log.decisions.append(None)
-        log.estimates.append({})
+        self.log.seen.append((None, None, None))
         self.previous = self.incumbent
 
     def _checked(self, decision: Decision | str) -> Decision:
@@ -180,7 +223,7 @@ class Controller:
         name = decision.name if isinstance(decision, Decision) else decision
         if not isinstance(name, str) or name not in candidates:
             raise PolicyError(
-                f"{who}.decide returned {decision!r} at window {len(self.log.decisions)}; "
+                f"{who}.decide returned {decision!r} at window {len(self.log.seen)}; "
                 f"it must be a Decision or a candidate's name: {', '.join(candidates)}"
             )
         if isinstance(decision, Decision):
@@ -189,7 +232,7 @@ class Controller:
             ):
                 raise PolicyError(
                     f"{who}.decide returned a decision for {name!r} at window "
-                    f"{len(self.log.decisions)} whose placement or `migrated` contradicts its "
+                    f"{len(self.log.seen)} whose placement or `migrated` contradicts its "
                     f"name (incumbent: {self.incumbent!r})"
                 )
             return decision
@@ -243,9 +286,8 @@ def static_columns(
     problem, name = controller.problem, controller.incumbent
     age_ns = window.close_ns - window.release_ns
     missed = missed_cycles(window.latency_ns, age_ns, controller._deadline_ns)
-    span_ns = window.close_ns - window.open_ns
-    used = controller.utilisation(window)
-    own = utilisation(window.own_ns, controller._cores, span_ns)
+    share = controller.utilisation(window)
+    used, own = share[:, 0], share[:, 1]
     seen = {
         "l95_ms": seen_l95_ns(window.latency_ns, age_ns, controller._censor_ns) / 1e6,
         "violation_rate": missed / age_ns.shape[-1],

@@ -26,7 +26,7 @@ def l95_rank(cycles: int) -> int:
     return (19 * cycles + 19) // 20
 
 
-def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints:
+def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:
     """Count the cycles that missed: later than D, or unfinished when their window closed.
 
     Parameters
@@ -40,10 +40,11 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints:
 
     Returns
     -------
-    int64 array, shape (...)
+    int, or int64 array of shape (...)
     """
-    missed: Ints = (latency_ns > np.minimum(age_ns, deadline_ns)).sum(axis=-1)
-    return missed
+    late = latency_ns > np.minimum(age_ns, deadline_ns)
+    # On one window the plain count is several times as fast.
+    return np.count_nonzero(late) if late.ndim == 1 else np.count_nonzero(late, axis=-1)
 
 
 def seen_l95_ns(latency_ns: Ints, age_ns: Ints, censor_ns: int) -> Ints:
@@ -61,10 +62,10 @@ def seen_l95_ns(latency_ns: Ints, age_ns: Ints, censor_ns: int) -> Ints:
     int64 array, shape (...)
     """
     seen = np.minimum(latency_ns, age_ns)
-    np.minimum(seen, censor_ns, out=seen)
     rank = l95_rank(seen.shape[-1])
     seen.partition(rank - 1, axis=-1)
-    l95: Ints = seen[..., rank - 1]
+    # Censoring is monotone, so censoring the order statistic is censoring every latency.
+    l95: Ints = np.minimum(seen[..., rank - 1], censor_ns)
     return l95
 
 

@@ -15,7 +15,6 @@ from dwell.study import AIM, Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["distributions", "intervals", "latency_split", "node_use", "placement_shares"]
 

@@ -2,14 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
-from typing import TypeAlias
+from typing import NamedTuple
 
-__all__ = ["Cell", "cells", "document", "figure", "paragraph", "section", "swatch", "table"]
+__all__ = [
+    "Cell",
+    "definitions",
+    "document",
+    "figure",
+    "items",
+    "marked",
+    "paragraph",
+    "section",
+    "swatch",
+    "table",
+]
 
-#: A table's cell: text, or text with a class (`head`, `num`, `err`, `group`, ...) and columns.
-Cell: TypeAlias = "str | tuple[str, str] | tuple[str, str, int]"
+
+class Cell(NamedTuple):
+    """A cell of a table.
+
+    Parameters
+    ----------
+    html : str
+    kind : str
+        Class: ``num`` for a number, ``err`` for what is known of its error, ``pair`` for the
+        heading of both.
+    columns : int
+        How many it spans.
+    """
+
+    html: str
+    kind: str = ""
+    columns: int = 1
+
 
 STYLE = """
 :root { color-scheme: light dark;
@@ -63,6 +91,8 @@ tr.group > * { padding: 30px 0 6px; border-top: 0 !important; border-bottom: 1px
   font-weight: 650; color: var(--ink); font-size: 15px; }
 tr.first > * { border-top: 0 !important; }
 .best { font-weight: 650; }
+sub { font-size: 0.72em; line-height: 0; }
+h1.chapter { margin-top: 120px; }
 .swatch { display: inline-block; width: 10px; height: 10px; border-radius: 2px;
   margin-right: 7px; }
 .ring { background: none !important; border: 2px solid var(--ink); border-radius: 5px; }
@@ -106,12 +136,23 @@ def section(heading: str, *parts: str) -> str:
 def paragraph(text: str, kind: str = "") -> str:
     """Return a paragraph of plain text."""
     attribute = f' class="{kind}"' if kind else ""
-    return f"<p{attribute}>{escape(text)}</p>"
+    return f"<p{attribute}>{marked(text)}</p>"
+
+
+def items(texts: Iterable[str]) -> str:
+    """Return a list of plain texts; `code` in them is set as such."""
+    return "<ul>\n" + "\n".join(f"<li>{marked(text)}</li>" for text in texts) + "\n</ul>"
+
+
+def definitions(entries: Mapping[str, str]) -> str:
+    """Return a list of terms and what stands for them, both plain text."""
+    rows = (f"<dt>{escape(term)}</dt><dd>{marked(text)}</dd>" for term, text in entries.items())
+    return "<dl>\n" + "\n".join(rows) + "\n</dl>"
 
 
 def figure(svg: str, caption: str) -> str:
     """Return a figure with a caption of plain text."""
-    return f"<figure>\n{svg}\n<figcaption>{escape(caption)}</figcaption>\n</figure>"
+    return f"<figure>\n{svg}\n<figcaption>{marked(caption)}</figcaption>\n</figure>"
 
 
 def swatch(colour: str) -> str:
@@ -119,17 +160,20 @@ def swatch(colour: str) -> str:
     return f'<span class="swatch" style="background:{colour}"></span>'
 
 
-def cells(row: Sequence[Cell], *, heading: bool = False) -> str:
-    """Return the cells of a row; their text is HTML already."""
+def marked(text: str) -> str:
+    """Escape a text; set `code` and the symbols with an index."""
+    html = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
+    return re.sub(r"\b(V_D|U_r|U_e)\b", lambda m: f"{m[0][0]}<sub>{m[0][2]}</sub>", html)
+
+
+def _cells(row: Sequence[Cell], *, heading: bool = False) -> str:
+    """Return the cells of a row; the first names it."""
     parts = []
     for index, cell in enumerate(row):
-        text, kind, columns = (*cell, "", 1)[:3] if isinstance(cell, tuple) else (cell, "", 1)
-        if isinstance(cell, tuple) and len(cell) == 3:
-            columns = cell[2]
         name = "th" if heading or index == 0 else "td"
-        attributes = f' class="{kind}"' if kind else ""
-        attributes += f' colspan="{columns}"' if columns != 1 else ""
-        parts.append(f"<{name}{attributes}>{text}</{name}>")
+        attributes = f' class="{cell.kind}"' if cell.kind else ""
+        attributes += f' colspan="{cell.columns}"' if cell.columns != 1 else ""
+        parts.append(f"<{name}{attributes}>{cell.html}</{name}>")
     return "".join(parts)
 
 
@@ -145,12 +189,12 @@ def table(head: Sequence[Cell], rows: Iterable[tuple[str, Sequence[Cell]]], capt
         Plain text.
     """
     lines = [
-        f'<tr class="{kind}">{cells(row)}</tr>' if kind else f"<tr>{cells(row)}</tr>"
+        f'<tr class="{kind}">{_cells(row)}</tr>' if kind else f"<tr>{_cells(row)}</tr>"
         for kind, row in rows
     ]
     body = "\n".join(lines)
     return (
-        f'<div class="scroll"><table>\n<caption>{escape(caption)}</caption>\n'
-        f"<thead><tr>{cells(head, heading=True)}</tr></thead>\n<tbody>\n{body}\n</tbody>\n"
+        f'<div class="scroll"><table>\n<caption>{marked(caption)}</caption>\n'
+        f"<thead><tr>{_cells(head, heading=True)}</tr></thead>\n<tbody>\n{body}\n</tbody>\n"
         "</table></div>"
     )

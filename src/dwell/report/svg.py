@@ -6,7 +6,7 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dwell.report.palette import INK, MUTED, PAPER, RULE
 
@@ -18,7 +18,8 @@ __all__ = ["WIDTH", "inline", "new_figure"]
 #: Inches; the page shows a figure at most at 4/3 pixels a point, 9-point text at 12 pixels.
 WIDTH = 10.0
 
-STYLE: dict[str, object] = {
+# Keys are literals that only some versions of matplotlib declare, so they have no type here.
+STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
     "font.family": "DejaVu Sans",
     "font.size": 9,

@@ -142,7 +142,7 @@ def _widen(ax: Axes, include: Sequence[float], bottom: float | None) -> None:
     """Choose a linear or logarithmic axis that holds the data and what is to be included."""
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
-    data = [line.get_ydata(orig=True) for line in ax.get_lines() if len(line.get_xdata()) > 2]
+    data = [line.get_ydata(orig=True) for line in ax.get_lines() if np.size(line.get_xdata()) > 2]
     values = np.concatenate([np.asarray(part, float) for part in data] or [np.zeros(0)])
     values = np.concatenate([values[np.isfinite(values)], np.asarray(include, float)])
     if not len(values):

@@ -1,6 +1,6 @@
 """The simulator: scenario to realisation, realisation through the kernels, kernels to a Run."""
 
-from dwell.sim.draw import draw
+from dwell.sim.drawing import draw
 from dwell.sim.engine import simulate, simulate_realisation
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 

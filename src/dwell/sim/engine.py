@@ -19,7 +19,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out
-from dwell.sim.draw import draw
+from dwell.sim.drawing import draw
 from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.tables import Played, make_tables
 
@@ -203,16 +203,13 @@ class _Stamper:
         if self._host_down(close_ns):
             self.controller.miss()
         else:
-            opened, closed = tables.opened[0, index], tables.closed[0, index]
-            used = closed - opened
             order = self.controller.close(
                 ClosedWindow(
                     latency_ns=tables.latency_ns[0, first:boundary],
                     release_ns=self.release_ns[first:boundary],
                     close_ns=close_ns,
                     open_ns=int(self.release_ns[first]),
-                    busy_ns=used[0],
-                    own_ns=used[1],
+                    core_ns=tables.closed[0, index] - tables.opened[0, index],
                 )
             )
         start = self.stamped

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -71,8 +71,7 @@ class Played:
             release_ns=self.realisation.release_ns[self.rows],
             close_ns=self.close_ns[:, None],
             open_ns=self.realisation.release_ns[self.first][:, None],
-            busy_ns=used[:, 0],
-            own_ns=used[:, 1],
+            core_ns=used,
         )
 
     def missed(self) -> NDArray[np.bool_]:
@@ -88,7 +87,7 @@ class Played:
 def make_tables(played: Played) -> dict[str, Callable[[], pl.DataFrame]]:
     """Functions that make each table when it is first asked for."""
     controller = played.controller
-    static = not controller.log.incumbent
+    static = not controller.log.seen
     seen: tuple[dict[str, Floats], dict[str, dict[str, Floats]]] | None = None
 
     def columns() -> tuple[dict[str, Floats], dict[str, dict[str, Floats]]]:
@@ -159,20 +158,18 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
-        },
-        nan_to_null=True,
-    )
+        }
+    ).with_columns(pl.col("seen_l95_ms", "seen_violation_rate", "cost").fill_nan(None))
 
 
 def _seen(played: Played) -> dict[str, Floats]:
     controller = played.controller
-    log = controller.log
-    window = played.closed_windows()
-    used = controller.utilisation(window)
+    seen = np.array(controller.log.seen, np.float64).reshape(-1, 3)
+    used = controller.utilisation(played.closed_windows())[:, 0]
     return {
-        "l95_ms": np.array(log.seen_l95_ms, np.float64),
-        "violation_rate": np.array(log.seen_violation_rate, np.float64),
-        "cost": np.array(log.cost, np.float64),
+        "l95_ms": seen[:, 0],
+        "violation_rate": seen[:, 1],
+        "cost": seen[:, 2],
         **{f"u_{node}": used[:, i] for i, node in enumerate(controller.nodes)},
     }
 
@@ -180,43 +177,23 @@ def _seen(played: Played) -> dict[str, Floats]:
 REASONS = ("dwell", "hold", "migrate", "infeasible", "guard")
 
 
-def _decision_frame(columns: dict[str, object], candidates: tuple[str, ...]) -> pl.DataFrame:
+def _decision_frame(columns: Mapping[str, object], candidates: tuple[str, ...]) -> pl.DataFrame:
     import polars as pl
 
-    frame = pl.DataFrame(columns, nan_to_null=True)
-    return frame.with_columns(
+    return pl.DataFrame(columns).with_columns(
         pl.col("incumbent", "placement").cast(pl.Enum(candidates)),
         pl.col("reason").cast(pl.Enum(REASONS)),
         pl.col("window", "dwell").cast(pl.Int64),
-        pl.col("delta_j", "^j_.*$", "^est_.*$").cast(pl.Float64),
+        pl.col("migrated").cast(pl.Boolean),
+        pl.col("delta_j", "^j_.*$", "^est_.*$").cast(pl.Float64).fill_nan(None),
     )
 
 
 def _decisions(controller: Controller) -> pl.DataFrame:
-    log = controller.log
     candidates = tuple(controller.problem.candidates)
-    made = [
-        (window, incumbent, decision, estimates)
-        for window, (incumbent, decision, estimates) in enumerate(
-            zip(log.incumbent, log.decisions, log.estimates, strict=True)
-        )
-        if decision is not None
-    ]
-    columns: dict[str, object] = {
-        "window": [window for window, _, _, _ in made],
-        "incumbent": [incumbent for _, incumbent, _, _ in made],
-        "placement": [decision.name for _, _, decision, _ in made],
-        "migrated": [decision.migrated for _, _, decision, _ in made],
-        "reason": [decision.reason for _, _, decision, _ in made],
-        "dwell": [decision.dwell for _, _, decision, _ in made],
-        "delta_j": [decision.delta_j for _, _, decision, _ in made],
-    }
-    for name in candidates:
-        columns[f"j_{name}"] = [decision.costs.get(name) for _, _, decision, _ in made]
-    for name in candidates:
-        columns[f"est_l95_ms_{name}"] = [est[name].l95_ms for _, _, _, est in made]
-        rates = [est[name].violation_rate for _, _, _, est in made]
-        columns[f"est_violation_rate_{name}"] = rates
+    names = controller.log.columns(candidates)
+    rows = controller.log.decisions
+    columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
     return _decision_frame(columns, candidates)
 
 
