@@ -140,7 +140,7 @@ class _SampleCycles:
         finish: dict[str, Floats] = {}
         for name in pipeline.topological():
             task = pipeline.tasks[name]
-            ready = np.full(self.samples, task.offset_ms)
+            ready = np.full(self.samples, float(task.offset_ms))
             for flow in pipeline.inputs(name):
                 np.maximum(ready, finish[flow.source] + self._sent(flow, placement), out=ready)
             finish[name] = ready + self._executed(task, placement[name])

@@ -246,8 +246,9 @@ def _turn_sites(s: Tables, node: int, down: int, now: int) -> None:
             s.sites[site, IDLE] = s.sites[site, WORKERS]
             continue
         ready = now + s.sites[site, START_NS]
-        s.sites[site, READY_AT] = ready
+        s.sites[site, READY_AT] = 0
         if ready > now:
+            s.sites[site, READY_AT] = ready
             key = (RESTART << KIND_SHIFT) | (s.sites[site, SITE_CELL] << CELL_SHIFT) | site
             push_event(s.clock, s.event_t, s.event_key, ready, key)
     if down != 0:
@@ -328,8 +329,11 @@ def _retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
 
 
 @phase
-def _restart(s: Tables, cell: int, site: int) -> None:
-    """Workers of a restarted node take what has come meanwhile."""
+def _restart(s: Tables, cell: int, site: int, now: int) -> None:
+    """Workers of a restarted node take what has come meanwhile, unless it is down again."""
+    if s.sites[site, READY_AT] != now:
+        return
+    s.sites[site, READY_AT] = 0
     waiting = min(s.sites[site, WAITING], s.sites[site, IDLE])
     s.sites[site, IDLE] -= waiting
     for _ in range(waiting):
@@ -366,7 +370,7 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         _change(s, now)
         _announce_change(s)
     elif kind == RESTART:
-        _restart(s, cell, item)
+        _restart(s, cell, item, now)
 
 
 @kernel

@@ -15,6 +15,7 @@ from dwell.kernels.layout import (
     DIRTY,
     DONE,
     DOWN,
+    DROPPED,
     FAIR,
     FLOW_0,
     HEAD,
@@ -27,6 +28,7 @@ from dwell.kernels.layout import (
     LOG_READY,
     LOG_START,
     LOST,
+    LOST_ON_LINK,
     MISSING,
     N_CYCLES,
     N_DIRTY,
@@ -143,7 +145,7 @@ def become_ready(s: Tables, cell: int, cycle: int, local: int, now: int) -> bool
     if s.servers[index(s.sites[site, SERVER]), DOWN] != 0:
         drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
         return False
-    if s.sites[site, IDLE] > 0 and now >= s.sites[site, READY_AT]:
+    if s.sites[site, IDLE] > 0 and s.sites[site, READY_AT] == 0:
         s.sites[site, IDLE] -= 1
         return True
     depth = s.sites[site, DEPTH]
@@ -181,7 +183,11 @@ def drop_waiting(s: Tables, cell: int, local: int, site: int, now: int) -> None:
 
 @phase
 def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
-    """Handle a message that reaches its node."""
+    """Handle a message that reaches its node, or that is lost on its link."""
+    if flow & LOST_ON_LINK:
+        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+        lose(s, cell, cycle, DROPPED)
+        return
     row = job_row(s, cell, cycle, s.flows[_flow_row(s, cell, flow), TARGET])
     if s.servers[index(s.sites[index(s.jobs[row, SITE]), SERVER]), DOWN] != 0:
         s.slots[slot_row(s, cell, cycle), LIVE] -= 1

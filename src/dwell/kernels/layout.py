@@ -26,6 +26,8 @@ CELL_SHIFT = ITEM_BITS + CYCLE_BITS
 KIND_SHIFT = ITEM_BITS + CYCLE_BITS + CELL_BITS
 # Marks a job on the ready list that a worker has taken already; the kind's place is free there.
 TAKEN = 1 << KIND_SHIFT
+# Marks an arrival that is the loss of a message; flows stay below it.
+LOST_ON_LINK = 1 << (ITEM_BITS - 1)
 ITEM_MASK = (1 << ITEM_BITS) - 1
 CYCLE_MASK = (1 << CYCLE_BITS) - 1
 CELL_MASK = (1 << CELL_BITS) - 1

@@ -21,6 +21,7 @@ from dwell.kernels.layout import (
     LINK,
     LIVE,
     LOST,
+    LOST_ON_LINK,
     PAYLOAD,
     RETRANSMIT_NS,
     RETRY,
@@ -56,24 +57,35 @@ def lose(s: Tables, cell: int, cycle: int, outcome: int) -> None:
 
 @phase
 def _begin(s: Tables, link: int, now: int) -> int:
-    """First instant at which the link can take a message; moves on to the segment of that instant.
+    """When the link can take a message; its current segment becomes the one of that instant.
 
-    Returns -1 where the link is down and drops, -2 where it is down for good and would hold.
+    A link that drops takes it at once even while it is down, to lose it; one that retransmits
+    holds it back to the end of the outage, if there is one.
     """
     start = max(now, s.links[link, FREE])
-    while True:
-        segment = s.links[link, SEGMENT]
-        last = s.links[link, SEGMENT_END] - 1
-        while segment < last and s.segments[index(segment + 1), SEGMENT_AT] <= start:
+    last = s.links[link, SEGMENT_END] - 1
+    segment = s.links[link, SEGMENT]
+    while segment < last and s.segments[index(segment + 1), SEGMENT_AT] <= start:
+        segment += 1
+    if s.links[link, RETRANSMIT_NS] >= 0:
+        while segment < last and s.segments[index(segment), SEGMENT_DOWN] != 0:
             segment += 1
-        s.links[link, SEGMENT] = segment
-        if s.segments[index(segment), SEGMENT_DOWN] == 0:
-            return start
-        if s.links[link, RETRANSMIT_NS] < 0:
-            return -1
-        if segment == last:
-            return -2
-        start = s.segments[index(segment + 1), SEGMENT_AT]
+            start = s.segments[index(segment), SEGMENT_AT]
+    s.links[link, SEGMENT] = segment
+    return int(start)
+
+
+@phase
+def _lose_message(
+    s: Tables, cell: int, cycle: int, flow: int, outcome: int, at: int, now: int
+) -> None:
+    """Lose a message when its transmission begins, or would begin."""
+    if at > now:
+        key = (ARRIVAL << KIND_SHIFT) | (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT)
+        push_event(s.clock, s.event_t, s.event_key, at, key | flow | LOST_ON_LINK)
+        return
+    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+    lose(s, cell, cycle, outcome)
 
 
 @phase
@@ -81,39 +93,46 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     """Send one message of a flow for the first time (attempt 0) or once more."""
     link = index(s.hops[index(hop), LINK])
     start = _begin(s, link, now)
-    if start < 0:
-        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
-        lose(s, cell, cycle, DROPPED if start == -1 else IN_FLIGHT)
-        return
     segment = index(s.links[link, SEGMENT])
-    rate = s.segments_f[segment, SEGMENT_RATE]
     transmission = 0
-    if rate < math.inf:
-        transmission = int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+    lost = s.segments[segment, SEGMENT_DOWN] != 0
+    if not lost:
+        rate = s.segments_f[segment, SEGMENT_RATE]
+        if rate < math.inf:
+            transmission = int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+        s.links[link, FREE] = start + transmission
+        loss = s.segments_f[segment, SEGMENT_LOSS]
+        lost = loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss
     sent = start + transmission
-    s.links[link, FREE] = sent
-    loss = s.segments_f[segment, SEGMENT_LOSS]
     name = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | flow
-    slot = slot_row(s, cell, cycle)
-    if loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss:
+    if lost:
         timeout = s.links[link, RETRANSMIT_NS]
         if timeout < 0:
-            s.slots[slot, LIVE] -= 1
-            lose(s, cell, cycle, DROPPED)
-            return
-        s.attempts[slot, flow] = attempt
-        push_event(s.clock, s.event_t, s.event_key, sent + timeout, (RETRY << KIND_SHIFT) | name)
+            _lose_message(s, cell, cycle, flow, DROPPED, start, now)
+        elif s.segments[segment, SEGMENT_DOWN] != 0:
+            # A link that holds messages back and is down for good: it waits for ever.
+            _lose_message(s, cell, cycle, flow, IN_FLIGHT, now, now)
+        else:
+            s.attempts[slot_row(s, cell, cycle), flow] = attempt
+            key = (RETRY << KIND_SHIFT) | name
+            push_event(s.clock, s.event_t, s.event_key, sent + timeout, key)
         return
-    delay = s.delay_ns[index(hop), cycle]
-    layers = s.segments[segment, SEGMENT_LAYERS]
-    layer = 0
-    while layers != 0:
-        if layers & 1:
-            delay += s.extra_ns[s.layer_rows[hop, layer], cycle]
-        layers >>= 1
-        layer += 1
-    arrival = sent + delay
+    arrival = sent + _propagation(s, hop, segment, cycle)
     if s.links[link, IN_ORDER] != 0:
         arrival = max(arrival, s.links[link, LAST_ARRIVAL])
         s.links[link, LAST_ARRIVAL] = arrival
     push_event(s.clock, s.event_t, s.event_key, arrival, (ARRIVAL << KIND_SHIFT) | name)
+
+
+@phase
+def _propagation(s: Tables, hop: int, segment: int, cycle: int) -> int:
+    """Delay of a message, extra delays of what is active included."""
+    delay = s.delay_ns[index(hop), cycle]
+    layers = s.segments[index(segment), SEGMENT_LAYERS]
+    layer = 0
+    while layers != 0:
+        if layers & 1:
+            delay += s.extra_ns[s.layer_rows[index(hop), layer], cycle]
+        layers >>= 1
+        layer += 1
+    return int(delay)

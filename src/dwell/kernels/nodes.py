@@ -158,6 +158,8 @@ def _preempt(s: Tables, server: int) -> bool:
     rank, ready, key = s.wait_rank[base], s.wait_ready[base], s.wait_key[base]
     for i in range(s.servers[server, N_RUN]):
         other = s.run_key[base + i]
+        if s.run_v[index(base + i)] - s.servers_f[server, VIRTUAL] <= SLACK:
+            continue  # it has all its work and completes at this very instant
         row = key_row(s, other)
         other_rank = s.sites[index(s.jobs[row, SITE]), RANK]
         other_ready = s.jobs[row, READY]

@@ -248,8 +248,8 @@ class _Layout:
     def _check_keys(self) -> None:
         limits = (
             ("cells", len(self.cells), k.CELL_MASK),
-            ("tasks", len(self.tasks), k.ITEM_MASK),
-            ("flows", len(self.flows), k.ITEM_MASK),
+            ("tasks of a cell", self.max_tasks, k.ITEM_MASK),
+            ("flows of a cell", self.max_flows, k.LOST_ON_LINK - 1),
             ("feasible (task, node) pairs", len(self.sites), k.ITEM_MASK),
         )
         for what, number, limit in limits:
