@@ -31,7 +31,7 @@ __all__ = [
     "transmission_ns",
 ]
 
-COMPLETION, ARRIVAL, DISTURBANCE, CLOSE, RELEASE = 1, 2, 3, 4, 5
+COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, CLOSE, RELEASE = 1, 2, 3, 4, 5, 6, 7
 MASK = 2**64 - 1
 NEAR_NS = 1000
 
@@ -438,7 +438,7 @@ class Simulation:
                 else:
                     self.at(
                         self.release[cycle] + offset,
-                        ARRIVAL,
+                        START,
                         cycle,
                         self.index[name],
                         lambda name=name: self.start_source(cycle, name),  # type: ignore[misc]
@@ -691,7 +691,7 @@ class Simulation:
             self.send(link, message)
 
         task = self.index[message.flow.target]
-        self.at(again, ARRIVAL, message.cycle, task, happen, cause=begun)
+        self.at(again, REPEAT, message.cycle, task, happen, cause=begun)
 
 
 def closest_unrelated(log: Sequence[LogEntry]) -> int | None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from dwell.report.palette import INK, MUTED, PAPER, PARTS, Palette
+from dwell.report.scales import is_wide, set_log_ticks
 from dwell.report.svg import inline, new_figure
-from dwell.report.wording import Measure, shown_policy, shown_scenario, write_number
+from dwell.report.wording import Measure, shown_policy, shown_scenario
 from dwell.study import AIM, Comparison
 
 if TYPE_CHECKING:
@@ -23,9 +24,7 @@ Draw: TypeAlias = "Callable[[Axes, str], None]"
 PANELS_A_ROW = 5
 ROW_INCHES = 0.235
 NODE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-# Where a ratio of values asks for a logarithmic axis.
-WIDE = 6.0
-LOG_TICKS = (1, 2, 5)
+LATER_RANGE = (0.1, 120.0)
 
 
 def intervals(
@@ -33,6 +32,7 @@ def intervals(
     palette: Palette,
     measure: Measure,
     *,
+    title: str,
     limit: float,
     limit_name: str,
 ) -> str:
@@ -43,12 +43,12 @@ def intervals(
     comparison : Comparison
     palette : Palette
     measure : Measure
+    title : str
+        What the axis shows, with its unit.
     limit : float
         A line to be under, in the column's unit.
     limit_name : str
     """
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-
     policies = comparison.policies
     found = {
         (scenario, policy): comparison.interval(scenario, policy, measure.column)
@@ -58,7 +58,7 @@ def intervals(
     shown = [over.value * measure.factor for over in found.values()]
     positive = [value for value in [*shown, limit * measure.factor] if 0 < value < math.inf]
     low, high = min(positive), max(positive)
-    wide = high > WIDE * low
+    wide = is_wide(positive)
     # Room below the smallest value, where zeros stand as open marks.
     edge = low / 2.5 if wide else 0.0
 
@@ -75,19 +75,17 @@ def intervals(
                 ends = [max(left, edge), min(right, high * 2)]
                 ax.plot(ends, [row, row], "-", color=style.colour, lw=2.2, alpha=0.45)
             ax.plot([value], [row], style.marker, color=style.colour)
-        ax.axvline(limit * measure.factor, color=INK, lw=0.9, ls=(0, (4, 2)))
+        _line(ax, limit * measure.factor)
         if wide:
             ax.set_xscale("log")
             ax.set_xlim(edge, high * 1.6)
-            ticks = _log_ticks(edge, high * 1.6)
-            ax.xaxis.set_major_locator(FixedLocator(ticks))
-            ax.xaxis.set_minor_locator(NullLocator())
-            ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+            set_log_ticks(ax.xaxis, edge, high * 1.6)
         else:
             ax.set_xlim(0, high * 1.08)
         ax.grid(axis="y", visible=False)
 
-    label = f"{measure.heading}; dashed: {limit_name}"
+    scale = ", logarithmic" if wide else ""
+    label = f"{title}{scale}; dashed: {limit_name}"
     return _panels(comparison, policies, f"{measure.column}-{comparison.problem.name}", draw, label)
 
 
@@ -118,8 +116,12 @@ def placement_shares(comparison: Comparison, palette: Palette, policies: Sequenc
 
 def latency_split(comparison: Comparison) -> str:
     """Where the time of a finished cycle goes along its critical path, as stacked bars."""
+    import polars as pl
+
     deadline_ms = comparison.problem.pipeline.deadline_ms
     policies = comparison.policies
+    sums = comparison.runs.select(total=sum(pl.col(f"{part}_ms") for part in PARTS))["total"]
+    longest = max([deadline_ms, *(value for value in sums if math.isfinite(value))])
 
     def draw(ax: Axes, scenario: str) -> None:
         for row, policy in enumerate(policies):
@@ -129,14 +131,14 @@ def latency_split(comparison: Comparison) -> str:
                 if math.isfinite(width):
                     ax.barh(row, width, left=left, color=colour, height=0.66, ec=PAPER, lw=0.6)
                     left += width
-        ax.axvline(deadline_ms, color=INK, lw=0.9, ls=(0, (4, 2)))
-        ax.set_xlim(left=0)
+        _line(ax, deadline_ms)
+        ax.set_xlim(0, 1.04 * longest)
         ax.grid(axis="y", visible=False)
 
-    legend = list(PARTS.items())
+    legend = list(zip(("computing", "waiting", "network"), PARTS.values(), strict=True))
     name = f"split-{comparison.problem.name}"
     label = "mean latency of finished cycles (ms); dashed: deadline"
-    return _panels(comparison, policies, name, draw, label, legend=legend, same_x=True)
+    return _panels(comparison, policies, name, draw, label, legend=legend)
 
 
 def node_use(comparison: Comparison) -> str:
@@ -154,7 +156,7 @@ def node_use(comparison: Comparison) -> str:
                 face = PAPER if i % 2 else shade
                 ax.plot([used], [row], marker, mfc=face, mec=shade, ms=5.5, clip_on=False)
         if math.isfinite(cap):
-            ax.axvline(cap * 100, color=INK, lw=0.9, ls=(0, (4, 2)))
+            _line(ax, cap * 100)
         ax.set_xlim(0, 100)
         ax.set_xticks([0, 50, 100])
 
@@ -178,38 +180,43 @@ def node_use(comparison: Comparison) -> str:
 
 
 def distributions(comparison: Comparison, palette: Palette) -> str:
-    """Distribution of the final latency of all cycles, one line a policy."""
+    """Share of the cycles that took longer than a latency: one less the empirical distribution."""
     import polars as pl
     from matplotlib.lines import Line2D
 
     deadline_ms = comparison.problem.pipeline.deadline_ms
     scenarios, columns = comparison.scenarios, min(3, len(comparison.scenarios))
     rows = math.ceil(len(scenarios) / columns)
-    with new_figure(1.95 * rows + 0.5) as figure:
-        axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
-        for ax, scenario in zip(axes, scenarios, strict=False):
+    with new_figure(2.15 * rows + 0.5) as figure:
+        axes = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+        for i, ax in enumerate(axes):
+            if i >= len(scenarios):
+                ax.set_axis_off()
+                continue
             for policy in comparison.policies:
                 style = palette.policies[policy]
                 line = comparison.latencies.filter(
-                    (pl.col("scenario") == scenario) & (pl.col("policy") == policy)
+                    (pl.col("scenario") == scenarios[i]) & (pl.col("policy") == policy)
                 )
+                later = 100 * (1 - line["share"].to_numpy())
+                # Zero has no place on a logarithmic axis.
+                later[later <= 0] = np.nan
                 ax.plot(
                     line["latency_ms"].to_numpy(),
-                    line["share"].to_numpy() * 100,
+                    later,
                     color=style.colour,
                     ls=style.dashes,
                     lw=style.width,
                 )
-            ax.axvline(deadline_ms, color=INK, lw=0.9, ls=(0, (4, 2)))
-            ax.axhline(100 * (1 - AIM), color=MUTED, lw=0.7, ls=(0, (1, 2)))
-            ax.set_title(shown_scenario(scenario))
-            ax.set_ylim(0, 102)
+            _line(ax, deadline_ms)
+            ax.axhline(100 * AIM, color=MUTED, lw=0.8, ls=(0, (1, 2)))
+            ax.set_title(shown_scenario(scenarios[i]))
+            ax.set_yscale("log")
+            ax.set_ylim(*LATER_RANGE)
+            set_log_ticks(ax.yaxis, *LATER_RANGE)
             ax.set_xlim(0, 3 * deadline_ms)
-            ax.set_yticks([0, 50, 95])
-        for ax in list(axes)[len(scenarios) :]:
-            ax.set_axis_off()
         figure.supxlabel("latency (ms); dashed: deadline", size=9, color=MUTED)
-        figure.supylabel("cycles done within it (%)", size=9, color=MUTED)
+        figure.supylabel("cycles that took longer (%)", size=9, color=MUTED)
         handles = [
             Line2D(
                 [],
@@ -235,7 +242,6 @@ def _panels(
     *,
     legend: Sequence[tuple[str, str]] = (),
     handles: Sequence[object] = (),
-    same_x: bool = False,
 ) -> str:
     """Draw one panel a scenario, side by side, the policies named at the left."""
     from matplotlib.patches import Patch
@@ -246,7 +252,7 @@ def _panels(
     patches = handles or [Patch(color=colour, label=text) for text, colour in legend]
     height = rows * (len(policies) * ROW_INCHES + 0.45) + 0.3 + (0.3 if patches else 0)
     with new_figure(height) as figure:
-        grid = figure.subplots(rows, columns, sharey=True, sharex=same_x, squeeze=False)
+        grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
         for i, ax in enumerate(grid.flat):
             if i >= len(scenarios):
                 ax.set_axis_off()
@@ -255,22 +261,19 @@ def _panels(
             ax.set_title(_folded(shown_scenario(scenarios[i])))
             ax.tick_params(axis="y", length=0)
             ax.spines["left"].set_visible(False)
-        first = grid[0, 0]
-        first.set_ylim(len(policies) - 0.4, -0.6)
-        first.set_yticks(range(len(policies)))
-        _name_rows(grid[:, 0], policies)
+        grid[0, 0].set_ylim(len(policies) - 0.4, -0.6)
+        for ax in grid[:, 0]:
+            ax.set_yticks(range(len(policies)), [shown_policy(name) for name in policies])
+            ax.tick_params(axis="y", labelcolor=INK)
         figure.supxlabel(label, size=9, color=MUTED)
         if patches:
             figure.legend(handles=patches, loc="outside upper left", ncols=len(patches))
         return inline(figure, name, label)
 
 
-def _name_rows(axes: Iterable[Axes], policies: Sequence[str]) -> None:
-    for ax in axes:
-        ax.set_yticks(range(len(policies)), [_folded(shown_policy(name), 14) for name in policies])
-        for text in ax.get_yticklabels():
-            text.set_color(INK)
-            text.set_linespacing(0.95)
+def _line(ax: Axes, x: float) -> None:
+    """Draw a limit, behind the data."""
+    ax.axvline(x, color=INK, lw=0.9, ls=(0, (4, 2)), zorder=1)
 
 
 def _folded(text: str, width: int = 22) -> str:
@@ -280,18 +283,3 @@ def _folded(text: str, width: int = 22) -> str:
     blanks = [i for i, letter in enumerate(text) if letter == " "]
     middle = min(blanks, key=lambda i: abs(i - len(text) / 2))
     return f"{text[:middle]}\n{text[middle + 1 :]}"
-
-
-def _log_ticks(low: float, high: float) -> list[float]:
-    """Return 1, 2 and 5 times powers of ten between the two, thinned out where they are many."""
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ticks = [step * 10.0**power for power in powers for step in LOG_TICKS]
-    ticks = [tick for tick in ticks if low <= tick <= high]
-    if len(ticks) > 5:
-        ticks = [tick for tick in ticks if np.isclose(math.log10(tick) % 1, [0, 1]).any()]
-    return ticks
-
-
-def percent(value: float) -> str:
-    """Write a share in percent."""
-    return f"{write_number(100 * value)} %"

@@ -41,23 +41,24 @@ class Cell(NamedTuple):
 
 STYLE = """
 :root { color-scheme: light dark;
-  --paper: #fff; --ink: #1c1c1e; --muted: #66666b; --rule: #dededf; --tint: #f5f5f6;
+  --paper: #fff; --ink: #1c1c1e; --muted: #66666b; --rule: #dededf;
   --good: #00694d; --bad: #b04a00; }
 @media (prefers-color-scheme: dark) { :root {
-  --paper: #17181a; --ink: #e6e6e8; --muted: #a0a0a6; --rule: #38393d; --tint: #202124;
+  --paper: #17181a; --ink: #e6e6e8; --muted: #a0a0a6; --rule: #38393d;
   --good: #4cc9a0; --bad: #ff9a52; } }
 @media print { :root { color-scheme: light;
-  --paper: #fff; --ink: #000; --muted: #444; --rule: #bbb; --tint: #fff;
+  --paper: #fff; --ink: #000; --muted: #444; --rule: #bbb;
   --good: #00694d; --bad: #b04a00; } }
 * { box-sizing: border-box; }
 html { -webkit-text-size-adjust: 100%; }
 body { margin: 0; background: var(--paper); color: var(--ink);
   font: 16px/1.6 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif;
 }
-main { max-width: 1040px; margin: 0 auto; padding: 72px 32px 120px; }
-.prose, p, h1, h2, h3, ul, dl { max-width: 46em; }
+main { max-width: 1100px; margin: 0 auto; padding: 72px 32px 120px; }
+p, h1, h2, h3, ul, dl { max-width: 46em; }
 h1 { font-size: 32px; line-height: 1.2; font-weight: 650; letter-spacing: -0.01em;
   margin: 0 0 8px; }
+h1.chapter { margin-top: 120px; }
 h2 { font-size: 22px; line-height: 1.3; font-weight: 650; margin: 80px 0 16px; }
 h3 { font-size: 17px; line-height: 1.4; font-weight: 650; margin: 44px 0 8px; }
 p, ul { margin: 0 0 14px; }
@@ -69,42 +70,49 @@ li { margin: 0 0 8px; }
 .tag { font-size: 13px; font-weight: 600; margin-left: 10px; white-space: nowrap; }
 .good { color: var(--good); } .bad { color: var(--bad); } .open { color: var(--muted); }
 code { font: 0.9em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
-figure { margin: 28px 0 44px; }
+sub { font-size: 0.72em; line-height: 0; }
+small { font-size: 12px; color: var(--muted); }
+figure { margin: 28px 0 48px; }
 figcaption { max-width: 52em; margin-top: 10px; }
-svg { display: block; width: 100%; height: auto; color: var(--ink); overflow: visible;
-  font-family: inherit; stroke-linejoin: round; }
+svg { display: block; width: 100%; max-width: 960px; height: auto; color: var(--ink);
+  overflow: visible; font-family: inherit; stroke-linejoin: round; }
 .scroll { overflow-x: auto; margin: 20px 0 12px; }
 table { border-collapse: collapse; font-size: 14px; line-height: 1.35;
   font-variant-numeric: tabular-nums; }
-caption { text-align: left; padding-bottom: 10px; }
-th, td { padding: 5px 0; text-align: left; vertical-align: baseline; font-weight: 400; }
+caption { text-align: left; padding-bottom: 14px; max-width: 52em; }
+th, td { padding: 5px 0 5px 12px; text-align: left; vertical-align: baseline; font-weight: 400; }
+th:first-child, td:first-child { padding-left: 0; }
 th { color: var(--muted); font-size: 13px; }
-thead th { border-bottom: 1px solid var(--ink); padding: 0 0 6px; vertical-align: bottom; }
+thead th { padding-bottom: 6px; vertical-align: bottom; }
+thead tr:last-child th { border-bottom: 1px solid var(--ink); }
 tbody tr + tr > * { border-top: 1px solid var(--rule); }
-tbody th { color: inherit; font-size: inherit; padding-right: 18px; white-space: nowrap; }
-td + td, th + th, th + td { padding-left: 14px; }
-.num { text-align: right; white-space: nowrap; }
-.err { padding-left: 5px !important; color: var(--muted); font-size: 12.5px;
-  white-space: nowrap; }
-thead .pair { text-align: right; padding-right: 20px; }
+tbody th { color: inherit; font-size: inherit; white-space: nowrap; }
+.num, .err { white-space: nowrap; }
+.num { text-align: right; }
+.err { padding-left: 5px; color: var(--muted); font-size: 12.5px; }
+thead .pair { text-align: center; padding-left: 24px; }
+thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
+.begin { padding-left: 36px; }
+.wide { width: 100%; }
+.prose { width: 100%; max-width: 52em; }
+.prose td, .prose th { padding-left: 20px; }
 tr.group > * { padding: 30px 0 6px; border-top: 0 !important; border-bottom: 1px solid var(--ink);
-  font-weight: 650; color: var(--ink); font-size: 15px; }
-tr.first > * { border-top: 0 !important; }
+  font-weight: 650; font-size: 15px; }
+tr.group + tr > * { border-top: 0; }
+tbody tr.group:first-child > * { padding-top: 16px; }
 .best { font-weight: 650; }
-sub { font-size: 0.72em; line-height: 0; }
-h1.chapter { margin-top: 120px; }
 .swatch { display: inline-block; width: 10px; height: 10px; border-radius: 2px;
   margin-right: 7px; }
-.ring { background: none !important; border: 2px solid var(--ink); border-radius: 5px; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 4px 20px; font-size: 15px; }
+.ring { background: none; border: 2px solid; border-radius: 5px; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: 6px 20px; font-size: 15px; }
 dt { color: var(--muted); } dd { margin: 0; }
 @media (max-width: 640px) { main { padding: 40px 18px 80px; } dl { display: block; }
   dd { margin-bottom: 8px; } }
 @media print { body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
   h2 { margin-top: 32pt; } h2, h3 { break-after: avoid; }
   figure, tr, li { break-inside: avoid; } .scroll { overflow: visible; }
-  table { font-size: 8.5pt; } th, .err { font-size: 8pt; }
-  td + td, th + th, th + td { padding-left: 7px; } }
+  table { font-size: 8.5pt; } th, .err, small { font-size: 8pt; }
+  td, th { padding-left: 6px; } .err { padding-left: 3px; } }
 """
 
 
@@ -162,8 +170,10 @@ def swatch(colour: str) -> str:
 
 def marked(text: str) -> str:
     """Escape a text; set `code` and the symbols with an index."""
-    html = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text))
-    return re.sub(r"\b(V_D|U_r|U_e)\b", lambda m: f"{m[0][0]}<sub>{m[0][2]}</sub>", html)
+    html = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text, quote=False))
+    html = re.sub(r"(?<!\w)([A-ZΔ])_(D|r|e|min|max)\b", r"\1<sub>\2</sub>", html)
+    # A number stays on one line with its unit.
+    return re.sub(r"(?<=\d) (?=(?:%|ms|s)(?!\w))", "\u00a0", html)
 
 
 def _cells(row: Sequence[Cell], *, heading: bool = False) -> str:
@@ -177,7 +187,14 @@ def _cells(row: Sequence[Cell], *, heading: bool = False) -> str:
     return "".join(parts)
 
 
-def table(head: Sequence[Cell], rows: Iterable[tuple[str, Sequence[Cell]]], caption: str) -> str:
+def table(
+    head: Sequence[Cell],
+    rows: Iterable[tuple[str, Sequence[Cell]]],
+    caption: str = "",
+    *,
+    above: Sequence[Cell] = (),
+    kind: str = "",
+) -> str:
     """Return a table.
 
     Parameters
@@ -187,14 +204,20 @@ def table(head: Sequence[Cell], rows: Iterable[tuple[str, Sequence[Cell]]], capt
         A row's class is empty, or ``group`` for a heading across the table.
     caption : str
         Plain text.
+    above : sequence of cells
+        A second row of headings, over the first.
+    kind : str
+        Class of the table.
     """
     lines = [
-        f'<tr class="{kind}">{_cells(row)}</tr>' if kind else f"<tr>{_cells(row)}</tr>"
-        for kind, row in rows
+        f'<tr class="{group}">{_cells(row)}</tr>' if group else f"<tr>{_cells(row)}</tr>"
+        for group, row in rows
     ]
-    body = "\n".join(lines)
+    heads = [f"<tr>{_cells(row, heading=True)}</tr>" for row in (above, head) if row]
     return (
-        f'<div class="scroll"><table>\n<caption>{marked(caption)}</caption>\n'
-        f"<thead><tr>{_cells(head, heading=True)}</tr></thead>\n<tbody>\n{body}\n</tbody>\n"
-        "</table></div>"
+        f'<div class="scroll"><table class="{kind}">\n'
+        + (f"<caption>{marked(caption)}</caption>\n" if caption else "")
+        + f"<thead>{''.join(heads)}</thead>\n<tbody>\n"
+        + "\n".join(lines)
+        + "\n</tbody>\n</table></div>"
     )

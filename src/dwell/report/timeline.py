@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.report.palette import INK, MUTED, RULE
+from dwell.report.scales import is_wide, set_log_ticks
 from dwell.report.svg import inline, new_figure
 from dwell.study import AIM
 
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["timeline"]
 
 Floats: TypeAlias = NDArray[np.float64]
-
-WIDE = 5.0
 
 
 def timeline(
@@ -62,7 +62,7 @@ def timeline(
         strip, rates, tails, costs = axes
         _strip(strip, begin_s, end_s, names, placements)
         for ax, column, factor, title, line in (
-            (rates, "violation_rate", 100.0, "V_D (%)", AIM * 100),
+            (rates, "violation_rate", 100.0, "missed (%)", AIM * 100),
             (tails, "seen_l95_ms", 1.0, "L95 (ms)", deadline_ms),
         ):
             values = windows[column].cast(float).fill_null(math.nan).to_numpy() * factor
@@ -91,12 +91,12 @@ def _strip(
     placements: Mapping[str, str],
 ) -> None:
     """Draw a band that has the colour of the placement."""
+    change = [0, *(i for i in range(1, len(names)) if names[i] != names[i - 1]), len(names)]
+    stretches = [
+        (float(begin_s[i]), float(end_s[j - 1]), names[i]) for i, j in itertools.pairwise(change)
+    ]
     for placement, colour in placements.items():
-        mine = [
-            (float(begin), float(end - begin))
-            for begin, end, name in zip(begin_s, end_s, names, strict=True)
-            if name == placement
-        ]
+        mine = [(begin, end - begin) for begin, end, name in stretches if name == placement]
         ax.broken_barh(mine, (0, 1), color=colour, lw=0)
     ax.set_ylim(0, 1)
     ax.set_yticks([])
@@ -111,7 +111,7 @@ def _marks(ax: Axes, x: Floats, values: Floats, colours: Sequence[str]) -> None:
     ax.plot(x, values, "-", color=RULE, lw=0.8, zorder=1)
     for colour in dict.fromkeys(colours):
         mine = np.array([c == colour for c in colours])
-        ax.plot(x[mine], values[mine], "o", color=colour, ms=2.8, mew=0, zorder=2)
+        ax.plot(x[mine], values[mine], "o", color=colour, ms=3, mew=0, zorder=2)
 
 
 def _costs(
@@ -134,25 +134,22 @@ def _costs(
         series = np.full(len(middle_s), math.nan)
         series[at[known]] = estimated[known]
         ax.step(middle_s, series, where="mid", color=colour, lw=1.1, zorder=3)
-    ax.set_ylabel("J")
+    ax.set_ylabel("cost J")
     _widen(ax, [], bottom=None)
 
 
 def _widen(ax: Axes, include: Sequence[float], bottom: float | None) -> None:
     """Choose a linear or logarithmic axis that holds the data and what is to be included."""
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
     data = [line.get_ydata(orig=True) for line in ax.get_lines() if np.size(line.get_xdata()) > 2]
     values = np.concatenate([np.asarray(part, float) for part in data] or [np.zeros(0)])
     values = np.concatenate([values[np.isfinite(values)], np.asarray(include, float)])
     if not len(values):
         return
     low, high = float(values.min()), float(values.max())
-    if bottom is None and low > 0 and high > WIDE * low:
+    if bottom is None and is_wide((low, high)):
         ax.set_yscale("log")
         ax.set_ylim(low / 1.25, high * 1.25)
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        set_log_ticks(ax.yaxis, low / 1.25, high * 1.25)
         return
     margin = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
     ax.set_ylim(low - margin if bottom is None else bottom - 0.3 * margin, high + margin)
@@ -167,7 +164,7 @@ def _legend(figure: Figure, placements: Mapping[str, str]) -> None:
         Patch(color=colour, label=name) for name, colour in placements.items()
     ]
     handles += [
-        Line2D([], [], ls="", marker="o", ms=3.5, mew=0, color=MUTED, label="measured, active"),
+        Line2D([], [], ls="", marker="o", ms=4, mew=0, color=MUTED, label="measured, active"),
         Line2D([], [], color=MUTED, lw=1.1, label="estimated, not active"),
         Line2D([], [], color=INK, lw=0.9, ls=(0, (4, 2)), label="5 % aim, deadline"),
     ]

@@ -12,6 +12,7 @@ __all__ = [
     "Measure",
     "Written",
     "listed",
+    "percent",
     "shown_policy",
     "shown_scenario",
     "write_interval",
@@ -41,6 +42,8 @@ class Measure(NamedTuple):
     factor : float
         From the column's unit to the one shown.
     decimals : int
+    ends : bool
+        Whether the interval is always written by its ends.
     """
 
     column: str
@@ -48,6 +51,7 @@ class Measure(NamedTuple):
     unit: str = ""
     factor: float = 1.0
     decimals: int = 1
+    ends: bool = False
 
     @property
     def heading(self) -> str:
@@ -80,23 +84,20 @@ def write_number(value: float, decimals: int = 1) -> str:
 def write_interval(interval: Interval, measure: Measure) -> Written:
     """Write a number over seeds with its 95 % interval.
 
-    Symmetric intervals become ``± half``; others, and those with an infinite end, ``[low, high]``.
-    A number that was the same for every seed has no error beside it.
+    Symmetric intervals become ``± half``, others ``[low, high]``. Where every seed showed the same
+    number, or the same extreme of a share, nothing stands beside it.
     """
-    factor, decimals = measure.factor, measure.decimals
-    value, low, high = (end * factor for end in interval)
-    text = write_number(value, decimals)
-    if not interval.known or low == high:
+    value, low, high = (end * measure.factor for end in interval)
+    if value == low == high == 0:
+        return Written("0", "")
+    text = write_number(value, measure.decimals)
+    if not interval.known or low == high or (value in (low, high) and interval.value in (0, 1)):
         return Written(text, "")
-    if value in (low, high) or not math.isfinite(high):
-        # One end only: every seed showed the same extreme.
-        if interval.value in (0.0, 1.0):
-            return Written(text, "")
-        return Written(text, _between(low, high, decimals))
-    half, other = high - value, value - low
-    if abs(half - other) > 0.02 * (high - low):
-        return Written(text, _between(low, high, decimals))
-    places = decimals if abs(value) < 1000 else 0
+    half = high - value
+    even = math.isfinite(half) and abs(half - (value - low)) <= 0.02 * (high - low)
+    if measure.ends or not even:
+        return Written(text, _between(low, high, measure.decimals))
+    places = measure.decimals if abs(value) < 1000 else 0
     least = 10.0**-places
     if half < least / 2:
         return Written(text, f"± <{least:.{places}f}")
@@ -105,6 +106,11 @@ def write_interval(interval: Interval, measure: Measure) -> Written:
 
 def _between(low: float, high: float, decimals: int) -> str:
     return f"[{write_number(low, decimals)}, {write_number(high, decimals)}]"
+
+
+def percent(share: float, decimals: int = 0) -> str:
+    """Write a share in percent: ``5 %``."""
+    return f"{write_number(100 * share, decimals)} %"
 
 
 def shown_policy(name: str) -> str:
