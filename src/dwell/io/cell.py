@@ -18,13 +18,15 @@ from dwell.model import Problem
 __all__ = ["from_document", "load"]
 
 
-def load(path: str | PathLike[str]) -> Problem:
+def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
     """Read a cell file.
 
     Parameters
     ----------
     path : str or path
-        A YAML 1.2 (or JSON) file; traces that it names are found relative to its folder.
+        A YAML 1.2 (or JSON) file.
+    traces : str or path, optional
+        Folder where the relative names of trace files start; the cell's own where None.
 
     Returns
     -------
@@ -43,7 +45,8 @@ def load(path: str | PathLike[str]) -> Problem:
     text = read_yaml(source, faults)
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
-    return _read(text, faults, Path(source).parent, Path(source).stem or "cell")
+    folder = Path(source).parent if traces is None else Path(traces)
+    return _read(text, faults, folder, Path(source).stem or "cell")
 
 
 def from_document(

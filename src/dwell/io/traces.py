@@ -35,6 +35,11 @@ Steps: TypeAlias = tuple[Step, ...]
 SUFFIXES = (".parquet", ".csv")
 DEFAULT_TIME = "sent_ms"
 
+RELATIVE = (
+    "file names are relative to the cell file's folder, or to the one given as `traces` "
+    "(`--traces FOLDER`)"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Source:
@@ -345,8 +350,8 @@ def _beside(path: Path) -> str:
     try:
         names = [item.name for item in path.parent.iterdir() if item.suffix.lower() in SUFFIXES]
     except OSError:
-        return f"there is no folder {path.parent}; file names are relative to the cell file"
+        return f"there is no folder {path.parent}; {RELATIVE}"
     match = difflib.get_close_matches(path.name, names, n=1)
     if match:
         return f"did you mean {match[0]!r}?"
-    return "file names are relative to the cell file's folder"
+    return RELATIVE

@@ -42,9 +42,7 @@ IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
 FAIR, FIFO, PRIORITY = range(3)
 
 # clock: scalars that outlive a call.
-N_EVENTS, N_DIRTY, NEXT_CHANGE, PAUSE, CLOSED_CELL, RING, STRIDE, MARGIN, N_READY, N_CLOCK = range(
-    10
-)
+N_EVENTS, N_DIRTY, N_READY, NEXT_CHANGE, PAUSE, CLOSED_CELL, N_CLOCK = range(7)
 
 # cells
 (

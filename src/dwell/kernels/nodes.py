@@ -84,15 +84,22 @@ def mark(s: Tables, server: int) -> None:
 
 
 @phase
+def _account(s: Tables, server: int, now: int) -> int:
+    """Bring a server's busy time up to now; returns the time since it last was."""
+    elapsed = now - s.servers[server, LAST]
+    busy = s.servers[server, USED] + s.servers[server, STRESS]
+    if elapsed > 0 and busy > 0 and s.servers[server, DOWN] == 0:
+        s.servers[server, BUSY] += elapsed * min(busy, s.servers[server, CORES])
+    s.servers[server, LAST] = now
+    return int(elapsed)
+
+
+@phase
 def tick(s: Tables, server: int, now: int) -> None:
     """Bring a server's virtual clock and busy time up to now."""
-    elapsed = now - s.servers[server, LAST]
-    if elapsed > 0:
+    elapsed = _account(s, server, now)
+    if s.servers[server, N_RUN] > 0:
         s.servers_f[server, VIRTUAL] += elapsed * s.servers_f[server, SPEED]
-        if s.servers[server, DOWN] == 0:
-            busy = s.servers[server, USED] + s.servers[server, STRESS]
-            s.servers[server, BUSY] += elapsed * min(busy, s.servers[server, CORES])
-        s.servers[server, LAST] = now
 
 
 @phase
@@ -138,7 +145,11 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
         _start(s, server, site, key, row, float(work), now)
         if scheduler == FAIR:
             set_speed(s, server)
-        if s.servers[server, DIRTY] == 0:
+        if s.servers[server, DIRTY] != 0:
+            return
+        if s.servers[server, N_RUN] == 1 and s.servers_f[server, SPEED] == 1.0:
+            _announce(s, server, now + work, key)
+        else:
             schedule(s, server, now)
         return
     mark(s, server)
@@ -207,9 +218,11 @@ def dispatch(s: Tables, server: int, now: int) -> None:
 @phase
 def leave(s: Tables, server: int, site: int, at: int, now: int) -> None:
     """Take running entry `at` off a server."""
-    tick(s, server, now)
     base = s.servers[server, BASE]
     n = s.servers[server, N_RUN]
+    elapsed = _account(s, server, now)
+    if n > 1:  # the virtual clock of an empty server starts anew
+        s.servers_f[server, VIRTUAL] += elapsed * s.servers_f[server, SPEED]
     pop_running(s.run_v, s.run_key, base, n, at)
     s.servers[server, N_RUN] = n - 1
     s.servers[server, USED] -= s.sites[site, NEED]
@@ -232,7 +245,11 @@ def schedule(s: Tables, server: int, now: int) -> None:
     if speed != 1.0:
         left = left / speed
     t = now + max(int(math.ceil(left - SLACK)), 0)
-    key = s.run_key[index(base)]
+    _announce(s, server, t, s.run_key[index(base)])
+
+
+@phase
+def _announce(s: Tables, server: int, t: int, key: int) -> None:
     if key != s.servers[server, NEXT_KEY] or t != s.servers[server, NEXT_T]:
         s.servers[server, NEXT_KEY] = key
         s.servers[server, NEXT_T] = t

@@ -1,5 +1,5 @@
 """The Run: tables, open, save."""
 
-from dwell.record.run import OUTCOMES, SCHEMA_VERSION, Run, open_run
+from dwell.record.run import OUTCOMES, SCHEMA_VERSION, Run, open_run, require_free
 
-__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run"]
+__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run", "require_free"]

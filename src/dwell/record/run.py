@@ -15,7 +15,7 @@ from dwell.errors import RunError
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run"]
+__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run", "require_free"]
 
 SCHEMA_VERSION = 1
 OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down")
@@ -93,8 +93,7 @@ class Run:
             If the folder holds something that is not a run, or cannot be written.
         """
         target = Path(path)
-        if target.exists() and not (target / "run.json").is_file() and _occupied(target):
-            raise RunError(f"{target} exists and is not a run; choose another folder")
+        require_free(target)
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             draft = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -114,6 +113,24 @@ class Run:
         return target
 
 
+def require_free(path: str | os.PathLike[str]) -> None:
+    """Refuse a folder that a run may not be saved to.
+
+    Parameters
+    ----------
+    path : path-like
+        Fine where it does not exist, is empty, or holds a run.
+
+    Raises
+    ------
+    RunError
+        If it holds something else, or is no folder.
+    """
+    target = Path(path)
+    if target.exists() and not (target / "run.json").is_file() and _occupied(target):
+        raise RunError(f"{target} exists and is not a run; choose another folder")
+
+
 def _occupied(target: Path) -> bool:
     return not target.is_dir() or any(target.iterdir())
 
@@ -122,9 +139,16 @@ def _replace(draft: Path, target: Path) -> None:
     """Put a finished folder in its place; an older run there survives until that moment."""
     if target.exists():
         old = Path(tempfile.mkdtemp(prefix=f".{target.name}-old-", dir=target.parent))
-        target.replace(old / target.name)
-        draft.replace(target)
-        shutil.rmtree(old, ignore_errors=True)
+        kept = old / target.name
+        try:
+            target.replace(kept)
+            draft.replace(target)
+        except BaseException:
+            if kept.exists():
+                kept.replace(target)
+            raise
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
     else:
         draft.replace(target)
 

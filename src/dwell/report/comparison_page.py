@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from dwell.model import Disturbance, NodeDisturbance, Problem, Scenario
 from dwell.report import figures
 from dwell.report.findings import (
     COST,
@@ -21,9 +21,9 @@ from dwell.report.findings import (
     standing,
     verdict,
 )
+from dwell.report.method import method, placements
 from dwell.report.page import (
     Cell,
-    definitions,
     document,
     figure,
     items,
@@ -38,13 +38,14 @@ from dwell.report.timeline import timeline
 from dwell.report.wording import (
     Measure,
     listed,
+    percent,
     shown_policy,
     shown_scenario,
     write_interval,
     write_number,
 )
 from dwell.study import AIM, Comparison, Interval
-from dwell.study.predictions import Answer, judge_claim
+from dwell.study.predictions import Answer, Prediction, judge_claim
 
 if TYPE_CHECKING:
     import polars as pl
@@ -61,13 +62,20 @@ MEASURES = (
     Measure("migrations", "migrations"),
 )
 MORE = (
-    Measure("p95_ms", "P95 of all cycles", "ms"),
+    Measure("p95_ms", "P95 of all cycles", "ms", ends=True),
     Measure("lost", "lost cycles"),
-    Measure("longest_misses", "misses in a row"),
+    Measure("longest_misses", "misses in a row", decimals=0),
     Measure("compute_ms", "computing", "ms"),
     Measure("queue_ms", "waiting", "ms"),
     Measure("network_ms", "network", "ms"),
 )
+POLICY_NOTES = {
+    "dtp": "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
+    "once the dwell time is over and the improvement large enough.",
+    "atp": "ATP, our reconstruction, moves one task to the edge and back by thresholds on L95 and "
+    "utilisation.",
+    "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
+}
 TAGS: dict[Answer, tuple[str, str]] = {
     "agrees": ("agrees", "good"),
     "agrees in part": ("agrees in part", "open"),
@@ -75,10 +83,10 @@ TAGS: dict[Answer, tuple[str, str]] = {
     "open": ("not decided by these runs", "open"),
 }
 STANDING: dict[Status, tuple[str, str]] = {
-    "under": ("under 5 %", "good"),
+    "under": ("under", "good"),
     "above": ("above", "bad"),
-    "open": ("not shown", "open"),
-    "none seen": ("no miss", "good"),
+    "open": ("open", "open"),
+    "none seen": ("never seen", "good"),
 }
 
 
@@ -110,7 +118,7 @@ def _chapter(comparison: Comparison) -> Iterator[str]:
     yield items(verdict(comparison))
     yield section("Results", *_results(comparison, palette))
     if judge_all(comparison):
-        yield section("Prediction and result", *_predictions(comparison))
+        yield section("Prediction and result", *_predictions(comparison, palette))
     yield section("Figures", *_figures(comparison, palette))
     shown = _shown_in_time(comparison)
     if shown is not None:
@@ -118,7 +126,7 @@ def _chapter(comparison: Comparison) -> Iterator[str]:
         yield section(heading, *_timelines(comparison, palette, shown))
         yield section("What was estimated, and what was measured", _beliefs(comparison, shown))
     yield section("More numbers", _more(comparison))
-    yield section("How it was measured", *_method(comparison))
+    yield section("How it was measured", *method(comparison))
     yield section("What it does not say", items(limits(comparison)))
 
 
@@ -140,12 +148,16 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
     problem = comparison.problem
     statics = [name for name in problem.candidates if name in comparison.policies]
     if statics:
-        yield paragraph(f"{_placements(problem, statics)} These never move; the others do.")
+        yield paragraph(f"{placements(problem, statics)} As policies these never move.")
+    notes = [POLICY_NOTES[name] for name in comparison.policies if name in POLICY_NOTES]
+    if notes:
+        yield paragraph(" ".join(notes))
     yield paragraph(
         "V_D is the share of cycles that finished after the deadline or not at all; L95 the 95th "
         "percentile of a window's latencies, averaged over the windows; U_r and U_e the "
         "utilisation of the busiest robot and edge node; J the cost that weighs all of these and "
-        "that DTP seeks to lower. Migrations are those of one run. Each number is the mean over "
+        "that DTP seeks to lower. Migrations are those of one run of "
+        f"{comparison.windows - problem.warmup_windows} windows. Each number is the mean over "
         f"{len(comparison.seeds)} seeds with its 95 % interval."
     )
     shares = [Measure(f"share_{name}", name, "%", 100.0, decimals=0) for name in problem.candidates]
@@ -154,7 +166,7 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
     for measure in measures:
         head.append(Cell(marked(measure.heading), "pair", 2))
         if measure is RATE:
-            head.append(Cell("to 5 %"))
+            head.append(Cell(marked("V_D is")))
     rows: list[tuple[str, Sequence[Cell]]] = []
     width = 2 * len(measures) + 2
     for scenario in comparison.scenarios:
@@ -166,10 +178,16 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
     yield table(
         head,
         rows,
-        "The last columns but one are the shares of windows that began under each placement. Bold: "
-        "the lowest V_D and J of a scenario. “Under 5 %” stands where the one-sided 95 % limit of "
-        "V_D is below 5 %, “above” where the limit from below is above it.",
+        f"{_columns(problem.candidates)} the shares of the windows that began under each. Bold: "
+        "the lowest V_D and J of a scenario. V_D is “under” 5 % where its one-sided 95 % limit is, "
+        "“above” where its lower limit is, else “open”.",
+        kind="wide",
     )
+
+
+def _columns(names: Iterable[str]) -> str:
+    names = list(names)
+    return f"Columns {listed(names)} are" if len(names) > 1 else f"Column {names[0]} is"
 
 
 def _result_row(
@@ -202,34 +220,42 @@ def _pair(interval: Interval, measure: Measure, *, best: bool = False) -> list[C
 def _named(palette: Palette, policy: str) -> str:
     """Return a policy's name behind its mark: a square for a placement, a ring for the others."""
     colour = palette.policies[policy].colour
-    name = escape(shown_policy(policy))
+    # What stands in brackets is set smaller: columns are narrow.
+    name = re.sub(r"(\(.*\))$", r"<small>\1</small>", escape(shown_policy(policy)))
     if policy in palette.placements:
         return swatch(colour) + name
     ring = "currentColor" if colour == INK else colour
     return f'<span class="swatch ring" style="border-color:{ring}"></span>{name}'
 
 
-def _placements(problem: Problem, names: Sequence[str]) -> str:
-    """Say where each candidate puts the tasks that can move."""
-    movable = [name for name, task in problem.pipeline.tasks.items() if not task.anchored]
-    parts = []
-    for name in names:
-        placement = problem.candidates[name]
-        where = listed(f"{task} on {placement[task]}" for task in movable)
-        parts.append(f"{name} has {where}" if where else f"{name} is the only placement")
-    return "; ".join(parts) + "."
-
-
 # ------------------------------------------------------------------------------- predictions
 
 
-def _predictions(comparison: Comparison) -> Iterator[str]:
+def _predictions(comparison: Comparison, palette: Palette) -> Iterator[str]:
+    judged = judge_all(comparison)
     yield paragraph(
-        "What the paper's table of scenarios says, in its words, and what the runs say. Words are "
-        "read as conditions on numbers, given in brackets; a condition holds or fails only where "
-        "the 95 % interval over seeds says so. On this cell the paper predicts; it does not report."
+        "The paper predicts which placement dominates under DTP in each scenario, and how LOC and "
+        "SO behave. Its words are read as conditions on numbers, given beside them; a condition "
+        "holds or fails only where the 95 % interval over seeds says so."
     )
-    for judgement in judge_all(comparison):
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for judgement in judged:
+        prediction = judgement.prediction
+        word, kind = TAGS[judgement.answer]
+        rows.append(
+            (
+                "",
+                [
+                    Cell(escape(shown_scenario(prediction.scenario))),
+                    Cell(escape(prediction.dtp)),
+                    Cell(_shares(comparison, palette, prediction.scenario)),
+                    Cell(f'<span class="{kind} nowrap">{word}</span>'),
+                ],
+            )
+        )
+    head = [Cell("scenario"), Cell("predicted"), Cell("share of the windows here"), Cell("")]
+    yield table(head, rows, kind="prose")
+    for judgement in judged:
         prediction = judgement.prediction
         word, kind = TAGS[judgement.answer]
         yield (
@@ -237,27 +263,43 @@ def _predictions(comparison: Comparison) -> Iterator[str]:
             f'<span class="tag {kind}">{word}</span></h3>'
         )
         yield (
-            f"<p>Predicted under DTP: <b>“{escape(prediction.dtp)}”</b> "
-            f'<span class="note">[{escape(prediction.reading)}]</span></p>'
+            f"<p>Predicted under DTP: “{escape(prediction.dtp)}”, "
+            f'<span class="note">read as: {marked(prediction.reading)}.</span></p>'
         )
         yield paragraph(" ".join(explain(comparison, judgement)))
-        rows: list[tuple[str, Sequence[Cell]]] = []
-        for policy, claims in prediction.claims.items():
-            for claim in claims:
-                word, kind = TAGS[judge_claim(comparison, prediction.scenario, claim)]
-                rows.append(
-                    (
-                        "",
-                        [
-                            Cell(escape(policy)),
-                            Cell(marked(f"“{claim.words}”")),
-                            Cell(marked(claim.reading)),
-                            Cell(f'<span class="{kind}">{word}</span>'),
-                        ],
-                    )
-                )
-        head = [Cell("static"), Cell("the paper"), Cell("read as"), Cell("these runs")]
-        yield table(head, rows, "")
+        yield _claims(comparison, prediction)
+
+
+def _shares(comparison: Comparison, palette: Palette, scenario: str) -> str:
+    """Return the shares of windows under DTP, the largest first."""
+    found = {
+        name: comparison.interval(scenario, DTP, f"share_{name}").value
+        for name in comparison.problem.candidates
+    }
+    order = sorted(found, key=lambda name: -found[name])
+    return "&emsp; ".join(
+        f'<span class="nowrap">{swatch(palette.placements[name])}{escape(name)} '
+        f"{marked(percent(found[name]))}</span>"
+        for name in order
+        if found[name] > 0
+    )
+
+
+def _claims(comparison: Comparison, prediction: Prediction) -> str:
+    """Return the table of what the paper says of static placements."""
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for policy, claims in prediction.claims.items():
+        for claim in claims:
+            word, kind = TAGS[judge_claim(comparison, prediction.scenario, claim)]
+            cells = [
+                Cell(escape(policy)),
+                Cell(marked(f"“{claim.words}”")),
+                Cell(marked(claim.reading)),
+                Cell(f'<span class="{kind}">{word}</span>'),
+            ]
+            rows.append(("", cells))
+    head = [Cell("static"), Cell("predicted"), Cell("read as"), Cell("")]
+    return table(head, rows, kind="prose")
 
 
 # ----------------------------------------------------------------------------------- figures
@@ -266,20 +308,35 @@ def _predictions(comparison: Comparison) -> Iterator[str]:
 def _figures(comparison: Comparison, palette: Palette) -> Iterator[str]:
     deadline_ms = comparison.problem.pipeline.deadline_ms
     yield figure(
-        figures.intervals(comparison, palette, RATE, limit=AIM, limit_name="the aim, 5 %"),
-        "Missed deadlines: mean over seeds, with the 95 % interval as a bar where it is wider than "
-        "the mark. Open marks at the left edge: no miss. The axis may be logarithmic.",
+        figures.intervals(
+            comparison,
+            palette,
+            RATE,
+            title="missed deadlines (%)",
+            limit=AIM,
+            limit_name="the aim, 5 %",
+        ),
+        "V_D: mean over seeds, with its 95 % interval as a bar where that is wider than the mark. "
+        "An open mark at the left edge: no miss was seen.",
     )
     yield figure(
-        figures.intervals(comparison, palette, L95, limit=deadline_ms, limit_name="the deadline"),
+        figures.intervals(
+            comparison,
+            palette,
+            L95,
+            title="L95 (ms)",
+            limit=deadline_ms,
+            limit_name="the deadline",
+        ),
         "Tail latency: L95 as the controller sees it, a cycle that has not finished counting with "
         "its age.",
     )
     yield figure(
         figures.distributions(comparison, palette),
-        "Final latencies of all cycles after the warm-up, all seeds together. A curve that "
-        "crosses the dashed line below the dotted one misses more than 5 %; one that never "
-        "reaches 100 % lost cycles.",
+        "Latency of all cycles after the warm-up, all seeds together: one less the empirical "
+        "distribution function, on a logarithmic scale. Where a curve crosses the dashed line one "
+        "reads V_D; below the dotted line that is less than 5 %. A curve that ends on a plateau "
+        "lost that share of its cycles.",
     )
     moving = [name for name in comparison.policies if name not in comparison.statics]
     if moving:
@@ -290,7 +347,7 @@ def _figures(comparison: Comparison, palette: Palette) -> Iterator[str]:
     yield figure(
         figures.latency_split(comparison),
         "Where the time goes along the critical path of the cycles that finished: computing, "
-        "waiting for a worker or for other inputs, and on the network. Lost cycles are not in it.",
+        "waiting for a worker, and on the network. Lost cycles are not in it.",
     )
     yield figure(
         figures.node_use(comparison),
@@ -334,33 +391,36 @@ def _beliefs(comparison: Comparison, policy: str) -> str:
     """Return the table of estimated against measured J."""
     import polars as pl
 
-    palette = Palette.of(comparison.problem.candidates)
-    head = [
-        Cell("placement"),
-        Cell("estimated while not active", "num"),
-        Cell(f"measured under {escape(shown_policy(policy))}", "num"),
-        Cell("measured when run alone", "num"),
-    ]
+    placements_ = Palette.of(comparison.problem.candidates).placements
+    above, head = [Cell("")], [Cell("scenario")]
+    for name, colour in placements_.items():
+        above.append(Cell(swatch(colour) + escape(name), "over", 3))
+        head += [Cell("idle", "num begin"), Cell("active", "num"), Cell("alone", "num")]
     rows: list[tuple[str, Sequence[Cell]]] = []
     mine = comparison.costs.filter(pl.col("policy") == policy)
     for scenario in comparison.scenarios:
-        rows.append(("group", [Cell(escape(shown_scenario(scenario)), columns=4)]))
+        row = [Cell(escape(shown_scenario(scenario)))]
         here = mine.filter(pl.col("scenario") == scenario)
-        for name, colour in palette.placements.items():
+        for name in placements_:
             found = here.filter(pl.col("candidate") == name)
             numbers = [_known_mean(found[column]) for column in ("estimated", "measured")]
+            alone = math.nan
             if name in comparison.statics:
-                numbers.append(float(comparison.values(scenario, name, "cost").mean()))
-            else:
-                numbers.append(math.nan)
-            cells = [Cell(write_number(number, COST.decimals), "num") for number in numbers]
-            rows.append(("", [Cell(swatch(colour) + escape(name)), *cells]))
+                alone = float(comparison.values(scenario, name, "cost").mean())
+            kinds = ("num begin", "num", "num")
+            row += [
+                Cell(write_number(number, COST.decimals), kind)
+                for number, kind in zip([*numbers, alone], kinds, strict=True)
+            ]
+        rows.append(("", row))
     return table(
         head,
         rows,
-        f"J of each placement, mean over seeds. Estimates are those that "
-        f"{shown_policy(policy)} was given (“{comparison.problem.controller.estimator}”), the "
-        "switching term included; a dash: it was never, or always, active.",
+        "J of each placement, mean over seeds. Idle: as estimated for "
+        f"{shown_policy(policy)} by “{comparison.problem.controller.estimator}” while another "
+        "was active, the cost of switching to it included. Active: as measured while it was. "
+        "Alone: as measured of the static placement on the same realisations. A dash: never so.",
+        above=above,
     )
 
 
@@ -385,89 +445,6 @@ def _more(comparison: Comparison) -> str:
         f"replaced, of {write_number(cycles if isinstance(cycles, float) else math.nan, 0)} in a "
         "run. The last three are means over the cycles that finished.",
     )
-
-
-# ------------------------------------------------------------------------------------ method
-
-
-def _method(comparison: Comparison) -> Iterator[str]:
-    problem = comparison.problem
-    pipeline, objective, controller = problem.pipeline, problem.objective, problem.controller
-    weights, targets, caps = objective.weights, objective.targets, objective.caps
-    span_s = problem.window_cycles * pipeline.period_ms / 1e3
-    yield paragraph(
-        "For every scenario and seed one realisation of everything random (execution times, "
-        "delays, losses, foreign load) is drawn before any policy acts, and every policy plays "
-        "the same one. Differences between policies are therefore differences of pairs. A "
-        "discrete-event simulation carries each cycle through queues, nodes and links. The "
-        "controller sees a window when it closes, and decides for those after it."
-    )
-    yield definitions(
-        {
-            "pipeline": f"{' → '.join(pipeline.topological())}; period "
-            f"{write_number(pipeline.period_ms)} ms, deadline "
-            f"{write_number(pipeline.deadline_ms)} ms",
-            "nodes": listed(
-                f"{node.name} ({node.tier}, {node.cores} cores)"
-                for node in problem.fabric.nodes.values()
-            ),
-            "window": f"{problem.window_cycles} cycles, {write_number(span_s)} s",
-            "run": f"{comparison.windows} windows, of which the first {problem.warmup_windows} "
-            "are warm-up and count nowhere",
-            "seeds": _ranges(comparison.seeds),
-            "scenarios": "; ".join(
-                f"{shown_scenario(name)}: {disturbances(problem.scenario(name))}"
-                for name in comparison.scenarios
-            ),
-            "cost": f"J = {weights.latency:g} · L95/{targets.latency_ms:.4g} ms + "
-            f"{weights.violations:g} · V_D + {weights.robot:g} · U_r/{targets.robot:g} + "
-            f"{weights.edge:g} · U_e/{targets.edge:g} + {weights.switching:g} · share of tasks "
-            "moved",
-            "caps": f"L95 {caps.latency_ms:g} ms, utilisation {caps.utilisation:g}",
-            "controller": f"on {problem.controller_node}, begins with {problem.initial}; at "
-            f"least {controller.min_dwell} windows between a migration and the next decision "
-            f"(N_min), improvement above {controller.min_improvement:g} (Δ_min), estimator "
-            f"“{controller.estimator}”",
-            "intervals": "95 %, two-sided, over seeds: Student's t; medians by order statistics. "
-            "No interval is taken over windows or cycles, which are not independent.",
-            "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
-        }
-    )
-
-
-def disturbances(scenario: Scenario) -> str:
-    """Say what a scenario does to the fabric."""
-    return listed(map(_disturbance, scenario)) or "nothing added"
-
-
-def _disturbance(item: Disturbance) -> str:
-    what = []
-    if isinstance(item, NodeDisturbance):
-        if item.stress_threads:
-            what.append(f"{item.stress_threads} foreign threads on {item.node}")
-        where = item.node
-    else:
-        where = item.link.replace("->", "→")
-        if item.add_delay_ms is not None:
-            what.append(f"+{item.add_delay_ms.expectation:.3g} ms on {where} in the mean")
-        if item.loss:
-            what.append(f"{item.loss:.1%} loss on {where}")
-        if math.isfinite(item.rate_mbps):
-            what.append(f"{item.rate_mbps:g} Mbit/s on {where}")
-    if item.down:
-        what.append(f"{where} down")
-    text = listed(what) or f"nothing on {where}"
-    if item.at_s or math.isfinite(item.for_s):
-        until = f" for {item.for_s:g} s" if math.isfinite(item.for_s) else ""
-        text += f" from {item.at_s:g} s{until}"
-    return text
-
-
-def _ranges(seeds: Sequence[int]) -> str:
-    """``1 to 20``, or the list where it is none."""
-    if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
-        return f"{seeds[0]} to {seeds[-1]} ({len(seeds)})"
-    return ", ".join(map(str, seeds))
 
 
 def _known_mean(values: pl.Series) -> float:

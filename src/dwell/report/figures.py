@@ -71,7 +71,7 @@ def intervals(
             if value <= edge:
                 ax.plot([edge], [row], style.marker, mfc=PAPER, mec=style.colour, clip_on=False)
                 continue
-            if not math.isnan(left):
+            if not math.isnan(left) and found[scenario, policy].value != 1.0:
                 ends = [max(left, edge), min(right, high * 2)]
                 ax.plot(ends, [row, row], "-", color=style.colour, lw=2.2, alpha=0.45)
             ax.plot([value], [row], style.marker, color=style.colour)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -11,6 +11,7 @@ from dwell.model.document import to_document
 from dwell.report.wording import (
     Measure,
     listed,
+    percent,
     shown_policy,
     shown_scenario,
     write_interval,
@@ -58,8 +59,8 @@ def question(comparison: Comparison) -> str:
     count = len(comparison.scenarios)
     where = f"in each of {count} scenarios" if count > 1 else "in this scenario"
     return (
-        f"Which policy keeps the share of missed deadlines, V_D, under {AIM:.0%} {where} of the "
-        f"cell “{comparison.problem.name}”, and at what cost J?"
+        f"Which policy keeps the share of missed deadlines, V_D, under {percent(AIM)} {where} "
+        f"of the cell “{comparison.problem.name}”, and at what cost J?"
     )
 
 
@@ -90,27 +91,30 @@ def _on_aim(comparison: Comparison) -> str:
         for policy in policies
     }
     everywhere = [policy for policy in policies if len(good[policy]) == len(scenarios)]
+    aim, all_ = percent(AIM), _all(len(scenarios))
     if everywhere:
-        names = listed(shown_policy(policy) for policy in everywhere)
         verb = "keeps" if len(everywhere) == 1 else "keep"
-        return f"{names} {verb} V_D under {AIM:.0%} in {_all(len(scenarios))}."
+        return f"{listed(map(shown_policy, everywhere))} {verb} V_D under {aim} in {all_}."
+    text = f"No policy keeps V_D under {aim} in {all_}."
     most = max(len(found) for found in good.values())
-    text = f"No policy keeps V_D under {AIM:.0%} in {_all(len(scenarios))}."
-    if most:
-        best = [policy for policy in policies if len(good[policy]) == most]
-        missed = [s for s in scenarios if s not in good[best[0]]]
-        text += f" {listed(shown_policy(policy) for policy in best)} comes closest, with {most}"
-        if len(best) == 1:
-            where = listed(f"{shown_scenario(s)} ({_rate(comparison, s, best[0])})" for s in missed)
-            text += f" of {len(scenarios)}; it fails, or is not shown to be under, in {where}"
-        text += "."
-    hopeless = [s for s in scenarios if not any(s in good[policy] for policy in policies)]
-    for scenario in hopeless:
-        lowest = min(policies, key=lambda p: comparison.values(scenario, p, RATE.column).mean())
-        text += (
-            f" In {shown_scenario(scenario)} none is shown to be; the lowest is "
-            f"{shown_policy(lowest)} with {_rate(comparison, scenario, lowest)}."
-        )
+    best = [policy for policy in policies if len(good[policy]) == most]
+    if most and len(best) == 1:
+        missed = [
+            f"{shown_scenario(s)}, {_rate(comparison, s, best[0])}"
+            for s in scenarios
+            if s not in good[best[0]]
+        ]
+        text += f" {shown_policy(best[0])} does in {most} of {len(scenarios)} (not in "
+        text += f"{'; '.join(missed)}), more than any other."
+    elif most:
+        text += f" {listed(map(shown_policy, best))} do in {most} of {len(scenarios)}."
+    for scenario in scenarios:
+        if not any(scenario in good[policy] for policy in policies):
+            lowest = min(policies, key=lambda p: comparison.values(scenario, p, RATE.column).mean())
+            text += (
+                f" In {shown_scenario(scenario)} none is shown to do so; the lowest is "
+                f"{shown_policy(lowest)}, {_rate(comparison, scenario, lowest)}."
+            )
     return text
 
 
@@ -118,12 +122,17 @@ def _on_statics(comparison: Comparison) -> str:
     """Hold DTP against the static placement that is cheapest in each scenario."""
     if not comparison.statics:
         return ""
-    gaps: dict[str, Interval] = {}
-    for scenario in comparison.scenarios:
-        best = cheapest_static(comparison, scenario)
-        gaps[scenario] = comparison.difference(scenario, (DTP, best), "cost")
-    lead = "Against the static placement that is cheapest in each scenario (known only afterwards)"
-    return f"{lead}, DTP {_more_or_less(gaps, 'costs', 'in J')}."
+    gaps = {
+        scenario: comparison.difference(
+            scenario, (DTP, cheapest_static(comparison, scenario)), COST.column
+        )
+        for scenario in comparison.scenarios
+    }
+    said = _higher_or_lower(gaps, decimals=2)
+    return (
+        "Against the static placement that is cheapest in each scenario, which is known only "
+        f"afterwards, the cost J of DTP is {said}."
+    )
 
 
 def _on_atp(comparison: Comparison) -> str:
@@ -134,28 +143,28 @@ def _on_atp(comparison: Comparison) -> str:
         for scenario in comparison.scenarios
     }
     points = {name: Interval(*(100 * end for end in gap)) for name, gap in gaps.items()}
-    said = _more_or_less(points, "misses", "points of V_D", decimals=1)
-    return f"Against {shown_policy(ATP)}, DTP {said}."
+    said = _higher_or_lower(points, decimals=1, unit=" points")
+    return f"Against {shown_policy(ATP)}, V_D of DTP is {said}."
 
 
 def _on_predictions(comparison: Comparison) -> str:
+    words = {
+        "agrees": "agree with it",
+        "agrees in part": "agree in part",
+        "differs": "differ",
+        "open": "leave it open",
+    }
     judged = judge_all(comparison)
-    if not judged:
-        return ""
-    by_answer = {
-        answer: [
+    found = []
+    for answer, verb in words.items():
+        names = [
             shown_scenario(item.prediction.scenario) for item in judged if item.answer == answer
         ]
-        for answer in ("agrees", "agrees in part", "differs", "open")
-    }
-    words = {
-        "agrees": "agrees with the runs",
-        "agrees in part": "agrees in part",
-        "differs": "differs",
-        "open": "is left open",
-    }
-    found = [f"{words[answer]} in {listed(names)}" for answer, names in by_answer.items() if names]
-    return f"The paper's prediction of the placement that dominates under DTP {'; '.join(found)}."
+        if names:
+            found.append(f"{verb} in {listed(names)}")
+    if not found:
+        return ""
+    return f"The paper predicts which placement dominates under DTP: the runs {listed(found)}."
 
 
 def _on_estimates(comparison: Comparison) -> str:
@@ -169,25 +178,24 @@ def _on_estimates(comparison: Comparison) -> str:
     if not moves:
         return "DTP never migrated after the warm-up."
     windows = comparison.windows - comparison.problem.warmup_windows
+    share = float(undone / moves)
     text = (
-        f"DTP migrated {_span(spans)} times in a run of {windows} windows, and "
-        f"{undone / moves:.0%} of these moves undid the one before."
+        f"DTP migrated {_span(spans)} times in a run of {windows} windows, and {percent(share)} of "
+        "these moves undid the one before."
     )
-    if undone / moves < TO_AND_FRO:
+    if share < TO_AND_FRO:
         return text
+    estimator = comparison.problem.controller.estimator
+    text += f" It leaves and returns because its estimator, `{estimator}`, prices what is not "
+    if estimator != "profile":
+        return f"{text}active differently from what it then measures."
+    text += "active as if nothing disturbed it"
     gap = _widest_gap(comparison)
-    text += (
-        f" It leaves and returns because its estimator, `{comparison.problem.controller.estimator}`"
-        ", prices what is not active"
-    )
-    if comparison.problem.controller.estimator != "profile":
-        return f"{text} differently from what it then measures."
-    text += " as if nothing disturbed it"
     if gap is not None:
         text += (
             f": in {shown_scenario(gap.scenario)} it puts {gap.candidate} at J = "
-            f"{write_number(gap.estimated, 2)}, which measures {write_number(gap.alone, 2)} when "
-            "run alone"
+            f"{write_number(gap.estimated, 2)}, and run alone {gap.candidate} measures "
+            f"{write_number(gap.alone, 2)}"
         )
     return f"{text}."
 
@@ -197,30 +205,12 @@ def _on_estimates(comparison: Comparison) -> str:
 
 def explain(comparison: Comparison, judgement: Judgement) -> list[str]:
     """Return why the runs agree with a prediction or differ, as sentences."""
-    prediction = judgement.prediction
-    scenario = prediction.scenario
     sentences = [_what_happened(comparison, judgement)]
     if comparison.statics:
         sentences.append(_what_is_cheapest(comparison, judgement))
-    moves = comparison.interval(scenario, DTP, "migrations")
-    if judgement.answer != "agrees" and moves.value:
-        gaps = [
-            gap
-            for gap in _gaps(comparison, scenario)
-            if gap.active - gap.estimated > comparison.problem.controller.min_improvement
-        ]
-        undone = comparison.interval(scenario, DTP, "returns").value / moves.value
-        text = f"It migrated {write_number(moves.value)} times a run"
-        text += f", {undone:.0%} of them back to where it had just come from" if undone else ""
-        if gaps:
-            seen = listed(
-                f"{gap.candidate} {write_number(gap.active, 2)} where "
-                f"{write_number(gap.estimated, 2)} had been estimated"
-                for gap in gaps
-            )
-            text += f": once active, {seen}"
-        sentences.append(f"{text}.")
-    return sentences
+    if judgement.answer != "agrees":
+        sentences.append(_what_was_believed(comparison, judgement.prediction.scenario))
+    return [sentence for sentence in sentences if sentence]
 
 
 def _what_happened(comparison: Comparison, judgement: Judgement) -> str:
@@ -229,35 +219,63 @@ def _what_happened(comparison: Comparison, judgement: Judgement) -> str:
     shares = {name: comparison.interval(scenario, DTP, f"share_{name}") for name in names}
     order = sorted(shares, key=lambda name: -shares[name].value)
     measure = Measure("", "", "%", 100.0)
-    seen = listed(f"{name} {write_interval(shares[name], measure)} %" for name in order)
-    text = f"Under DTP the windows went to {seen}."
-    together = f"{listed(dominant, 'and')} together hold" if len(dominant) > 1 else ""
-    if judgement.answer == "agrees in part" and together:
+    seen = listed(
+        f"{write_interval(shares[name], measure)} %{' of the windows' if i == 0 else ''} on {name}"
+        for i, name in enumerate(order)
+    )
+    text = f"DTP spent {seen}."
+    if judgement.answer == "agrees in part" and len(dominant) > 1:
         share = write_interval(judgement.share, measure)
-        text += f" {together} {share} %, the most, but {judgement.leader} alone has the largest "
-        text += "share." if judgement.leader not in dominant else "part of it."
+        text += f" {listed(dominant)} together have {share} %, the most"
+        if judgement.leader not in dominant:
+            text += f", but no placement alone has more than {judgement.leader}"
+        text += "."
     return text
 
 
 def _what_is_cheapest(comparison: Comparison, judgement: Judgement) -> str:
+    """Tell whether the cell itself is as predicted, or the policy departs from it."""
     scenario, dominant = judgement.prediction.scenario, judgement.prediction.dominant
     best = cheapest_static(comparison, scenario)
-    others = [name for name in comparison.statics if name != best]
     costs = {name: comparison.interval(scenario, name, "cost") for name in comparison.statics}
-    against = listed(f"{name} {write_number(costs[name].value, 2)}" for name in others)
+    others = sorted((name for name in costs if name != best), key=lambda name: costs[name].value)
+    against = ", ".join(f"{name} {write_number(costs[name].value, 2)}" for name in others)
     text = f"Run alone, {best} costs least (J = {write_number(costs[best].value, 2)}"
     text += f"; {against})" if others else ")"
-    rivals = [name for name in others if (name in dominant) != (best in dominant)]
     close = [
-        name for name in rivals if not comparison.difference(scenario, (name, best), "cost").low > 0
+        name
+        for name in others
+        if (name in dominant) != (best in dominant)
+        and not comparison.difference(scenario, (name, best), "cost").low > 0
     ]
     if close:
-        return f"{text}, which the seeds do not tell from {listed(close, 'or')}."
-    if best in dominant:
-        mine = "as the prediction has it" if judgement.answer == "agrees" else "as predicted"
-        blame = "" if judgement.answer == "agrees" else ": it is the policy that departs"
-        return f"{text}, {mine}{blame}."
-    return f"{text}: it is this cell that departs from the prediction, whatever the policy."
+        return f"{text}, which these seeds cannot tell from {listed(close, 'or')}."
+    if best not in dominant:
+        return f"{text}: on this cell the predicted placement is not the cheapest to begin with."
+    if judgement.answer == "agrees":
+        return f"{text}."
+    return f"{text}, so the prediction fits the cell; it is the policy that departs from it."
+
+
+def _what_was_believed(comparison: Comparison, scenario: str) -> str:
+    """Tell how often the policy moved, and how far its estimates were from what followed."""
+    moves = comparison.interval(scenario, DTP, "migrations").value
+    if not moves:
+        return "It never migrated after the warm-up."
+    undone = comparison.interval(scenario, DTP, "returns").value / moves
+    text = f"It migrated {write_number(moves)} times a run"
+    if undone:
+        text += f", {percent(undone)} of them straight back"
+    least = comparison.problem.controller.min_improvement
+    gaps = [gap for gap in _gaps(comparison, scenario) if gap.active - gap.estimated > least]
+    if gaps:
+        seen = listed(
+            f"{gap.candidate} {write_number(gap.active, 2)} (estimated "
+            f"{write_number(gap.estimated, 2)})"
+            for gap in gaps
+        )
+        text += f", because placements measured more once active than had been estimated: {seen}"
+    return f"{text}."
 
 
 # ----------------------------------------------------------------------- numbers behind words
@@ -356,10 +374,11 @@ def limits(comparison: Comparison) -> list[str]:
         for policy in comparison.policies
     ]
     if any(not values.any() for values in rates):
+        limit = percent(rule_of_three(seeds), 1)
         items.append(
-            "Where no run shows a miss, that is all that is said. Without further assumptions "
-            f"{seeds} independent runs limit such a rate at {rule_of_three(seeds):.1%} only (the "
-            "rule of three)."
+            "Where no run shows a miss, “never seen” is all that is said. Without further "
+            f"assumptions {seeds} independent runs limit such a rate at {limit} only (the rule of "
+            "three)."
         )
     return items
 
@@ -392,19 +411,19 @@ def _span(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _more_or_less(gaps: Mapping[str, Interval], verb: str, unit: str, decimals: int = 2) -> str:
+def _higher_or_lower(gaps: Mapping[str, Interval], decimals: int, unit: str = "") -> str:
     """Say in which scenarios a difference is above 0, below, or not told by the seeds."""
-    more = {name: gap.value for name, gap in gaps.items() if gap.known and gap.low > 0}
-    less = {name: -gap.value for name, gap in gaps.items() if gap.known and gap.high < 0}
-    open_ = [name for name in gaps if name not in more and name not in less]
-    words: list[str] = []
-    number: Callable[[float], str] = lambda value: write_number(value, decimals)  # noqa: E731
-    for found, word in ((more, "more"), (less, "less")):
+    higher = {name: gap.value for name, gap in gaps.items() if gap.known and gap.low > 0}
+    lower = {name: -gap.value for name, gap in gaps.items() if gap.known and gap.high < 0}
+    words = []
+    for found, word in ((higher, "higher"), (lower, "lower")):
         if found:
-            names = listed(f"{shown_scenario(s)} ({number(gap)})" for s, gap in found.items())
-            words.append(f"{verb} {word} in {names}")
-    if open_:
-        names = listed(shown_scenario(name) for name in open_)
-        words.append(f"cannot be told apart in {names}")
-    text = "; it ".join(words)
-    return f"{text}; numbers are differences {unit}" if more or less else text
+            where = listed(
+                f"{write_number(gap, decimals)}{unit if i == 0 else ''} in {shown_scenario(name)}"
+                for i, (name, gap) in enumerate(found.items())
+            )
+            words.append(f"{word} by {where}")
+    level = [shown_scenario(name) for name in gaps if name not in higher and name not in lower]
+    if level:
+        words.append(f"not told apart in {listed(level)}")
+    return "; ".join(words)

@@ -95,7 +95,8 @@ thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .begin { padding-left: 36px; }
 .wide { width: 100%; }
 .prose { width: 100%; max-width: 52em; }
-.prose td, .prose th { padding-left: 20px; }
+.prose :not(:first-child):is(td, th) { padding-left: 20px; }
+.nowrap { white-space: nowrap; }
 tr.group > * { padding: 30px 0 6px; border-top: 0 !important; border-bottom: 1px solid var(--ink);
   font-weight: 650; font-size: 15px; }
 tr.group + tr > * { border-top: 0; }

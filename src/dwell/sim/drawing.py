@@ -129,7 +129,7 @@ class _Draw:
     def _releases(self) -> Ints:
         pipeline = self.problem.pipeline
         nominal = np.arange(self.cycles + 1) * (pipeline.period_ms * NS_PER_MS)
-        release = np.rint(nominal).astype(np.int64)
+        release = np.rint(nominal, out=nominal).astype(np.int64)
         jitter = pipeline.release_jitter_ms
         if jitter == Constant(0.0):
             return release
@@ -161,7 +161,7 @@ class _Draw:
             end = min(begin + BLOCK, len(out))
             values, state = self._block(process, rng, begin, end, state)
             if scale is not None:
-                values = values * scale[begin:end]
+                values *= scale[begin:end]
             values *= NS_PER_MS
             np.minimum(values, LONGEST_NS, out=values)
             out[begin:end] = np.rint(values, out=values)
@@ -241,17 +241,20 @@ class _Draw:
         begins, ends = [np.empty(0)], [np.empty(0)]
         now = 0.0
         while now < horizon:
-            pause = bursts.every_ms.marginal(quiet, count) * NS_PER_MS
-            length = bursts.for_ms.marginal(active, count) * NS_PER_MS
-            end = now + np.cumsum(pause + length)
-            begins.append(end - length)
-            ends.append(end)
+            end = bursts.every_ms.marginal(quiet, count)
+            end *= NS_PER_MS
+            length = bursts.for_ms.marginal(active, count)
+            length *= NS_PER_MS
+            end += length
+            np.cumsum(end, out=end)
+            end += now
             now = float(end[-1])
-        begin, end = np.concatenate(begins), np.concatenate(ends)
-        begin, end = begin[begin < horizon], end[begin < horizon]
-        return np.rint(begin).astype(np.int64), np.rint(np.minimum(end, LONGEST_NS)).astype(
-            np.int64
-        )
+            begins.append(np.subtract(end, length, out=length))
+            ends.append(end)
+        begin = np.concatenate(begins)
+        begun = int(np.searchsorted(begin, horizon))
+        begin, end = begin[:begun], np.minimum(np.concatenate(ends)[:begun], LONGEST_NS)
+        return np.rint(begin).astype(np.int64), np.rint(end).astype(np.int64)
 
     def _node_changes(self) -> NodeChanges:
         """Fold stress, bursts and outages of each node into the states it goes through."""
@@ -259,23 +262,20 @@ class _Draw:
         horizon = int(self.release_ns[-1])
         tables = [np.empty((0, 4), np.int64)]
         for row, node in enumerate(self.problem.fabric.nodes.values()):
-            steps = [np.empty((0, 3), np.int64)]
+            steps = [np.empty((3, 0), np.int64)]
+            if node.bursts is not None and node.bursts.threads:
+                steps.append(_in_turn(*self._episodes(node.bursts, node.name)))
+                steps[-1][1] *= node.bursts.threads
             for item in self.scenario:
                 if isinstance(item, NodeDisturbance) and item.node == node.name:
                     begin, end = _interval_ns(item.at_s, item.for_s)
                     threads, down = item.stress_threads, int(item.down)
-                    steps.append(np.array([[begin, threads, down], [end, -threads, -down]]))
-            if node.bursts is not None and node.bursts.threads:
-                begins, ends = self._episodes(node.bursts, node.name)
-                for at, threads in ((begins, node.bursts.threads), (ends, -node.bursts.threads)):
-                    change = np.zeros((len(at), 3), np.int64)
-                    change[:, 0], change[:, 1] = at, threads
-                    steps.append(change)
-            at, level = _accumulate(np.concatenate(steps))
-            table = np.empty((len(at), 4), np.int64)
-            table[:, 0], table[:, 1] = at, row
-            table[:, 2], table[:, 3] = level[:, 0], level[:, 1] > 0
-            tables.append(table[at <= horizon])
+                    steps.append(np.array([[begin, end], [threads, -threads], [down, -down]]))
+            at, threads, down = _accumulate(np.concatenate(steps, axis=1))
+            table = np.empty((np.searchsorted(at, horizon, side="right"), 4), np.int64)
+            for column, values in enumerate((at, row, threads, down > 0)):
+                table[:, column] = values[: len(table)] if column != 1 else row
+            tables.append(table)
         table = np.concatenate(tables)
         return NodeChanges(nodes, table[np.argsort(table[:, 0], kind="stable")])
 
@@ -320,13 +320,21 @@ class _Draw:
         return LinkSegments(links, np.concatenate(tables), np.concatenate(tables_f))
 
 
-def _accumulate(steps: Ints) -> tuple[Ints, Ints]:
-    """Sum steps (at, change, change) up into the levels that hold from each instant on."""
-    steps = steps[np.argsort(steps[:, 0], kind="stable")]
-    level = np.cumsum(steps[:, 1:], axis=0)
-    last = np.ones(len(steps), np.bool_)
-    last[:-1] = steps[1:, 0] != steps[:-1, 0]
-    return steps[last, 0], level[last]
+def _in_turn(begins: Ints, ends: Ints) -> Ints:
+    """Steps of episodes that never overlap: rows at, change by one thread, no outage."""
+    steps = np.zeros((3, 2 * len(begins)), np.int64)
+    steps[0, 0::2], steps[0, 1::2] = begins, ends
+    steps[1, 0::2], steps[1, 1::2] = 1, -1
+    return steps
+
+
+def _accumulate(steps: Ints) -> Ints:
+    """Sum steps (rows at, change, change) up into the levels that hold from each instant on."""
+    steps = steps[:, np.argsort(steps[0], kind="stable")]
+    np.cumsum(steps[1:], axis=1, out=steps[1:])
+    last = np.ones(steps.shape[1], np.bool_)
+    np.not_equal(steps[0, 1:], steps[0, :-1], out=last[:-1])
+    return steps[:, last]
 
 
 def _interval_ns(at_s: float, for_s: float) -> tuple[int, int]:

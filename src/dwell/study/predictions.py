@@ -140,7 +140,7 @@ class Prediction:
     def reading(self) -> str:
         """What the words on DTP are read as."""
         names = " or ".join(self.dominant)
-        return f"{names} leads, with at least {self.share:.0%} of the windows"
+        return f"{names} leads, with at least {self.share * 100:.0f} % of the windows"
 
 
 def _low(policy: str) -> Claim:
