@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from importlib.resources import files
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
@@ -19,9 +21,31 @@ R = TypeVar("R")
 T = TypeVar("T", bound=np.generic)
 
 
+def _fingerprint() -> str:
+    """Hash of the sources of all kernels."""
+    digest = hashlib.sha256()
+    for source in sorted(files(__package__).iterdir(), key=lambda entry: entry.name):
+        if source.name.endswith(".py"):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile an entry point that Python calls; its machine code is cached on disk."""
-    return cast(Callable[P, R], numba.njit(cache=True, error_model="numpy", _nrt=False)(function))
+    """Compile an entry point that Python calls; its machine code is cached on disk.
+
+    Numba throws cached code away when the file of the entry point changes, but not when one that
+    it inlines from does. The stamp it compares therefore takes in the sources of all kernels. Where
+    no folder can hold the cache, every process compiles for itself.
+    """
+    options = {"error_model": "numpy", "_nrt": False}
+    try:
+        compiled = numba.njit(cache=True, **options)(function)
+    except RuntimeError:
+        return cast(Callable[P, R], numba.njit(**options)(function))
+    if not numba.config.DISABLE_JIT:
+        file = compiled._cache._cache_file
+        file._source_stamp = (file._source_stamp, _fingerprint())
+    return cast(Callable[P, R], compiled)
 
 
 def phase(function: Callable[P, R]) -> Callable[P, R]:

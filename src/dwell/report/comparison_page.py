@@ -86,7 +86,7 @@ STANDING: dict[Status, tuple[str, str]] = {
     "under": ("under", "good"),
     "above": ("above", "bad"),
     "open": ("open", "open"),
-    "none seen": ("never seen", "good"),
+    "none seen": ("no miss", "good"),
 }
 
 
@@ -106,7 +106,7 @@ def comparison_html(*comparisons: Comparison) -> str:
     body = [f"<h1>{TITLE}</h1>"]
     for comparison in comparisons:
         if len(comparisons) > 1:
-            body.append(f'<h1 class="chapter">{escape(comparison.problem.name)}</h1>')
+            body.append(f'<h1 class="chapter">Cell {escape(comparison.problem.name)}</h1>')
         body += _chapter(comparison)
     return document(TITLE, body)
 

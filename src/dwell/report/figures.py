@@ -78,10 +78,10 @@ def intervals(
         _line(ax, limit * measure.factor)
         if wide:
             ax.set_xscale("log")
-            ax.set_xlim(edge, high * 1.6)
-            set_log_ticks(ax.xaxis, edge, high * 1.6)
+            ax.set_xlim(edge / 1.3, high * 1.5)
+            set_log_ticks(ax.xaxis, edge * 1.2, high * 1.5)
         else:
-            ax.set_xlim(0, high * 1.08)
+            ax.set_xlim(-0.05 * high, high * 1.08)
         ax.grid(axis="y", visible=False)
 
     scale = ", logarithmic" if wide else ""
@@ -157,7 +157,7 @@ def node_use(comparison: Comparison) -> str:
                 ax.plot([used], [row], marker, mfc=face, mec=shade, ms=5.5, clip_on=False)
         if math.isfinite(cap):
             _line(ax, cap * 100)
-        ax.set_xlim(0, 100)
+        ax.set_xlim(-5, 105)
         ax.set_xticks([0, 50, 100])
 
     from matplotlib.lines import Line2D
@@ -185,7 +185,8 @@ def distributions(comparison: Comparison, palette: Palette) -> str:
     from matplotlib.lines import Line2D
 
     deadline_ms = comparison.problem.pipeline.deadline_ms
-    scenarios, columns = comparison.scenarios, min(3, len(comparison.scenarios))
+    scenarios = comparison.scenarios
+    columns = len(scenarios) if len(scenarios) <= 4 else 3
     rows = math.ceil(len(scenarios) / columns)
     with new_figure(2.15 * rows + 0.5) as figure:
         axes = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)

@@ -108,13 +108,14 @@ def _on_aim(comparison: Comparison) -> str:
         text += f"{'; '.join(missed)}), more than any other."
     elif most:
         text += f" {listed(map(shown_policy, best))} do in {most} of {len(scenarios)}."
+    hopeless = []
     for scenario in scenarios:
         if not any(scenario in good[policy] for policy in policies):
             lowest = min(policies, key=lambda p: comparison.values(scenario, p, RATE.column).mean())
-            text += (
-                f" In {shown_scenario(scenario)} none is shown to do so; the lowest is "
-                f"{shown_policy(lowest)}, {_rate(comparison, scenario, lowest)}."
-            )
+            low = _rate(comparison, scenario, lowest)
+            hopeless.append(f"{shown_scenario(scenario)} ({shown_policy(lowest)}, {low})")
+    if hopeless:
+        text += f" None is shown to in {listed(hopeless)}; in brackets the lowest V_D there."
     return text
 
 
@@ -376,7 +377,7 @@ def limits(comparison: Comparison) -> list[str]:
     if any(not values.any() for values in rates):
         limit = percent(rule_of_three(seeds), 1)
         items.append(
-            "Where no run shows a miss, “never seen” is all that is said. Without further "
+            "Where no run shows a miss, “no miss” is all that is said. Without further "
             f"assumptions {seeds} independent runs limit such a rate at {limit} only (the rule of "
             "three)."
         )
@@ -407,7 +408,7 @@ def _all(count: int) -> str:
 
 
 def _span(values: list[float]) -> str:
-    low, high = write_number(min(values)), write_number(max(values))
+    low, high = write_number(min(values), 0), write_number(max(values), 0)
     return low if low == high else f"{low} to {high}"
 
 

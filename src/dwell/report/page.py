@@ -58,7 +58,7 @@ main { max-width: 1100px; margin: 0 auto; padding: 72px 32px 120px; }
 p, h1, h2, h3, ul, dl { max-width: 46em; }
 h1 { font-size: 32px; line-height: 1.2; font-weight: 650; letter-spacing: -0.01em;
   margin: 0 0 8px; }
-h1.chapter { margin-top: 120px; }
+h1.chapter { margin-top: 120px; } h1 + h1.chapter { margin-top: 40px; font-size: 24px; }
 h2 { font-size: 22px; line-height: 1.3; font-weight: 650; margin: 80px 0 16px; }
 h3 { font-size: 17px; line-height: 1.4; font-weight: 650; margin: 44px 0 8px; }
 p, ul { margin: 0 0 14px; }
@@ -90,7 +90,7 @@ tbody th { color: inherit; font-size: inherit; white-space: nowrap; }
 .num, .err { white-space: nowrap; }
 .num { text-align: right; }
 .err { padding-left: 5px; color: var(--muted); font-size: 12.5px; }
-thead .pair { text-align: center; padding-left: 24px; }
+thead .pair { text-align: center; padding-left: 24px; white-space: nowrap; }
 thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .begin { padding-left: 36px; }
 .wide { width: 100%; }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -13,7 +14,8 @@ __all__ = ["is_wide", "log_ticks", "set_log_ticks"]
 
 # Ratio of the largest to the smallest value that asks for a logarithmic axis.
 WIDE = 5.0
-MOST_TICKS = 5
+# Room that the label of a tick needs, as a share of the axis.
+ROOM = 0.16
 
 
 def is_wide(values: Iterable[float]) -> bool:
@@ -23,13 +25,14 @@ def is_wide(values: Iterable[float]) -> bool:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Return 1, 2 and 5 times the powers of ten between the two, or fewer where they are many."""
+    """Return 1, 2 and 5 times the powers of ten between the two, or 1 and 3 times, or 1 times."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     ticks: list[float] = []
-    for steps in ((1, 2, 5), (1, 5), (1,)):
+    for steps in ((1, 2, 5), (1, 3), (1,)):
         ticks = [step * 10.0**power for power in powers for step in steps]
         ticks = [tick for tick in ticks if low <= tick <= high]
-        if len(ticks) <= MOST_TICKS:
+        gaps = [math.log(after / tick) for tick, after in itertools.pairwise(ticks)]
+        if not gaps or min(gaps) >= ROOM * math.log(high / low):
             break
     return ticks
 

@@ -71,14 +71,15 @@ class Written(NamedTuple):
 
 
 def write_number(value: float, decimals: int = 1) -> str:
-    """Write a number; large ones without decimals and with thin spaces, infinity as ∞."""
+    """Write a number with three digits that count, or fewer decimals where it is large.
+
+    Thousands are parted by thin spaces, infinity is ∞, and what is not known is a dash.
+    """
     if math.isnan(value):
         return "–"
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    places = decimals if abs(value) < 1000 else 0
-    text = f"{value:,.{places}f}".replace(",", "\u2009")
-    return text.replace("-", "−")
+    return _fixed(value, _places(value, decimals))
 
 
 def write_interval(interval: Interval, measure: Measure) -> Written:
@@ -97,11 +98,21 @@ def write_interval(interval: Interval, measure: Measure) -> Written:
     even = math.isfinite(half) and abs(half - (value - low)) <= 0.02 * (high - low)
     if measure.ends or not even:
         return Written(text, _between(low, high, measure.decimals))
-    places = measure.decimals if abs(value) < 1000 else 0
+    places = _places(value, measure.decimals)
     least = 10.0**-places
     if half < least / 2:
-        return Written(text, f"± <{least:.{places}f}")
-    return Written(text, f"± {write_number(half, places)}")
+        return Written(text, f"± <{_fixed(least, places)}")
+    return Written(text, f"± {_fixed(half, places)}")
+
+
+def _places(value: float, decimals: int) -> int:
+    """Decimals that leave three digits, at most `decimals`."""
+    whole = len(f"{abs(value):.0f}")
+    return max(0, min(decimals, 3 - whole))
+
+
+def _fixed(value: float, places: int) -> str:
+    return f"{value:,.{places}f}".replace(",", "\u2009").replace("-", "−")
 
 
 def _between(low: float, high: float, decimals: int) -> str:

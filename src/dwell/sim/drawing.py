@@ -272,12 +272,13 @@ class _Draw:
                     threads, down = item.stress_threads, int(item.down)
                     steps.append(np.array([[begin, end], [threads, -threads], [down, -down]]))
             at, threads, down = _accumulate(np.concatenate(steps, axis=1))
-            table = np.empty((np.searchsorted(at, horizon, side="right"), 4), np.int64)
-            for column, values in enumerate((at, row, threads, down > 0)):
-                table[:, column] = values[: len(table)] if column != 1 else row
+            count = int(np.searchsorted(at, horizon, side="right"))
+            table = np.empty((count, 4), np.int64)
+            table[:, 0], table[:, 1] = at[:count], row
+            table[:, 2], table[:, 3] = threads[:count], down[:count] > 0
             tables.append(table)
         table = np.concatenate(tables)
-        return NodeChanges(nodes, table[np.argsort(table[:, 0], kind="stable")])
+        return NodeChanges(nodes, table.take(np.argsort(table[:, 0], kind="stable"), axis=0))
 
     def _link_segments(self, of_link: dict[str, list[Bursts | LinkDisturbance]]) -> LinkSegments:
         """Cut each link's time where something begins or ends, and sum up what holds in between."""
@@ -330,11 +331,12 @@ def _in_turn(begins: Ints, ends: Ints) -> Ints:
 
 def _accumulate(steps: Ints) -> Ints:
     """Sum steps (rows at, change, change) up into the levels that hold from each instant on."""
-    steps = steps[:, np.argsort(steps[0], kind="stable")]
+    # take and compress are several times as fast as indexing, here
+    steps = steps.take(np.argsort(steps[0], kind="stable"), axis=1)
     np.cumsum(steps[1:], axis=1, out=steps[1:])
     last = np.ones(steps.shape[1], np.bool_)
     np.not_equal(steps[0, 1:], steps[0, :-1], out=last[:-1])
-    return steps[:, last]
+    return steps.compress(last, axis=1)
 
 
 def _interval_ns(at_s: float, for_s: float) -> tuple[int, int]:

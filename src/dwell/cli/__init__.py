@@ -1,0 +1,27 @@
+"""The command `dwell`: arguments, progress, exit codes.
+
+Exit codes: 0 done, 1 the work failed, 2 the input is wrong, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+__all__ = ["main"]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit with its code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the process where None.
+    """
+    try:
+        from dwell.cli.commands import app
+
+        app(arguments, prog_name="dwell")
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,168 @@
+"""`dwell check`: every fault of a cell, or what it amounts to before anything is run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from dwell.cli.output import aligned, print_json
+from dwell.errors import Fault, ProblemError
+from dwell.estimators import Profile
+from dwell.io import load
+from dwell.model import Problem
+
+__all__ = ["check_cell", "find_warnings"]
+
+
+def check_cell(cell: Path, traces: Path | None, *, as_json: bool) -> bool:
+    """Check a cell and print what was found.
+
+    Returns
+    -------
+    bool
+        Whether it has no fault.
+    """
+    try:
+        problem = load(cell, traces=traces)
+    except ProblemError as error:
+        if as_json:
+            faults = [_fault(fault) | {"line": fault.line} for fault in error.faults]
+            print_json({"valid": False, "faults": faults})
+        else:
+            typer.echo(str(error), err=True)
+        return False
+    profile = Profile(problem)
+    warnings = tuple(find_warnings(problem, profile))
+    if as_json:
+        found = [_fault(warning) for warning in warnings]
+        print_json({"valid": True, **_contents(problem, profile), "warnings": found})
+    else:
+        typer.echo(_summary(problem, profile))
+        for warning in warnings:
+            typer.echo(f"{cell}: warning: {warning}", err=True)
+    return True
+
+
+def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
+    """Yield what is allowed in a cell but seldom meant."""
+    yield from _overloads(problem, profile)
+    yield from _over_caps(problem, profile)
+    yield from _false_alarms(problem, profile)
+
+
+def _overloads(problem: Problem, profile: Profile) -> Iterator[Fault]:
+    """Yield candidates whose own work is more than a node can do."""
+    for name, shares in profile.own.items():
+        for node, share in shares.items():
+            if share > 1:
+                yield Fault(
+                    f"candidates.{name}",
+                    f"its own work takes {share:.0%} of the cores of {node}: it can never keep "
+                    "pace; place less there, or give the node more cores",
+                )
+
+
+def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
+    """Yield candidates that are over the latency cap before anything disturbs them."""
+    cap_ms = problem.objective.caps.latency_ms
+    for name, l95_ms in profile.l95_ms.items():
+        if cap_ms is not None and l95_ms > cap_ms:
+            yield Fault(
+                f"candidates.{name}",
+                f"L95 is {l95_ms:.1f} ms undisturbed, over the cap of {cap_ms:g} ms: it is never "
+                "eligible while another one is",
+            )
+
+
+def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
+    """Yield candidates under which the guard would fire although nothing is wrong.
+
+    It fires when the cycle after the newest completed one is older than `guard_cycles` periods,
+    never while a fallback is active.
+    """
+    settings = problem.controller
+    if not settings.fallbacks:
+        return
+    bound_ms = (settings.guard_cycles - 1) * problem.pipeline.period_ms
+    for name, l95_ms in profile.l95_ms.items():
+        needed_ms = l95_ms + _return_ms(problem, name)
+        if name not in settings.fallbacks and needed_ms > bound_ms:
+            yield Fault(
+                "controller.guard_cycles",
+                f"{settings.guard_cycles} is tight for {name}: L95 and the way back to the source "
+                f"take {needed_ms:.1f} ms of (guard_cycles - 1) periods = {bound_ms:.1f} ms, so "
+                "that the guard fires without a fault; raise it",
+            )
+
+
+def _return_ms(problem: Problem, candidate: str) -> float:
+    """Longest mean delay from a sink's node back to a source's, where there is a link."""
+    pipeline, placement = problem.pipeline, problem.candidates[candidate]
+    sources = [placement[task] for task in pipeline.tasks if not pipeline.inputs(task)]
+    sinks = [placement[task] for task in pipeline.tasks if not pipeline.outputs(task)]
+    names = [f"{sink}->{source}" for sink in sinks for source in sources]
+    links = problem.fabric.links
+    return max((links[name].delay_ms.expectation for name in names if name in links), default=0.0)
+
+
+def _fault(fault: Fault) -> dict[str, Any]:
+    return {"path": fault.path, "message": fault.message}
+
+
+def _contents(problem: Problem, profile: Profile) -> dict[str, Any]:
+    """What the cell holds, as plain values."""
+    pipeline = problem.pipeline
+    return {
+        "name": problem.name,
+        "period_ms": pipeline.period_ms,
+        "deadline_ms": pipeline.deadline_ms,
+        "window_cycles": problem.window_cycles,
+        "tasks": {name: list(task.on) for name, task in pipeline.tasks.items()},
+        "nodes": {name: node.tier for name, node in problem.fabric.nodes.items()},
+        "links": list(problem.fabric.links),
+        "scenarios": list(problem.scenarios),
+        "candidates": {
+            name: {
+                "placement": dict(placement),
+                "l95_ms": profile.l95_ms[name],
+                "violation_rate": profile.violation_rate[name],
+                "own_work": dict(profile.own[name]),
+            }
+            for name, placement in problem.candidates.items()
+        },
+    }
+
+
+def _summary(problem: Problem, profile: Profile) -> str:
+    pipeline, nodes = problem.pipeline, problem.fabric.nodes
+    movable = [
+        f"{name} ({', '.join(task.on)})"
+        for name, task in pipeline.tasks.items()
+        if not task.anchored
+    ]
+    head = ["candidate", "L95 (ms)", "V_D (%)", *(f"{node} (%)" for node in nodes)]
+    rows = [
+        [
+            name,
+            f"{profile.l95_ms[name]:.1f}",
+            f"{profile.violation_rate[name] * 100:.1f}",
+            *(f"{profile.own[name][node] * 100:.0f}" for node in nodes),
+        ]
+        for name in problem.candidates
+    ]
+    return "\n".join(
+        (
+            f"{problem.name}: no faults",
+            f"{len(pipeline.tasks)} tasks, {len(nodes)} nodes, {len(problem.fabric.links)} links; "
+            f"P {pipeline.period_ms:.4g} ms, D {pipeline.deadline_ms:.4g} ms, "
+            f"W {problem.window_cycles} cycles",
+            f"can move: {', '.join(movable) or 'nothing'}",
+            f"scenarios: {', '.join(problem.scenarios)}",
+            "",
+            "Undisturbed, without queues: L95, V_D, and the cell's own work on each node",
+            aligned(head, rows),
+        )
+    )

@@ -1,0 +1,199 @@
+"""Every command and its arguments; the work is imported where a command needs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from dwell import __version__
+from dwell.errors import (
+    DwellError,
+    MetricError,
+    PlacementError,
+    PolicyError,
+    ProblemError,
+    RunError,
+)
+
+__all__ = ["app"]
+
+FAILED, WRONG, INTERRUPTED = 1, 2, 130
+
+# A TraceError is a ProblemError.
+MISTAKES = (ProblemError, PolicyError, PlacementError, MetricError, RunError)
+
+
+class Commands(TyperGroup):
+    """All commands; an error that is meant for the user is printed and becomes an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command that the arguments name."""
+        try:
+            return super().invoke(ctx)
+        except DwellError as error:
+            located = isinstance(error, ProblemError) and error.source is not None
+            typer.echo(str(error) if located else f"error: {error}", err=True)
+            raise typer.Exit(WRONG if isinstance(error, MISTAKES) else FAILED) from None
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            typer.echo(f"error: {where}{error.strerror or error}", err=True)
+            raise typer.Exit(FAILED) from None
+        except MemoryError:
+            typer.echo("error: not enough memory; ask for fewer windows", err=True)
+            raise typer.Exit(FAILED) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+
+
+app = typer.Typer(
+    cls=Commands,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    no_args_is_help=True,
+    help="Decide, while a robot control pipeline runs, on which computer each stage runs.",
+)
+
+Cell = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
+Traces = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Where its trace files are; beside it if not given."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"dwell {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_show_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options before any command."""
+
+
+@app.command()
+def check(cell: Cell, traces: Traces = None, as_json: Json = False) -> None:
+    """Find every fault in a cell, or say what it amounts to.
+
+    Faults go to stderr, one a line as file:line: path: message, and the exit code is 2. Warnings
+    go there too, but do not change it.
+    """
+    from dwell.cli.check import check_cell
+
+    if not check_cell(cell, traces, as_json=as_json):
+        raise typer.Exit(WRONG)
+
+
+@app.command()
+def run(
+    cell: Cell,
+    scenario: Annotated[str, typer.Option(help="One of the cell's scenarios.")] = "baseline",
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            help="A policy, or a candidate's name for the placement that never moves; "
+            "what the cell says if not given."
+        ),
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="An estimator; what the cell says if not given.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 1,
+    windows: Annotated[int, typer.Option(min=1, help="Length of the run.")] = 300,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where to save the run; runs/CELL-SCENARIO-POLICY-SEED if not given.",
+        ),
+    ] = None,
+    traces: Traces = None,
+    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Simulate a policy on a scenario, save the run, sum it up."""
+    from dwell.cli.run import Request, run_cell
+
+    request = Request(cell, scenario, policy, estimator, seed, windows, out, traces, jobs)
+    if not run_cell(request, as_json=as_json):
+        raise typer.Exit(FAILED)
+
+
+@app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Page to write [default: RUN/report.html]."),
+    ] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write every job as a trace for Perfetto; the run must have kept its jobs.",
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a run's report: one HTML file that needs nothing else."""
+    from dwell.cli.report import report_run
+
+    report_run(folder, out or folder / "report.html", trace, as_json=as_json)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of the cell file."""
+    import json
+
+    from dwell.io import schema as cell_schema
+
+    typer.echo(json.dumps(cell_schema(), indent=2))
+
+
+@app.command()
+def demo(
+    real: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Replay the measurements in this folder instead."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds: 1 to this.")] = 20,
+    windows: Annotated[int, typer.Option(min=1, help="Length of each run.")] = 150,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html goes.")] = Path(
+        "demo-out"
+    ),
+    examples: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where the example cells are, if not found."),
+    ] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="How many to use; one a CPU if not given.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare all policies in all scenarios of an example, and write the report."""
+    from dwell.cli.demo import run_demo
+
+    run_demo(
+        real,
+        seeds=seeds,
+        windows=windows,
+        out=out,
+        examples=examples,
+        processes=processes,
+        as_json=as_json,
+    )

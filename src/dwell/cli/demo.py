@@ -1,0 +1,123 @@
+"""`dwell demo`: all policies in all scenarios of an example, as a table and as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+import dwell
+from dwell.cli.output import aligned, print_json, progress, working, write_file
+from dwell.errors import ProblemError
+from dwell.report import comparison_html
+from dwell.report.wording import Measure, shown_policy, shown_scenario, write_interval
+from dwell.study import Comparison, canonical_demo, real_demo
+from dwell.study.demo import CANONICAL
+
+__all__ = ["find_examples", "run_demo"]
+
+MEASURES = (
+    Measure("violation_rate", "V_D", "%", 100.0, decimals=2),
+    Measure("l95_ms", "L95", "ms"),
+    Measure("u_robot", "U_r", "%", 100.0, decimals=0),
+    Measure("u_edge", "U_e", "%", 100.0, decimals=0),
+    Measure("cost", "J", decimals=2),
+    Measure("migrations", "migrations"),
+)
+
+
+def run_demo(
+    real: Path | None,
+    *,
+    seeds: int,
+    windows: int,
+    out: Path,
+    examples: Path | None,
+    processes: int | None,
+    as_json: bool,
+) -> None:
+    """Compare, print the tables, write the page.
+
+    Parameters
+    ----------
+    real : Path or None
+        Folder with the measurements to replay; None takes the canonical cell.
+    seeds, windows, processes
+        See `dwell.study.canonical_demo`.
+    out : Path
+        Folder for ``report.html``.
+    examples : Path or None
+        Folder with the cells; None looks for it.
+    as_json : bool
+        Print the tables as JSON.
+    """
+    folder = find_examples(examples)
+    with progress("simulating") as shown:
+        comparisons: Sequence[Comparison]
+        if real is None:
+            comparisons = [
+                canonical_demo(
+                    folder, seeds=seeds, windows=windows, processes=processes, progress=shown
+                )
+            ]
+        else:
+            comparisons = real_demo(
+                folder, real, seeds=seeds, windows=windows, processes=processes, progress=shown
+            )
+    page = out / "report.html"
+    if not as_json:
+        for comparison in comparisons:
+            typer.echo(_title(comparison))
+            for scenario in comparison.scenarios:
+                typer.echo(f"\n{_table(comparison, scenario)}")
+            typer.echo()
+    with working("writing the report"):
+        write_file(page, comparison_html(*comparisons))
+    if as_json:
+        tables = {one.problem.name: one.table().to_dicts() for one in comparisons}
+        print_json({"report": page, "comparisons": tables})
+    else:
+        typer.echo(f"report: {page}")
+
+
+def find_examples(given: Path | None) -> Path:
+    """Return the folder with the example cells.
+
+    Raises
+    ------
+    ProblemError
+        If it is not given and neither beside the package nor here.
+    """
+    if given is not None:
+        return given
+    places = (Path(dwell.__file__).parents[2] / "examples", Path("examples"))
+    for place in places:
+        if (place / CANONICAL).is_file():
+            return place
+    raise ProblemError(
+        "the example cells are not installed with the package; run this in a checkout of the "
+        "repository, or name their folder with --examples"
+    )
+
+
+def _title(comparison: Comparison) -> str:
+    return (
+        f"Cell {comparison.problem.name}: {len(comparison.seeds)} seeds, {comparison.windows} "
+        "windows a run; mean over seeds with its 95 % interval"
+    )
+
+
+def _table(comparison: Comparison, scenario: str) -> str:
+    head = [shown_scenario(scenario), *(measure.heading for measure in MEASURES)]
+    rows = [
+        [
+            shown_policy(policy),
+            *(
+                str(write_interval(comparison.interval(scenario, policy, measure.column), measure))
+                for measure in MEASURES
+            ),
+        ]
+        for policy in comparison.policies
+    ]
+    return aligned(head, rows)

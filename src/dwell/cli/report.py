@@ -1,0 +1,35 @@
+"""`dwell report`: a saved run as a page, and its jobs as a trace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from dwell.cli.output import print_json, working, write_file
+from dwell.record import open_run
+from dwell.report import run_html, trace_events
+
+__all__ = ["report_run"]
+
+
+def report_run(folder: Path, page: Path, trace: Path | None, *, as_json: bool) -> None:
+    """Write the page of a run, and its trace where a file is named for it.
+
+    Raises
+    ------
+    RunError
+        If the folder is not a run, or a trace is asked for and the run kept no jobs.
+    """
+    run = open_run(folder)
+    with working("writing the report"):
+        events = None if trace is None else trace_events(run)
+        write_file(page, run_html(run))
+    if trace is not None and events is not None:
+        write_file(trace, events)
+    if as_json:
+        print_json({"report": page, "trace": trace})
+        return
+    typer.echo(f"report: {page}")
+    if trace is not None:
+        typer.echo(f"trace: {trace} (open it at https://ui.perfetto.dev)")

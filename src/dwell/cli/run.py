@@ -1,0 +1,117 @@
+"""`dwell run`: one policy on one realisation, saved and summed up."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+
+import dwell
+from dwell.cli.output import print_json, working
+from dwell.errors import RunError
+from dwell.model import Problem
+from dwell.record import require_free
+from dwell.study.summary import Row, summarise
+
+__all__ = ["Request", "run_cell"]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What a run was asked to be; None is what the cell says, or the default folder."""
+
+    cell: Path
+    scenario: str
+    policy: str | None
+    estimator: str | None
+    seed: int
+    windows: int
+    out: Path | None
+    traces: Path | None
+    jobs: bool
+
+
+def run_cell(request: Request, *, as_json: bool) -> bool:
+    """Simulate, save and print.
+
+    Returns
+    -------
+    bool
+        Whether the run could be saved.
+
+    Raises
+    ------
+    DwellError
+        If anything named is unknown, or the folder holds something else than a run.
+    """
+    problem = dwell.load(request.cell, traces=request.traces)
+    policy = request.policy or problem.controller.policy
+    folder = request.out or _folder(problem, request.scenario, policy, request.seed)
+    require_free(folder)
+    with working(f"simulating {request.windows} windows"):
+        result = dwell.simulate(
+            problem,
+            scenario=request.scenario,
+            policy=policy,
+            estimator=request.estimator,
+            seed=request.seed,
+            windows=request.windows,
+            jobs=request.jobs,
+        )
+        try:
+            result.save(folder)
+        except RunError as error:
+            typer.echo(f"error: {error}", err=True)
+            return False
+    labels: dict[str, str | int] = {
+        "scenario": request.scenario,
+        "policy": policy,
+        "seed": request.seed,
+    }
+    measured = None
+    if request.windows > problem.warmup_windows:
+        measured = summarise(result, problem, labels).row
+    if as_json:
+        head: dict[str, Any] = {"cell": problem.name, **labels, "run": folder}
+        print_json({**head, "summary": measured})
+    else:
+        typer.echo(_summary(problem, request, policy, measured))
+        typer.echo(f"\nsaved to {folder}")
+    return True
+
+
+def _folder(problem: Problem, scenario: str, policy: str, seed: int) -> Path:
+    """Return the folder of a run that names none; a name may hold what a file name may not."""
+    name = f"{problem.name}-{scenario}-{policy}-{seed}"
+    return Path("runs", re.sub(r"[^\w.-]", "_", name))
+
+
+def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -> str:
+    warmup = problem.warmup_windows
+    title = (
+        f"{problem.name}, {request.scenario}, {policy}, seed {request.seed}: "
+        f"{request.windows} windows of {problem.window_cycles} cycles"
+    )
+    if row is None:
+        return f"{title}, all of them warm-up: nothing to sum up; ask for more than {warmup}"
+    shares = (f"{name} {row[f'share_{name}']:.0%}" for name in problem.candidates)
+    used = (f"{node} {row[f'node_{node}']:.0%}" for node in problem.fabric.nodes)
+    lines = (
+        ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
+        ("L95, mean of windows", f"{row['l95_ms']:.2f} ms"),
+        ("median latency", f"{row['p50_ms']:.2f} ms"),
+        ("95th percentile of all cycles", f"{row['p95_ms']:.2f} ms"),
+        ("cost J, mean of windows", f"{row['cost']:.3f}"),
+        ("cycles lost", f"{row['lost']} of {row['cycles']}"),
+        ("longest run of misses", f"{row['longest_misses']}"),
+        ("migrations", f"{row['migrations']}"),
+        ("windows by placement", ", ".join(shares)),
+        ("utilisation", ", ".join(used)),
+    )
+    width = max(len(name) for name, _ in lines)
+    left_out = f", the first {warmup} (warm-up) left out below" if warmup else ""
+    body = "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)
+    return f"{title}{left_out}\n\n{body}"

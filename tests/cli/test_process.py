@@ -1,0 +1,150 @@
+"""The command as a process: exit codes, streams, signals, and what it imports."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dwell
+
+ROOT = Path(__file__).parents[2]
+CANONICAL = ROOT / "examples" / "canonical.yaml"
+HEAVY = ("polars", "numba", "numpy", "matplotlib", "pydantic", "rich", "yaml", "zenoh")
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+
+
+def call(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "dwell", *map(str, arguments)],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+
+def running(*arguments: str) -> str:
+    """Return code that runs a command and goes on."""
+    call = f"    main({list(arguments)!r})"
+    return f"from dwell.cli import main\ntry:\n{call}\nexcept SystemExit:\n    pass"
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["import dwell, dwell.cli, dwell.errors", running("--help"), running("run", "--help")],
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
+    script = f"{code}\nimport sys\nprint([name for name in {HEAVY} if name in sys.modules])"
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_results_go_to_stdout(tmp_path: Path) -> None:
+    result = call("--version", folder=tmp_path)
+    assert (result.returncode, result.stdout) == (0, f"dwell {dwell.__version__}\n")
+    result = call("check", CANONICAL, folder=tmp_path)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith("canonical: no faults\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("check", "missing.yaml"), "missing.yaml"),
+        (("check", "."), "."),
+        (("run", CANONICAL, "--policy", "nope"), "unknown policy"),
+        (("report", "missing"), "missing"),
+        (("run",), "CELL"),
+        (("nope",), "nope"),
+    ],
+)
+def test_a_mistake_is_told_without_a_traceback(
+    tmp_path: Path, arguments: tuple[str | Path, ...], words: str
+) -> None:
+    result = call(*arguments, folder=tmp_path)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def interrupt_at_first_sign(arguments: list[str], folder: Path) -> tuple[int, str, str]:
+    """Start a command on a terminal of its own, and press Ctrl-C once it shows progress.
+
+    Returns
+    -------
+    tuple
+        Exit code, what stdout had, and what the terminal had.
+    """
+    main_end, its_end = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dwell", *arguments],
+        cwd=folder,
+        env={**environment(), "TERM": "xterm"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=its_end,
+        start_new_session=True,
+    )
+    os.close(its_end)
+    shown = os.read(main_end, 1024)
+    # A terminal sends it to the whole group: worker processes as well.
+    os.killpg(process.pid, signal.SIGINT)
+    while True:
+        try:
+            data = os.read(main_end, 65536)
+        except OSError:  # its end is closed
+            break
+        if not data:
+            break
+        shown += data
+    stdout, _ = process.communicate(timeout=300)
+    os.close(main_end)
+    return process.returncode, stdout.decode(), shown.decode()
+
+
+def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
+    arguments = ["run", str(CANONICAL), "--windows", "200000", "--out", "here"]
+    code, stdout, shown = interrupt_at_first_sign(arguments, tmp_path)
+    assert (code, stdout) == (130, "")
+    assert "simulating" in shown
+    assert "Traceback" not in shown
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupted_run_leaves_the_one_before(tmp_path: Path) -> None:
+    assert (
+        call("run", CANONICAL, "--windows", "6", "--out", "here", folder=tmp_path).returncode == 0
+    )
+    arguments = ["run", str(CANONICAL), "--windows", "200000", "--out", "here"]
+    code, _, _ = interrupt_at_first_sign(arguments, tmp_path)
+    assert code == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+    assert dwell.open_run(tmp_path / "here").windows.height == 6
+
+
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_an_interrupted_demo_leaves_nothing(tmp_path: Path, processes: str) -> None:
+    arguments = ["demo", "--seeds", "5000", "--processes", processes, "--out", "out"]
+    code, stdout, shown = interrupt_at_first_sign(arguments, tmp_path)
+    assert (code, stdout) == (130, "")
+    assert "Traceback" not in shown
+    assert list(tmp_path.iterdir()) == []
