@@ -214,7 +214,7 @@ def test_a_run_that_is_all_warm_up(cell: Path) -> None:
     cell.write_text(SMALL + "warmup_windows: 5\n", encoding="utf-8")
     result = call("run", cell, "--windows", "5", "--out", "here")
     assert result.exit_code == 0
-    assert "ask for more than 5" in result.stdout
+    assert "none after the 5 of warm-up" in result.stdout
     assert dwell.open_run("here").windows.height == 5
     assert read_json(call("run", cell, "--windows", "5", "--json"))["summary"] is None
 

@@ -72,7 +72,7 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
         "seed": request.seed,
     }
     measured = None
-    if request.windows > problem.warmup_windows:
+    if not result.windows["warmup"].all():
         measured = summarise(result, problem, labels).row
     if as_json:
         head: dict[str, Any] = {"cell": problem.name, **labels, "run": folder}
@@ -96,7 +96,7 @@ def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -
         f"{request.windows} windows of {problem.window_cycles} cycles"
     )
     if row is None:
-        return f"{title}, all of them warm-up: nothing to sum up; ask for more than {warmup}"
+        return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"
     shares = (f"{name} {row[f'share_{name}']:.0%}" for name in problem.candidates)
     used = (f"{node} {row[f'node_{node}']:.0%}" for node in problem.fabric.nodes)
     lines = (

@@ -112,7 +112,8 @@ class Controller:
         else:
             self.estimator = copy.deepcopy(estimator)
         initial = getattr(self.policy, "initial", None)
-        self.incumbent: str = initial if initial in problem.candidates else problem.initial
+        known = isinstance(initial, str) and initial in problem.candidates
+        self.incumbent = str(initial) if known else problem.initial
         self.previous = self.incumbent
         self.dwell = 0
         self.nodes = tuple(problem.fabric.nodes)
@@ -129,9 +130,11 @@ class Controller:
         self._censor_ns = round(problem.censor_ms * 1e6)
 
     @property
-    def never_moves(self) -> bool:
-        """Whether all windows may be closed at once, because nothing decided in one matters."""
-        return type(self.policy) is Static and type(self.estimator) is Profile
+    def fixed_profile(self) -> Profile | None:
+        """The profile where nothing decided in a window matters, so that all close at once."""
+        estimator = self.estimator
+        never_moves = type(self.policy) is Static and type(estimator) is Profile
+        return estimator if never_moves and isinstance(estimator, Profile) else None
 
     def close(self, window: ClosedWindow) -> str:
         """Look at a closed window and decide the placement of the cycles after it.
@@ -178,10 +181,12 @@ class Controller:
     def _price(self, observed: QoS, incumbent: str) -> float:
         """J of what was observed, with the switching term of the decision that led to it."""
         used = observed.utilisation
-        tiers = [max([used[node] for node in nodes], default=0.0) for nodes in self._tiers]
+        robot, edge, cloud = [
+            max([used[node] for node in nodes], default=0.0) for nodes in self._tiers
+        ]
         switching = self._moved[incumbent, self.previous]
         l95_ms, violation_rate = observed.l95_ms, observed.violation_rate
-        return price(l95_ms, violation_rate, *tiers, switching, self.problem.objective)
+        return price(l95_ms, violation_rate, robot, edge, cloud, switching, self.problem.objective)
 
     def _record(
         self,
@@ -263,7 +268,7 @@ def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> Mi
 
 
 def static_columns(
-    controller: Controller, window: ClosedWindow
+    controller: Controller, profile: Profile, window: ClosedWindow
 ) -> tuple[dict[str, Floats], dict[str, dict[str, Floats]]]:
     """Metrics, costs and estimates of all windows of a run that never moves, in one go.
 
@@ -272,7 +277,8 @@ def static_columns(
     Parameters
     ----------
     controller : Controller
-        With `never_moves`.
+    profile : Profile
+        Its `fixed_profile`.
     window : ClosedWindow
         All windows as rows.
 
@@ -295,15 +301,13 @@ def static_columns(
     by_node = {node: used[:, i] for i, node in enumerate(controller.nodes)}
     seen["cost"] = _priced(problem, seen["l95_ms"], seen["violation_rate"], by_node, 0.0)
     foreign = np.maximum(used - own, 0.0)
-    estimator = controller.estimator
-    assert isinstance(estimator, Profile)
     estimated: dict[str, dict[str, Floats]] = {}
     for candidate, placement in problem.candidates.items():
         l95_ms, violation_rate, busy = seen["l95_ms"], seen["violation_rate"], by_node
         if candidate != name:
-            l95_ms = np.full(len(used), estimator.l95_ms[candidate])
-            violation_rate = np.full(len(used), estimator.violation_rate[candidate])
-            work = estimator.own[candidate]
+            l95_ms = np.full(len(used), profile.l95_ms[candidate])
+            violation_rate = np.full(len(used), profile.violation_rate[candidate])
+            work = profile.own[candidate]
             busy = {
                 node: np.minimum(foreign[:, i] + work[node], 1.0)
                 for i, node in enumerate(controller.nodes)

@@ -44,7 +44,10 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
     """
     late = latency_ns > np.minimum(age_ns, deadline_ns)
     # On one window the plain count is several times as fast.
-    return np.count_nonzero(late) if late.ndim == 1 else np.count_nonzero(late, axis=-1)
+    if late.ndim == 1:
+        return int(np.count_nonzero(late))
+    missed: Ints = np.asarray(np.count_nonzero(late, axis=-1))
+    return missed
 
 
 def seen_l95_ns(latency_ns: Ints, age_ns: Ints, censor_ns: int) -> Ints:

@@ -14,7 +14,14 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 from numpy.typing import NDArray
 
-__all__ = ["fixed_columns", "index", "kernel", "phase"]
+__all__ = ["COMPILED", "fixed_columns", "index", "kernel", "phase"]
+
+# Numba's own types know neither the flags below nor its configuration.
+njit: Any = numba.njit
+config: Any = cast(Any, numba).config
+
+#: Whether kernels are compiled; NUMBA_DISABLE_JIT=1 runs the same code as plain Python.
+COMPILED: bool = not config.DISABLE_JIT
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -37,12 +44,12 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     it inlines from does. The stamp it compares therefore takes in the sources of all kernels. Where
     no folder can hold the cache, every process compiles for itself.
     """
-    options = {"error_model": "numpy", "_nrt": False}
+    options: dict[str, Any] = {"error_model": "numpy", "_nrt": False}
     try:
-        compiled = numba.njit(cache=True, **options)(function)
+        compiled = njit(cache=True, **options)(function)
     except RuntimeError:
-        return cast(Callable[P, R], numba.njit(**options)(function))
-    if not numba.config.DISABLE_JIT:
+        return cast(Callable[P, R], njit(**options)(function))
+    if COMPILED:
         file = compiled._cache._cache_file
         file._source_stamp = (file._source_stamp, _fingerprint())
     return cast(Callable[P, R], compiled)
@@ -50,7 +57,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 
 def phase(function: Callable[P, R]) -> Callable[P, R]:
     """Compile one phase of a kernel into its caller (inlined by LLVM)."""
-    compiled = numba.njit(
+    compiled = njit(
         error_model="numpy",
         forceinline=True,
         no_cpython_wrapper=True,
@@ -92,12 +99,12 @@ def _fixed_view(_context: Any, table: Any, columns: Any) -> Any:
 
     def lower(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array_type = signature.args[0]
-        make = make_array(array_type)
+        make = cast(Any, make_array)(array_type)
         old, new = make(context, builder, value=arguments[0]), make(context, builder)
         itemsize = context.get_abi_sizeof(context.get_data_type(array_type.dtype))
         word, width = types.intp, columns.literal_value
         rows = builder.extract_value(old.shape, 0)
-        populate_array(
+        cast(Any, populate_array)(
             new,
             data=old.data,
             shape=[rows, context.get_constant(word, width)],
@@ -113,6 +120,6 @@ def _fixed_view(_context: Any, table: Any, columns: Any) -> Any:
     return table(table, columns), lower
 
 
-if not numba.config.DISABLE_JIT:
-    fixed_columns = _fixed_view
-    index = _unsigned
+if COMPILED:
+    fixed_columns = _fixed_view  # type: ignore[assignment]
+    index = _unsigned  # type: ignore[assignment]

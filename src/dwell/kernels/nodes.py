@@ -8,7 +8,7 @@ whenever the server runs empty, which keeps its rounding error below a picosecon
 
 from __future__ import annotations
 
-import math
+import numpy as np
 
 from dwell.kernels.compiled import index, phase
 from dwell.kernels.heaps import (
@@ -163,7 +163,7 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
 
 @phase
 def _preempt(s: Tables, server: int) -> bool:
-    """Take the cores of the last running job behind the first waiting one; False if there is none."""
+    """Take the cores of the last running job behind the first waiting one, if there is any."""
     base = s.servers[server, BASE]
     worst = -1
     rank, ready, key = s.wait_rank[base], s.wait_ready[base], s.wait_key[base]
@@ -244,7 +244,7 @@ def schedule(s: Tables, server: int, now: int) -> None:
     speed = s.servers_f[server, SPEED]
     if speed != 1.0:
         left = left / speed
-    t = now + max(int(math.ceil(left - SLACK)), 0)
+    t = now + max(int(np.ceil(left - SLACK)), 0)
     _announce(s, server, t, s.run_key[index(base)])
 
 

@@ -1,5 +1,8 @@
-"""Reports: pages, text for the terminal, traces of jobs."""
+"""Reports: pages, text for the terminal, traces of jobs; nothing heavy is imported here."""
 
 from dwell.report.comparison_page import comparison_html
+from dwell.report.comparison_text import comparison_text
+from dwell.report.run_page import run_html
+from dwell.report.trace_events import trace_events
 
-__all__ = ["comparison_html"]
+__all__ = ["comparison_html", "comparison_text", "run_html", "trace_events"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import platform
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numba
@@ -15,6 +15,7 @@ from dwell.control import ClosedWindow, Controller, Estimator, MinimalPolicy
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.kernels.advance import advance
+from dwell.kernels.compiled import COMPILED
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import Run
@@ -87,7 +88,7 @@ def simulate_realisation(
     _check_fit(problem, realisation)
     controller = Controller(problem, policy, estimator)
     arrays = lay_out([(problem, realisation)], log_jobs=jobs)
-    if controller.never_moves and not by_window:
+    if controller.fixed_profile is not None and not by_window:
         played = _play_static(problem, realisation, controller, arrays)
     else:
         played = _play_windows(problem, realisation, controller, arrays)
@@ -129,9 +130,9 @@ def _check_fit(problem: Problem, realisation: Realisation) -> None:
         )
 
 
-def _quiet() -> Any:
+def _quiet() -> AbstractContextManager[object]:
     """Without compilation, NumPy warns where 64-bit counters wrap, as they are meant to."""
-    return np.errstate(over="ignore") if numba.config.DISABLE_JIT else nullcontext()
+    return nullcontext() if COMPILED else np.errstate(over="ignore")
 
 
 def _play_static(
@@ -157,7 +158,7 @@ def _play_windows(
 
 
 class _Stamper:
-    """Carries closed windows to the controller, and its orders to the cycles they take effect on."""
+    """Carries closed windows to the controller, and its orders to the cycles they stamp."""
 
     def __init__(
         self, problem: Problem, realisation: Realisation, controller: Controller, arrays: Arrays

@@ -77,7 +77,7 @@ class Played:
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0]
-        missed = latency_ns > round(self.problem.pipeline.deadline_ms * 1e6)
+        missed: NDArray[np.bool_] = latency_ns > round(self.problem.pipeline.deadline_ms * 1e6)
         rows = self.rows
         age_ns = self.close_ns[:, None] - self.realisation.release_ns[rows]
         missed[rows] |= latency_ns[rows] > age_ns
@@ -87,20 +87,20 @@ class Played:
 def make_tables(played: Played) -> dict[str, Callable[[], pl.DataFrame]]:
     """Functions that make each table when it is first asked for."""
     controller = played.controller
-    static = not controller.log.seen
+    profile = None if controller.log.seen else controller.fixed_profile
     seen: tuple[dict[str, Floats], dict[str, dict[str, Floats]]] | None = None
 
     def columns() -> tuple[dict[str, Floats], dict[str, dict[str, Floats]]]:
         nonlocal seen
-        if seen is None:
-            seen = static_columns(controller, played.closed_windows())
-        return seen
+        if seen is None and profile is not None:
+            seen = static_columns(controller, profile, played.closed_windows())
+        return seen or (_seen(played), {})
 
     tables = {
         "cycles": lambda: _cycles(played),
-        "windows": lambda: _windows(played, columns()[0] if static else _seen(played)),
+        "windows": lambda: _windows(played, columns()[0]),
         "decisions": lambda: (
-            _static_decisions(played, columns()[1]) if static else _decisions(controller)
+            _decisions(controller) if profile is None else _static_decisions(played, columns()[1])
         ),
     }
     if len(played.arrays.tables.log):

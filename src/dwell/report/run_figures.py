@@ -1,0 +1,109 @@
+"""Figures of a single run, by placement: latencies, where the time goes, how busy the nodes are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dwell.report.palette import INK, MUTED, PAPER, PARTS
+from dwell.report.scales import set_log_ticks
+from dwell.report.svg import inline, new_figure
+from dwell.study import AIM
+from dwell.study.summary import latency_ms
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["latencies_by_placement", "node_use_in_time", "split_by_placement"]
+
+LINES = ("solid", (0, (5, 2)), (0, (1.2, 1.6)), (0, (5, 1.5, 1.2, 1.5)))
+DASHED = (0, (4, 2))
+
+
+def latencies_by_placement(
+    cycles: pl.DataFrame, placements: Mapping[str, str], deadline_ms: float
+) -> str:
+    """Share of the cycles that took longer than a latency, a line for each placement."""
+    with new_figure(2.7) as figure:
+        ax = figure.subplots()
+        least = 0.5
+        for name, colour in placements.items():
+            final_ms = np.sort(latency_ms(cycles.filter(cycles["placement"].cast(str) == name)))
+            if not len(final_ms):
+                continue
+            finite = final_ms[np.isfinite(final_ms)]
+            later = 100 * (1 - np.arange(1, len(finite) + 1) / len(final_ms))
+            least = min(least, 100 / len(final_ms))
+            keep = _thinned(len(finite))
+            later[later <= 0] = math.nan
+            ax.plot(finite[keep], later[keep], color=colour, label=name)
+        ax.axvline(deadline_ms, color=INK, lw=0.9, ls=DASHED, zorder=1)
+        ax.axhline(100 * AIM, color=MUTED, lw=0.8, ls=(0, (1, 2)))
+        ax.set_yscale("log")
+        ax.set_ylim(least, 120)
+        set_log_ticks(ax.yaxis, least, 120)
+        ax.set_xlim(0, 3 * deadline_ms)
+        ax.set_xlabel("latency (ms); dashed: deadline")
+        ax.set_ylabel("cycles that took longer (%)")
+        figure.legend(loc="outside upper left", ncols=max(len(placements), 1))
+        return inline(figure, "latencies", "Distribution of latency by placement")
+
+
+def split_by_placement(
+    cycles: pl.DataFrame, placements: Mapping[str, str], deadline_ms: float
+) -> str:
+    """Where the time of finished cycles goes, a bar for each placement."""
+    from matplotlib.patches import Patch
+
+    used = [name for name in placements if (cycles["placement"].cast(str) == name).any()]
+    with new_figure(0.3 * len(used) + 0.9) as figure:
+        ax = figure.subplots()
+        longest = deadline_ms
+        for row, name in enumerate(used):
+            mine = cycles.filter(cycles["placement"].cast(str) == name)
+            left = 0.0
+            for part, colour in PARTS.items():
+                mean = mine[f"{part}_ns"].cast(float).mean()
+                if isinstance(mean, float):
+                    width = mean / 1e6
+                    ax.barh(row, width, left=left, color=colour, height=0.6, ec=PAPER, lw=0.6)
+                    left += width
+            longest = max(longest, left)
+        ax.axvline(deadline_ms, color=INK, lw=0.9, ls=DASHED, zorder=1)
+        ax.set_xlim(0, 1.04 * longest)
+        ax.set_ylim(len(used) - 0.5, -0.5)
+        ax.set_yticks(range(len(used)), used)
+        ax.tick_params(axis="y", length=0, labelcolor=INK)
+        ax.spines["left"].set_visible(False)
+        ax.grid(axis="y", visible=False)
+        ax.set_xlabel("mean latency of finished cycles (ms); dashed: deadline")
+        names = zip(("computing", "waiting", "network"), PARTS.values(), strict=True)
+        handles = [Patch(color=colour, label=text) for text, colour in names]
+        figure.legend(handles=handles, loc="outside upper left", ncols=3)
+        return inline(figure, "split", "Mean latency by placement and part")
+
+
+def node_use_in_time(windows: pl.DataFrame, nodes: Sequence[str], period_ms: float) -> str:
+    """Utilisation of every node, window by window."""
+    begin_s = windows["first_cycle"].to_numpy() * (period_ms / 1e3)
+    with new_figure(2.0) as figure:
+        ax = figure.subplots()
+        for i, node in enumerate(nodes):
+            used = windows[f"u_{node}"].cast(float).fill_null(math.nan).to_numpy() * 100
+            shade = INK if i % 2 == 0 else MUTED
+            ax.plot(begin_s, used, color=shade, ls=LINES[i % len(LINES)], lw=1.1, label=node)
+        ax.set_ylim(0, 104)
+        ax.set_yticks([0, 50, 100])
+        ax.set_xlim(0, float(begin_s[-1]) or 1.0)
+        ax.set_xlabel("time (s)")
+        ax.set_ylabel("utilisation (%)")
+        figure.legend(loc="outside upper left", ncols=max(len(nodes), 1))
+        return inline(figure, "nodes", "Utilisation of the nodes over time")
+
+
+def _thinned(count: int, points: int = 600) -> slice:
+    """Return every so many points, so that a page stays small."""
+    return slice(None, None, max(count // points, 1))

@@ -1,0 +1,302 @@
+"""The report of a single run: what happened, when, and why it was decided so."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from html import escape
+from typing import TYPE_CHECKING
+
+from dwell.report import run_figures
+from dwell.report.facts import Facts
+from dwell.report.page import (
+    Cell,
+    definitions,
+    document,
+    figure,
+    items,
+    marked,
+    paragraph,
+    section,
+    swatch,
+    table,
+)
+from dwell.report.palette import Palette
+from dwell.report.timeline import timeline
+from dwell.report.wording import listed, percent, shown_scenario, write_number
+from dwell.study import AIM
+from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.record import Run
+
+__all__ = ["run_html"]
+
+MOST_ROWS = 40
+WORST = 10
+REASONS = {
+    "dwell": "dwell: too soon after the last migration",
+    "hold": "hold: no placement promised enough",
+    "migrate": "migrate: another placement promised more than the least improvement",
+    "infeasible": "infeasible: every placement was over a cap; the one nearest to it counted",
+    "guard": "guard: the robot moved by itself",
+}
+OUTCOMES = {
+    "dropped": "a message or an input was lost",
+    "replaced": "a newer one took its place",
+    "node_down": "a node was down",
+    "in_flight": "unfinished at the end",
+}
+
+
+def run_html(run: Run) -> str:
+    """Return a self-contained page about a run.
+
+    Parameters
+    ----------
+    run : Run
+        Simulated or live, just made or opened from its folder.
+
+    Returns
+    -------
+    str
+        HTML without scripts, and without anything that is loaded from elsewhere.
+
+    Raises
+    ------
+    RunError
+        If the run's record is incomplete.
+    SimulationError
+        If the run has no window after its warm-up.
+    """
+    facts = Facts.of(run)
+    counted = count_in(run, facts.window_cycles)
+    palette = Palette.of(facts.candidates)
+    title = f"A run of {facts.policy_name} on {facts.cell}"
+    return document(title, _body(run, facts, counted, palette, title))
+
+
+def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str) -> Iterator[str]:
+    seconds = counted.cycles.height * facts.period_ms / 1e3
+    yield f"<h1>{escape(title)}</h1>"
+    yield paragraph(
+        f"Scenario “{shown_scenario(facts.scenario)}”, {facts.kind}, seed {facts.seed}: "
+        f"{counted.windows.height} windows of {facts.window_cycles} cycles after the warm-up, "
+        f"{write_number(seconds / 60)} minutes",
+        "subtitle",
+    )
+    yield paragraph(
+        "Did the cell meet its deadline, and what did the policy do for it?", "question"
+    )
+    yield items(_verdict(facts, counted))
+    yield section("Through time", *_in_time(run, facts, palette))
+    yield section("Latency", *_latency(facts, counted, palette))
+    yield section("Decisions", *_decisions(run, facts, palette))
+    yield section("Worst windows", _worst_windows(facts, counted, palette))
+    yield section("What this is", *_about(facts))
+
+
+# ----------------------------------------------------------------------------------- verdict
+
+
+def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
+    cycles, windows, decisions = counted.cycles, counted.windows, counted.decisions
+    missed = cycles["missed"].to_numpy()
+    rate = float(missed.mean())
+    place = "under" if rate < AIM else "not under"
+    final_ms = latency_ms(cycles)
+    yield (
+        f"{percent(rate, 1)} of {write_number(cycles.height, 0)} cycles missed the deadline of "
+        f"{write_number(facts.deadline_ms)} ms, which is {place} the aim of {percent(AIM)}. The "
+        f"95th percentile of their latencies is {write_number(order_statistic(final_ms, 95))} ms; "
+        f"at worst {longest_streak(missed)} cycles in a row missed."
+    )
+    yield _lost(cycles)
+    shares = windows["placement"].cast(str).value_counts(sort=True)
+    where = listed(f"{percent(count / windows.height)} on {name}" for name, count in shares.rows())
+    moves = decisions.filter(decisions["migrated"])
+    text = f"Of its windows it spent {where}, with {_count(moves.height, 'migration')}"
+    undone = _undone(moves)
+    text += f", {undone} of which undid the one before" if undone else ""
+    yield f"{text}."
+    yield (
+        "One run is one sample: it says what happened, not what to expect. For intervals, compare "
+        "runs over seeds."
+    )
+
+
+def _lost(cycles: pl.DataFrame) -> str:
+    outcomes = dict(cycles["outcome"].cast(str).value_counts().rows())
+    found = [
+        f"{_count(outcomes[name], 'cycle')} because {why}"
+        if name != "in_flight"
+        else f"{_count(outcomes[name], 'cycle')} {why}"
+        for name, why in OUTCOMES.items()
+        if outcomes.get(name)
+    ]
+    if not found:
+        return "Every cycle finished."
+    return f"Not finished: {listed(found)}."
+
+
+def _undone(moves: pl.DataFrame) -> int:
+    pairs = moves.select("incumbent", "placement").rows()
+    return sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
+
+
+def _count(number: int, what: str) -> str:
+    return f"{write_number(number, 0)} {what}{'' if number == 1 else 's'}"
+
+
+# ----------------------------------------------------------------------------------- figures
+
+
+def _in_time(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
+    yield figure(
+        timeline(
+            run.windows,
+            run.decisions,
+            placements=palette.placements,
+            period_ms=facts.period_ms,
+            deadline_ms=facts.deadline_ms,
+            name="time",
+        ),
+        "Each mark is a window and has the colour of the placement that was active. In the lowest "
+        "panel the lines are what the other placements were estimated to cost.",
+    )
+    yield figure(
+        run_figures.node_use_in_time(run.windows, facts.nodes, facts.period_ms),
+        "Utilisation of each node as its operating system shows it: foreign work included.",
+    )
+
+
+def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
+    yield figure(
+        run_figures.latencies_by_placement(counted.cycles, palette.placements, facts.deadline_ms),
+        "Latency of the cycles that were released under each placement: one less the empirical "
+        "distribution function, on a logarithmic scale. Dotted: 5 %.",
+    )
+    yield figure(
+        run_figures.split_by_placement(counted.cycles, palette.placements, facts.deadline_ms),
+        "Where the time goes along the critical path of the cycles that finished.",
+    )
+
+
+# ------------------------------------------------------------------------------------ tables
+
+
+def _decisions(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
+    decisions = run.decisions
+    counts = dict(decisions["reason"].cast(str).value_counts().rows())
+    yield items(
+        f"{_count(counts[name], 'decision')}, {text}"
+        for name, text in REASONS.items()
+        if counts.get(name)
+    )
+    moves = decisions.filter(decisions["migrated"])
+    if not moves.is_empty():
+        yield _migrations(run, facts, palette, moves)
+
+
+def _migrations(run: Run, facts: Facts, palette: Palette, moves: pl.DataFrame) -> str:
+    cost = dict(run.windows.select("window", "cost").rows())
+    first = dict(run.windows.select("window", "first_cycle").rows())
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for move in moves.head(MOST_ROWS).iter_rows(named=True):
+        window, target = move["window"], move["placement"]
+        close_s = (first[window] + facts.window_cycles) * facts.period_ms / 1e3
+        numbers = (cost.get(window), move[f"j_{target}"], cost.get(window + 1))
+        cells = [
+            Cell(str(window)),
+            Cell(write_number(close_s), "num"),
+            Cell(f"{_placed(palette, move['incumbent'])} → {_placed(palette, target)}"),
+            Cell(escape(str(move["reason"]))),
+            *(Cell(write_number(_number(value), 2), "num") for value in numbers),
+        ]
+        rows.append(("", cells))
+    head = [
+        Cell("after window"),
+        Cell("at (s)", "num"),
+        Cell("migration"),
+        Cell("reason"),
+        Cell("J before", "num"),
+        Cell("J estimated", "num"),
+        Cell("J after", "num"),
+    ]
+    more = moves.height - MOST_ROWS
+    caption = (
+        "Every migration: measured J of the window before it, J that was estimated for the "
+        "target, and measured J of the first window on it."
+    )
+    return table(head, rows, f"{caption} {more} more are left out." if more > 0 else caption)
+
+
+def _worst_windows(facts: Facts, counted: Counted, palette: Palette) -> str:
+    worst = counted.windows.sort(
+        "violation_rate", "seen_l95_ms", descending=True, nulls_last=True, maintain_order=True
+    ).head(WORST)
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for window in worst.iter_rows(named=True):
+        begin_s = window["first_cycle"] * facts.period_ms / 1e3
+        used = [_number(window[f"u_{node}"]) for node in facts.nodes]
+        cells = [
+            Cell(str(window["window"])),
+            Cell(write_number(begin_s), "num"),
+            Cell(_placed(palette, window["placement"])),
+            Cell(write_number(100 * window["violation_rate"]), "num"),
+            Cell(write_number(_number(window["l95_ms"])), "num"),
+            Cell(write_number(_number(window["cost"]), 2), "num"),
+            *(Cell(write_number(100 * value, 0), "num") for value in used),
+        ]
+        rows.append(("", cells))
+    head = [
+        Cell("window"),
+        Cell("at (s)", "num"),
+        Cell("placement"),
+        Cell(marked("V_D (%)"), "num"),
+        Cell("L95 (ms)", "num"),
+        Cell("J", "num"),
+        *(Cell(f"{escape(node)} (%)", "num") for node in facts.nodes),
+    ]
+    return table(
+        head,
+        rows,
+        f"The {len(rows)} windows with the most misses. L95 of final latencies: ∞ where more than "
+        "5 % of the cycles never finished. The last columns are the utilisation of the nodes.",
+    )
+
+
+def _about(facts: Facts) -> Iterator[str]:
+    yield definitions(
+        {
+            "cell": facts.cell,
+            "scenario": facts.scenario,
+            "record": f"{facts.kind}, seed {facts.seed}",
+            "policy": facts.policy,
+            "estimator": facts.estimator,
+            "window": f"{facts.window_cycles} cycles of {write_number(facts.period_ms)} ms, "
+            f"deadline {write_number(facts.deadline_ms)} ms",
+            "placements": "; ".join(
+                f"{name}: {listed(f'{task} on {node}' for task, node in placed.items())}"
+                for name, placed in facts.candidates.items()
+                if placed
+            )
+            or "one only",
+            "versions": ", ".join(f"{name} {text}" for name, text in facts.versions.items()),
+        }
+    )
+    if facts.policy_name == "ATP":
+        yield paragraph(
+            "ATP is our reconstruction from a description in words: its rule has no public numbers."
+        )
+
+
+def _placed(palette: Palette, name: str) -> str:
+    return f'<span class="nowrap">{swatch(palette.placements[name])}{escape(name)}</span>'
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -1,0 +1,202 @@
+"""The jobs of a run as a trace that chrome://tracing and Perfetto show.
+
+Nodes are processes and tasks are threads. A job is a slice from its start to its end; while it
+waits for a worker it is an asynchronous slice of its own, because waiting jobs of a task overlap.
+Cycles are asynchronous slices of a process of their own, where migrations stand as instants.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NotRequired, TypeAlias, TypedDict
+
+from dwell.report.facts import Facts
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.record import Run
+
+__all__ = ["TraceDocument", "TraceEvent", "trace_events"]
+
+NS_PER_US = 1e3
+# Process of the cycles; nodes follow.
+CELL = 0
+# Threads kept for the workers of a task on a node.
+LANES = 1000
+
+Arguments: TypeAlias = "dict[str, str | int | float | bool | None]"
+
+
+class TraceEvent(TypedDict):
+    """One event of the Chrome JSON trace event format; times are microseconds."""
+
+    name: str
+    ph: str
+    pid: int
+    tid: int
+    ts: NotRequired[float]
+    dur: NotRequired[float]
+    cat: NotRequired[str]
+    id: NotRequired[str]
+    s: NotRequired[str]
+    args: NotRequired[Arguments]
+
+
+class TraceDocument(TypedDict):
+    """A whole trace, ready for JSON."""
+
+    traceEvents: list[TraceEvent]
+    displayTimeUnit: str
+    otherData: dict[str, str]
+
+
+def trace_events(run: Run) -> TraceDocument:
+    """Return the jobs, cycles and migrations of a run as trace events.
+
+    Parameters
+    ----------
+    run : Run
+        One that kept its jobs.
+
+    Returns
+    -------
+    dict
+        In the Chrome JSON trace event format, to be written with ``json.dump``.
+
+    Raises
+    ------
+    RunError
+        If the run kept no jobs, or its record is incomplete.
+    """
+    facts = Facts.of(run)
+    jobs = run.jobs
+    return {
+        "traceEvents": [
+            *_names(facts, jobs),
+            *_job_events(facts, jobs),
+            *_cycle_events(run.cycles, jobs),
+            *_migration_events(run, facts),
+        ],
+        "displayTimeUnit": "ms",
+        "otherData": {
+            "cell": facts.cell,
+            "scenario": facts.scenario,
+            "policy": facts.policy,
+            "seed": facts.seed,
+        },
+    }
+
+
+def _names(facts: Facts, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+    """Name the processes, and the first thread of every task."""
+    yield _name("process_name", CELL, 0, f"cell {facts.cell}")
+    for node, pid in _processes(facts).items():
+        yield _name("process_name", pid, 0, f"node {node}")
+    for node, task in jobs.select("node", "task").unique(maintain_order=True).rows():
+        yield _name("thread_name", _processes(facts)[node], _threads(jobs)[task], task)
+
+
+def _job_events(facts: Facts, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+    """Jobs as slices, their waiting as asynchronous ones."""
+    threads = _threads(jobs)
+    known = [jobs[column].max() for column in ("ready_ns", "start_ns", "end_ns")]
+    # A job that runs when the run ends is shown up to there.
+    last_ns = max((value for value in known if isinstance(value, int)), default=0)
+    for (node, task), mine in jobs.group_by("node", "task", maintain_order=True):
+        pid, thread = _processes(facts)[str(node)], threads[str(task)]
+        free: list[tuple[int, int]] = []
+        for job in mine.sort("start_ns", nulls_last=True).iter_rows(named=True):
+            ready_ns, start_ns = job["ready_ns"], job["start_ns"]
+            end_ns = last_ns if job["end_ns"] is None else job["end_ns"]
+            begun_ns = end_ns if start_ns is None else start_ns
+            about: Arguments = {"cycle": job["cycle"], "outcome": str(job["outcome"])}
+            if begun_ns > ready_ns:
+                name, key = f"{task} waits", f"{pid}/{task}/{job['cycle']}"
+                yield from _span(name, "waiting", pid, key, (ready_ns, begun_ns), about)
+            if start_ns is not None:
+                # Workers of a task run jobs at once, but slices of a thread may not overlap.
+                lane = heapq.heappop(free)[1] if free and free[0][0] <= start_ns else len(free)
+                heapq.heappush(free, (end_ns, lane))
+                yield {
+                    "name": str(task),
+                    "cat": "job",
+                    "ph": "X",
+                    "pid": pid,
+                    "tid": thread + lane,
+                    "ts": start_ns / NS_PER_US,
+                    "dur": (end_ns - start_ns) / NS_PER_US,
+                    "args": about,
+                }
+
+
+def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+    """Cycles from their release to their completion, or to where the last of them was seen."""
+    import polars as pl
+
+    seen = jobs.group_by("cycle").agg(
+        last_ns=pl.max_horizontal(pl.col("ready_ns").max(), pl.col("end_ns").max())
+    )
+    played = cycles.join(seen, on="cycle", how="inner", maintain_order="left")
+    for cycle in played.iter_rows(named=True):
+        release_ns, latency_ns = cycle["release_ns"], cycle["latency_ns"]
+        end_ns = cycle["last_ns"] if latency_ns is None else release_ns + latency_ns
+        about: Arguments = {
+            "placement": str(cycle["placement"]),
+            "outcome": str(cycle["outcome"]),
+            "missed": cycle["missed"],
+        }
+        name, key = f"cycle {cycle['cycle']}", f"cycle/{cycle['cycle']}"
+        yield from _span(name, "cycle", CELL, key, (release_ns, end_ns), about)
+
+
+def _migration_events(run: Run, facts: Facts) -> Iterator[TraceEvent]:
+    """Decisions that migrate, at the close of the window they were made after."""
+    import polars as pl
+
+    closes = run.windows.select("window", cycle=pl.col("first_cycle") + facts.window_cycles)
+    moves = run.decisions.filter(pl.col("migrated")).join(closes, on="window")
+    for move in moves.join(run.cycles, on="cycle", suffix="_of_cycle").iter_rows(named=True):
+        yield {
+            "name": f"{move['incumbent']} → {move['placement']}",
+            "cat": "decision",
+            "ph": "i",
+            "s": "g",
+            "pid": CELL,
+            "tid": 0,
+            "ts": move["release_ns"] / NS_PER_US,
+            "args": {"window": move["window"], "reason": str(move["reason"])},
+        }
+
+
+def _processes(facts: Facts) -> dict[str, int]:
+    return {node: pid for pid, node in enumerate(facts.nodes, start=CELL + 1)}
+
+
+def _threads(jobs: pl.DataFrame) -> dict[str, int]:
+    """First thread of every task; further workers of it take the numbers after."""
+    tasks = jobs["task"].unique(maintain_order=True).to_list()
+    return {task: LANES * i + 1 for i, task in enumerate(tasks)}
+
+
+def _name(what: str, pid: int, tid: int, name: str) -> TraceEvent:
+    return {"name": what, "ph": "M", "pid": pid, "tid": tid, "args": {"name": name}}
+
+
+def _span(
+    name: str, category: str, pid: int, key: str, ns: tuple[int, int], about: Arguments
+) -> Iterator[TraceEvent]:
+    """Begin and end of an asynchronous slice."""
+    begin: TraceEvent = {
+        "name": name,
+        "cat": category,
+        "ph": "b",
+        "id": key,
+        "pid": pid,
+        "tid": 0,
+        "ts": ns[0] / NS_PER_US,
+        "args": about,
+    }
+    yield begin
+    yield {**begin, "ph": "e", "ts": ns[1] / NS_PER_US, "args": {}}
