@@ -32,6 +32,7 @@ from dwell.model import (
     Pipeline,
     Placement,
     Problem,
+    Quota,
     Process,
     Targets,
     Task,
@@ -282,7 +283,14 @@ class _Maker:
             scheduler=rng.choice(self.schedulers),
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
             bursts=self.bursts(rng.randint(1, 4)),
+            quota=self.quota(),
         )
+
+    def quota(self) -> Quota | None:
+        rng = self.rng
+        if rng.random() >= 0.2:
+            return None
+        return Quota(rng.choice([0.3, 0.5, 1, 1.7, 2.5]), rng.choice([1, 4, 10, 100]))
 
     def task(self, name: str, load: float, *, source: bool) -> Task:
         rng = self.rng

@@ -5,7 +5,7 @@ sentence: every node looks at all of its jobs after every event, remaining work 
 fraction, a link is a SimPy process that takes messages out of a queue. What the page leaves open is
 read as the comments marked "Reading:" say.
 
-Out of its scope: CPU quotas, `close_grace_ms`, shadow jobs, fleets.
+Out of its scope: `close_grace_ms`, shadow jobs, fleets.
 """
 
 from __future__ import annotations
@@ -206,6 +206,23 @@ class NodeState:
         self.served: dict[str, list[Job]] = {kind: [] for kind in node.accelerators}
         self.busy = Fraction(0)
         self.since = 0
+        self.period = self.quota = self.left = 0
+        if node.quota is not None:
+            self.period = nanoseconds(node.quota.period_ms)
+            self.quota = self.left = round(node.quota.cpu * self.period)
+        self.empty_at: int | None = None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the quota is used up."""
+        return self.quota > 0 and self.left <= 0
+
+    @property
+    def rate(self) -> int:
+        """Cores that are busy."""
+        if self.down or self.stopped:
+            return 0
+        return min(self.node.cores, self.threads + self.foreign)
 
     @property
     def running(self) -> list[Job]:
@@ -222,6 +239,8 @@ class NodeState:
 
     @property
     def speed(self) -> Fraction:
+        if self.stopped:
+            return Fraction(0)
         c, s = self.node.cores, self.foreign
         if self.node.scheduler == "fair":
             return min(Fraction(1), Fraction(c, max(1, self.threads + s)))
@@ -231,13 +250,14 @@ class NodeState:
         """Let the time since the last change pass."""
         elapsed = now - self.since
         self.since = now
+        speed, rate = self.speed, self.rate
         for job in self.running:
-            job.left -= self.speed * elapsed
+            job.left -= speed * elapsed
         for jobs in self.served.values():
             for job in jobs:
                 job.left -= elapsed * (job.cores > 0)
-        if not self.down:
-            self.busy += min(self.node.cores, self.threads + self.foreign) * elapsed
+        self.busy += rate * elapsed
+        self.left -= rate * elapsed
 
     def runnable(self, job: Job) -> list[Job]:
         """Jobs among which this one runs: the CPU's, or those of its accelerator."""
@@ -269,6 +289,8 @@ class NodeState:
         if job.cores == 0:
             return None
         speed = self.speed if job.execution.accelerator is None else Fraction(1)
+        if speed == 0:
+            return None
         return now + math.ceil(job.left / speed)
 
 
@@ -382,6 +404,18 @@ class Simulation:
                 job.due = due
                 if due is not None:
                     self.foresee(job, due)
+        empty_at = now + -(-node.left // node.rate) if node.quota and node.rate else None
+        if empty_at != node.empty_at:
+            node.empty_at = empty_at
+            if empty_at is not None:
+                # Nothing else happens then; every event looks anew at who runs, and how fast.
+                self.at(empty_at, DISTURBANCE, -1, 0, lambda: None)
+
+    def renewer(self, node: NodeState) -> Callable[[], None]:
+        def renew() -> None:
+            node.left = node.quota
+
+        return renew
 
     def foresee(self, job: Job, due: int) -> None:
         self.at(
@@ -403,6 +437,9 @@ class Simulation:
             self.env.process(self.transmit(name))
         for i, change in enumerate(self.real.node_changes):
             self.at(change.at_ns, DISTURBANCE, -1, i, self.changer(change), fixed=True)
+        for node in self.nodes.values():
+            for begin in range(node.period, self.end + 1, node.period) if node.quota else ():
+                self.at(begin, DISTURBANCE, -1, 0, self.renewer(node), fixed=True)
         for k in range(self.real.cycles):
             if self.release[k] < self.end:
                 self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)

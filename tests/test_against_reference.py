@@ -154,7 +154,7 @@ def utilisation_differences(case: Case, run: dwell.Run, result: Result) -> Itera
     for name, node in case.problem.fabric.nodes.items():
         for k, found in enumerate(windows[f"u_{name}"]):
             busy = result.busy[name][k + 1] - result.busy[name][k]
-            expected = float(busy / (node.cores * (closes[k + 1] - closes[k])))
+            expected = min(1.0, float(busy) / (node.capacity * (closes[k + 1] - closes[k])))
             if found is None or abs(found - expected) > 1e-6:
                 yield f"window {k}: u_{name} {found}, expected {expected}"
 

@@ -266,6 +266,38 @@ def test_names_that_are_no_file_names(cell: Path) -> None:
     )
 
 
+# ---------------------------------------------------------------------------------- report
+
+
+def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept", "--jobs")
+    result = call("report", "kept")
+    assert (result.exit_code, result.stdout) == (0, "report: kept/report.html\n")
+    assert Path("kept/report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    found = read_json(call("report", "kept", "--out", "r.html", "--trace", "t.json", "--json"))
+    assert found == {"report": "r.html", "trace": "t.json"}
+    assert Path("r.html").is_file()
+    assert json.loads(Path("t.json").read_text(encoding="utf-8"))["traceEvents"]
+
+
+def test_report_of_what_is_not_there(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    without_jobs = call("report", "kept", "--trace", "t.json")
+    assert (without_jobs.exit_code, without_jobs.stdout) == (2, "")
+    assert "dwell run --jobs" in without_jobs.stderr
+    assert {path.name for path in cell.parent.iterdir()} == {"small.yaml", "kept"}
+    assert not Path("kept/report.html").exists()
+    assert call("report", "nowhere").exit_code == 2
+    assert call("report", ".").exit_code == 2
+
+
+def test_a_page_that_cannot_be_written_is_a_failure(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    result = call("report", "kept", "--out", "small.yaml/report.html")
+    assert result.exit_code == 1
+    assert "error: " in result.stderr
+
+
 # ---------------------------------------------------------------------------------- schema
 
 
@@ -280,7 +312,7 @@ def test_demo_prints_tables_and_writes_the_page(tmp_path: Path) -> None:
     arguments = ("--seeds", "2", "--windows", "8", "--processes", "1", "--out", tmp_path / "out")
     result = call("demo", *arguments)
     assert (result.exit_code, result.stderr) == (0, "")
-    for words in ("Cell canonical: 2 seeds", "Robot CPU stress", "DTP", "our reconstruction"):
+    for words in ("Cell canonical", "Robot CPU stress", "DTP", "our reconstruction"):
         assert words in result.stdout
     assert result.stdout.endswith(f"report: {tmp_path / 'out' / 'report.html'}\n")
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")

@@ -8,23 +8,13 @@ from pathlib import Path
 import typer
 
 import dwell
-from dwell.cli.output import aligned, print_json, progress, working, write_file
+from dwell.cli.output import print_json, progress, working, write_file
 from dwell.errors import ProblemError
-from dwell.report import comparison_html
-from dwell.report.wording import Measure, shown_policy, shown_scenario, write_interval
+from dwell.report import comparison_html, comparison_text
 from dwell.study import Comparison, canonical_demo, real_demo
 from dwell.study.demo import CANONICAL
 
 __all__ = ["find_examples", "run_demo"]
-
-MEASURES = (
-    Measure("violation_rate", "V_D", "%", 100.0, decimals=2),
-    Measure("l95_ms", "L95", "ms"),
-    Measure("u_robot", "U_r", "%", 100.0, decimals=0),
-    Measure("u_edge", "U_e", "%", 100.0, decimals=0),
-    Measure("cost", "J", decimals=2),
-    Measure("migrations", "migrations"),
-)
 
 
 def run_demo(
@@ -68,10 +58,8 @@ def run_demo(
     page = out / "report.html"
     if not as_json:
         for comparison in comparisons:
-            typer.echo(_title(comparison))
-            for scenario in comparison.scenarios:
-                typer.echo(f"\n{_table(comparison, scenario)}")
-            typer.echo()
+            typer.echo(f"Cell {comparison.problem.name}\n")
+            typer.echo(comparison_text(comparison))
     with working("writing the report"):
         write_file(page, comparison_html(*comparisons))
     if as_json:
@@ -99,25 +87,3 @@ def find_examples(given: Path | None) -> Path:
         "the example cells are not installed with the package; run this in a checkout of the "
         "repository, or name their folder with --examples"
     )
-
-
-def _title(comparison: Comparison) -> str:
-    return (
-        f"Cell {comparison.problem.name}: {len(comparison.seeds)} seeds, {comparison.windows} "
-        "windows a run; mean over seeds with its 95 % interval"
-    )
-
-
-def _table(comparison: Comparison, scenario: str) -> str:
-    head = [shown_scenario(scenario), *(measure.heading for measure in MEASURES)]
-    rows = [
-        [
-            shown_policy(policy),
-            *(
-                str(write_interval(comparison.interval(scenario, policy, measure.column), measure))
-                for measure in MEASURES
-            ),
-        ]
-        for policy in comparison.policies
-    ]
-    return aligned(head, rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import typer
@@ -26,7 +27,7 @@ def report_run(folder: Path, page: Path, trace: Path | None, *, as_json: bool) -
         events = None if trace is None else trace_events(run)
         write_file(page, run_html(run))
     if trace is not None and events is not None:
-        write_file(trace, events)
+        write_file(trace, json.dumps(events))
     if as_json:
         print_json({"report": page, "trace": trace})
         return

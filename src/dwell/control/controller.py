@@ -119,7 +119,7 @@ class Controller:
         self.nodes = tuple(problem.fabric.nodes)
         self._names = tuple(problem.candidates)
         self.log = Log()
-        self._cores = np.array([node.cores for node in problem.fabric.nodes.values()], float)
+        self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
         self._tiers = tier_nodes(problem.objective)
         self._moved = {
             (one, other): hamming(problem.candidates[one], problem.candidates[other])

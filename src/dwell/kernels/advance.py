@@ -23,6 +23,7 @@ from dwell.kernels.cycles import (
 )
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
+    QUOTA_T,
     ARRIVAL,
     BASE,
     BUSY,
@@ -108,7 +109,7 @@ from dwell.kernels.layout import (
     Tables,
 )
 from dwell.kernels.links import lose, send, slot_row
-from dwell.kernels.nodes import admit, job_row, key_row, leave, mark, set_speed, tick
+from dwell.kernels.nodes import admit, job_row, key_row, leave, mark, refill, set_speed, tick
 
 __all__ = ["advance"]
 
@@ -233,6 +234,16 @@ def _change(s: Tables, now: int) -> None:
         mark(s, server)
     if turned:
         _turn_sites(s, node, down, now)
+
+
+@phase
+def _quota(s: Tables, server: int, now: int) -> None:
+    """A server's quota is used up or renewed, unless the announcement has gone stale."""
+    if s.servers[server, QUOTA_T] == now:
+        s.servers[server, QUOTA_T] = -1
+        tick(s, server, now)
+        refill(s, server, now)
+        mark(s, server)
 
 
 @phase
@@ -366,9 +377,11 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         note_ready(s, cell, cycle, item)
     elif kind == RETRY:
         _retry(s, cell, cycle, item, now)
-    elif kind == CHANGE:
+    elif kind == CHANGE and item == 0:
         _change(s, now)
         _announce_change(s)
+    elif kind == CHANGE:
+        _quota(s, item - 1, now)
     elif kind == RESTART:
         _restart(s, cell, item, now)
 

@@ -103,8 +103,14 @@ SOURCE, TARGET, N_FLOW = range(3)
     NODE_OF,
     DIRTY,
     IS_CPU,
+    QUOTA_NS,
+    PERIOD_NS,
+    LEFT_NS,
+    PERIOD,
+    THROTTLED,
+    QUOTA_T,
     N_SERVER,
-) = range(16)
+) = range(22)
 
 # servers, float64
 VIRTUAL, SPEED, N_SERVER_F = range(3)

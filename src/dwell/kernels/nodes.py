@@ -19,6 +19,14 @@ from dwell.kernels.heaps import (
     push_waiting,
 )
 from dwell.kernels.layout import (
+    CHANGE,
+    KIND_SHIFT,
+    LEFT_NS,
+    PERIOD,
+    PERIOD_NS,
+    QUOTA_NS,
+    QUOTA_T,
+    THROTTLED,
     BASE,
     BUSY,
     CELL_MASK,
@@ -53,10 +61,20 @@ from dwell.kernels.layout import (
     Tables,
 )
 
-__all__ = ["admit", "dispatch", "job_row", "leave", "mark", "schedule", "set_speed", "tick"]
+__all__ = [
+    "admit",
+    "dispatch",
+    "job_row",
+    "leave",
+    "mark",
+    "refill",
+    "schedule",
+    "set_speed",
+    "tick",
+]
 
 # Work left below this many nanoseconds is rounding, not work.
-SLACK = 1e-6
+SLACK = 1e-3
 
 
 @phase
@@ -89,9 +107,46 @@ def _account(s: Tables, server: int, now: int) -> int:
     elapsed = now - s.servers[server, LAST]
     busy = s.servers[server, USED] + s.servers[server, STRESS]
     if elapsed > 0 and busy > 0 and s.servers[server, DOWN] == 0:
-        s.servers[server, BUSY] += elapsed * min(busy, s.servers[server, CORES])
+        spent = elapsed * min(busy, s.servers[server, CORES])
+        if s.servers[server, THROTTLED] == 0:
+            s.servers[server, BUSY] += spent
+            s.servers[server, LEFT_NS] -= spent
     s.servers[server, LAST] = now
     return int(elapsed)
+
+
+@phase
+def refill(s: Tables, server: int, now: int) -> None:
+    """Open or shut a server by its quota; its clock must be up to date.
+
+    While anything runs there is an event at every boundary of a period and wherever the quota is
+    used up, so nothing that was spent belongs to two periods.
+    """
+    period = now // s.servers[server, PERIOD_NS]
+    if period > s.servers[server, PERIOD]:
+        s.servers[server, PERIOD] = period
+        s.servers[server, LEFT_NS] = s.servers[server, QUOTA_NS]
+    s.servers[server, THROTTLED] = 1 if s.servers[server, LEFT_NS] <= 0 else 0
+    set_speed(s, server)
+
+
+@phase
+def _announce_quota(s: Tables, server: int, now: int) -> None:
+    """Announce when a server's quota is used up or renewed; an older announcement goes stale."""
+    refill(s, server, now)
+    busy = s.servers[server, USED] + s.servers[server, STRESS]
+    if busy == 0 or s.servers[server, DOWN] != 0:
+        s.servers[server, QUOTA_T] = -1
+        return
+    t = (s.servers[server, PERIOD] + 1) * s.servers[server, PERIOD_NS]
+    if s.servers[server, THROTTLED] == 0:
+        rate = min(busy, s.servers[server, CORES])
+        t = min(t, now + (s.servers[server, LEFT_NS] + rate - 1) // rate)
+    if t != s.servers[server, QUOTA_T]:
+        s.servers[server, QUOTA_T] = t
+        # The item of a change of a node is 0; that of a server's quota is its row, from 1.
+        key = (CHANGE << KIND_SHIFT) | (server + 1)
+        push_event(s.clock, s.event_t, s.event_key, t, key)
 
 
 @phase
@@ -104,9 +159,9 @@ def tick(s: Tables, server: int, now: int) -> None:
 
 @phase
 def set_speed(s: Tables, server: int) -> None:
-    """Set the common speed after threads or stress changed; the clock must be up to date.
+    """Set the common speed after threads, stress or quota changed; the clock must be up to date.
 
-    fair: min(1, c / (K + s)); fifo and priority: c / (c + s).
+    fair: min(1, c / (K + s)); fifo and priority: c / (c + s); any: 0 while the quota is used up.
     """
     cores = s.servers[server, CORES]
     stress = s.servers[server, STRESS]
@@ -115,6 +170,8 @@ def set_speed(s: Tables, server: int) -> None:
         s.servers_f[server, SPEED] = 1.0 if load <= cores else cores / load
     else:
         s.servers_f[server, SPEED] = 1.0 if stress == 0 else cores / (cores + stress)
+    if s.servers[server, THROTTLED] != 0:
+        s.servers_f[server, SPEED] = 0.0
 
 
 @phase
@@ -140,6 +197,9 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
     # Where nobody else can want the cores now, the job needs no queue.
     alone = n == 0 and s.clock[N_READY] == 1
     fits = alone and s.servers[server, USED] + need <= s.servers[server, CORES]
+    if s.servers[server, QUOTA_NS] > 0:
+        tick(s, server, now)
+        refill(s, server, now)
     if scheduler == FAIR or fits:
         tick(s, server, now)
         _start(s, server, site, key, row, float(work), now)
@@ -147,7 +207,8 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
             set_speed(s, server)
         if s.servers[server, DIRTY] != 0:
             return
-        if s.servers[server, N_RUN] == 1 and s.servers_f[server, SPEED] == 1.0:
+        lone = s.servers[server, N_RUN] == 1 and s.servers[server, QUOTA_NS] == 0
+        if lone and s.servers_f[server, SPEED] == 1.0:
             _announce(s, server, now + work, key)
         else:
             schedule(s, server, now)
@@ -227,7 +288,7 @@ def leave(s: Tables, server: int, site: int, at: int, now: int) -> None:
     s.servers[server, N_RUN] = n - 1
     s.servers[server, USED] -= s.sites[site, NEED]
     s.servers[server, NEXT_KEY] = -1
-    if n > 1 or s.servers[server, N_WAIT] > 0:
+    if n > 1 or s.servers[server, N_WAIT] > 0 or s.servers[server, QUOTA_NS] > 0:
         mark(s, server)
     if s.servers[server, SCHEDULER] == FAIR:
         set_speed(s, server)
@@ -236,13 +297,16 @@ def leave(s: Tables, server: int, site: int, at: int, now: int) -> None:
 @phase
 def schedule(s: Tables, server: int, now: int) -> None:
     """Announce the completion of the job that finishes first; an older announcement goes stale."""
-    if s.servers[server, N_RUN] == 0 or s.servers[server, DOWN] != 0:
-        s.servers[server, NEXT_KEY] = -1
-        return
+    if s.servers[server, QUOTA_NS] > 0:
+        _announce_quota(s, server, now)
+    speed = s.servers_f[server, SPEED]
     base = s.servers[server, BASE]
     left = s.run_v[index(base)] - s.servers_f[server, VIRTUAL]
-    speed = s.servers_f[server, SPEED]
-    if speed != 1.0:
+    stopped = speed == 0.0 and left > SLACK
+    if s.servers[server, N_RUN] == 0 or s.servers[server, DOWN] != 0 or stopped:
+        s.servers[server, NEXT_KEY] = -1
+        return
+    if speed != 1.0 and speed != 0.0:
         left = left / speed
     t = now + max(int(np.ceil(left - SLACK)), 0)
     _announce(s, server, t, s.run_key[index(base)])

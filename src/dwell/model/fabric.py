@@ -78,7 +78,7 @@ class Node:
     bursts : Bursts, optional
         Foreign work of other tenants, in every scenario.
     quota : Quota, optional
-        CPU bandwidth limit on the cell's own work.
+        CPU bandwidth limit on everything that runs there.
     """
 
     name: str
@@ -100,6 +100,11 @@ class Node:
             delay = self.bursts.add_delay_ms
             require(False, "bursts.add_delay_ms", delay, "left out: only a link adds a delay")
         object.__setattr__(self, "accelerators", FrozenDict(self.accelerators))
+
+    @property
+    def capacity(self) -> float:
+        """Cores' worth of work it can do: what its utilisation is relative to."""
+        return min(self.quota.cpu, self.cores) if self.quota is not None else float(self.cores)
 
 
 @dataclass(frozen=True, slots=True)

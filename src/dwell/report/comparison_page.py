@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from dwell.report import figures
 from dwell.report.findings import (
@@ -14,6 +14,7 @@ from dwell.report.findings import (
     DTP,
     RATE,
     Status,
+    beliefs,
     explain,
     judge_all,
     limits,
@@ -47,9 +48,6 @@ from dwell.report.wording import (
 from dwell.study import AIM, Comparison, Interval
 from dwell.study.predictions import Answer, Prediction, judge_claim
 
-if TYPE_CHECKING:
-    import polars as pl
-
 __all__ = ["comparison_html"]
 
 TITLE = "Placement policies compared"
@@ -57,6 +55,7 @@ L95 = Measure("l95_ms", "L95", "ms")
 MEASURES = (
     RATE,
     L95,
+    COST,
     Measure("u_robot", "U_r", "%", 100.0),
     Measure("u_edge", "U_e", "%", 100.0),
     Measure("migrations", "migrations"),
@@ -161,7 +160,7 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
         f"{len(comparison.seeds)} seeds with its 95 % interval."
     )
     shares = [Measure(f"share_{name}", name, "%", 100.0, decimals=0) for name in problem.candidates]
-    measures = (*MEASURES, *shares, COST)
+    measures = (*MEASURES, *shares)
     head = [Cell("policy")]
     for measure in measures:
         head.append(Cell(marked(measure.heading), "pair", 2))
@@ -207,7 +206,7 @@ def _result_row(
         row += _pair(comparison.interval(scenario, policy, measure.column), measure, best=best)
         if measure is RATE:
             word, kind = STANDING[standing(comparison, scenario, policy)]
-            row.append(Cell(f'<span class="{kind}">{word}</span>'))
+            row.append(Cell(f'<span class="{kind} nowrap">{word}</span>'))
     return row
 
 
@@ -389,29 +388,18 @@ def _timelines(comparison: Comparison, palette: Palette, policy: str) -> Iterato
 
 def _beliefs(comparison: Comparison, policy: str) -> str:
     """Return the table of estimated against measured J."""
-    import polars as pl
-
-    placements_ = Palette.of(comparison.problem.candidates).placements
+    colours = Palette.of(comparison.problem.candidates).placements
     above, head = [Cell("")], [Cell("scenario")]
-    for name, colour in placements_.items():
+    for name, colour in colours.items():
         above.append(Cell(swatch(colour) + escape(name), "over", 3))
         head += [Cell("idle", "num begin"), Cell("active", "num"), Cell("alone", "num")]
     rows: list[tuple[str, Sequence[Cell]]] = []
-    mine = comparison.costs.filter(pl.col("policy") == policy)
     for scenario in comparison.scenarios:
         row = [Cell(escape(shown_scenario(scenario)))]
-        here = mine.filter(pl.col("scenario") == scenario)
-        for name in placements_:
-            found = here.filter(pl.col("candidate") == name)
-            numbers = [_known_mean(found[column]) for column in ("estimated", "measured")]
-            alone = math.nan
-            if name in comparison.statics:
-                alone = float(comparison.values(scenario, name, "cost").mean())
-            kinds = ("num begin", "num", "num")
-            row += [
-                Cell(write_number(number, COST.decimals), kind)
-                for number, kind in zip([*numbers, alone], kinds, strict=True)
-            ]
+        for belief in beliefs(comparison, scenario, policy):
+            row.append(Cell(write_number(belief.estimated, COST.decimals), "num begin"))
+            row.append(Cell(write_number(belief.active, COST.decimals), "num"))
+            row.append(Cell(write_number(belief.alone, COST.decimals), "num"))
         rows.append(("", row))
     return table(
         head,
@@ -435,18 +423,13 @@ def _more(comparison: Comparison) -> str:
             for measure in MORE:
                 row += _pair(comparison.interval(scenario, policy, measure.column), measure)
             rows.append(("", row))
-    cycles = comparison.runs["cycles"].mean()
+    cycles = np.mean(comparison.runs["cycles"].to_numpy())
     return table(
         head,
         rows,
         "P95 is the 95th percentile of the final latencies of all cycles of a run, ∞ where more "
         "than 5 % never finished; its value is the median over seeds, its interval lies between "
         "order statistics. Lost are cycles of which a message, a job or an input was dropped or "
-        f"replaced, of {write_number(cycles if isinstance(cycles, float) else math.nan, 0)} in a "
-        "run. The last three are means over the cycles that finished.",
+        f"replaced, of {write_number(float(cycles), 0)} in a run. "
+        " The last three are means over the cycles that finished.",
     )
-
-
-def _known_mean(values: pl.Series) -> float:
-    mean = values.drop_nulls().drop_nans().mean()
-    return float(mean) if isinstance(mean, float) else math.nan

@@ -11,10 +11,13 @@ from dwell.study import Comparison
 
 __all__ = ["comparison_text"]
 
-WIDTH = 110
+# Of tables where the terminal's width is not given, and of sentences at most.
+WIDEST = 1000
+PROSE = 100
 MEASURES = (
     RATE,
     Measure("l95_ms", "L95", "ms"),
+    COST,
     Measure("u_robot", "U_r", "%", 100.0),
     Measure("u_edge", "U_e", "%", 100.0),
     Measure("migrations", "migr."),
@@ -24,16 +27,15 @@ NAMES = {"atp": "ATP *"}
 REMARK = "* our reconstruction of ATP, whose rule has no public numbers"
 
 
-def comparison_text(comparison: Comparison, *, width: int = WIDTH) -> str:
+def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
     """Return the tables of a comparison and its verdict as plain text.
 
     Parameters
     ----------
     comparison : Comparison
-    width : int
-        Columns of the terminal; cells fold where they are too few.
+    width : int, optional
+        Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
     """
-    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
@@ -41,31 +43,35 @@ def comparison_text(comparison: Comparison, *, width: int = WIDTH) -> str:
         Measure(f"share_{name}", name, "%", 100.0, decimals=0)
         for name in comparison.problem.candidates
     ]
-    measures = (*MEASURES, *shares, COST)
+    measures = (*MEASURES, *shares)
     buffer = io.StringIO()
-    console = Console(file=buffer, width=width, color_system=None, highlight=False)
+    console = Console(file=buffer, width=width or WIDEST, color_system=None, highlight=False)
     for scenario in comparison.scenarios:
-        table = Table(box=SIMPLE_HEAD, title=shown_scenario(scenario), title_justify="left")
-        table.add_column("policy")
+        table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+        table.add_column(shown_scenario(scenario), no_wrap=True)
         for measure in measures:
-            table.add_column(measure.heading, justify="right")
+            table.add_column(
+                f"{measure.name} {measure.unit}".rstrip(), justify="right", overflow="fold"
+            )
             if measure is RATE:
-                table.add_column("is")
+                table.add_column("", overflow="fold")
         for policy in comparison.policies:
             table.add_row(*_row(comparison, measures, scenario, policy))
         console.print(table)
-    lines = [buffer.getvalue().rstrip(), ""]
-    lines.append(
-        f"Mean over {len(comparison.seeds)} seeds and half of the 95 % interval. Columns "
-        f"{', '.join(comparison.problem.candidates)}: share of the windows."
+        console.print()
+    columns = min(width or PROSE, PROSE)
+    note = (
+        f"Mean over {len(comparison.seeds)} seeds and half of its 95 % interval, or the interval. "
+        f"Columns {', '.join(comparison.problem.candidates)}: share of the windows."
     )
+    lines = [buffer.getvalue().rstrip(), "", textwrap.fill(note, columns)]
     if any(policy in NAMES for policy in comparison.policies):
-        lines.append(REMARK)
-    lines += ["", question(comparison), ""]
-    for item in verdict(comparison):
-        lines.append(
-            textwrap.fill(item.replace("`", ""), width, initial_indent="- ", subsequent_indent="  ")
-        )
+        lines.append(textwrap.fill(REMARK, columns, subsequent_indent="  "))
+    lines += ["", textwrap.fill(question(comparison), columns), ""]
+    lines += [
+        textwrap.fill(item.replace("`", ""), columns, initial_indent="- ", subsequent_indent="  ")
+        for item in verdict(comparison)
+    ]
     return "\n".join(line.rstrip() for line in "\n".join(lines).splitlines()) + "\n"
 
 

@@ -25,7 +25,9 @@ __all__ = [
     "COST",
     "DTP",
     "RATE",
+    "Belief",
     "Status",
+    "beliefs",
     "cheapest_static",
     "explain",
     "judge_all",
@@ -94,7 +96,8 @@ def _on_aim(comparison: Comparison) -> str:
     aim, all_ = percent(AIM), _all(len(scenarios))
     if everywhere:
         verb = "keeps" if len(everywhere) == 1 else "keep"
-        return f"{listed(map(shown_policy, everywhere))} {verb} V_D under {aim} in {all_}."
+        names = listed(map(shown_policy, everywhere))
+        return f"{names} {verb} V_D under {aim} in {all_}.{_on_no_miss(comparison)}"
     text = f"No policy keeps V_D under {aim} in {all_}."
     most = max(len(found) for found in good.values())
     best = [policy for policy in policies if len(good[policy]) == most]
@@ -116,7 +119,23 @@ def _on_aim(comparison: Comparison) -> str:
             hopeless.append(f"{shown_scenario(scenario)} ({shown_policy(lowest)}, {low})")
     if hopeless:
         text += f" None is shown to in {listed(hopeless)}; in brackets the lowest V_D there."
-    return text
+    return text + _on_no_miss(comparison)
+
+
+def _on_no_miss(comparison: Comparison) -> str:
+    """Say how rates are counted that no run showed a miss of."""
+    found = [
+        standing(comparison, scenario, policy)
+        for scenario in comparison.scenarios
+        for policy in comparison.policies
+    ]
+    if "none seen" not in found:
+        return ""
+    limit = percent(rule_of_three(len(comparison.seeds)), 1)
+    return (
+        " Where no run shows a miss, V_D is counted as under it, though without further "
+        f"assumptions {len(comparison.seeds)} independent runs limit it at {limit} only."
+    )
 
 
 def _on_statics(comparison: Comparison) -> str:
@@ -184,21 +203,17 @@ def _on_estimates(comparison: Comparison) -> str:
         f"DTP migrated {_span(spans)} times in a run of {windows} windows, and {percent(share)} of "
         "these moves undid the one before."
     )
-    if share < TO_AND_FRO:
+    belief = _widest_gap(comparison)
+    if share < TO_AND_FRO or belief is None:
         return text
     estimator = comparison.problem.controller.estimator
-    text += f" It leaves and returns because its estimator, `{estimator}`, prices what is not "
-    if estimator != "profile":
-        return f"{text}active differently from what it then measures."
-    text += "active as if nothing disturbed it"
-    gap = _widest_gap(comparison)
-    if gap is not None:
-        text += (
-            f": in {shown_scenario(gap.scenario)} it puts {gap.candidate} at J = "
-            f"{write_number(gap.estimated, 2)}, and run alone {gap.candidate} measures "
-            f"{write_number(gap.alone, 2)}"
-        )
-    return f"{text}."
+    blind = " as if nothing disturbed it" if estimator == "profile" else ""
+    return (
+        f"{text} It leaves and returns because its estimator, `{estimator}`, prices what is not "
+        f"active{blind}: in {shown_scenario(belief.scenario)} it puts {belief.candidate} at J = "
+        f"{write_number(belief.estimated, 2)}, and run alone {belief.candidate} measures "
+        f"{write_number(belief.alone, 2)}."
+    )
 
 
 # ------------------------------------------------------------- one prediction, one explanation
@@ -268,12 +283,13 @@ def _what_was_believed(comparison: Comparison, scenario: str) -> str:
     if undone:
         text += f", {percent(undone)} of them straight back"
     least = comparison.problem.controller.min_improvement
-    gaps = [gap for gap in _gaps(comparison, scenario) if gap.active - gap.estimated > least]
-    if gaps:
+    told = beliefs(comparison, scenario, DTP)
+    wrong = [belief for belief in told if belief.active - belief.estimated > least]
+    if wrong:
         seen = listed(
-            f"{gap.candidate} {write_number(gap.active, 2)} (estimated "
-            f"{write_number(gap.estimated, 2)})"
-            for gap in gaps
+            f"{belief.candidate} {write_number(belief.active, 2)} (estimated "
+            f"{write_number(belief.estimated, 2)})"
+            for belief in wrong
         )
         text += f", because placements measured more once active than had been estimated: {seen}"
     return f"{text}."
@@ -283,8 +299,19 @@ def _what_was_believed(comparison: Comparison, scenario: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Gap:
-    """J of a candidate in a scenario: as DTP estimated it, as it measured it, and run alone."""
+class Belief:
+    """J of a candidate under a policy, mean over seeds; NaN where it never came to that.
+
+    Parameters
+    ----------
+    scenario, candidate : str
+    estimated : float
+        While another was active.
+    active : float
+        Measured while it was.
+    alone : float
+        Measured of the static placement.
+    """
 
     scenario: str
     candidate: str
@@ -300,27 +327,31 @@ def cheapest_static(comparison: Comparison, scenario: str) -> str:
     )
 
 
-def _gaps(comparison: Comparison, scenario: str) -> list[_Gap]:
-    """Return estimated and measured J of the candidates that DTP was on."""
+def beliefs(comparison: Comparison, scenario: str, policy: str) -> list[Belief]:
+    """Return what a policy was told of every candidate in a scenario, and what was measured."""
     import polars as pl
 
-    mine = comparison.costs.filter((pl.col("scenario") == scenario) & (pl.col("policy") == DTP))
-    gaps = []
+    mine = comparison.costs.filter((pl.col("scenario") == scenario) & (pl.col("policy") == policy))
+    found = []
     for name in comparison.problem.candidates:
-        rows = mine.filter(pl.col("candidate") == name)
-        estimated, active = (_mean(rows[column]) for column in ("estimated", "measured"))
+        means = mine.filter(pl.col("candidate") == name).select("estimated", "measured").mean()
+        estimated, active = (math.nan if mean is None else float(mean) for mean in means.row(0))
         alone = math.nan
         if name in comparison.statics:
-            alone = float(comparison.values(scenario, name, "cost").mean())
-        if not math.isnan(estimated) and not math.isnan(active):
-            gaps.append(_Gap(scenario, name, estimated, active, alone))
-    return gaps
+            alone = float(comparison.values(scenario, name, COST.column).mean())
+        found.append(Belief(scenario, name, estimated, active, alone))
+    return found
 
 
-def _widest_gap(comparison: Comparison) -> _Gap | None:
-    gaps = [gap for scenario in comparison.scenarios for gap in _gaps(comparison, scenario)]
-    known = [gap for gap in gaps if gap.alone > gap.estimated]
-    return max(known, key=lambda gap: gap.alone - gap.estimated, default=None)
+def _widest_gap(comparison: Comparison) -> Belief | None:
+    """Return the candidate that DTP was on at some time and was told the most wrongly of."""
+    known = [
+        belief
+        for scenario in comparison.scenarios
+        for belief in beliefs(comparison, scenario, DTP)
+        if belief.active > belief.estimated and belief.alone > belief.estimated
+    ]
+    return max(known, key=lambda belief: belief.alone - belief.estimated, default=None)
 
 
 def replayed_files(comparison: Comparison) -> list[str]:
@@ -369,28 +400,7 @@ def limits(comparison: Comparison) -> list[str]:
             "starts, so that runs of different seeds share rows and their intervals are narrower "
             "than those of new measurements would be."
         )
-    rates = [
-        comparison.values(scenario, policy, RATE.column)
-        for scenario in comparison.scenarios
-        for policy in comparison.policies
-    ]
-    if any(not values.any() for values in rates):
-        limit = percent(rule_of_three(seeds), 1)
-        items.append(
-            "Where no run shows a miss, “no miss” is all that is said. Without further "
-            f"assumptions {seeds} independent runs limit such a rate at {limit} only (the rule of "
-            "three)."
-        )
     return items
-
-
-def _mean(values: object) -> float:
-    import polars as pl
-
-    if not isinstance(values, pl.Series):
-        return math.nan
-    mean = values.drop_nulls().drop_nans().mean()
-    return float(mean) if isinstance(mean, float) else math.nan
 
 
 def _rate(comparison: Comparison, scenario: str, policy: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.report.palette import INK, MUTED, PAPER, PARTS
 from dwell.report.scales import set_log_ticks
@@ -27,19 +28,21 @@ def latencies_by_placement(
     cycles: pl.DataFrame, placements: Mapping[str, str], deadline_ms: float
 ) -> str:
     """Share of the cycles that took longer than a latency, a line for each placement."""
+    from matplotlib.lines import Line2D
+
     with new_figure(2.7) as figure:
         ax = figure.subplots()
         least = 0.5
         for name, colour in placements.items():
             final_ms = np.sort(latency_ms(cycles.filter(cycles["placement"].cast(str) == name)))
-            if not len(final_ms):
-                continue
             finite = final_ms[np.isfinite(final_ms)]
+            if not len(finite):
+                continue
             later = 100 * (1 - np.arange(1, len(finite) + 1) / len(final_ms))
             least = min(least, 100 / len(final_ms))
             keep = _thinned(len(finite))
             later[later <= 0] = math.nan
-            ax.plot(finite[keep], later[keep], color=colour, label=name)
+            ax.plot(finite[keep], later[keep], color=colour)
         ax.axvline(deadline_ms, color=INK, lw=0.9, ls=DASHED, zorder=1)
         ax.axhline(100 * AIM, color=MUTED, lw=0.8, ls=(0, (1, 2)))
         ax.set_yscale("log")
@@ -48,7 +51,8 @@ def latencies_by_placement(
         ax.set_xlim(0, 3 * deadline_ms)
         ax.set_xlabel("latency (ms); dashed: deadline")
         ax.set_ylabel("cycles that took longer (%)")
-        figure.legend(loc="outside upper left", ncols=max(len(placements), 1))
+        handles = [Line2D([], [], color=hue, label=name) for name, hue in placements.items()]
+        figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
         return inline(figure, "latencies", "Distribution of latency by placement")
 
 
@@ -100,10 +104,11 @@ def node_use_in_time(windows: pl.DataFrame, nodes: Sequence[str], period_ms: flo
         ax.set_xlim(0, float(begin_s[-1]) or 1.0)
         ax.set_xlabel("time (s)")
         ax.set_ylabel("utilisation (%)")
-        figure.legend(loc="outside upper left", ncols=max(len(nodes), 1))
+        figure.legend(loc="outside upper left", ncols=len(nodes))
         return inline(figure, "nodes", "Utilisation of the nodes over time")
 
 
-def _thinned(count: int, points: int = 600) -> slice:
-    """Return every so many points, so that a page stays small."""
-    return slice(None, None, max(count // points, 1))
+def _thinned(count: int, points: int = 500) -> NDArray[np.int64]:
+    """Return which of `count` sorted values to draw: the nearer to the tail, the more of them."""
+    from_end = np.unique(np.rint(np.geomspace(1, count, min(count, points))).astype(np.int64))
+    return (count - from_end)[::-1]

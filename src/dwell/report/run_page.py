@@ -38,11 +38,11 @@ __all__ = ["run_html"]
 MOST_ROWS = 40
 WORST = 10
 REASONS = {
-    "dwell": "dwell: too soon after the last migration",
-    "hold": "hold: no placement promised enough",
-    "migrate": "migrate: another placement promised more than the least improvement",
-    "infeasible": "infeasible: every placement was over a cap; the one nearest to it counted",
-    "guard": "guard: the robot moved by itself",
+    "dwell": "too soon after the last migration",
+    "hold": "no other placement promised enough",
+    "migrate": "another placement promised more than the least improvement",
+    "infeasible": "every placement was over a cap, and those nearest to it were compared",
+    "guard": "the robot moved by itself",
 }
 OUTCOMES = {
     "dropped": "a message or an input was lost",
@@ -75,7 +75,7 @@ def run_html(run: Run) -> str:
     facts = Facts.of(run)
     counted = count_in(run, facts.window_cycles)
     palette = Palette.of(facts.candidates)
-    title = f"A run of {facts.policy_name} on {facts.cell}"
+    title = f"A run of {_policy(facts, counted)} on {facts.cell}"
     return document(title, _body(run, facts, counted, palette, title))
 
 
@@ -99,6 +99,13 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     yield section("What this is", *_about(facts))
 
 
+def _policy(facts: Facts, counted: Counted) -> str:
+    """Return the policy's name; a placement's where it never moves."""
+    if facts.policy_name == "Static":
+        return f"{counted.windows['placement'][0]}, which never moves,"
+    return facts.policy_name
+
+
 # ----------------------------------------------------------------------------------- verdict
 
 
@@ -106,7 +113,7 @@ def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
     cycles, windows, decisions = counted.cycles, counted.windows, counted.decisions
     missed = cycles["missed"].to_numpy()
     rate = float(missed.mean())
-    place = "under" if rate < AIM else "not under"
+    place = "under" if rate < AIM else "above"
     final_ms = latency_ms(cycles)
     yield (
         f"{percent(rate, 1)} of {write_number(cycles.height, 0)} cycles missed the deadline of "
@@ -118,7 +125,8 @@ def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
     shares = windows["placement"].cast(str).value_counts(sort=True)
     where = listed(f"{percent(count / windows.height)} on {name}" for name, count in shares.rows())
     moves = decisions.filter(decisions["migrated"])
-    text = f"Of its windows it spent {where}, with {_count(moves.height, 'migration')}"
+    moved = f"with {_count(moves.height, 'migration')}" if len(moves) else "and never migrated"
+    text = f"Of its windows it spent {where}, {moved}"
     undone = _undone(moves)
     text += f", {undone} of which undid the one before" if undone else ""
     yield f"{text}."
@@ -192,7 +200,7 @@ def _decisions(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
     decisions = run.decisions
     counts = dict(decisions["reason"].cast(str).value_counts().rows())
     yield items(
-        f"{_count(counts[name], 'decision')}, {text}"
+        f"`{name}`, {_count(counts[name], 'time')}: {text}"
         for name, text in REASONS.items()
         if counts.get(name)
     )
@@ -211,7 +219,7 @@ def _migrations(run: Run, facts: Facts, palette: Palette, moves: pl.DataFrame) -
         numbers = (cost.get(window), move[f"j_{target}"], cost.get(window + 1))
         cells = [
             Cell(str(window)),
-            Cell(write_number(close_s), "num"),
+            Cell(f"{close_s:.1f}", "num"),
             Cell(f"{_placed(palette, move['incumbent'])} → {_placed(palette, target)}"),
             Cell(escape(str(move["reason"]))),
             *(Cell(write_number(_number(value), 2), "num") for value in numbers),
@@ -244,7 +252,7 @@ def _worst_windows(facts: Facts, counted: Counted, palette: Palette) -> str:
         used = [_number(window[f"u_{node}"]) for node in facts.nodes]
         cells = [
             Cell(str(window["window"])),
-            Cell(write_number(begin_s), "num"),
+            Cell(f"{begin_s:.1f}", "num"),
             Cell(_placed(palette, window["placement"])),
             Cell(write_number(100 * window["violation_rate"]), "num"),
             Cell(write_number(_number(window["l95_ms"])), "num"),
@@ -279,12 +287,7 @@ def _about(facts: Facts) -> Iterator[str]:
             "estimator": facts.estimator,
             "window": f"{facts.window_cycles} cycles of {write_number(facts.period_ms)} ms, "
             f"deadline {write_number(facts.deadline_ms)} ms",
-            "placements": "; ".join(
-                f"{name}: {listed(f'{task} on {node}' for task, node in placed.items())}"
-                for name, placed in facts.candidates.items()
-                if placed
-            )
-            or "one only",
+            "placements": _placements(facts),
             "versions": ", ".join(f"{name} {text}" for name, text in facts.versions.items()),
         }
     )
@@ -292,6 +295,20 @@ def _about(facts: Facts) -> Iterator[str]:
         yield paragraph(
             "ATP is our reconstruction from a description in words: its rule has no public numbers."
         )
+
+
+def _placements(facts: Facts) -> str:
+    """Say where each candidate puts the tasks that are not on the same node in all of them."""
+    first = next(iter(facts.candidates.values()))
+    parts = []
+    for name, placed in facts.candidates.items():
+        moving = [
+            f"{task} on {node}"
+            for task, node in placed.items()
+            if any(other.get(task) != first.get(task) for other in facts.candidates.values())
+        ]
+        parts.append(f"{name}: {listed(moving)}" if moving else name)
+    return "; ".join(parts)
 
 
 def _placed(palette: Palette, name: str) -> str:

@@ -25,7 +25,7 @@ POLICY_NAMES = {
     "latency-first": "Latency-first",
     "work-function": "Work-function",
 }
-ABBREVIATIONS = {"cpu": "CPU"}
+ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}
 
 
 class Measure(NamedTuple):
@@ -89,11 +89,9 @@ def write_interval(interval: Interval, measure: Measure) -> Written:
     number, or the same extreme of a share, nothing stands beside it.
     """
     value, low, high = (end * measure.factor for end in interval)
-    if value == low == high == 0:
-        return Written("0", "")
     text = write_number(value, measure.decimals)
     if not interval.known or low == high or (value in (low, high) and interval.value in (0, 1)):
-        return Written(text, "")
+        return Written(text if value else "0", "")
     half = high - value
     even = math.isfinite(half) and abs(half - (value - low)) <= 0.02 * (high - low)
     if measure.ends or not even:
@@ -107,7 +105,7 @@ def write_interval(interval: Interval, measure: Measure) -> Written:
 
 def _places(value: float, decimals: int) -> int:
     """Decimals that leave three digits, at most `decimals`."""
-    whole = len(f"{abs(value):.0f}")
+    whole = len(str(int(abs(value))))
     return max(0, min(decimals, 3 - whole))
 
 

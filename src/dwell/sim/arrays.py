@@ -127,17 +127,23 @@ class _Layout:
                 continue
             self.node_row[key] = len(self.node_row)
             scheduler = SCHEDULER_CODE[node.scheduler]
-            self._add_server(key, None, scheduler, node.cores)
+            cpu = self._add_server(key, None, scheduler, node.cores)
+            cpu[k.QUOTA_T] = -1
+            if node.quota is not None:
+                period_ns = round(node.quota.period_ms * 1e6)
+                quota_ns = round(node.quota.cpu * period_ns)
+                cpu[k.PERIOD_NS], cpu[k.QUOTA_NS], cpu[k.LEFT_NS] = period_ns, quota_ns, quota_ns
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
 
-    def _add_server(self, node: str, kind: str | None, scheduler: int, cores: int) -> None:
+    def _add_server(self, node: str, kind: str | None, scheduler: int, cores: int) -> list[int]:
         row = [0] * k.N_SERVER
         row[k.SCHEDULER], row[k.CORES] = scheduler, cores
         row[k.NODE_OF], row[k.IS_CPU], row[k.NEXT_KEY] = self.node_row[node], int(not kind), -1
         self.server_row[node, kind] = len(self.servers)
         self.servers.append(row)
         self.server_workers.append(0)
+        return row
 
     def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
         pipeline = problem.pipeline
@@ -251,6 +257,7 @@ class _Layout:
             ("tasks of a cell", self.max_tasks, k.ITEM_MASK),
             ("flows of a cell", self.max_flows, k.LOST_ON_LINK - 1),
             ("feasible (task, node) pairs", len(self.sites), k.ITEM_MASK),
+            ("nodes and accelerators", len(self.servers), k.ITEM_MASK - 1),
         )
         for what, number, limit in limits:
             if number > limit:

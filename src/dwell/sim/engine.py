@@ -9,6 +9,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell import __version__
 from dwell.control import ClosedWindow, Controller, Estimator, MinimalPolicy
@@ -88,7 +89,8 @@ def simulate_realisation(
     _check_fit(problem, realisation)
     controller = Controller(problem, policy, estimator)
     arrays = lay_out([(problem, realisation)], log_jobs=jobs)
-    if controller.fixed_profile is not None and not by_window:
+    sees_all = not _host_changes(problem, realisation)[:, 3].any()
+    if controller.fixed_profile is not None and sees_all and not by_window:
         played = _play_static(problem, realisation, controller, arrays)
     else:
         played = _play_windows(problem, realisation, controller, arrays)
@@ -135,6 +137,13 @@ def _quiet() -> AbstractContextManager[object]:
     return nullcontext() if COMPILED else np.errstate(over="ignore")
 
 
+def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int64]:
+    """Return the rows of `NodeChanges` that are about the controller's node."""
+    changes = NodeChanges.of(realisation.node_changes)
+    mine = [i for i, name in enumerate(changes.nodes) if name == problem.controller_node]
+    return changes.table[np.isin(changes.table[:, 1], mine)]
+
+
 def _play_static(
     problem: Problem, realisation: Realisation, controller: Controller, arrays: Arrays
 ) -> Played:
@@ -172,10 +181,7 @@ class _Stamper:
         self.lead = settings.order_lead_cycles
         self.delay_ns = round(settings.order_delay_ms * 1e6)
         self.grace_ns = round(settings.close_grace_ms * 1e6)
-        host = problem.controller_node
-        changes = NodeChanges.of(realisation.node_changes)
-        mine = [i for i, name in enumerate(changes.nodes) if name == host]
-        table = changes.table[np.isin(changes.table[:, 1], mine)]
+        table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
         self.stamped = self._reach(self.window_cycles)

@@ -213,9 +213,9 @@ def _static_decisions(played: Played, estimated: dict[str, dict[str, Floats]]) -
     }
     for name in candidates:
         columns[f"j_{name}"] = estimated[name]["j"] if priced else np.full(count, np.nan)
-    for name in candidates:
-        columns[f"est_l95_ms_{name}"] = estimated[name]["l95_ms"]
-        columns[f"est_violation_rate_{name}"] = estimated[name]["violation_rate"]
+    for metric in ("l95_ms", "violation_rate"):
+        for name in candidates:
+            columns[f"est_{metric}_{name}"] = estimated[name][metric]
     return _decision_frame(columns, candidates)
 
 

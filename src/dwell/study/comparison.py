@@ -133,7 +133,7 @@ class Comparison:
                 row["violation_rate_at_least"] = at_least
                 row["violation_rate_at_most"] = at_most
                 rows.append(row)
-        return pl.DataFrame(rows, infer_schema_length=None, nan_to_null=True)
+        return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
 
 
 def compare(
@@ -295,7 +295,7 @@ def _gather(
         seeds=seeds,
         windows=plan.windows,
         runs=pl.DataFrame(rows, infer_schema_length=None),
-        costs=pl.DataFrame(costs, infer_schema_length=None, nan_to_null=True),
+        costs=pl.DataFrame(costs, infer_schema_length=None).fill_nan(None),
         latencies=pl.concat(latencies),
         examples={
             (scenario, policy): played[scenario, seed].examples[policy]

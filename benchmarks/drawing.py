@@ -1,0 +1,86 @@
+"""Drawing: what a value of each kind of process costs, rounded and stored."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+import dwell
+from benchmarks.figures import Figure, Section
+from benchmarks.timing import Took, in_turns, shared_core, took
+from dwell.model import (
+    AR1,
+    Constant,
+    Execution,
+    Exponential,
+    Fabric,
+    Gamma,
+    LogNormal,
+    Node,
+    Normal,
+    Objective,
+    Pipeline,
+    Placement,
+    Problem,
+    Process,
+    Targets,
+    Task,
+    Trace,
+    TraceTable,
+    Uniform,
+    Weights,
+)
+
+__all__ = ["measure"]
+
+WINDOW_CYCLES = 100
+
+
+def measure(quick: bool) -> Section:
+    """Nanoseconds a value over a constant."""
+    windows, rounds = (1_000, 3) if quick else (5_000, 5)
+    recorded = TraceTable("recorded", {"ms": np.linspace(1, 3, 10_007)}, wrap=True)
+    processes: dict[str, Process] = {
+        "constant": Constant(2.0),
+        "uniform": Uniform(1.0, 3.0),
+        "normal": Normal(2.0, 0.2),
+        "lognormal": LogNormal(2.0, 0.2),
+        "exponential": Exponential(2.0),
+        "gamma": Gamma(2.0, 0.2),
+        "ar1": AR1(2.0, 0.2, 0.9),
+        "trace": Trace(recorded, "ms"),
+    }
+    variants: dict[str, Callable[[], Took]] = {
+        name: partial(_draw, _problem(process), windows) for name, process in processes.items()
+    }
+    runs = in_turns(variants, rounds)
+    values = windows * WINDOW_CYCLES
+    spent = {name: [1e9 * run.cpu_s / values for run in runs[name]] for name in processes}
+    constant = spent.pop("constant")
+    figures = [Figure("releases and a constant", constant, "ns a cycle")]
+    for name, taken in spent.items():
+        over = [one - other for one, other in zip(taken, constant, strict=True)]
+        figures.append(Figure(f"{name}, over that", over, "ns a value"))
+    notes = shared_core(run for some in runs.values() for run in some)
+    return Section(f"Drawing {values} values", figures, notes)
+
+
+def _problem(process: Process) -> Problem:
+    """One task on one node, and nothing else."""
+    node, task = Node("N", tier="edge", cores=1), Task("T", on={"N": Execution(process)})
+    return Problem(
+        name="drawing",
+        pipeline=Pipeline(tasks={"T": task}, flows=(), period_ms=10.0, deadline_ms=10.0),
+        fabric=Fabric(nodes={"N": node}, links={}),
+        candidates={"ONE": Placement({"T": "N"})},
+        objective=Objective(
+            weights=Weights(), targets=Targets(latency_ms=10.0), tiers={"N": node.tier}
+        ),
+        window_cycles=WINDOW_CYCLES,
+    )
+
+
+def _draw(problem: Problem, windows: int) -> Took:
+    return took(lambda: dwell.draw(problem, seed=1, windows=windows))

@@ -1,0 +1,137 @@
+"""Time what is to be compared in turns, so that a machine's moods fall on all of it alike."""
+
+from __future__ import annotations
+
+import gc
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+__all__ = [
+    "ROOT",
+    "Stopwatch",
+    "Took",
+    "in_turns",
+    "ratios",
+    "run_module",
+    "run_program",
+    "shared_core",
+    "took",
+]
+
+#: Folder from which `python -m benchmarks...` works.
+ROOT = Path(__file__).resolve().parents[1]
+
+Key = TypeVar("Key")
+
+
+@dataclass(frozen=True, slots=True)
+class Took:
+    """Elapsed time and CPU time of this process (or of a child) of one piece of work."""
+
+    wall_s: float
+    cpu_s: float
+
+    def __add__(self, other: Took) -> Took:
+        return Took(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
+
+
+class Stopwatch:
+    """Times one piece of work after another; begins with nothing for the garbage collector."""
+
+    def __init__(self) -> None:
+        gc.collect()
+        self.wall_s, self.cpu_s = time.perf_counter(), time.process_time()
+
+    def lap(self) -> Took:
+        """Time since the lap before, or since the beginning."""
+        wall_s, cpu_s = time.perf_counter(), time.process_time()
+        passed = Took(wall_s - self.wall_s, cpu_s - self.cpu_s)
+        self.wall_s, self.cpu_s = wall_s, cpu_s
+        return passed
+
+
+def took(work: Callable[[], object]) -> Took:
+    """Time one piece of work."""
+    stopwatch = Stopwatch()
+    work()
+    return stopwatch.lap()
+
+
+def in_turns(
+    variants: Mapping[Key, Callable[[], Took]], rounds: int, *, warm_up: bool = True
+) -> dict[Key, list[Took]]:
+    """Run every variant once a round, beginning with another one each time.
+
+    Parameters
+    ----------
+    variants : mapping
+        Functions that do the work and say what it took.
+    rounds : int
+    warm_up : bool
+        Whether a round that does not count goes ahead.
+    """
+    keys = list(variants)
+    if warm_up:
+        for key in keys:
+            variants[key]()
+    results: dict[Key, list[Took]] = {key: [] for key in keys}
+    for i in range(rounds):
+        begin = i % len(keys)
+        for key in keys[begin:] + keys[:begin]:
+            results[key].append(variants[key]())
+    return results
+
+
+def ratios(numerator: Iterable[float], denominator: Iterable[float]) -> list[float]:
+    """Quotients, round by round."""
+    return [one / other for one, other in zip(numerator, denominator, strict=True)]
+
+
+def shared_core(runs: Iterable[Took]) -> list[str]:
+    """Return a note on how much of the elapsed time the core was ours."""
+    runs = list(runs)
+    share = sum(run.cpu_s for run in runs) / sum(run.wall_s for run in runs)
+    text = f"CPU time; it was {share:.0%} of the elapsed time"
+    return [text if share > 0.9 else f"{text}: others used the core"]
+
+
+def run_program(command: Sequence[str], environment: Mapping[str, str] | None = None) -> str:
+    """Run a program in the folder of the project and return what it printed.
+
+    Raises
+    ------
+    RuntimeError
+        If it fails, with what it said.
+    """
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env={**os.environ, **(environment or {})},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        said = done.stderr.strip() or done.stdout.strip()
+        raise RuntimeError(f"{' '.join(command)} failed ({done.returncode}):\n{said}")
+    return done.stdout
+
+
+def run_module(
+    name: str, *arguments: str, environment: Mapping[str, str] | None = None
+) -> tuple[str, Took]:
+    """Run ``python -m name`` and return what it printed and what the whole process took."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    wall = time.perf_counter()
+    said = run_program([sys.executable, "-m", name, *arguments], environment)
+    wall = time.perf_counter() - wall
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return said, Took(wall, cpu)

@@ -1,0 +1,30 @@
+"""Colours: one a placement, none shared, the same wherever they are asked for."""
+
+from __future__ import annotations
+
+from dwell.report.palette import INK, MUTED, PAPER, PARTS, RULE, Palette
+
+CANDIDATES = ("LOC", "SO", "HYB")
+
+
+def test_a_placement_has_its_colour_whoever_is_compared() -> None:
+    alone = Palette.of(CANDIDATES)
+    among = Palette.of(CANDIDATES, ("dtp", "HYB", "LOC", "atp"))
+    assert alone.placements == among.placements
+    assert among.policies["HYB"].colour == alone.placements["HYB"]
+    assert len(set(alone.placements.values())) == len(CANDIDATES)
+
+
+def test_policies_that_move_differ_from_placements_and_each_other() -> None:
+    palette = Palette.of(CANDIDATES, (*CANDIDATES, "atp", "dtp", "latency-first"))
+    assert palette.policies["dtp"].colour == INK
+    assert len({style.colour for style in palette.policies.values()}) == 6
+    moving = [palette.policies[name] for name in ("atp", "dtp", "latency-first")]
+    assert len({style.marker for style in moving}) == 3
+    assert len({str(style.dashes) for style in moving}) == 3
+
+
+def test_no_colour_is_a_placeholder_of_the_page() -> None:
+    many = Palette.of([f"c{i}" for i in range(9)], ["a", "b"])
+    drawn = {*many.placements.values(), *PARTS.values()}
+    assert not drawn & {INK, MUTED, PAPER, RULE}

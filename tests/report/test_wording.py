@@ -1,0 +1,78 @@
+"""Numbers and names as they are written."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from dwell.report.wording import (
+    Measure,
+    listed,
+    percent,
+    shown_policy,
+    shown_scenario,
+    write_interval,
+    write_number,
+)
+from dwell.study import Interval
+
+MS = Measure("l95_ms", "L95", "ms")
+COST = Measure("cost", "J", decimals=2)
+SHARE = Measure("share_LOC", "LOC", "%", 100.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "text"),
+    [
+        (3.36, 1, "3.4"),
+        (0.0, 1, "0.0"),
+        (-0.25, 2, "−0.25"),
+        (9.837, 2, "9.84"),
+        (23.59, 2, "23.6"),
+        (225.58, 1, "226"),
+        (14467.0, 1, "14\u2009467"),
+        (math.inf, 1, "∞"),
+        (math.nan, 1, "–"),
+    ],
+)
+def test_numbers_have_three_digits_that_count(value: float, decimals: int, text: str) -> None:
+    assert write_number(value, decimals) == text
+
+
+@pytest.mark.parametrize(
+    ("interval", "measure", "text"),
+    [
+        (Interval(31.76, 31.56, 31.96), MS, "31.8 ± 0.2"),
+        (Interval(1.2118, 1.2098, 1.2138), COST, "1.21 ± <0.01"),
+        (Interval(225.6, 211.8, 239.4), MS, "226 ± 14"),
+        (Interval(0.0, 0.0, 0.0), MS, "0"),
+        (Interval(36.0, 36.0, 36.0), MS, "36.0"),
+        (Interval(3.0, math.nan, math.nan), MS, "3.0"),
+        (Interval(0.546, 0.538, 0.554), SHARE, "54.6 ± 0.8"),
+        (Interval(0.01, 0.0, 0.03), SHARE, "1.0 [0.0, 3.0]"),
+        (Interval(0.0, 0.0, 0.139), SHARE, "0"),
+        (Interval(1.0, 0.861, 1.0), SHARE, "100"),
+        (Interval(98.9, 85.0, math.inf), MS, "98.9 [85.0, ∞]"),
+        (Interval(math.inf, 85.0, math.inf), MS, "∞ [85.0, ∞]"),
+        (Interval(30.0, 29.0, 31.0), MS._replace(ends=True), "30.0 [29.0, 31.0]"),
+    ],
+)
+def test_intervals(interval: Interval, measure: Measure, text: str) -> None:
+    assert str(write_interval(interval, measure)) == text
+
+
+def test_names() -> None:
+    assert shown_scenario("robot-cpu-stress") == "Robot CPU stress"
+    assert shown_policy("dtp") == "DTP"
+    assert "our reconstruction" in shown_policy("atp")
+    assert shown_policy("my own") == "my own"
+
+
+def test_lists_and_shares() -> None:
+    assert listed([]) == ""
+    assert listed(["a"]) == "a"
+    assert listed(["a", "b", "c"]) == "a, b and c"
+    assert listed(["a", "b"], "or") == "a or b"
+    assert percent(0.05) == "5 %"
+    assert percent(0.139, 1) == "13.9 %"

@@ -1,0 +1,193 @@
+"""Comparisons: pairs, intervals, and the same result from any number of processes."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+from collections.abc import Sequence
+
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from dwell import simulate
+from dwell.errors import DwellError, PolicyError, ProblemError, SimulationError
+from dwell.policies import Static
+from dwell.study import Comparison, compare
+from dwell.study.intervals import mean_interval, share_limits
+from dwell.study.summary import summarise
+from dwell.study.workers import spread
+from tests.study.cell import make_problem
+
+POLICIES = ("LOC", "SO", "HYB", "dtp")
+PROBLEM = make_problem()
+
+
+def small(processes: int = 1, seeds: Sequence[int] = (1, 2, 3)) -> Comparison:
+    return compare(
+        PROBLEM,
+        scenarios=("baseline", "network-impairment"),
+        policies=POLICIES,
+        seeds=seeds,
+        windows=12,
+        processes=processes,
+    )
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    return small()
+
+
+def test_runs_come_in_the_order_they_were_asked_for(comparison: Comparison) -> None:
+    labels = comparison.runs.select("scenario", "policy", "seed").rows()
+    assert labels == [
+        (scenario, policy, seed)
+        for scenario in ("baseline", "network-impairment")
+        for policy in POLICIES
+        for seed in (1, 2, 3)
+    ]
+
+
+def test_the_number_of_processes_changes_nothing(comparison: Comparison) -> None:
+    other = small(processes=2)
+    assert_frame_equal(comparison.runs, other.runs)
+    assert_frame_equal(comparison.costs, other.costs)
+    assert_frame_equal(comparison.latencies, other.latencies)
+    assert_frame_equal(comparison.table(), other.table())
+    for key, example in comparison.examples.items():
+        assert_frame_equal(example.windows, other.examples[key].windows)
+        assert_frame_equal(example.decisions, other.examples[key].decisions)
+
+
+def test_a_row_is_the_summary_of_that_run(comparison: Comparison) -> None:
+    run = simulate(PROBLEM, scenario="network-impairment", policy="dtp", seed=2, windows=12)
+    labels: dict[str, str | int] = {
+        "scenario": "network-impairment",
+        "policy": "dtp",
+        "seed": 2,
+    }
+    expected = summarise(run, PROBLEM, labels).row
+    found = comparison.runs.filter(
+        (pl.col("scenario") == "network-impairment")
+        & (pl.col("policy") == "dtp")
+        & (pl.col("seed") == 2)
+    )
+    assert found.row(0, named=True) == expected
+
+
+def test_all_policies_play_the_same_realisation() -> None:
+    own = Static(candidates=PROBLEM.candidates, initial="SO")
+    found = compare(
+        PROBLEM,
+        scenarios=("network-impairment",),
+        policies={"SO": "SO", "mine": own},
+        seeds=(1, 2),
+        windows=6,
+        processes=1,
+    )
+    assert found.policies == ("SO", "mine")
+    assert found.statics == ("SO",)
+    columns = [name for name in found.runs.columns if name != "policy"]
+    first, second = (
+        found.runs.filter(pl.col("policy") == name).select(columns) for name in found.policies
+    )
+    assert_frame_equal(first, second)
+    assert found.difference("network-impairment", ("SO", "mine"), "cost") == (0.0, 0.0, 0.0)
+
+
+def test_the_table_has_every_column_with_its_interval(comparison: Comparison) -> None:
+    table = comparison.table()
+    assert table.height == 2 * len(POLICIES)
+    row = table.filter((pl.col("scenario") == "baseline") & (pl.col("policy") == "dtp"))
+    costs = comparison.values("baseline", "dtp", "cost")
+    over = mean_interval(costs)
+    assert row.select("cost", "cost_low", "cost_high").row(0) == over
+    rates = comparison.values("baseline", "dtp", "violation_rate")
+    limits = row.select("violation_rate_at_least", "violation_rate_at_most").row(0)
+    assert limits == share_limits(rates)
+    for name in ("l95_ms", "u_robot", "u_edge", "migrations", "share_LOC", "share_HYB"):
+        assert {name, f"{name}_low", f"{name}_high"} <= set(table.columns)
+
+
+def test_differences_are_those_of_pairs(comparison: Comparison) -> None:
+    found = comparison.difference("baseline", ("dtp", "LOC"), "l95_ms")
+    gaps = comparison.values("baseline", "dtp", "l95_ms") - comparison.values(
+        "baseline", "LOC", "l95_ms"
+    )
+    assert found == mean_interval(gaps)
+
+
+def test_one_seed_gives_no_interval() -> None:
+    table = small(seeds=(1,)).table()
+    assert table["cost"].null_count() == 0
+    assert table["cost_low"].null_count() == table.height
+
+
+def test_distributions_never_fall_and_end_at_what_finished(comparison: Comparison) -> None:
+    for scenario in comparison.scenarios:
+        for policy in POLICIES:
+            line = comparison.latencies.filter(
+                (pl.col("scenario") == scenario) & (pl.col("policy") == policy)
+            )
+            share = line["share"].to_numpy()
+            assert (np.diff(share) >= 0).all()
+            assert share[-1] <= 1
+            at_deadline = line.filter(pl.col("latency_ms") == 33.0)["share"].item()
+            cycles = comparison.values(scenario, policy, "cycles")
+            rates = comparison.values(scenario, policy, "violation_rate")
+            assert at_deadline == pytest.approx(1 - np.average(rates, weights=cycles))
+
+
+def test_progress_counts_runs() -> None:
+    seen: list[tuple[int, int]] = []
+    compare(
+        PROBLEM,
+        scenarios=("baseline",),
+        policies=("LOC", "SO"),
+        seeds=(1, 2),
+        windows=4,
+        processes=1,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert seen == [(2, 4), (4, 4)]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "error", "message"),
+    [
+        ({"seeds": ()}, SimulationError, "seeds is empty"),
+        ({"seeds": (1, 2, 1)}, SimulationError, "seeds holds 1 twice"),
+        ({"policies": ("LOC", "LOC")}, SimulationError, "policies holds 'LOC' twice"),
+        ({"windows": 2}, SimulationError, "more than the 2 windows of warm-up"),
+        ({"scenarios": ("rain",)}, ProblemError, "unknown scenario 'rain'"),
+        ({"policies": ("dpt",)}, PolicyError, "unknown policy 'dpt'"),
+    ],
+)
+def test_wrong_requests_are_refused(
+    wrong: dict[str, tuple[str | int, ...]], error: type[DwellError], message: str
+) -> None:
+    right = {"scenarios": ("baseline",), "policies": ("LOC",), "seeds": (1,), "windows": 4}
+    with pytest.raises(error, match=message):
+        compare(PROBLEM, **{**right, **wrong}, processes=1)  # type: ignore[arg-type]
+
+
+def test_work_is_spread_in_order() -> None:
+    assert spread(math.sqrt, [9.0, 1.0, 4.0], processes=2, done=lambda: None) == [3.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_an_interrupt_leaves_no_process_behind(processes: int) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        spread(math.sqrt, [4.0] * 50, processes=processes, done=interrupt)
+    assert not multiprocessing.active_children()
+
+
+def test_an_error_in_a_process_arrives_as_it_is() -> None:
+    with pytest.raises(ValueError, match="math domain"):
+        spread(math.sqrt, [1.0, -1.0], processes=2, done=lambda: None)
+    assert not multiprocessing.active_children()

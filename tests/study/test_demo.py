@@ -1,0 +1,73 @@
+"""The demo, made small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dwell.errors import TraceError
+from dwell.model import Problem, Trace, TraceTable
+from dwell.study import canonical_demo, real_demo
+from dwell.study.demo import longest_run
+from tests.study.cell import make_problem
+
+ROOT = Path(__file__).parents[2]
+TRACES = ROOT.parent / "shared" / "data"
+
+
+def with_trace(rows: int, *, wrap: bool = False) -> Problem:
+    """Return the small cell with a trace of so many rows in the place of its scale."""
+    from dataclasses import replace
+
+    problem = make_problem()
+    table = TraceTable(file="scene.csv", columns={"scale": np.ones(rows)}, wrap=wrap)
+    pipeline = replace(problem.pipeline, scales={"scene": Trace(table, "scale")})
+    return replace(problem, pipeline=pipeline)
+
+
+@pytest.mark.parametrize(("rows", "windows"), [(1000, 40), (400, 40), (399, 39), (35, 3)])
+def test_a_short_trace_shortens_the_run(rows: int, windows: int) -> None:
+    assert longest_run(with_trace(rows), 40) == windows
+
+
+def test_a_trace_that_wraps_does_not() -> None:
+    assert longest_run(with_trace(35, wrap=True), 40) == 40
+
+
+def test_a_trace_shorter_than_the_warm_up_is_an_error() -> None:
+    with pytest.raises(TraceError, match="needs 30 cycles"):
+        longest_run(with_trace(29), 40)
+
+
+def test_the_canonical_demo() -> None:
+    seen: list[tuple[int, int]] = []
+    found = canonical_demo(
+        ROOT / "examples",
+        seeds=1,
+        windows=7,
+        processes=1,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    paper = {"baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment"}
+    assert paper < set(found.scenarios)
+    assert found.policies == ("LOC", "SO", "HYB", "atp", "dtp", "latency-first")
+    assert seen[-1] == (found.runs.height, found.runs.height)
+
+
+@pytest.mark.skipif(not TRACES.is_dir(), reason="the measurements are not at ../shared/data")
+def test_the_demo_on_measurements() -> None:
+    seen: list[tuple[int, int]] = []
+    found = real_demo(
+        ROOT / "examples",
+        TRACES,
+        seeds=1,
+        windows=7,
+        processes=1,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert [one.problem.name for one in found] == ["real", "real-5g"]
+    total = sum(one.runs.height for one in found)
+    assert seen[-1] == (total, total)
+    assert len({total for _, total in seen}) == 1

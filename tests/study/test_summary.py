@@ -1,0 +1,165 @@
+"""Summaries of runs against tables made by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import polars as pl
+import pytest
+
+from dwell.errors import SimulationError
+from dwell.record import OUTCOMES, Run
+from dwell.study.summary import (
+    count_in,
+    latency_grid_ms,
+    longest_streak,
+    order_statistic,
+    summarise,
+)
+from tests.study.cell import make_problem
+
+W = 4
+LABELS: dict[str, str | int] = {"scenario": "baseline", "policy": "dtp", "seed": 1}
+
+
+def make_run(
+    placements: Sequence[str] = ("LOC", "LOC", "SO", "LOC"),
+    *,
+    warmup: int = 1,
+    tail: int = 3,
+) -> Run:
+    """Return a run of windows of four cycles, with some that no window holds at its end.
+
+    Cycle i takes i milliseconds; every fourth is lost, and so are the last ones, never played.
+    """
+    count = len(placements)
+    following = [*placements[1:], placements[-1]]
+    cycles = count * W + tail
+    lost = [i % W == W - 1 or i >= count * W for i in range(cycles)]
+    final = [None if gone else i * 1_000_000 for i, gone in enumerate(lost)]
+    outcomes = ["in_flight" if i >= count * W else "dropped" for i in range(cycles)]
+    tables = {
+        "cycles": pl.DataFrame(
+            {
+                "cycle": range(cycles),
+                "release_ns": [33_000_000 * i for i in range(cycles)],
+                "placement": "LOC",
+                "latency_ns": final,
+                "missed": lost,
+                "outcome": [
+                    how if gone else "done" for gone, how in zip(lost, outcomes, strict=True)
+                ],
+                "compute_ns": [None if gone else 600_000 for gone in lost],
+                "queue_ns": [None if gone else 0 for gone in lost],
+                "network_ns": [None if gone else 400_000 for gone in lost],
+            },
+            schema_overrides={"outcome": pl.Enum(OUTCOMES)},
+        ),
+        "windows": pl.DataFrame(
+            {
+                "window": range(count),
+                "first_cycle": [W * i for i in range(count)],
+                "warmup": [i < warmup for i in range(count)],
+                "placement": list(placements),
+                "seen_l95_ms": [10.0 * (i + 1) for i in range(count)],
+                "violation_rate": 0.25,
+                "u_R1": [0.9, 0.2, 0.4, 0.6][:count],
+                "u_E": 0.1,
+                "u_R2": [0.1, 0.3, 0.3, 0.3][:count],
+                "cost": [9.0, 1.0, 2.0, 3.0][:count],
+            }
+        ),
+        "decisions": pl.DataFrame(
+            {
+                "window": range(count),
+                "incumbent": list(placements),
+                "placement": following,
+                "migrated": [a != b for a, b in zip(placements, following, strict=True)],
+                "j_LOC": [1.0] * count,
+                "j_SO": [2.0] * count,
+                "j_HYB": [None] * count,
+            },
+            schema_overrides={"j_HYB": pl.Float64},
+        ),
+    }
+    return Run({}, tables)
+
+
+def test_the_warm_up_and_what_no_window_holds_are_left_out() -> None:
+    counted = count_in(make_run(), W)
+    assert counted.windows["window"].to_list() == [1, 2, 3]
+    assert counted.decisions["window"].to_list() == [1, 2, 3]
+    assert counted.cycles["cycle"].to_list() == list(range(4, 16))
+
+
+def test_a_run_of_warm_up_alone_is_refused() -> None:
+    with pytest.raises(SimulationError, match="ask for more windows"):
+        count_in(make_run(warmup=4), W)
+
+
+def test_a_row_holds_what_the_tables_show() -> None:
+    row = summarise(make_run(), make_problem(warmup_windows=1, window_cycles=W), LABELS).row
+    expected = {
+        **LABELS,
+        "windows": 3,
+        "cycles": 12,
+        "violation_rate": 0.25,
+        "l95_ms": 30.0,
+        "p95_ms": math.inf,
+        "p50_ms": 10.0,
+        "spread_ms": math.inf,
+        # The busiest robot of each window: 0.3, 0.4 and 0.6.
+        "u_robot": pytest.approx(1.3 / 3),
+        "u_edge": pytest.approx(0.1),
+        "node_R1": pytest.approx(0.4),
+        "node_E": pytest.approx(0.1),
+        "node_R2": pytest.approx(0.3),
+        "migrations": 2,
+        "returns": 1,
+        "share_LOC": pytest.approx(2 / 3),
+        "share_SO": pytest.approx(1 / 3),
+        "share_HYB": 0.0,
+        "cost": 2.0,
+        "lost": 3,
+        "longest_misses": 1,
+        "compute_ms": pytest.approx(0.6),
+        "queue_ms": 0.0,
+        "network_ms": pytest.approx(0.4),
+    }
+    assert row == expected
+
+
+def test_costs_are_those_estimated_while_idle_and_measured_while_active() -> None:
+    costs = summarise(make_run(), make_problem(warmup_windows=1, window_cycles=W), LABELS).costs
+    by_name = {row["candidate"]: row for row in costs}
+    assert (by_name["LOC"]["estimated"], by_name["LOC"]["measured"]) == (1.0, 2.0)
+    assert (by_name["SO"]["estimated"], by_name["SO"]["measured"]) == (2.0, 2.0)
+    assert math.isnan(float(by_name["HYB"]["estimated"]))
+    assert math.isnan(float(by_name["HYB"]["measured"]))
+
+
+def test_a_distribution_counts_what_finished() -> None:
+    summary = summarise(make_run(), make_problem(warmup_windows=1, window_cycles=W), LABELS)
+    grid = latency_grid_ms(33.0)
+    finished = [i for i in range(4, 16) if i % W != W - 1]
+    assert summary.within.tolist() == [sum(i <= at for i in finished) for at in grid]
+
+
+def test_the_deadline_is_a_point_of_the_grid() -> None:
+    assert 100 / 3 in latency_grid_ms(100 / 3)
+
+
+@pytest.mark.parametrize(
+    ("missed", "length"), [("", 0), ("..", 0), ("xx", 2), (".xx.xxx.", 3), ("xx.x", 2)]
+)
+def test_longest_streak(missed: str, length: int) -> None:
+    assert longest_streak(np.array([letter == "x" for letter in missed], bool)) == length
+
+
+def test_percentiles_are_order_statistics() -> None:
+    values = np.random.default_rng(1).permutation(np.arange(1.0, 101.0))
+    assert order_statistic(values, 95) == 95.0
+    assert order_statistic(values[:50], 95) == np.sort(values[:50])[47]
+    assert order_statistic(np.array([7.0]), 95) == 7.0

@@ -1,0 +1,123 @@
+"""The documentation: examples run, commands exist, links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from dwell.cli.commands import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+EXECUTED = ("README.md", "docs/tutorial.md")
+
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def page_name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path) -> Iterator[tuple[str, str, int]]:
+    """Yield language, text and first line of every fenced block."""
+    text = page.read_text(encoding="utf-8")
+    for match in FENCE.finditer(text):
+        yield match[1], match[2], text[: match.start(2)].count("\n") + 1
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """Yield the words of every command line."""
+    for line in text.splitlines():
+        words = shlex.split(line, comments=True)
+        if words:
+            yield words
+
+
+def heading_anchors(page: Path) -> set[str]:
+    """Return the anchors that a page's headings get."""
+    prose = FENCE.sub("", page.read_text(encoding="utf-8"))
+    titles = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty folder with the examples, the current one."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", EXECUTED)
+def test_examples_run(name: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From top to bottom in one namespace, as a reader would."""
+    scope: dict[str, Any] = {"__name__": "example"}
+    count = 0
+    for language, text, line in blocks(ROOT / name):
+        if language == "python":
+            # Lines of a traceback are those of the page.
+            exec(compile("\n" * (line - 1) + text, name, "exec"), scope)
+            count += 1
+        elif language == "sh":
+            for words in commands(text):
+                if words[0] == "dwell" and words[1] != "demo":
+                    result = CliRunner().invoke(app, words[1:])
+                    assert result.exit_code == 0, result.output
+                    count += 1
+    assert count > 0
+
+
+def options(command: str) -> set[str]:
+    """Return the options of a command."""
+    group: Any = typer.main.get_command(app)
+    assert command in group.commands, f"there is no command {command!r}"
+    return {option for one in group.commands[command].params for option in one.opts}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_commands_exist(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    lines = [text for language, text, _ in blocks(page) if language == "sh"]
+    prose = FENCE.sub("", page.read_text(encoding="utf-8"))
+    lines += re.findall(r"`((?:dwell|make) [a-z][^`]*)`", prose)
+    for words in (words for text in lines for words in commands(text)):
+        if words[0] == "make":
+            assert words[1] in targets
+        elif words[0] == "dwell":
+            used = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
+            assert used <= options(words[1]) | {"--help"}
+
+
+def test_every_command_is_in_the_readme() -> None:
+    group: Any = typer.main.get_command(app)
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for name in group.commands:
+        assert f"| `dwell {name}" in text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_lead_somewhere(page: Path) -> None:
+    prose = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for target in LINK.findall(prose):
+        if re.match(r"[a-z]+:", target):
+            assert target.startswith("https://")
+            continue
+        path, _, anchor = target.partition("#")
+        linked = (page.parent / path).resolve() if path else page
+        assert linked.exists(), target
+        assert linked.is_relative_to(ROOT), target
+        if anchor:
+            assert anchor in heading_anchors(linked), target
+
+
+def test_pictures_are_small() -> None:
+    for picture in (ROOT / "docs" / "images").iterdir():
+        assert picture.stat().st_size < 400_000
