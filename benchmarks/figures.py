@@ -101,40 +101,37 @@ def as_json(name: str, section: Section) -> dict[str, Any]:
 
 def print_sections(sections: Iterable[Section]) -> None:
     """Print a table a section as soon as it is there."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False)
     for section in sections:
-        table = Table(title=section.title, title_justify="left", title_style="bold")
-        table.add_column("figure", overflow="fold")
-        for heading in ("median", "lowest", "highest"):
-            table.add_column(heading, justify="right", no_wrap=True)
-        table.add_column("unit")
-        table.add_column("goal", no_wrap=True)
-        table.add_column("met (runs)", no_wrap=True)
+        rows = [("", "median", "lowest", "highest", "", "goal", "met in runs")]
         for figure in section.figures:
             low, high = min(figure.values), max(figure.values)
-            spread = (_digits(low), _digits(high)) if len(figure.values) > 1 else ("", "")
-            goal = "" if figure.goal is None else str(figure.goal)
-            style = "red" if figure.met is False else None
-            table.add_row(
-                figure.what,
-                _digits(figure.value),
-                *spread,
-                figure.unit,
-                goal,
-                figure.verdict,
-                style=style,
+            alone = len(figure.values) == 1
+            rows.append(
+                (
+                    figure.what,
+                    _digits(figure.value),
+                    "" if alone else _digits(low),
+                    "" if alone else _digits(high),
+                    figure.unit,
+                    "" if figure.goal is None else str(figure.goal),
+                    figure.verdict,
+                )
             )
-        console.print(table)
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+        print(section.title)
+        for row in rows:
+            cells = [
+                text.rjust(width) if 1 <= column <= 3 else text.ljust(width)
+                for column, (text, width) in enumerate(zip(row, widths, strict=True))
+            ]
+            print("  " + "  ".join(cells).rstrip())
         for note in section.notes:
-            console.print(f"  {note}", style="dim")
-        console.print()
+            print(f"  ({note})")
+        print(flush=True)
 
 
 def _digits(value: float) -> str:
-    """Four significant digits, whole numbers with thin groups of thousands."""
+    """Four significant digits, thousands apart."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     places = max(0, 3 - math.floor(math.log10(abs(value))))

@@ -67,6 +67,7 @@ def small_comparison() -> Comparison:
     """Return a comparison of a few short runs."""
     return compare(
         make_problem(),
+        scenarios=("baseline", "robot-cpu-stress"),
         policies=("LOC", "SO", "HYB", "atp", "dtp"),
         seeds=(1, 2, 3),
         windows=12,

@@ -9,7 +9,7 @@ from tests.report.pages import small_comparison
 def test_it_has_a_table_for_every_scenario_and_the_verdict() -> None:
     comparison = small_comparison()
     text = comparison_text(comparison)
-    for name in ("Baseline", "Robot CPU stress", "Network impairment"):
+    for name in ("Baseline", "Robot CPU stress"):
         assert text.count(f"\n{name} ") + text.startswith(name) == 1
     assert text.count("ATP *") == len(comparison.scenarios)
     assert "* our reconstruction" in text

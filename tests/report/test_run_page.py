@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from dwell import Run, open_run, simulate
 from dwell.errors import RunError
+from dwell.model import NodeDisturbance
 from dwell.report import run_html
 from tests.report.pages import Page, small_run
 from tests.study.cell import make_problem
@@ -48,10 +50,6 @@ def test_a_run_from_its_folder_makes_the_same_page(html: str, tmp_path: Path) ->
 
 
 def test_a_run_that_lost_everything_has_a_page() -> None:
-    from dataclasses import replace
-
-    from dwell.model import NodeDisturbance
-
     scenarios = {"dead": (NodeDisturbance("R2", down=True),)}
     run = simulate(replace(make_problem(), scenarios=scenarios), scenario="dead", seed=1, windows=6)
     text = Page(run_html(run)).text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -78,8 +79,6 @@ def test_migrations_are_instants(events: list[TraceEvent]) -> None:
 
 
 def test_workers_of_a_task_have_threads_of_their_own() -> None:
-    from dataclasses import replace
-
     problem = make_problem()
     task = problem.pipeline.tasks["perception"]
     on = {node: replace(run, workers=3) for node, run in task.on.items()}

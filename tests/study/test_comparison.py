@@ -30,7 +30,7 @@ def small(processes: int = 1, seeds: Sequence[int] = (1, 2, 3)) -> Comparison:
         scenarios=("baseline", "network-impairment"),
         policies=POLICIES,
         seeds=seeds,
-        windows=12,
+        windows=8,
         processes=processes,
     )
 
@@ -62,7 +62,7 @@ def test_the_number_of_processes_changes_nothing(comparison: Comparison) -> None
 
 
 def test_a_row_is_the_summary_of_that_run(comparison: Comparison) -> None:
-    run = simulate(PROBLEM, scenario="network-impairment", policy="dtp", seed=2, windows=12)
+    run = simulate(PROBLEM, scenario="network-impairment", policy="dtp", seed=2, windows=8)
     labels: dict[str, str | int] = {
         "scenario": "network-impairment",
         "policy": "dtp",

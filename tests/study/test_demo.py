@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,6 @@ TRACES = ROOT.parent / "shared" / "data"
 
 def with_trace(rows: int, *, wrap: bool = False) -> Problem:
     """Return the small cell with a trace of so many rows in the place of its scale."""
-    from dataclasses import replace
-
     problem = make_problem()
     table = TraceTable(file="scene.csv", columns={"scale": np.ones(rows)}, wrap=wrap)
     pipeline = replace(problem.pipeline, scales={"scene": Trace(table, "scale")})
