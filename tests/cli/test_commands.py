@@ -17,6 +17,7 @@ from dwell.record import Run
 
 ROOT = Path(__file__).parents[2]
 CANONICAL = ROOT / "examples" / "canonical.yaml"
+REAL = ROOT.parent / "shared" / "data"
 
 SMALL = """\
 dwell: 1
@@ -326,6 +327,16 @@ def test_demo_as_json(tmp_path: Path) -> None:
     rows = found["comparisons"]["canonical"]
     assert {row["policy"] for row in rows} == {"LOC", "SO", "HYB", "atp", "dtp", "latency-first"}
     assert {row["seeds"] for row in rows} == {1}
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the measurements are not beside the repository")
+def test_demo_on_measurements(tmp_path: Path) -> None:
+    arguments = ("--seeds", "1", "--windows", "8", "--processes", "1", "--out", tmp_path)
+    result = call("demo", "--real", REAL, *arguments)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "Cell real\n" in result.stdout
+    assert "Cell real-5g\n" in result.stdout
+    assert (tmp_path / "report.html").is_file()
 
 
 def test_demo_without_its_measurements_is_a_mistake(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_minimal_policies_are_sound() -> None:
 
 def test_degenerate_cells() -> None:
     alone = problem({"LOC": place("R1", "R2")})
-    for name in ("dtp", "latency-first", "LOC"):
+    for name in ("dtp", "latency-first", "work-function", "LOC"):
         assert check_policy(by_name(name, alone), alone) == ()
 
 

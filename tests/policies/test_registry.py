@@ -7,7 +7,7 @@ import pytest
 from dwell.errors import PolicyError
 from dwell.model import ControllerSettings
 from dwell.model.problem import POLICIES
-from dwell.policies import ATP, DTP, LatencyFirst, Policy, Static, by_name
+from dwell.policies import ATP, DTP, LatencyFirst, Policy, Static, WorkFunction, by_name
 from dwell.policies.registry import REGISTRY
 from tests.policies.cell import CANDIDATES, OBJECTIVE, place, problem
 
@@ -34,6 +34,9 @@ def test_parameters_come_from_the_problem() -> None:
     fastest = by_name("latency-first", problem(controller=SETTINGS))
     assert isinstance(fastest, LatencyFirst)
     assert fastest.initial == "HYB"
+    in_hindsight = by_name("work-function", problem(controller=SETTINGS))
+    assert isinstance(in_hindsight, WorkFunction)
+    assert (in_hindsight.initial, in_hindsight.objective) == ("HYB", OBJECTIVE)
 
 
 def test_a_candidate_by_name_is_static_whatever_the_initial_one_is() -> None:
@@ -43,7 +46,8 @@ def test_a_candidate_by_name_is_static_whatever_the_initial_one_is() -> None:
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_all() -> None:
-    expected = "unknown policy 'dpt'; did you mean 'dtp'.*dtp, atp, latency-first, LOC, SO, HYB"
+    known = "dtp, atp, latency-first, work-function, LOC, SO, HYB"
+    expected = f"unknown policy 'dpt'; did you mean 'dtp'.*{known}"
     with pytest.raises(PolicyError, match=expected):
         by_name("dpt", problem())
 

@@ -116,7 +116,7 @@ def test_a_rate_is_under_the_aim_only_where_its_limit_is() -> None:
     }
     comparison = make_comparison(shown)
     found = [standing(comparison, "baseline", name) for name in comparison.policies]
-    assert found == ["under", "open", "above", "none seen"]
+    assert found == ["under", "open", "above", "no miss"]
 
 
 def test_the_verdict_names_who_keeps_the_aim() -> None:
@@ -153,6 +153,8 @@ def test_the_verdict_holds_dtp_against_the_cheapest_placement() -> None:
     assert "J of DTP is higher by 0.25 in Baseline." in verdict(make_comparison(shown))[1]
     shown["baseline", "dtp"] = {"cost": [1.0 + x for x in NOISE]}
     assert "J of DTP is not told apart in Baseline." in verdict(make_comparison(shown))[1]
+    shown["baseline", "dtp"] = {"cost": 1.0}
+    assert "J of DTP is the same in Baseline." in verdict(make_comparison(shown))[1]
 
 
 def test_leaving_and_returning_is_put_down_to_the_estimator() -> None:

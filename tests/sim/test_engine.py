@@ -32,6 +32,7 @@ from dwell.model import (
     NodeDisturbance,
     Problem,
     QoS,
+    Quota,
     Task,
     Uniform,
 )
@@ -562,6 +563,19 @@ def test_jitter_beyond_the_period_keeps_the_order_of_cycles() -> None:
     run = dwell.simulate(problem, policy="LOC", seed=1, windows=20)
     assert (run.cycles["release_ns"].diff().drop_nulls() >= 0).all()
     assert (run.cycles["outcome"] == "done").sum() >= 198
+
+
+@pytest.mark.parametrize(("exec_ms", "latency_ms"), [(3.0, 3.0), (5.0, 5.0), (8.0, 13.0)])
+def test_a_quota_stops_a_job_whose_bucket_is_empty(exec_ms: float, latency_ms: float) -> None:
+    # 5 ms of one core in every 10 ms; releases fall on the begins of periods.
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(0.5, 10.0))],
+        [Task("work", {"R": Execution(Constant(exec_ms))})],
+        period_ms=20.0,
+        window_cycles=10,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    assert set(run.cycles["latency_ns"].to_list()) == {round(latency_ms * MS)}
 
 
 def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:

@@ -23,7 +23,6 @@ from dwell.kernels.cycles import (
 )
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
-    QUOTA_T,
     ARRIVAL,
     BASE,
     BUSY,
@@ -44,6 +43,7 @@ from dwell.kernels.layout import (
     CYCLE_SHIFT,
     DOWN,
     FINISHED,
+    FIRST,
     GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
@@ -85,6 +85,7 @@ from dwell.kernels.layout import (
     OUT_0,
     PAUSE,
     PAUSED,
+    QUOTA_T,
     READY_AT,
     RELEASE,
     RESTART,
@@ -132,7 +133,8 @@ def _progress(s: Tables, server: int, at: int) -> float:
 @phase
 def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
     """Write the busy and the cell's own core-nanoseconds of every node, up to now."""
-    for server in range(s.servers.shape[0]):
+    for number in range(s.servers.shape[0]):
+        server = index(number)
         if s.servers[server, IS_CPU] == 0:
             continue
         tick(s, server, now)
@@ -188,9 +190,9 @@ def _crash(s: Tables, server: int, now: int) -> None:
         key = s.run_key[base]
         cell = (key >> CELL_SHIFT) & CELL_MASK
         if s.servers[server, IS_CPU] != 0:
-            s.own[cell, s.servers[server, NODE_OF]] += _progress(s, server, 0)
+            s.own[cell, s.servers[server, NODE_OF]] += _progress(s, server, FIRST)
         _lose_key(s, key, now)
-        leave(s, server, s.jobs[key_row(s, key), SITE], 0, now)
+        leave(s, server, index(s.jobs[key_row(s, key), SITE]), now)
     for i in range(s.servers[server, N_WAIT]):
         _lose_key(s, s.wait_key[base + i], now)
     s.servers[server, N_WAIT] = 0
@@ -220,7 +222,8 @@ def _change(s: Tables, now: int) -> None:
     node = s.changes[change, CHANGE_NODE]
     down = s.changes[change, CHANGE_DOWN]
     turned = False
-    for server in range(s.servers.shape[0]):
+    for number in range(s.servers.shape[0]):
+        server = index(number)
         if s.servers[server, NODE_OF] != node:
             continue
         tick(s, server, now)
@@ -249,7 +252,8 @@ def _quota(s: Tables, server: int, now: int) -> None:
 @phase
 def _turn_sites(s: Tables, node: int, down: int, now: int) -> None:
     """Empty the inputs of a node that went down; restart its workers when it is up again."""
-    for site in range(s.sites.shape[0]):
+    for number in range(s.sites.shape[0]):
+        site = index(number)
         if s.sites[site, NODE] != node:
             continue
         if down != 0:
@@ -260,7 +264,7 @@ def _turn_sites(s: Tables, node: int, down: int, now: int) -> None:
         s.sites[site, READY_AT] = 0
         if ready > now:
             s.sites[site, READY_AT] = ready
-            key = (RESTART << KIND_SHIFT) | (s.sites[site, SITE_CELL] << CELL_SHIFT) | site
+            key = (RESTART << KIND_SHIFT) | (s.sites[site, SITE_CELL] << CELL_SHIFT) | number
             push_event(s.clock, s.event_t, s.event_key, ready, key)
     if down != 0:
         _lose_joins(s, node)
@@ -306,7 +310,7 @@ def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int
         if hop < 0:
             hand_over(s, cell, cycle, flow, now)
         else:
-            send(s, cell, cycle, flow, hop, 0, now)
+            send(s, cell, cycle, flow, hop, FIRST, now)
 
 
 @phase
@@ -381,9 +385,9 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         _change(s, now)
         _announce_change(s)
     elif kind == CHANGE:
-        _quota(s, item - 1, now)
+        _quota(s, index(item - 1), now)
     elif kind == RESTART:
-        _restart(s, cell, item, now)
+        _restart(s, cell, index(item), now)
 
 
 @kernel

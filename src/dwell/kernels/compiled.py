@@ -33,6 +33,7 @@ def _fingerprint() -> str:
     digest = hashlib.sha256()
     for source in sorted(files(__package__).iterdir(), key=lambda entry: entry.name):
         if source.name.endswith(".py"):
+            digest.update(source.name.encode())
             digest.update(source.read_bytes())
     return digest.hexdigest()
 

@@ -17,6 +17,7 @@ from dwell.kernels.layout import (
     DOWN,
     DROPPED,
     FAIR,
+    FIRST,
     FLOW_0,
     HEAD,
     IDLE,
@@ -57,6 +58,7 @@ from dwell.kernels.layout import (
     TAKEN,
     TARGET,
     TASK_0,
+    UNKNOWN,
     WAITING,
     Tables,
 )
@@ -140,7 +142,7 @@ def become_ready(s: Tables, cell: int, cycle: int, local: int, now: int) -> bool
     """Let a ready job wait at its site, or lose it; True if an idle worker takes it at once."""
     row = job_row(s, cell, cycle, local)
     s.jobs[row, READY] = now
-    _log(s, cell, cycle, row, local, IN_FLIGHT, -1)
+    _log(s, cell, cycle, row, local, IN_FLIGHT, UNKNOWN)
     site = index(s.jobs[row, SITE])
     if s.servers[index(s.sites[site, SERVER]), DOWN] != 0:
         drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
@@ -214,7 +216,7 @@ def complete(
     s: Tables, server: int, site: int, cell: int, cycle: int, local: int, row: int, now: int
 ) -> None:
     """The job of a server that finishes first has finished; its outputs are the caller's."""
-    leave(s, server, site, 0, now)
+    leave(s, server, site, now)
     if s.servers[server, IS_CPU] != 0:
         work = s.sites[site, NEED] * float(s.exec_ns[site, cycle])
         s.own[cell, index(s.sites[site, NODE])] += work
@@ -282,7 +284,7 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
     s.slots[slot, SINKS_LEFT] = s.cells[cell, N_SINKS]
     following = cycle + 1
     if following < s.cells[cell, N_CYCLES]:
-        key = (RELEASE << KIND_SHIFT) | job_key(cell, following, 0)
+        key = (RELEASE << KIND_SHIFT) | job_key(cell, following, FIRST)
         t = s.release_ns[cell, following]
         push_event(s.clock, s.event_t, s.event_key, t, key)
 

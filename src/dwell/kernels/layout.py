@@ -35,8 +35,11 @@ CELL_MASK = (1 << CELL_BITS) - 1
 # What `advance` returns.
 PAUSED, FINISHED, GROW_EVENTS, GROW_RING = range(4)
 
-# Outcomes of cycles and jobs.
-IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
+# Outcomes of cycles and jobs. As NumPy integers they are no literals to Numba, which compiles a
+# function once more for every literal it is called with.
+IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = (np.int64(code) for code in range(5))
+FIRST = np.int64(0)
+UNKNOWN = np.int64(-1)
 
 # Schedulers.
 FAIR, FIFO, PRIORITY = range(3)

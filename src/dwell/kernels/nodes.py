@@ -19,18 +19,11 @@ from dwell.kernels.heaps import (
     push_waiting,
 )
 from dwell.kernels.layout import (
-    CHANGE,
-    KIND_SHIFT,
-    LEFT_NS,
-    PERIOD,
-    PERIOD_NS,
-    QUOTA_NS,
-    QUOTA_T,
-    THROTTLED,
     BASE,
     BUSY,
     CELL_MASK,
     CELL_SHIFT,
+    CHANGE,
     CORES,
     CYCLE_MASK,
     CYCLE_SHIFT,
@@ -38,8 +31,11 @@ from dwell.kernels.layout import (
     DOWN,
     FAIR,
     FIFO,
+    FIRST,
     ITEM_MASK,
+    KIND_SHIFT,
     LAST,
+    LEFT_NS,
     N_DIRTY,
     N_READY,
     N_RUN,
@@ -47,7 +43,11 @@ from dwell.kernels.layout import (
     NEED,
     NEXT_KEY,
     NEXT_T,
+    PERIOD,
+    PERIOD_NS,
     PRIORITY,
+    QUOTA_NS,
+    QUOTA_T,
     RANK,
     READY,
     SCHEDULER,
@@ -56,6 +56,7 @@ from dwell.kernels.layout import (
     SPEED,
     STARTED,
     STRESS,
+    THROTTLED,
     USED,
     VIRTUAL,
     Tables,
@@ -226,7 +227,7 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
 def _preempt(s: Tables, server: int) -> bool:
     """Take the cores of the last running job behind the first waiting one, if there is any."""
     base = s.servers[server, BASE]
-    worst = -1
+    worst = np.int64(-1)
     rank, ready, key = s.wait_rank[base], s.wait_ready[base], s.wait_key[base]
     for i in range(s.servers[server, N_RUN]):
         other = s.run_key[base + i]
@@ -238,7 +239,7 @@ def _preempt(s: Tables, server: int) -> bool:
         if other_rank > rank or (
             other_rank == rank and (other_ready > ready or (other_ready == ready and other > key))
         ):
-            worst, rank, ready, key = i, other_rank, other_ready, other
+            worst, rank, ready, key = np.int64(i), other_rank, other_ready, other
     if worst < 0:
         return False
     row = key_row(s, key)
@@ -277,14 +278,14 @@ def dispatch(s: Tables, server: int, now: int) -> None:
 
 
 @phase
-def leave(s: Tables, server: int, site: int, at: int, now: int) -> None:
-    """Take running entry `at` off a server."""
+def leave(s: Tables, server: int, site: int, now: int) -> None:
+    """Take the job that finishes first off a server."""
     base = s.servers[server, BASE]
     n = s.servers[server, N_RUN]
     elapsed = _account(s, server, now)
     if n > 1:  # the virtual clock of an empty server starts anew
         s.servers_f[server, VIRTUAL] += elapsed * s.servers_f[server, SPEED]
-    pop_running(s.run_v, s.run_key, base, n, at)
+    pop_running(s.run_v, s.run_key, base, n, FIRST)
     s.servers[server, N_RUN] = n - 1
     s.servers[server, USED] -= s.sites[site, NEED]
     s.servers[server, NEXT_KEY] = -1

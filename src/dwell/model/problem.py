@@ -26,7 +26,7 @@ from dwell.model.scenario import Scenario
 
 __all__ = ["ESTIMATORS", "POLICIES", "ControllerSettings", "Problem"]
 
-POLICIES = ("dtp", "atp", "latency-first")
+POLICIES = ("dtp", "atp", "latency-first", "work-function")
 ESTIMATORS = ("profile",)
 
 

@@ -7,6 +7,7 @@ from dwell.policies.latency_first import LatencyFirst
 from dwell.policies.protocol import MinimalPolicy, Policy
 from dwell.policies.registry import by_name
 from dwell.policies.static import Static
+from dwell.policies.work_function import WorkFunction
 
 __all__ = [
     "ATP",
@@ -15,6 +16,7 @@ __all__ = [
     "MinimalPolicy",
     "Policy",
     "Static",
+    "WorkFunction",
     "by_name",
     "check_policy",
 ]

@@ -12,6 +12,7 @@ from dwell.policies.dtp import DTP
 from dwell.policies.latency_first import LatencyFirst
 from dwell.policies.protocol import Policy
 from dwell.policies.static import Static
+from dwell.policies.work_function import WorkFunction
 
 __all__ = ["REGISTRY", "by_name"]
 
@@ -82,9 +83,16 @@ def _latency_first(problem: Problem) -> LatencyFirst:
     )
 
 
+def _work_function(problem: Problem) -> WorkFunction:
+    return WorkFunction(
+        candidates=problem.candidates, initial=problem.initial, objective=problem.objective
+    )
+
+
 #: Makers by name; the same names as ``dwell.model.problem.POLICIES``.
 REGISTRY: dict[str, Callable[[Problem], Policy]] = {
     "dtp": _dtp,
     "atp": _atp,
     "latency-first": _latency_first,
+    "work-function": _work_function,
 }

@@ -85,7 +85,7 @@ STANDING: dict[Status, tuple[str, str]] = {
     "under": ("under", "good"),
     "above": ("above", "bad"),
     "open": ("open", "open"),
-    "none seen": ("no miss", "good"),
+    "no miss": ("no miss", "good"),
 }
 
 
@@ -135,8 +135,8 @@ def _subtitle(comparison: Comparison) -> str:
     runs = len(comparison.scenarios) * len(comparison.policies) * len(comparison.seeds)
     return (
         f"Cell “{problem.name}”: {len(comparison.scenarios)} scenarios × "
-        f"{len(comparison.policies)} policies × {len(comparison.seeds)} seeds = {runs} simulated "
-        f"runs of {write_number(minutes)} minutes each"
+        f"{len(comparison.policies)} policies × {len(comparison.seeds)} seeds = {runs} runs of "
+        f"{write_number(minutes)} minutes, simulated"
     )
 
 

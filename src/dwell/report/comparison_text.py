@@ -59,19 +59,17 @@ def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
             table.add_row(*_row(comparison, measures, scenario, policy))
         console.print(table)
         console.print()
-    columns = min(width or PROSE, PROSE)
+    prose = textwrap.TextWrapper(min(width or PROSE, PROSE), break_on_hyphens=False)
     note = (
         f"Mean over {len(comparison.seeds)} seeds and half of its 95 % interval, or the interval. "
         f"Columns {', '.join(comparison.problem.candidates)}: share of the windows."
     )
-    lines = [buffer.getvalue().rstrip(), "", textwrap.fill(note, columns)]
+    lines = [buffer.getvalue().rstrip(), "", prose.fill(note)]
     if any(policy in NAMES for policy in comparison.policies):
-        lines.append(textwrap.fill(REMARK, columns, subsequent_indent="  "))
-    lines += ["", textwrap.fill(question(comparison), columns), ""]
-    lines += [
-        textwrap.fill(item.replace("`", ""), columns, initial_indent="- ", subsequent_indent="  ")
-        for item in verdict(comparison)
-    ]
+        lines.append(prose.fill(REMARK))
+    lines += ["", prose.fill(question(comparison)), ""]
+    prose.initial_indent, prose.subsequent_indent = "- ", "  "
+    lines += [prose.fill(item.replace("`", "")) for item in verdict(comparison)]
     return "\n".join(line.rstrip() for line in "\n".join(lines).splitlines()) + "\n"
 
 

@@ -38,7 +38,7 @@ __all__ = [
     "verdict",
 ]
 
-Status: TypeAlias = Literal["under", "above", "open", "none seen"]
+Status: TypeAlias = Literal["under", "above", "open", "no miss"]
 
 RATE = Measure("violation_rate", "V_D", "%", 100.0)
 COST = Measure("cost", "J", decimals=2)
@@ -51,7 +51,7 @@ def standing(comparison: Comparison, scenario: str, policy: str) -> Status:
     """Where a violation rate stands to the aim, by its one-sided 95 % limits over seeds."""
     values = comparison.values(scenario, policy, RATE.column)
     if not values.any():
-        return "none seen"
+        return "no miss"
     at_least, at_most = share_limits(values)
     return "under" if at_most < AIM else "above" if at_least > AIM else "open"
 
@@ -89,7 +89,7 @@ def judge_all(comparison: Comparison) -> list[Judgement]:
 def _on_aim(comparison: Comparison) -> str:
     scenarios, policies = comparison.scenarios, comparison.policies
     good = {
-        policy: [s for s in scenarios if standing(comparison, s, policy) in ("under", "none seen")]
+        policy: [s for s in scenarios if standing(comparison, s, policy) in ("under", "no miss")]
         for policy in policies
     }
     everywhere = [policy for policy in policies if len(good[policy]) == len(scenarios)]
@@ -129,7 +129,7 @@ def _on_no_miss(comparison: Comparison) -> str:
         for scenario in comparison.scenarios
         for policy in comparison.policies
     ]
-    if "none seen" not in found:
+    if "no miss" not in found:
         return ""
     limit = percent(rule_of_three(len(comparison.seeds)), 1)
     return (
@@ -434,7 +434,9 @@ def _higher_or_lower(gaps: Mapping[str, Interval], decimals: int, unit: str = ""
                 for i, (name, gap) in enumerate(found.items())
             )
             words.append(f"{word} by {where}")
-    level = [shown_scenario(name) for name in gaps if name not in higher and name not in lower]
-    if level:
-        words.append(f"not told apart in {listed(level)}")
+    equal = [name for name, gap in gaps.items() if gap.low == gap.high == 0]
+    level = [name for name in gaps if name not in (*higher, *lower, *equal)]
+    for names, word in ((equal, "the same"), (level, "not told apart")):
+        if names:
+            words.append(f"{word} in {listed(map(shown_scenario, names))}")
     return "; ".join(words)

@@ -111,7 +111,8 @@ dt { color: var(--muted); } dd { margin: 0; }
   dd { margin-bottom: 8px; } }
 @media print { body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
   h2 { margin-top: 32pt; } h2, h3 { break-after: avoid; }
-  figure, tr, li { break-inside: avoid; } .scroll { overflow: visible; }
+  figure, tr, li { break-inside: avoid; } tr.group { break-after: avoid; }
+  .scroll { overflow: visible; }
   table { font-size: 8.5pt; } th, .err, small { font-size: 8pt; }
   td, th { padding-left: 6px; } .err { padding-left: 3px; } }
 """

@@ -55,6 +55,15 @@ class Played:
         return self.first[:, None] + np.arange(self.problem.window_cycles)
 
     @property
+    def released(self) -> int:
+        """Number of cycles played: those up to the last close.
+
+        Fewer than were drawn where orders take time, because the cycles between a close and the
+        first one an order stamps belong to no window, and the last window may not be complete.
+        """
+        return int(self.first[-1]) + self.problem.window_cycles if len(self.first) else 0
+
+    @property
     def close_ns(self) -> Ints:
         """Instant of every close, shape (windows,)."""
         boundary = self.first + self.problem.window_cycles
@@ -76,7 +85,7 @@ class Played:
 
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
-        latency_ns = self.arrays.tables.latency_ns[0]
+        latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > round(self.problem.pipeline.deadline_ms * 1e6)
         rows = self.rows
         age_ns = self.close_ns[:, None] - self.realisation.release_ns[rows]
@@ -118,17 +127,18 @@ def _cycles(played: Played) -> pl.DataFrame:
     import polars as pl
 
     tables = played.arrays.tables
+    count = played.released
     latency, compute, network = (
-        table[0] for table in (tables.latency_ns, tables.compute_ns, tables.network_ns)
+        table[0, :count] for table in (tables.latency_ns, tables.compute_ns, tables.network_ns)
     )
     frame = pl.DataFrame(
         {
-            "cycle": np.arange(played.realisation.cycles),
-            "release_ns": played.realisation.release_ns[:-1],
-            "placement": _names(tables.stamps[0], tuple(played.problem.candidates)),
+            "cycle": np.arange(count),
+            "release_ns": played.realisation.release_ns[:count],
+            "placement": _names(tables.stamps[0, :count], tuple(played.problem.candidates)),
             "latency_ns": latency,
             "missed": played.missed(),
-            "outcome": _names(tables.outcome[0], OUTCOMES),
+            "outcome": _names(tables.outcome[0, :count], OUTCOMES),
             "compute_ns": compute,
             "queue_ns": latency - compute - network,
             "network_ns": network,

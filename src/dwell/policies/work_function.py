@@ -1,0 +1,187 @@
+"""WorkFunction: the work-function algorithm for metrical task systems, one window late.
+
+Borodin, Linial and Saks (J. ACM 39(4), 1992, DOI 10.1145/146585.146588) pose the problem and give
+the bound; the algorithm is written here as in Chrobak and Larmore (LNCS 1442, 1998,
+DOI 10.1007/BFb0029565). Its states are the candidates, what it serves are windows, and its
+distance is the price of a move, ``d(x, s) = weights.switching * hamming(x, s)``.
+
+The work function w_k(s) is the least that windows 1 to k could have cost a cell that knew them all
+in advance, began on the initial candidate, and ends on s::
+
+    w_0(s) = d(initial, s)
+    w_k(s) = min over x of  w_{k-1}(x) + r_k(x) + d(x, s)
+
+where r_k(x) is J of window k under x without its switching term. The next candidate is the s that
+minimises w_k(s) + d(s, incumbent) among those with w_k(s) = w_{k-1}(s) + r_k(s), that is, among
+those that it would be best to have spent window k on in order to end there.
+
+How it is computed
+    Both conditions together say: s minimises w_{k-1}(s) + r_k(s) + d(s, incumbent). The minimum of
+    that sum is w_k(incumbent) by definition, and by the triangle inequality no w_k(s) +
+    d(s, incumbent) is below it. A window takes O(n^2) operations for n candidates. The minimum of
+    w_k is subtracted in each window, so that w_k lies in [0, weights.switching] however long a run
+    is; decisions depend on differences alone.
+
+What is not claimed
+    The algorithm costs at most 2n - 1 times the optimum, plus a constant, if it sees a window's
+    costs before it chooses where to spend that window, if the costs are exact, and if nothing
+    stops it from moving. Here a window is over when its costs are seen, those of all candidates
+    but the incumbent are estimates, and caps exclude candidates. **No bound holds**: costs that
+    always strike the incumbent are paid in full every time, however large. What it is worth on a
+    cell has to be measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from operator import add
+
+from dwell.model.frozen import FrozenDict
+from dwell.model.objective import Objective
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.qos import Decision, QoS
+from dwell.policies.incumbent import Incumbent, check_candidates, check_name
+from dwell.policies.pricing import Pricing
+
+__all__ = ["TIE_TOLERANCE", "WorkFunction"]
+
+#: Sums whose relative difference is at most this are a tie: w_k carries rounding errors.
+TIE_TOLERANCE = 1e-9
+
+
+class WorkFunction:
+    """Moves once the optimum in hindsight justifies it, with neither threshold nor dwell.
+
+    * A tie is a move: staying where the optimum would as soon have left is what an adversary
+      charges for. Among several candidates to move to, their order decides. Only a tie with
+      candidates at no distance from the incumbent (the same placement, or ``weights.switching``
+      of 0) is a hold: such equals would take turns for ever.
+    * A candidate over a cap is not eligible, as in DTP. If none is eligible, those closest to
+      their caps are compared as usual, and the reason is ``infeasible``. Caps restrict where it
+      goes, not what it remembers: r_k of a candidate over its caps enters w_k as it is, and the
+      candidate chosen minimises w_{k-1}(s) + r_k(s) + d(s, incumbent) over the eligible ones.
+    * A window that the policy is not shown leaves w_k as it is.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+        Pi_cand, over the same tasks.
+    initial : str, optional
+        The candidate it starts on; the first where None.
+    objective : Objective
+        Weights, targets, caps and tiers of J.
+
+    Raises
+    ------
+    PolicyError
+        If `initial` is no candidate, or candidates place different tasks.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: Mapping[str, Placement],
+        initial: str | None = None,
+        objective: Objective,
+    ) -> None:
+        self.candidates = check_candidates(candidates)
+        self.initial = check_name("initial", initial, self.candidates)
+        self.objective = objective
+        self._pricing = Pricing(self.candidates, objective)
+        self._index = {name: i for i, name in enumerate(self.candidates)}
+        weight = objective.weights.switching
+        self._distances = tuple(
+            tuple(weight * moved for moved in self._pricing.switching(name).values())
+            for name in self.candidates
+        )
+        self._incumbent = Incumbent(self.candidates, self.initial)
+        self._work = self._distances[self._index[self.initial]]
+
+    def __repr__(self) -> str:
+        return f"WorkFunction(initial={self.initial!r})"
+
+    @property
+    def incumbent(self) -> str:
+        """Name of the active candidate."""
+        return self._incumbent.name
+
+    @property
+    def work(self) -> FrozenDict[str, float]:
+        """w_k less its minimum, by candidate, in units of J."""
+        return FrozenDict(zip(self.candidates, self._work, strict=True))
+
+    def start(self, problem: Problem) -> None:
+        """Begin again: the initial candidate, and no window seen."""
+        self._incumbent.begin(self.initial)
+        self._work = self._distances[self._index[self.initial]]
+
+    def adopt(self, name: str) -> None:
+        """Take over `name` as the incumbent: somebody else moved the cell there.
+
+        The work function stays: it is about what was possible, not about where the cell was.
+        """
+        self._incumbent.adopt(name)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
+        """Add a window to the work function and decide the placement for the next one.
+
+        Parameters
+        ----------
+        observed : QoS
+            Metrics of the window under the incumbent; its r_k is the measured one.
+        estimates : mapping of str to QoS
+            Metrics by candidate; r_k of the others, and the caps of all.
+
+        Returns
+        -------
+        Decision
+            `costs` are estimated J against the incumbent, as every policy records them. `delta_j`
+            is NaN: the rule compares sums over all windows, not J of one.
+
+        Raises
+        ------
+        MetricError
+            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        """
+        incumbent, pricing = self._incumbent, self._pricing
+        now = incumbent.name
+        costs = pricing.estimated(estimates, now)
+        # From a candidate to itself: J of a window that no move preceded.
+        window = [
+            pricing.observed(observed if name == now else estimates[name], name, name)
+            for name in self.candidates
+        ]
+        served = list(map(add, self._work, window))
+        # Subtracted before distances are added: large costs then round off nothing of w_k.
+        least = min(served)
+        reduced = [value - least for value in served]
+        self._work = tuple(min(map(add, reduced, row)) for row in self._distances)
+        eligible, within_caps = pricing.eligible(estimates)
+        best = self._choose(served, eligible)
+        if best == now:
+            return incumbent.stay("hold" if within_caps else "infeasible", costs)
+        return incumbent.move(best, "migrate" if within_caps else "infeasible", costs)
+
+    def _choose(self, served: list[float], eligible: list[str]) -> str:
+        """Return the eligible candidate with the least ``served + distance``; ties move.
+
+        Parameters
+        ----------
+        served : list of float
+            w_{k-1} + r_k, in the candidates' order.
+        eligible : list of str
+            At least one, in the candidates' order.
+        """
+        now = self._incumbent.name
+        distances = self._distances[self._index[now]]
+        totals = {
+            name: served[self._index[name]] + distances[self._index[name]] for name in eligible
+        }
+        slack = TIE_TOLERANCE * min(totals.values())
+        bound = min(totals.values()) + slack
+        ties = [name for name, total in totals.items() if total <= bound]
+        if now in ties:
+            # A distance within the slack counts as none: equals would take turns for ever.
+            ties = [name for name in ties if distances[self._index[name]] > slack]
+        return ties[0] if ties else now
