@@ -10,7 +10,7 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import ROOT, Stopwatch, Took, in_turns, shared_core
 from dwell.model import Problem
 
-__all__ = ["CELL", "length", "measure"]
+__all__ = ["CELL", "PARTS", "length", "measure", "simulate_in_parts"]
 
 CELL = ROOT / "examples" / "canonical.yaml"
 SCENARIOS = ("baseline", "edge-cpu-stress")
@@ -72,13 +72,29 @@ def _simulate(
     """Simulate `times` runs, each with a seed of its own; note what each part took."""
     total = [Took(0.0, 0.0)] * len(PARTS)
     for seed in range(1, times + 1):
-        stopwatch = Stopwatch()
-        real = dwell.draw(problem, scenario=scenario, seed=seed, windows=windows)
-        drawn = stopwatch.lap()
-        run = dwell.simulate_realisation(problem, real, policy="dtp")
-        played = stopwatch.lap()
-        _ = run.windows, run.decisions
-        laps = (drawn, played, stopwatch.lap())
+        laps = simulate_in_parts(problem, scenario, policy="dtp", seed=seed, windows=windows)
         total = [before + lap for before, lap in zip(total, laps, strict=True)]
     parts.append(tuple(total))
     return total[0] + total[1] + total[2]
+
+
+def simulate_in_parts(
+    problem: Problem,
+    scenario: str,
+    *,
+    policy: str,
+    seed: int,
+    windows: int,
+    decisions: bool = True,
+) -> tuple[Took, Took, Took]:
+    """Simulate one run and return what each of `PARTS` took.
+
+    The table of windows is always made, that of decisions on request.
+    """
+    stopwatch = Stopwatch()
+    real = dwell.draw(problem, scenario=scenario, seed=seed, windows=windows)
+    drawn = stopwatch.lap()
+    run = dwell.simulate_realisation(problem, real, policy=policy)
+    played = stopwatch.lap()
+    _ = run.windows, run.decisions if decisions else None
+    return drawn, played, stopwatch.lap()

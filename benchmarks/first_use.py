@@ -21,7 +21,7 @@ __all__ = ["measure"]
 
 def measure(quick: bool) -> Section:
     """Seconds of the first simulation of a process, with an empty and with a filled cache."""
-    rounds = 1 if quick else 3
+    rounds = 1 if quick else 2
     empty: list[dict[str, Any]] = []
     filled: list[dict[str, Any]] = []
     for _ in range(rounds):

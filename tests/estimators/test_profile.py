@@ -302,7 +302,8 @@ def test_jobs_under_a_quota(exec_ms: float, threads: int, expected_ms: float) ->
     problem = make_problem([node], [Task("A", {"R1": fixed(exec_ms, threads)})])
     profile = Profile(problem, samples=10)
     assert profile.l95_ms["LOC"] == pytest.approx(expected_ms, abs=1e-6)
-    assert profile.own["LOC"]["R1"] == pytest.approx(exec_ms * threads / 400)
+    # Utilisation is relative to the quota: 0.4 of a core, over a period of 100 ms.
+    assert profile.own["LOC"]["R1"] == pytest.approx(exec_ms * threads / (100 * 0.4))
 
 
 def test_a_quota_that_is_wide_enough_changes_nothing() -> None:

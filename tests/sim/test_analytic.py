@@ -75,7 +75,8 @@ def poisson(problem: Problem, *, seed: int, windows: int) -> Realisation:
     real = dwell.draw(problem, scenario="baseline", seed=seed, windows=windows)
     mean = problem.pipeline.period_ms * MS
     gaps = np.random.default_rng(seed).exponential(mean, real.cycles + 1)
-    return dataclasses.replace(real, release_ns=np.cumsum(gaps).astype(np.int64))
+    moved: Realisation = dataclasses.replace(real, release_ns=np.cumsum(gaps).astype(np.int64))
+    return moved
 
 
 # ---------------------------------------------------------------------------- queueing theory

@@ -162,7 +162,8 @@ class _SampleCycles:
                     self._mean_ms(task, execution) * _stretch(execution, node) * held
                 )
         return {
-            name: work / (pipeline.period_ms * nodes[name].capacity) for name, work in work_ms.items()
+            name: work / (pipeline.period_ms * nodes[name].capacity)
+            for name, work in work_ms.items()
         }
 
     def _mean_ms(self, task: Task, execution: Execution) -> float:

@@ -7,7 +7,7 @@ what executes jobs: the CPU of a node, or one kind of its accelerators; a *hop* 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,11 +35,15 @@ CELL_MASK = (1 << CELL_BITS) - 1
 # What `advance` returns.
 PAUSED, FINISHED, GROW_EVENTS, GROW_RING = range(4)
 
-# Outcomes of cycles and jobs. As NumPy integers they are no literals to Numba, which compiles a
-# function once more for every literal it is called with.
-IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = (np.int64(code) for code in range(5))
-FIRST = np.int64(0)
-UNKNOWN = np.int64(-1)
+
+def _number(value: int) -> int:
+    """Return an integer that is no literal to Numba, which compiles functions anew for each."""
+    return cast(int, np.int64(value))
+
+
+# Outcomes of cycles and jobs.
+IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = (_number(code) for code in range(5))
+FIRST, UNKNOWN = _number(0), _number(-1)
 
 # Schedulers.
 FAIR, FIFO, PRIORITY = range(3)

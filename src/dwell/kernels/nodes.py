@@ -57,6 +57,7 @@ from dwell.kernels.layout import (
     STARTED,
     STRESS,
     THROTTLED,
+    UNKNOWN,
     USED,
     VIRTUAL,
     Tables,
@@ -227,7 +228,7 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
 def _preempt(s: Tables, server: int) -> bool:
     """Take the cores of the last running job behind the first waiting one, if there is any."""
     base = s.servers[server, BASE]
-    worst = np.int64(-1)
+    worst = UNKNOWN
     rank, ready, key = s.wait_rank[base], s.wait_ready[base], s.wait_key[base]
     for i in range(s.servers[server, N_RUN]):
         other = s.run_key[base + i]
@@ -239,7 +240,7 @@ def _preempt(s: Tables, server: int) -> bool:
         if other_rank > rank or (
             other_rank == rank and (other_ready > ready or (other_ready == ready and other > key))
         ):
-            worst, rank, ready, key = np.int64(i), other_rank, other_ready, other
+            worst, rank, ready, key = FIRST + i, other_rank, other_ready, other
     if worst < 0:
         return False
     row = key_row(s, key)
