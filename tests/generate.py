@@ -290,7 +290,9 @@ class _Maker:
         rng = self.rng
         if rng.random() >= 0.2:
             return None
-        return Quota(rng.choice([0.3, 0.5, 1, 1.7, 2.5]), rng.choice([1, 4, 10, 100]))
+        # Some ten of the quota's periods a cycle: the naive simulator looks at each.
+        period_ms = max(1.0, min(1000.0, round(self.period * rng.choice([0.03, 0.1, 0.5]))))
+        return Quota(rng.choice([0.3, 0.5, 1, 1.7, 2.5]), period_ms)
 
     def task(self, name: str, load: float, *, source: bool) -> Task:
         rng = self.rng
