@@ -31,7 +31,7 @@ __all__ = [
     "transmission_ns",
 ]
 
-COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, CLOSE, RELEASE = 1, 2, 3, 4, 5, 6, 7
+COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, CLOSE, RELEASE = range(1, 9)
 MASK = 2**64 - 1
 NEAR_NS = 1000
 
@@ -640,7 +640,7 @@ class Simulation:
             if site == name:
                 self.at(
                     self.now + nanoseconds(pool.task.start_ms),
-                    DISTURBANCE,
+                    RESTART,
                     -1,
                     self.index[task],
                     self.restarter(pool, name),
