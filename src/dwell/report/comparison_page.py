@@ -74,6 +74,8 @@ POLICY_NOTES = {
     "atp": "ATP, our reconstruction, moves one task to the edge and back by thresholds on L95 and "
     "utilisation.",
     "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
+    "work-function": "Work-function follows the optimum in hindsight over all windows so far, one "
+    "window late.",
 }
 TAGS: dict[Answer, tuple[str, str]] = {
     "agrees": ("agrees", "good"),
