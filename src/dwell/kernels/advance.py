@@ -124,7 +124,7 @@ def _progress(s: Tables, server: int, at: int) -> float:
     key = s.run_key[s.servers[server, BASE] + at]
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    site = s.jobs[job_row(s, cell, cycle, key & ITEM_MASK), SITE]
+    site = s.jobs[job_row(s.ring, s.stride, cell, cycle, key & ITEM_MASK), SITE]
     left = s.run_v[s.servers[server, BASE] + at] - s.servers_f[server, VIRTUAL]
     received: float = s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
     return received
@@ -179,7 +179,7 @@ def _lose_key(s: Tables, key: int, now: int) -> None:
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
     local = key & ITEM_MASK
-    drop_job(s, cell, cycle, local, job_row(s, cell, cycle, local), NODE_DOWN, now)
+    drop_job(s, cell, cycle, local, job_row(s.ring, s.stride, cell, cycle, local), NODE_DOWN, now)
 
 
 @phase
@@ -192,7 +192,7 @@ def _crash(s: Tables, server: int, now: int) -> None:
         if s.servers[server, IS_CPU] != 0:
             s.own[cell, s.servers[server, NODE_OF]] += _progress(s, server, FIRST)
         _lose_key(s, key, now)
-        leave(s, server, index(s.jobs[key_row(s, key), SITE]), now)
+        leave(s, server, index(s.jobs[key_row(s.ring, s.stride, key), SITE]), now)
     for i in range(s.servers[server, N_WAIT]):
         _lose_key(s, s.wait_key[base + i], now)
     s.servers[server, N_WAIT] = 0
@@ -288,7 +288,7 @@ def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
 @phase
 def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int) -> None:
     """Complete a job, unless its announcement has gone stale."""
-    row = job_row(s, cell, cycle, local)
+    row = job_row(s.ring, s.stride, cell, cycle, local)
     site = index(s.jobs[row, SITE])
     server = index(s.sites[site, SERVER])
     if s.servers[server, NEXT_KEY] != key or s.servers[server, NEXT_T] != now:
@@ -302,7 +302,7 @@ def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int
         return
     s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
     if n_out > 1:
-        s.slots[slot_row(s, cell, cycle), LIVE] += n_out - 1
+        s.slots[slot_row(s.ring, cell, cycle), LIVE] += n_out - 1
     first = s.tasks[task, OUT_0]
     for i in range(first, first + n_out):
         flow = s.out_flows[index(i)]
@@ -316,7 +316,7 @@ def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int
 @phase
 def _admit(s: Tables, cell: int, cycle: int, local: int, now: int) -> None:
     """A worker takes a job to its server."""
-    row = job_row(s, cell, cycle, local)
+    row = job_row(s.ring, s.stride, cell, cycle, local)
     site = index(s.jobs[row, SITE])
     key = job_key(cell, cycle, local)
     admit(s, site, key, row, s.exec_ns[site, cycle], now)
@@ -338,7 +338,7 @@ def _settle(s: Tables, now: int) -> None:
 @phase
 def _retry(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Send a message again after a lost attempt."""
-    slot = slot_row(s, cell, cycle)
+    slot = slot_row(s.ring, cell, cycle)
     attempt = s.attempts[slot, flow] + 1
     send(s, cell, cycle, flow, hop_of(s, cell, cycle, flow), attempt, now)
 
@@ -364,7 +364,7 @@ def _room(s: Tables) -> int:
     if key >> KIND_SHIFT == RELEASE:
         cell = (key >> CELL_SHIFT) & CELL_MASK
         cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-        if s.slots[slot_row(s, cell, cycle), LIVE] > 0:
+        if s.slots[slot_row(s.ring, cell, cycle), LIVE] > 0:
             return GROW_RING
     return PAUSED
 

@@ -106,7 +106,7 @@ def drop_job(
 ) -> None:
     """Lose a ready job, and with it its cycle."""
     _log(s, cell, cycle, row, local, outcome, now)
-    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+    s.slots[slot_row(s.ring, cell, cycle), LIVE] -= 1
     lose(s, cell, cycle, outcome)
 
 
@@ -116,7 +116,7 @@ def _append(s: Tables, cell: int, cycle: int, local: int, row: int, site: int) -
     if s.sites[site, WAITING] == 0:
         s.sites[site, HEAD] = cycle
     else:
-        s.jobs[job_row(s, cell, s.sites[site, TAIL], local), NEXT] = cycle
+        s.jobs[job_row(s.ring, s.stride, cell, s.sites[site, TAIL], local), NEXT] = cycle
     s.sites[site, TAIL] = cycle
     s.sites[site, WAITING] += 1
 
@@ -125,7 +125,7 @@ def _append(s: Tables, cell: int, cycle: int, local: int, row: int, site: int) -
 def _pop_input(s: Tables, cell: int, local: int, site: int) -> int:
     """Remove the oldest waiting job of a site and return its cycle."""
     cycle = s.sites[site, HEAD]
-    s.sites[site, HEAD] = s.jobs[job_row(s, cell, cycle, local), NEXT]
+    s.sites[site, HEAD] = s.jobs[job_row(s.ring, s.stride, cell, cycle, local), NEXT]
     s.sites[site, WAITING] -= 1
     return int(cycle)
 
@@ -140,7 +140,7 @@ def note_ready(s: Tables, cell: int, cycle: int, local: int) -> None:
 @phase
 def become_ready(s: Tables, cell: int, cycle: int, local: int, now: int) -> bool:
     """Let a ready job wait at its site, or lose it; True if an idle worker takes it at once."""
-    row = job_row(s, cell, cycle, local)
+    row = job_row(s.ring, s.stride, cell, cycle, local)
     s.jobs[row, READY] = now
     _log(s, cell, cycle, row, local, IN_FLIGHT, UNKNOWN)
     site = index(s.jobs[row, SITE])
@@ -157,7 +157,7 @@ def become_ready(s: Tables, cell: int, cycle: int, local: int, now: int) -> bool
             drop_job(s, cell, cycle, local, row, REPLACED, now)
             return False
         _pop_input(s, cell, local, site)
-        old_row = job_row(s, cell, oldest, local)
+        old_row = job_row(s.ring, s.stride, cell, oldest, local)
         drop_job(s, cell, oldest, local, old_row, REPLACED, now)
     _append(s, cell, cycle, local, row, site)
     return False
@@ -179,7 +179,7 @@ def drop_waiting(s: Tables, cell: int, local: int, site: int, now: int) -> None:
     """Lose everything that waits at a site, because its node went down."""
     while s.sites[site, WAITING] > 0:
         cycle = _pop_input(s, cell, local, site)
-        row = job_row(s, cell, cycle, local)
+        row = job_row(s.ring, s.stride, cell, cycle, local)
         drop_job(s, cell, cycle, local, row, NODE_DOWN, now)
 
 
@@ -187,12 +187,12 @@ def drop_waiting(s: Tables, cell: int, local: int, site: int, now: int) -> None:
 def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Handle a message that reaches its node, or that is lost on its link."""
     if flow & LOST_ON_LINK:
-        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+        s.slots[slot_row(s.ring, cell, cycle), LIVE] -= 1
         lose(s, cell, cycle, DROPPED)
         return
-    row = job_row(s, cell, cycle, s.flows[_flow_row(s, cell, flow), TARGET])
+    row = job_row(s.ring, s.stride, cell, cycle, s.flows[_flow_row(s, cell, flow), TARGET])
     if s.servers[index(s.sites[index(s.jobs[row, SITE]), SERVER]), DOWN] != 0:
-        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+        s.slots[slot_row(s.ring, cell, cycle), LIVE] -= 1
         lose(s, cell, cycle, NODE_DOWN)
         return
     hand_over(s, cell, cycle, flow, now)
@@ -201,7 +201,7 @@ def arrive(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
 @phase
 def finish(s: Tables, cell: int, cycle: int, row: int, now: int) -> None:
     """A sink has completed; the last one completes the cycle."""
-    slot = slot_row(s, cell, cycle)
+    slot = slot_row(s.ring, cell, cycle)
     s.slots[slot, LIVE] -= 1
     s.slots[slot, SINKS_LEFT] -= 1
     if s.slots[slot, SINKS_LEFT] == 0:
@@ -234,22 +234,22 @@ def hand_over(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Count an input in; the last one makes the job ready and names its critical path."""
     ends = _flow_row(s, cell, flow)
     local = s.flows[ends, TARGET]
-    row = job_row(s, cell, cycle, local)
+    row = job_row(s.ring, s.stride, cell, cycle, local)
     missing = s.jobs[row, MISSING] - 1
     s.jobs[row, MISSING] = missing
     if missing == 0:
-        sender = job_row(s, cell, cycle, s.flows[ends, SOURCE])
+        sender = job_row(s.ring, s.stride, cell, cycle, s.flows[ends, SOURCE])
         s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
         s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
         note_ready(s, cell, cycle, local)
     else:
-        s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+        s.slots[slot_row(s.ring, cell, cycle), LIVE] -= 1
 
 
 @phase
 def hop_of(s: Tables, cell: int, cycle: int, flow: int) -> int:
     """Hop that a flow takes in a cycle, -1 on the same node."""
-    return int(s.route[index(s.slots[slot_row(s, cell, cycle), CANDIDATE]), index(flow)])
+    return int(s.route[index(s.slots[slot_row(s.ring, cell, cycle), CANDIDATE]), index(flow)])
 
 
 @phase
@@ -260,7 +260,7 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
     sources = 0
     for local in range(s.cells[cell, N_TASKS]):
         task = index(first + local)
-        row = job_row(s, cell, cycle, local)
+        row = job_row(s.ring, s.stride, cell, cycle, local)
         n_in = s.tasks[task, N_IN]
         s.jobs[row, MISSING] = n_in
         s.jobs[row, STARTED] = -1
@@ -276,7 +276,7 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
         else:
             key = (START << KIND_SHIFT) | job_key(cell, cycle, local)
             push_event(s.clock, s.event_t, s.event_key, now + offset, key)
-    slot = slot_row(s, cell, cycle)
+    slot = slot_row(s.ring, cell, cycle)
     s.slots[slot, CYCLE] = cycle
     s.slots[slot, CANDIDATE] = candidate
     s.slots[slot, LIVE] = sources

@@ -40,16 +40,15 @@ __all__ = ["lose", "send", "slot_row"]
 
 
 @phase
-def slot_row(s: Tables, cell: int, cycle: int) -> int:
+def slot_row(ring: int, cell: int, cycle: int) -> int:
     """Row of a cycle in the ring of the cycles in flight."""
-    ring = s.ring
     return index(cell * ring + (cycle & (ring - 1)))
 
 
 @phase
 def lose(s: Tables, cell: int, cycle: int, outcome: int) -> None:
     """Mark a cycle as one that can never be done; its first loss names the outcome."""
-    slot = slot_row(s, cell, cycle)
+    slot = slot_row(s.ring, cell, cycle)
     if s.slots[slot, LOST] == 0:
         s.slots[slot, LOST] = 1
         s.outcome[cell, cycle] = outcome
@@ -84,7 +83,7 @@ def _lose_message(
         key = (ARRIVAL << KIND_SHIFT) | (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT)
         push_event(s.clock, s.event_t, s.event_key, at, key | flow | LOST_ON_LINK)
         return
-    s.slots[slot_row(s, cell, cycle), LIVE] -= 1
+    s.slots[slot_row(s.ring, cell, cycle), LIVE] -= 1
     lose(s, cell, cycle, outcome)
 
 
@@ -113,7 +112,7 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
             # A link that holds messages back and is down for good: it waits for ever.
             _lose_message(s, cell, cycle, flow, IN_FLIGHT, now, now)
         else:
-            s.attempts[slot_row(s, cell, cycle), flow] = attempt
+            s.attempts[slot_row(s.ring, cell, cycle), flow] = attempt
             key = (RETRY << KIND_SHIFT) | name
             push_event(s.clock, s.event_t, s.event_key, sent + timeout, key)
         return

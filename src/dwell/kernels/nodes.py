@@ -80,18 +80,17 @@ SLACK = 1e-3
 
 
 @phase
-def job_row(s: Tables, cell: int, cycle: int, local: int) -> int:
+def job_row(ring: int, stride: int, cell: int, cycle: int, local: int) -> int:
     """Row of a job in the ring of the cycles in flight."""
-    ring = s.ring
-    return index((cell * ring + (cycle & (ring - 1))) * s.stride + local)
+    return index((cell * ring + (cycle & (ring - 1))) * stride + local)
 
 
 @phase
-def key_row(s: Tables, key: int) -> int:
+def key_row(ring: int, stride: int, key: int) -> int:
     """Row of the job that a key names."""
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    return job_row(s, cell, cycle, key & ITEM_MASK)
+    return job_row(ring, stride, cell, cycle, key & ITEM_MASK)
 
 
 @phase
@@ -234,7 +233,7 @@ def _preempt(s: Tables, server: int) -> bool:
         other = s.run_key[base + i]
         if s.run_v[index(base + i)] - s.servers_f[server, VIRTUAL] <= SLACK:
             continue  # it has all its work and completes at this very instant
-        row = key_row(s, other)
+        row = key_row(s.ring, s.stride, other)
         other_rank = s.sites[index(s.jobs[row, SITE]), RANK]
         other_ready = s.jobs[row, READY]
         if other_rank > rank or (
@@ -243,7 +242,7 @@ def _preempt(s: Tables, server: int) -> bool:
             worst, rank, ready, key = FIRST + i, other_rank, other_ready, other
     if worst < 0:
         return False
-    row = key_row(s, key)
+    row = key_row(s.ring, s.stride, key)
     left = s.run_v[base + worst] - s.servers_f[server, VIRTUAL]
     pop_running(s.run_v, s.run_key, base, s.servers[server, N_RUN], worst)
     s.servers[server, N_RUN] -= 1
@@ -265,7 +264,7 @@ def dispatch(s: Tables, server: int, now: int) -> None:
     preemptive = s.servers[server, SCHEDULER] == PRIORITY
     while s.servers[server, N_WAIT] > 0:
         key = s.wait_key[base]
-        row = key_row(s, key)
+        row = key_row(s.ring, s.stride, key)
         site = index(s.jobs[row, SITE])
         need = s.sites[site, NEED]
         if s.servers[server, USED] + need <= s.servers[server, CORES]:
