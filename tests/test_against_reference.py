@@ -39,7 +39,7 @@ from tests.generate import (
 )
 from tests.reference_simulator import NEAR_NS, CycleResult, Result, attempt_uniform, simulate
 
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "120"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
 FAIR_TOLERANCE_NS = NEAR_NS
 MOST_EXCLUDED = 0.1
 

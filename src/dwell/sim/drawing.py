@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.kernels.streams import ar1_path
+from dwell.kernels.compiled import COMPILED
+from dwell.kernels.streams import ar1_path, nanoseconds, standard_normals
 from dwell.model import (
     AR1,
     Bursts,
@@ -87,6 +88,17 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
     return _Draw(problem, scenario, disturbances, seed, windows).realisation()
 
 
+class _Generator(np.random.Generator):
+    """NumPy's generator, with normals drawn by compiled code: the same ones, in half the time."""
+
+    def standard_normal(self, size: int) -> Floats:  # type: ignore[override]
+        if not COMPILED:
+            return super().standard_normal(size)
+        out = np.empty(size)
+        standard_normals(self, out)
+        return out
+
+
 class _Draw:
     """One drawing in progress: the seed, the releases and the rows that traces share."""
 
@@ -121,7 +133,7 @@ class _Draw:
         )
 
     def _rng(self, name: str) -> np.random.Generator:
-        return np.random.Generator(np.random.SFC64(stream(self.seed, name)))
+        return _Generator(np.random.SFC64(stream(self.seed, name)))
 
     def _key(self, name: str) -> int:
         return int(stream(self.seed, name).generate_state(1, np.uint64)[0])
@@ -163,9 +175,7 @@ class _Draw:
             values, state = self._block(process, rng, begin, end, state)
             if scale is not None:
                 values *= scale[begin:end]
-            values *= NS_PER_MS
-            np.minimum(values, LONGEST_NS, out=values)
-            out[begin:end] = np.rint(values, out=values)
+            nanoseconds(values, NS_PER_MS, LONGEST_NS, out[begin:end])
 
     def _block(
         self, process: Process, rng: np.random.Generator, begin: int, end: int, state: float

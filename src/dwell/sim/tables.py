@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ __all__ = ["Played", "make_tables"]
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(slots=True)
@@ -54,6 +55,17 @@ class Played:
         """Cycles of every window, shape (windows, W)."""
         return self.first[:, None] + np.arange(self.problem.window_cycles)
 
+    def by_window(self, cycles: NDArray[T]) -> NDArray[T]:
+        """Values of cycles as rows of windows, (windows, W); a view where none is left out."""
+        if self.whole:
+            return cycles[: self.released].reshape(-1, self.problem.window_cycles)
+        return cycles[self.rows]
+
+    @property
+    def whole(self) -> bool:
+        """Whether every cycle up to the last close is in a window."""
+        return self.released == len(self.first) * self.problem.window_cycles
+
     @property
     def released(self) -> int:
         """Number of cycles played: those up to the last close.
@@ -76,8 +88,8 @@ class Played:
         tables, count = self.arrays.tables, len(self.first)
         used = tables.closed[0, :count] - tables.opened[0, :count]
         return ClosedWindow(
-            latency_ns=tables.latency_ns[0][self.rows],
-            release_ns=self.realisation.release_ns[self.rows],
+            latency_ns=self.by_window(tables.latency_ns[0]),
+            release_ns=self.by_window(self.realisation.release_ns),
             close_ns=self.close_ns[:, None],
             open_ns=self.realisation.release_ns[self.first][:, None],
             core_ns=used,
@@ -87,9 +99,12 @@ class Played:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > round(self.problem.pipeline.deadline_ms * 1e6)
-        rows = self.rows
-        age_ns = self.close_ns[:, None] - self.realisation.release_ns[rows]
-        missed[rows] |= latency_ns[rows] > age_ns
+        age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
+        late = self.by_window(latency_ns) > age_ns
+        if self.whole:
+            missed |= late.ravel()
+        else:
+            missed[self.rows] |= late
         return missed
 
 
@@ -153,7 +168,7 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
     import polars as pl
 
     problem = played.problem
-    stamps = played.arrays.tables.stamps[0][played.rows]
+    stamps = played.by_window(played.arrays.tables.stamps[0])
     count = len(played.first)
     return pl.DataFrame(
         {
@@ -162,8 +177,8 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
             "warmup": np.arange(count) < problem.warmup_windows,
             "placement": _names(stamps[:, 0], tuple(problem.candidates)),
             "mixed": (stamps != stamps[:, :1]).any(axis=1),
-            "l95_ms": final_l95_ms(played.arrays.tables.latency_ns[0][played.rows]),
-            "violation_rate": played.missed()[played.rows].mean(axis=1),
+            "l95_ms": final_l95_ms(played.by_window(played.arrays.tables.latency_ns[0])),
+            "violation_rate": played.by_window(played.missed()).mean(axis=1),
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
