@@ -56,7 +56,7 @@ bench: env ## Run the benchmarks
 lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
 	$(COMPILE) --group uv --output-file requirements/uv.txt
 	$(COMPILE) pyproject.toml --output-file requirements/runtime.txt
-	$(COMPILE) pyproject.toml --group dev --constraint requirements/runtime.txt \
+	$(COMPILE) pyproject.toml --all-extras --group dev --constraint requirements/runtime.txt \
 		--output-file requirements/dev.txt
 	@! grep -nE '://|^ *--(index|extra-index|find-links|trusted-host)' requirements/*.txt
 

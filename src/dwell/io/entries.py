@@ -582,8 +582,28 @@ class ControllerEntry(Entry):
     min_improvement: Annotated[float, Number(bounds.MIN_IMPROVEMENT)] | None = Field(
         None, description="Improvement of J that a migration must promise; default 0.05."
     )
+    escape: bool | None = Field(
+        None,
+        description="Whether an incumbent over a cap may leave before the hysteresis is met; "
+        "default false.",
+    )
     estimator: str | None = Field(
-        None, description="How the QoS of candidates is estimated; default `profile`."
+        None,
+        description="How the QoS of candidates is estimated: `profile` (default), `shadow`, "
+        "`scaling` or `corrected`.",
+    )
+    shadow_fraction: Annotated[float, Number(bounds.SHADOW_FRACTION)] | None = Field(
+        None,
+        description="Share of cycles that are also sent through each alternative, where the "
+        "estimator uses shadow jobs; default 0.05.",
+    )
+    half_life_windows: Annotated[float, Number(bounds.HALF_LIFE_WINDOWS)] | None = Field(
+        None, description="Windows after which a measurement counts half; default 2."
+    )
+    migration: str | None = Field(
+        None,
+        description="`warm` (default): a moved task is ready at once; `cold`: after its "
+        "`start_ms` and the transfer of its `state_bytes`.",
     )
     guard_cycles: Annotated[int, Number(bounds.GUARD_CYCLES)] | None = Field(
         None,

@@ -25,6 +25,9 @@ __all__ = ["Parts", "find_faults", "nearest"]
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
 LONGEST_NAME = 64
+# Estimators that send shadow jobs, and how far shares may sum up beyond 1 by rounding.
+SHADOWING = ("shadow", "corrected")
+SHARE_TOLERANCE = 1e-9
 
 
 @dataclass(slots=True)
@@ -277,3 +280,43 @@ def _controller(parts: Parts) -> Iterator[Fault]:
         yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
     known = [*parts.reserved, *names]
     yield from _unknown("controller.policy", "policy", settings.policy, known)
+    yield from _shadow_budget(settings, len(names))
+    if settings.migration == "cold" and parts.links_complete:
+        yield from _state_transfers(parts)
+
+
+def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:
+    """A cycle is sent through one alternative at most."""
+    alternatives = max(candidates - 1, 1)
+    if (
+        settings.estimator in SHADOWING
+        and settings.shadow_fraction * alternatives > 1 + SHARE_TOLERANCE
+    ):
+        yield Fault(
+            "controller.shadow_fraction",
+            f"{settings.shadow_fraction:g} of the cycles through each of {alternatives} "
+            f"alternatives is more than all cycles; at most {1 / alternatives:.4g}",
+        )
+
+
+def _state_transfers(parts: Parts) -> Iterator[Fault]:
+    """A cold migration carries the state of a task over a direct link."""
+    links = {f"{link.source}->{link.target}" for _, link in parts.links}
+    for name, task in parts.tasks.items():
+        if task is None or task.state_bytes == 0:
+            continue
+        hosts = dict.fromkeys(
+            placement[name] for placement in parts.candidates.values() if name in placement
+        )
+        missing = [
+            f"{source}->{target}"
+            for source in hosts
+            for target in hosts
+            if source != target and f"{source}->{target}" not in links
+        ]
+        if missing:
+            yield Fault(
+                f"tasks.{name}.state_bytes",
+                f"its state cannot be carried where there is no link {', '.join(missing)}; "
+                "declare it, or use migration: warm",
+            )

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import (
     GUARD_CYCLES,
+    HALF_LIFE_WINDOWS,
     LEAD_CYCLES,
     MIN_DWELL,
     MIN_IMPROVEMENT,
+    SHADOW_FRACTION,
     TIME_MS,
     WARMUP_WINDOWS,
     WINDOW_CYCLES,
@@ -24,10 +26,11 @@ from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.scenario import Scenario
 
-__all__ = ["ESTIMATORS", "POLICIES", "ControllerSettings", "Problem"]
+__all__ = ["ESTIMATORS", "MIGRATIONS", "POLICIES", "ControllerSettings", "Problem"]
 
 POLICIES = ("dtp", "atp", "latency-first", "work-function")
-ESTIMATORS = ("profile",)
+ESTIMATORS = ("profile", "shadow", "scaling", "corrected")
+MIGRATIONS = ("warm", "cold")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +49,17 @@ class ControllerSettings:
         N_min, windows.
     min_improvement : float
         Delta_min, in units of J.
+    escape : bool
+        Whether an incumbent over a cap may leave before the hysteresis is met.
     estimator : str
+    shadow_fraction : float
+        Share of the cycles that are also sent through each alternative, where the estimator
+        measures it with shadow jobs.
+    half_life_windows : float
+        Age at which what an estimator has measured counts half.
+    migration : str
+        ``warm``: a moved task is ready at once; ``cold``: after its ``start_ms`` and the transfer
+        of its ``state_bytes``.
     guard_cycles : int
         Periods without a completion after which the guard on the robot moves to a fallback.
     fallbacks : tuple of str
@@ -64,7 +77,11 @@ class ControllerSettings:
     initial: str | None = None
     min_dwell: int = 3
     min_improvement: float = 0.05
+    escape: bool = False
     estimator: str = "profile"
+    shadow_fraction: float = 0.05
+    half_life_windows: float = 2.0
+    migration: str = "warm"
     guard_cycles: int = 3
     fallbacks: tuple[str, ...] = ()
     order_delay_ms: float = 0.0
@@ -79,8 +96,12 @@ class ControllerSettings:
         TIME_MS.check("order_delay_ms", self.order_delay_ms)
         TIME_MS.check("close_grace_ms", self.close_grace_ms)
         object.__setattr__(self, "fallbacks", tuple(self.fallbacks))
+        SHADOW_FRACTION.check("shadow_fraction", self.shadow_fraction)
+        HALF_LIFE_WINDOWS.check("half_life_windows", self.half_life_windows)
         bound = f"one of {', '.join(ESTIMATORS)}"
         require(self.estimator in ESTIMATORS, "estimator", self.estimator, bound)
+        bound = f"one of {', '.join(MIGRATIONS)}"
+        require(self.migration in MIGRATIONS, "migration", self.migration, bound)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,12 +13,17 @@ cases decided:
   incumbent, the window is a hold whatever Delta J says, and n_d grows.
 * A candidate over a cap is not eligible. If none is eligible, those closest to their caps are
   compared by J as usual, and the reason is ``infeasible``; the hysteresis still applies.
+
+``escape`` is an addition to the algorithm, off by default: an incumbent that was seen over a cap
+moves to the cheapest candidate within its caps, if there is one, whatever n_d and Delta J say. The
+bounds on migrations do not hold then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from dwell.cost import excess
 from dwell.errors import MetricError
 from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
@@ -52,6 +57,8 @@ class DTP:
         N_min, windows; 0 lets every window migrate.
     min_improvement : float
         Delta_min, in units of J: an improvement must exceed it.
+    escape : bool
+        Whether an incumbent over a cap may leave before the hysteresis is met.
 
     Raises
     ------
@@ -68,19 +75,21 @@ class DTP:
         objective: Objective,
         min_dwell: int = 3,
         min_improvement: float = 0.05,
+        escape: bool = False,
     ) -> None:
         self.candidates = check_candidates(candidates)
         self.initial = check_name("initial", initial, self.candidates)
         self.objective = objective
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self.min_improvement = check_parameter("min_improvement", min_improvement, MIN_IMPROVEMENT)
+        self.escape = escape
         self._pricing = Pricing(self.candidates, objective)
         self._incumbent = Incumbent(self.candidates, self.initial)
 
     def __repr__(self) -> str:
         return (
             f"DTP(initial={self.initial!r}, min_dwell={self.min_dwell}, "
-            f"min_improvement={self.min_improvement:g})"
+            f"min_improvement={self.min_improvement:g}{', escape=True' if self.escape else ''})"
         )
 
     @property
@@ -122,6 +131,11 @@ class DTP:
         costs = NOT_PRICED
         if estimates is not None:
             costs = pricing.estimated(estimates, incumbent.name)
+        if self.escape and estimates is not None and excess(observed, self.objective) > 0:
+            eligible, within_caps = pricing.eligible({**estimates, incumbent.name: observed})
+            if within_caps:
+                best = cheapest(costs, eligible, incumbent.name)
+                return incumbent.move(best, "migrate", costs, measured - costs[best])
         if incumbent.dwell < self.min_dwell:
             return incumbent.stay("dwell", costs)
         if estimates is None:

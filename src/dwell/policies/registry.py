@@ -49,6 +49,7 @@ def _dtp(problem: Problem) -> DTP:
         objective=problem.objective,
         min_dwell=problem.controller.min_dwell,
         min_improvement=problem.controller.min_improvement,
+        escape=problem.controller.escape,
     )
 
 
