@@ -1,8 +1,9 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
 from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
+from dwell.control.shadows import shadow_stamps
 from dwell.control.windows import NEVER_NS, final_l95_ms
-from dwell.estimators import Estimator
+from dwell.estimators import Estimator, Evidence, Instants
 from dwell.policies import MinimalPolicy
 
 __all__ = [
@@ -10,8 +11,11 @@ __all__ = [
     "ClosedWindow",
     "Controller",
     "Estimator",
+    "Evidence",
+    "Instants",
     "Log",
     "MinimalPolicy",
     "final_l95_ms",
+    "shadow_stamps",
     "static_columns",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dwell.control.windows import missed_cycles, seen_l95_ns, utilisation
 from dwell.cost import hamming, price, tier_nodes
 from dwell.errors import PolicyError
-from dwell.estimators import Estimator, Profile
+from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Decision, FrozenDict, Problem, QoS
 from dwell.policies import MinimalPolicy, Static
@@ -37,8 +37,10 @@ class ClosedWindow:
         Instant of the close.
     open_ns : int, or int64 array of shape (windows, 1)
         Release of its first cycle.
-    core_ns : float64 array, shape (2, nodes) or (windows, 2, nodes)
-        Core-nanoseconds in the window: of all work, and of the cell's own jobs.
+    core_ns : float64 array, shape (3, nodes) or (windows, 3, nodes)
+        Core-nanoseconds in the window: of all work, of the cell's own jobs, of its shadow jobs.
+    evidence : callable, optional
+        Makes the window's `Evidence`, for estimators that learn from it.
     """
 
     latency_ns: Ints
@@ -46,6 +48,7 @@ class ClosedWindow:
     close_ns: Ints | int
     open_ns: Ints | int
     core_ns: Floats
+    evidence: Callable[[], Evidence] | None = None
 
 
 @dataclass(slots=True)
@@ -63,20 +66,23 @@ class Log:
     decisions : list of tuple
         ``(window, incumbent, placement, migrated, reason, dwell, delta_j)``, then J of every
         candidate (None where not priced), then the estimated L95 (ms) and violation rate of every
-        candidate.
+        candidate, and where the estimator says it, how many samples stand behind the estimate and
+        how old (windows) the newest is.
     """
 
     seen: list[tuple[float | None, ...]] = field(default_factory=list)
     decisions: list[tuple[object, ...]] = field(default_factory=list)
 
-    def columns(self, candidates: Iterable[str]) -> tuple[str, ...]:
+    def columns(self, candidates: Iterable[str], *, support: bool = False) -> tuple[str, ...]:
         """Names of the decisions' columns."""
         names = tuple(candidates)
+        behind = ("est_samples", "est_age_windows") if support else ()
         return (
             *("window", "incumbent", "placement", "migrated", "reason", "dwell", "delta_j"),
             *(f"j_{name}" for name in names),
             *(f"est_l95_ms_{name}" for name in names),
             *(f"est_violation_rate_{name}" for name in names),
+            *(f"{what}_{name}" for what in behind for name in names),
         )
 
 
@@ -111,6 +117,13 @@ class Controller:
             self.estimator = estimator_by_name(name, problem)
         else:
             self.estimator = copy.deepcopy(estimator)
+            start = getattr(self.estimator, "start", None)
+            if start is not None:
+                start(problem)
+        self._support: Callable[[], Mapping[str, Support]] | None = getattr(
+            self.estimator, "support", None
+        )
+        self._learner = self.estimator if isinstance(self.estimator, Learner) else None
         initial = getattr(self.policy, "initial", None)
         known = isinstance(initial, str) and initial in problem.candidates
         self.incumbent = str(initial) if known else problem.initial
@@ -128,6 +141,16 @@ class Controller:
         }
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ns = round(problem.censor_ms * 1e6)
+
+    @property
+    def learns(self) -> bool:
+        """Whether windows have to bring their evidence."""
+        return self._learner is not None
+
+    @property
+    def shadow_fraction(self) -> float:
+        """Share of the cycles that the estimator wants sent through each alternative."""
+        return float(getattr(self.estimator, "shadow_fraction", 0.0))
 
     @property
     def fixed_profile(self) -> Profile | None:
@@ -152,14 +175,21 @@ class Controller:
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms = int(seen_l95_ns(window.latency_ns, age_ns, self._censor_ns)) / 1e6
-        used, own = self.utilisation(window).tolist()
+        used, own, shadow = self.utilisation(window)
+        if self._learner is not None and window.evidence is not None:
+            self._learner.learn(window.evidence())
         return self.decide(
-            QoS(l95_ms, missed / len(age_ns), FrozenDict(zip(self.nodes, used, strict=True))),
-            dict(zip(self.nodes, own, strict=True)),
+            QoS(
+                l95_ms,
+                missed / len(age_ns),
+                FrozenDict(zip(self.nodes, used.tolist(), strict=True)),
+            ),
+            # Neither the cell's jobs nor its shadow jobs are foreign.
+            dict(zip(self.nodes, (own + shadow).tolist(), strict=True)),
         )
 
     def utilisation(self, window: ClosedWindow) -> Floats:
-        """Busy and own share of every node's cores, shape (..., 2, nodes)."""
+        """Busy, own and shadow share of every node's cores, shape (..., 3, nodes)."""
         span_ns = window.close_ns - window.open_ns
         if isinstance(span_ns, np.ndarray):
             span_ns = span_ns[..., None]
@@ -213,8 +243,21 @@ class Controller:
                 *[costs.get(name) for name in names],
                 *[estimate.l95_ms for estimate in known],
                 *[estimate.violation_rate for estimate in known],
+                *self._supported(),
             )
         )
+
+    @property
+    def supports(self) -> bool:
+        """Whether the estimator says how much stands behind its estimates."""
+        return self._support is not None
+
+    def _supported(self) -> list[float]:
+        if self._support is None:
+            return []
+        support = self._support()
+        behind = [support[name] for name in self._names]
+        return [known.samples for known in behind] + [known.age_windows for known in behind]
 
     def miss(self) -> None:
         """Record a window whose close the controller did not see, because its node was down."""

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import MetricError
+from dwell.estimators.paths import longest_path, order_statistic
 from dwell.model.fabric import Link, Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.pipeline import Execution, Flow, Task
@@ -37,7 +38,7 @@ from dwell.model.problem import Problem
 from dwell.model.process import Process, Trace, require
 from dwell.model.qos import QoS
 
-__all__ = ["Profile"]
+__all__ = ["Profile", "SampleCycles"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ class Profile:
     def __init__(self, problem: Problem, samples: int = 4000, seed: int = SEED) -> None:
         require(1 <= samples <= 10_000_000, "samples", samples, "from 1 to 10000000")
         require(seed >= 0, "seed", seed, "a whole number of at least 0")
-        cycles = _SampleCycles(problem, samples, seed)
+        cycles = SampleCycles(problem, samples, seed)
         l95_ms, violation_rate, own = {}, {}, {}
         for name, placement in problem.candidates.items():
             latency_ms = cycles.latency_ms(placement)
@@ -117,13 +118,7 @@ class Profile:
         return estimates
 
 
-def order_statistic(values: Floats) -> float:
-    """L95: the ceil(0.95 n)-th smallest of n values, never interpolated."""
-    rank = (19 * len(values) + 19) // 20  # in integers: 0.95 * n is not exact
-    return float(np.partition(values, rank - 1)[rank - 1])
-
-
-class _SampleCycles:
+class SampleCycles:
     """Draws of every process that some candidate needs, for the same `samples` cycles."""
 
     def __init__(self, problem: Problem, samples: int, seed: int) -> None:
@@ -136,16 +131,11 @@ class _SampleCycles:
 
     def latency_ms(self, placement: Placement) -> Floats:
         """Latency of every sample cycle, censored; shape (samples,), milliseconds."""
-        pipeline = self.problem.pipeline
-        finish: dict[str, Floats] = {}
-        for name in pipeline.topological():
-            task = pipeline.tasks[name]
-            ready = np.full(self.samples, float(task.offset_ms))
-            for flow in pipeline.inputs(name):
-                np.maximum(ready, finish[flow.source] + self._sent(flow, placement), out=ready)
-            finish[name] = ready + self._executed(task, placement[name])
-        sinks = [finish[name] for name in pipeline.tasks if not pipeline.outputs(name)]
-        latency: Floats = np.maximum.reduce(sinks)
+        latency = longest_path(
+            self.problem.pipeline,
+            lambda task: self.executed(task, placement[task]),
+            lambda flow: self.sent(flow, placement),
+        )
         # To whole nanoseconds, as everything is timed: 0.1 + 0.2 must not miss a deadline of 0.3.
         return np.minimum(np.round(latency, 6), self.problem.censor_ms)
 
@@ -176,12 +166,13 @@ class _SampleCycles:
             return float((process.values * scale.values).mean())
         return process.expectation * scale.expectation
 
-    def _executed(self, task: Task, node_name: str) -> Floats:
+    def executed(self, task_name: str, node_name: str) -> Floats:
         """Execution times of a task on a node that runs nothing else."""
-        key = (task.name, node_name)
+        key = (task_name, node_name)
         if key not in self._exec:
+            task = self.problem.pipeline.tasks[task_name]
             node, execution = self.problem.fabric.nodes[node_name], task.on[node_name]
-            times = self._draw(execution.exec_ms, f"exec/{task.name}/{node_name}")
+            times = self._draw(execution.exec_ms, f"exec/{task_name}/{node_name}")
             if task.scale is not None:
                 scale = self.problem.pipeline.scales[task.scale]
                 times = times * self._draw(scale, f"scale/{task.scale}")
@@ -190,7 +181,7 @@ class _SampleCycles:
             self._exec[key] = times
         return self._exec[key]
 
-    def _sent(self, flow: Flow, placement: Placement) -> Floats:
+    def sent(self, flow: Flow, placement: Placement) -> Floats:
         """Times between a flow's output and input; infinite where the message is lost."""
         source, target = placement[flow.source], placement[flow.target]
         if source == target:

@@ -3,11 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
+from dwell.estimators.evidence import Evidence
+from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
-__all__ = ["Estimator"]
+__all__ = ["Estimator", "Learner", "Support"]
+
+
+class Support(NamedTuple):
+    """How much stands behind an estimate.
+
+    Parameters
+    ----------
+    samples : float
+        Number of samples, or their weight.
+    age_windows : float
+        Windows since the newest.
+    """
+
+    samples: float
+    age_windows: float
 
 
 @runtime_checkable
@@ -39,4 +56,28 @@ class Estimator(Protocol):
         MetricError
             If a node's utilisation is missing.
         """
+        ...
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """An estimator that learns from what happened to jobs and messages.
+
+    It may have an attribute ``shadow_fraction``, the share of the cycles that it wants sent through
+    each alternative as well, and a method ``support()`` that gives a `Support` for each candidate.
+    It is started before a run.
+    """
+
+    def start(self, problem: Problem) -> None:
+        """Forget everything that was learnt."""
+        ...
+
+    def learn(self, evidence: Evidence) -> None:
+        """Take in a window; called before `estimate` for the same window."""
+        ...
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """As `Estimator.estimate`."""
         ...

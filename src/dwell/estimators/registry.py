@@ -5,15 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dwell.errors import ProblemError
+from dwell.estimators.corrected import Corrected
 from dwell.estimators.profile import Profile
 from dwell.estimators.protocol import Estimator
+from dwell.estimators.scaling import Scaling
+from dwell.estimators.shadow import Shadow
 from dwell.model.meaning import nearest
 from dwell.model.problem import Problem
 
 __all__ = ["REGISTRY", "by_name"]
 
 #: Makers by name; the same names as ``dwell.model.problem.ESTIMATORS``.
-REGISTRY: dict[str, Callable[[Problem], Estimator]] = {"profile": Profile}
+REGISTRY: dict[str, Callable[[Problem], Estimator]] = {
+    "profile": Profile,
+    "shadow": Shadow,
+    "scaling": Scaling,
+    "corrected": Corrected,
+}
 
 
 def by_name(name: str, problem: Problem) -> Estimator:

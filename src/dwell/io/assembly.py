@@ -12,10 +12,12 @@ from dwell.io.entries import (
     ControllerEntry,
     DisturbanceEntry,
     Entry,
+    EpisodesEntry,
     LinkEntry,
     NodeEntry,
     ObjectiveEntry,
     ProcessEntry,
+    ServoEntry,
     TaskEntry,
 )
 from dwell.io.faults import Faults
@@ -27,6 +29,7 @@ from dwell.model import (
     Constant,
     ControllerSettings,
     Disturbance,
+    Episodes,
     Execution,
     Exponential,
     Fabric,
@@ -35,6 +38,7 @@ from dwell.model import (
     Link,
     LinkDisturbance,
     LogNormal,
+    MovingTarget,
     Node,
     NodeDisturbance,
     Normal,
@@ -44,6 +48,7 @@ from dwell.model import (
     Problem,
     Process,
     Quota,
+    Servo,
     Targets,
     Task,
     Trace,
@@ -111,6 +116,7 @@ class Assembly:
         timing = self._timing()
         objective = self._objective(entry.objective or ObjectiveEntry(), nodes)
         controller = self._controller(entry.controller or ControllerEntry())
+        servo = self._servo(entry.servo)
         scenarios = {
             name: list(self._disturbances(name, items or ()))
             for name, items in (entry.scenarios or {}).items()
@@ -155,6 +161,7 @@ class Assembly:
             objective=objective,
             scenarios={name: tuple(item for _, item in items) for name, items in scenarios.items()},
             controller=controller,
+            servo=servo,
             **_given(window_cycles=entry.window_cycles, warmup_windows=entry.warmup_windows),
         )
 
@@ -325,6 +332,14 @@ class Assembly:
             if getattr(entry, key) is not None:
                 self.faults.add(f"{path}.{key}", f"belongs to a disturbance of {what}; remove it")
 
+    def _episodes(self, entry: EpisodesEntry | None, path: str) -> Episodes | None:
+        # What is at fault must not be said to differ from what shares its name, too.
+        if entry is None or self.faults.touches(path):
+            return None
+        every_s = self._process(entry.every_s, f"{path}.every_s")
+        for_s = self._process(entry.for_s, f"{path}.for_s")
+        return Episodes(entry.name, every_s, for_s)
+
     def _node_disturbance(self, path: str, entry: DisturbanceEntry) -> Disturbance:
         return NodeDisturbance(
             entry.node or "",
@@ -333,6 +348,8 @@ class Assembly:
                 for_s=entry.for_s,
                 stress_threads=entry.stress_threads,
                 down=entry.down,
+                episodes=self._episodes(entry.episodes, f"{path}.episodes"),
+                ramp_s=entry.ramp_s,
             ),
         )
 
@@ -350,6 +367,8 @@ class Assembly:
                 loss=entry.loss,
                 rate_mbps=entry.rate_mbps,
                 down=entry.down,
+                episodes=self._episodes(entry.episodes, f"{path}.episodes"),
+                ramp_s=entry.ramp_s,
             ),
         )
 
@@ -378,6 +397,16 @@ class Assembly:
         if entry.fallbacks is not None:
             values["fallbacks"] = tuple(entry.fallbacks)
         return self.faults.attempt("controller", ControllerSettings, **values)
+
+    def _servo(self, entry: ServoEntry | None) -> Servo | None:
+        if entry is None:
+            return None
+        target = MovingTarget(entry.target.amplitude_mm, entry.target.period_s)
+        values = {**_values(entry), "target": target}
+        servo = self.faults.attempt("servo", Servo, **values)
+        if servo is not None and not self.faults.at("period_ms"):
+            self.faults.attempt("", servo.require_seen, self.entry.period_ms)
+        return servo
 
     # --------------------------------------------------------------------------- meaning
 

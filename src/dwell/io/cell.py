@@ -11,11 +11,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike, fspath
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dwell.io.faults import Faults
 from dwell.model import Problem
 
-__all__ = ["from_document", "load"]
+if TYPE_CHECKING:
+    from dwell.io.traces import Tables
+
+__all__ = ["from_document", "load", "read_problem"]
 
 
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
@@ -46,7 +50,7 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
     folder = Path(source).parent if traces is None else Path(traces)
-    return _read(text, faults, folder, Path(source).stem or "cell")
+    return read_problem(text, faults, folder, Path(source).stem or "cell")
 
 
 def from_document(
@@ -75,17 +79,47 @@ def from_document(
     ProblemError
         With every fault found.
     """
-    return _read(document, Faults(source), Path(folder), "cell")
+    return read_problem(document, Faults(source), Path(folder), "cell")
 
 
-def _read(document: object, faults: Faults, folder: Path, name: str) -> Problem:
+def read_problem(
+    document: object,
+    faults: Faults,
+    folder: Path,
+    name: str,
+    known: dict[object, Tables] | None = None,
+) -> Problem:
+    """Read a document into a Problem.
+
+    Parameters
+    ----------
+    document : object
+        Plain values.
+    faults : Faults
+        Those of the document so far, and the lines of its values.
+    folder : Path
+        Where the traces that it names are.
+    name : str
+        For a cell that does not name itself.
+    known : dict, optional
+        Traces that were read for documents like this one; takes those that are read now.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
     from dwell.io.assembly import Assembly
-    from dwell.io.structure import read_structure
-    from dwell.io.traces import read_traces
+    from dwell.io.faults import dotted
+    from dwell.io.structure import CELL, read_structure
+    from dwell.io.traces import declared_traces, read_traces
 
-    entry = read_structure(document, faults)
-    tables = read_traces(entry, folder, faults)
-    problem = Assembly(entry, tables, faults).problem(name)
+    known = {} if known is None else known
+    entry = read_structure(document, faults, CELL)
+    declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
+    if declared not in known:
+        known[declared] = read_traces(entry, folder, faults)
+    problem = Assembly(entry, known[declared], faults).problem(name)
     if problem is None or faults:
         raise faults.error()
     return problem

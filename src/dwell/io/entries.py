@@ -32,6 +32,7 @@ __all__ = [
     "ControllerEntry",
     "DisturbanceEntry",
     "Entry",
+    "EpisodesEntry",
     "ExecutionEntry",
     "FlowEntry",
     "LinkEntry",
@@ -39,6 +40,7 @@ __all__ = [
     "Number",
     "ObjectiveEntry",
     "ProcessEntry",
+    "ServoEntry",
     "TaskEntry",
     "TraceEntry",
 ]
@@ -483,6 +485,14 @@ class FlowEntry(Entry):
 # ------------------------------------------------------------- scenarios, objective, control
 
 
+class EpisodesEntry(Entry):
+    """Episodes that come and go: off, then on, and so on."""
+
+    name: str = Field(description="Name of the episodes; what shares it comes and goes together.")
+    every_s: ProcessEntry = Field(description="Time between episodes, s; mean above 1e-5.")
+    for_s: ProcessEntry = Field(description="Duration of an episode, s; mean above 1e-5.")
+
+
 class DisturbanceEntry(Entry):
     """One thing that happens to a node or to a link for a while."""
 
@@ -495,6 +505,14 @@ class DisturbanceEntry(Entry):
     )
     for_s: Annotated[float, Number(bounds.FOR_S)] | None = Field(
         None, description="Duration, seconds; default: to the end."
+    )
+    episodes: EpisodesEntry | None = Field(
+        None, description="When it is on within that time; default: all the time."
+    )
+    ramp_s: Annotated[float, Number(bounds.RAMP_S)] | None = Field(
+        None,
+        description="Time in which it grows from nothing, and in which it falls again at its end, "
+        "in 31 equal steps each, seconds; default 0.",
     )
     node: str | None = Field(None, description="Node that it happens to.")
     link: str | None = Field(None, description="Link that it happens to, as `R1->E`.")
@@ -624,6 +642,34 @@ class ControllerEntry(Entry):
     )
 
 
+class MovingTargetEntry(Entry):
+    """What the robot follows: a sine wave."""
+
+    amplitude_mm: Annotated[float, Number(bounds.AMPLITUDE_MM)] = Field(
+        description="Amplitude, mm; errors are proportional to it."
+    )
+    period_s: Annotated[float, Number(bounds.TARGET_PERIOD_S)] = Field(
+        description="Duration of one swing, s; at least two periods of the cell."
+    )
+
+
+class ServoEntry(Entry):
+    """The reference loop that the commands of every run are tried on."""
+
+    plant: Literal["integrator", "double-integrator"] = Field(
+        description="What a command sets: the velocity (`integrator`), or the acceleration."
+    )
+    gain: Annotated[float, Number(bounds.SERVO_GAIN)] = Field(
+        description="Command for an error of 1: 1/s, for a `double-integrator` 1/s²."
+    )
+    damping: Annotated[float, Number(bounds.DAMPING)] | None = Field(
+        None,
+        description="Command for an error that grows by 1 a second, 1/s; for a "
+        "`double-integrator`, which needs it.",
+    )
+    target: MovingTargetEntry = Field(description="What the robot follows.")
+
+
 # ------------------------------------------------------------------------------------ cell
 
 
@@ -674,3 +720,7 @@ class CellEntry(Entry):
     )
     objective: ObjectiveEntry | None = Field(None, description="Cost, targets and caps.")
     controller: ControllerEntry | None = Field(None, description="Policy and protocol.")
+    servo: ServoEntry | None = Field(
+        None,
+        description="A loop on which the tracking error of every run is computed; none by default.",
+    )

@@ -26,7 +26,7 @@ from dwell.model.meaning import nearest
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Source", "Tables", "read_traces"]
+__all__ = ["Source", "Tables", "declared_traces", "read_traces"]
 
 Floats: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -89,7 +89,7 @@ def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
     """
     uses: dict[Source, list[tuple[str, TraceEntry]]] = {}
     doubtful: set[Source] = set()
-    for steps, trace in _declared(entry, ()):
+    for steps, trace in declared_traces(entry, ()):
         path, source = dotted(steps), Source.of(trace)
         uses.setdefault(source, []).append((path, trace))
         if faults.touches(path):
@@ -108,7 +108,7 @@ def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
     return tables
 
 
-def _declared(
+def declared_traces(
     value: object, steps: tuple[Step, ...]
 ) -> Iterator[tuple[tuple[Step, ...], TraceEntry]]:
     """Yield every trace declared in an entry, with its place in the file."""
@@ -116,13 +116,13 @@ def _declared(
         yield steps, value
     elif isinstance(value, Entry):
         for name, info in type(value).model_fields.items():
-            yield from _declared(getattr(value, name), (*steps, info.alias or name))
+            yield from declared_traces(getattr(value, name), (*steps, info.alias or name))
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield from _declared(item, (*steps, key))
+            yield from declared_traces(item, (*steps, key))
     elif isinstance(value, list):
         for index, item in enumerate(value):
-            yield from _declared(item, (*steps, index))
+            yield from declared_traces(item, (*steps, index))
 
 
 @dataclass(slots=True)

@@ -61,7 +61,7 @@ for _name, _pattern, _first in RESOLVERS:
     _Loader.add_implicit_resolver(f"{TAG}{_name}", re.compile(f"{_pattern}\\Z"), _first)
 
 
-def read_yaml(path: str, faults: Faults) -> object:
+def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell: 1") -> object:
     """Read a file into dicts, lists, strings, numbers, truth values and None.
 
     Parameters
@@ -69,13 +69,15 @@ def read_yaml(path: str, faults: Faults) -> object:
     path : str
     faults : Faults
         Takes what is wrong with the file as such, and the line of every value.
+    what, begin : str
+        What kind of file it should be, and how such a file begins, for messages.
 
     Returns
     -------
     object
         None where the file could not be read at all.
     """
-    text = _read_text(path, faults)
+    text = _read_text(path, faults, what)
     if text is None:
         return None
     try:
@@ -96,25 +98,25 @@ def read_yaml(path: str, faults: Faults) -> object:
         faults.add("", f"not a YAML document: {error}")
         return None
     if root is None:
-        faults.add("", "the file is empty; a cell file begins with `dwell: 1`")
+        faults.add("", f"the file is empty; a {what} file begins with `{begin}`")
         return None
     return _Builder(faults).build(root, ())
 
 
-def _read_text(path: str, faults: Faults) -> str | None:
+def _read_text(path: str, faults: Faults, what: str) -> str | None:
     try:
         with open(path, "rb") as stream:
             data = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
         faults.add("", "no such file; check the path")
     except IsADirectoryError:
-        faults.add("", "this is a folder; name the cell file in it")
+        faults.add("", f"this is a folder; name the {what} file in it")
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         faults.add("", f"cannot be read: {reason}")
     else:
         if len(data) > MAX_BYTES:
-            faults.add("", f"longer than {MAX_BYTES} bytes, the most a cell file may have")
+            faults.add("", f"longer than {MAX_BYTES} bytes, the most a {what} file may have")
             return None
         try:
             return data.decode("utf-8-sig")

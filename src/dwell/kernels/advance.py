@@ -14,12 +14,14 @@ from dwell.kernels.cycles import (
     drop_waiting,
     finish,
     flush,
+    fork,
     free_worker,
     hand_over,
     hop_of,
     job_key,
     note_ready,
     release,
+    release_shadow,
 )
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
@@ -42,6 +44,7 @@ from dwell.kernels.layout import (
     CYCLE_MASK,
     CYCLE_SHIFT,
     DOWN,
+    END,
     FINISHED,
     FIRST,
     GRACE_NS,
@@ -52,7 +55,12 @@ from dwell.kernels.layout import (
     ITEM_MASK,
     KIND_SHIFT,
     LIVE,
+    MIGRATING,
     MISSING,
+    MOVED,
+    MOVED_CELL,
+    MOVED_NS,
+    MOVES_LEFT,
     N_CELL,
     N_CHANGE,
     N_CYCLES,
@@ -79,10 +87,18 @@ from dwell.kernels.layout import (
     NEXT_CHANGE,
     NEXT_KEY,
     NEXT_T,
+    NO_ORDER,
     NODE,
     NODE_DOWN,
     NODE_OF,
+    ORDER,
+    ORDER_ARRIVED,
+    ORDER_CYCLE,
+    ORDER_NS,
+    ORDER_PAIR,
+    ORDERED,
     OUT_0,
+    PARENT,
     PAUSE,
     PAUSED,
     QUOTA_T,
@@ -91,25 +107,32 @@ from dwell.kernels.layout import (
     RESTART,
     RETRY,
     SERVER,
+    SHADOW,
     SITE,
     SITE_CELL,
     SITE_TASK,
     START,
     START_NS,
+    STATE_ARRIVED,
+    STATELESS,
+    STAYS,
+    STEP_BITS,
     STRESS,
     TAKEN,
     TASK_0,
+    TASK_START_NS,
     VIRTUAL,
     WAITING,
     WINDOW,
     WINDOW_CYCLES,
     WINDOW_FIRST,
+    WORKER_STARTED,
     WORKERS,
     Floats,
     Ints,
     Tables,
 )
-from dwell.kernels.links import lose, send, slot_row
+from dwell.kernels.links import lose, send, send_state, slot_row
 from dwell.kernels.nodes import admit, job_row, key_row, leave, mark, refill, set_speed, tick
 
 __all__ = ["advance"]
@@ -132,27 +155,38 @@ def _progress(s: Tables, server: int, at: int) -> float:
 
 @phase
 def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
-    """Write the busy and the cell's own core-nanoseconds of every node, up to now."""
+    """Write every node's core-nanoseconds up to now: busy, the cell's own, its shadow's."""
     for number in range(s.servers.shape[0]):
         server = index(number)
         if s.servers[server, IS_CPU] == 0:
             continue
         tick(s, server, now)
         node = s.servers[server, NODE_OF]
+        shadow = s.cells[cell, SHADOW]
         own = s.own[cell, node]
+        extra = s.own[shadow, node] if shadow >= 0 else 0.0
         for i in range(s.servers[server, N_RUN]):
-            key = s.run_key[s.servers[server, BASE] + i]
-            if (key >> CELL_SHIFT) & CELL_MASK == cell:
+            whose = (s.run_key[s.servers[server, BASE] + i] >> CELL_SHIFT) & CELL_MASK
+            if whose == cell:
                 own += _progress(s, server, i)
+            elif whose == shadow:
+                extra += _progress(s, server, i)
         out[cell, row, 0, node] = float(s.servers[server, BUSY])
         out[cell, row, 1, node] = own
+        out[cell, row, 2, node] = extra
 
 
 @phase
-def _announce_closes(s: Tables) -> int:
-    """Announce the close of every cell's next window; return how many cells have one."""
+def _announce(s: Tables) -> int:
+    """Announce every cell's next close or migration; return how many cells wait for one."""
     n = 0
     for cell in range(s.cells.shape[0]):
+        if s.cells[cell, ORDER] == ORDERED:
+            s.cells[cell, ORDER] = MIGRATING
+            key = (RESTART << KIND_SHIFT) | (cell << CELL_SHIFT) | (ORDER_ARRIVED << CYCLE_SHIFT)
+            push_event(s.clock, s.event_t, s.event_key, s.cells[cell, ORDER_NS], key)
+        if s.cells[cell, ORDER] == MIGRATING:
+            n += 1
         boundary = s.cells[cell, CLOSE_CYCLE]
         if s.cells[cell, CLOSE_PENDING] == 0 and boundary <= s.cells[cell, N_CYCLES]:
             s.cells[cell, CLOSE_PENDING] = 1
@@ -202,9 +236,10 @@ def _crash(s: Tables, server: int, now: int) -> None:
 def _lose_joins(s: Tables, node: int) -> None:
     """Lose the inputs that wait on a node for the rest of their join."""
     for slot in range(s.slots.shape[0]):
-        if s.slots[slot, LIVE] == 0:
-            continue
         cell = slot // s.ring
+        # A shadow may have nothing under way and yet wait for what it shares with its parent.
+        if s.slots[slot, LIVE] == 0 and s.cells[cell, PARENT] < 0:
+            continue
         for local in range(s.cells[cell, N_TASKS]):
             row = slot * s.stride + local
             inputs = s.tasks[s.cells[cell, TASK_0] + local, N_IN]
@@ -283,6 +318,7 @@ def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
     if cycle == s.cells[cell, WINDOW_FIRST] and s.cells[cell, WINDOW] < s.opened.shape[1]:
         _snapshot(s, s.opened, cell, s.cells[cell, WINDOW], now)
     release(s, cell, cycle, now)
+    release_shadow(s, cell, cycle, now)
 
 
 @phase
@@ -311,6 +347,7 @@ def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int
             hand_over(s, cell, cycle, flow, now)
         else:
             send(s, cell, cycle, flow, hop, FIRST, now)
+    fork(s, cell, cycle, local, now)
 
 
 @phase
@@ -356,6 +393,42 @@ def _restart(s: Tables, cell: int, site: int, now: int) -> None:
 
 
 @phase
+def _announce_step(s: Tables, cell: int, step: int, attempt: int, local: int, t: int) -> None:
+    """Announce a step of a task's cold migration."""
+    name = (cell << CELL_SHIFT) | (((attempt << STEP_BITS) | step) << CYCLE_SHIFT) | local
+    push_event(s.clock, s.event_t, s.event_key, t, (RESTART << KIND_SHIFT) | name)
+
+
+@phase
+def _migrate(s: Tables, cell: int, step: int, attempt: int, local: int, now: int) -> None:
+    """Carry a cold migration one step on: start workers, send state, be ready.
+
+    The tasks that are not ready yet are counted; with the last one the caller may move the cell.
+    """
+    pair = index(s.cells[cell, ORDER_PAIR])
+    if step == ORDER_ARRIVED:
+        s.cells[cell, MOVES_LEFT] = 0
+        for task in range(s.cells[cell, N_TASKS]):
+            if s.state_hops[pair, task] != STAYS:
+                s.cells[cell, MOVES_LEFT] += 1
+                started = now + s.tasks[index(s.cells[cell, TASK_0] + task), TASK_START_NS]
+                _announce_step(s, cell, WORKER_STARTED, FIRST, task, started)
+    elif step == WORKER_STARTED and s.state_hops[pair, local] != STATELESS:
+        hop = s.state_hops[pair, local]
+        t, arrived = send_state(s, hop, s.cells[cell, ORDER_CYCLE], attempt, now)
+        if arrived:
+            _announce_step(s, cell, STATE_ARRIVED, FIRST, local, t)
+        elif t >= 0:
+            _announce_step(s, cell, WORKER_STARTED, attempt + 1, local, t)
+    else:
+        s.cells[cell, MOVES_LEFT] -= 1
+    if s.cells[cell, MOVES_LEFT] == 0:
+        s.cells[cell, ORDER] = NO_ORDER
+        s.clock[MOVED_CELL] = cell
+        s.clock[MOVED_NS] = now
+
+
+@phase
 def _room(s: Tables) -> int:
     """Whether the next event finds room for all it may add; otherwise what must grow."""
     if s.clock[N_EVENTS] + s.margin > s.event_t.size:
@@ -365,6 +438,9 @@ def _room(s: Tables) -> int:
         cell = (key >> CELL_SHIFT) & CELL_MASK
         cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
         if s.slots[slot_row(s.ring, cell, cycle), LIVE] > 0:
+            return GROW_RING
+        shadow = s.cells[cell, SHADOW]
+        if shadow >= 0 and s.slots[slot_row(s.ring, shadow, cycle), LIVE] > 0:
             return GROW_RING
     return PAUSED
 
@@ -386,8 +462,10 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         _announce_change(s)
     elif kind == CHANGE:
         _quota(s, index(item - 1), now)
-    elif kind == RESTART:
+    elif kind == RESTART and cycle == 0:
         _restart(s, cell, index(item), now)
+    elif kind == RESTART:
+        _migrate(s, cell, cycle & ((1 << STEP_BITS) - 1), cycle >> STEP_BITS, item, now)
 
 
 @kernel
@@ -400,6 +478,8 @@ def advance(
     out_flows: Ints,
     site_of: Ints,
     route: Ints,
+    shadow_parts: Ints,
+    state_hops: Ints,
     hops: Ints,
     loss_keys: NDArray[np.uint64],
     layer_rows: Ints,
@@ -439,6 +519,7 @@ def advance(
     closed: Floats,
     log: Ints,
     log_outcome: NDArray[np.int8],
+    log_arrived: Ints,
 ) -> int:
     """Play events until a window closes (with PAUSE set), room runs out, or every window closed.
 
@@ -449,8 +530,10 @@ def advance(
     -------
     int
         PAUSED: clock[CLOSED_CELL] closed a window, call again after stamping the next cycles.
-        FINISHED: no window is left to close. GROW_EVENTS, GROW_RING: enlarge the heap of events,
-        or the ring of cycles in flight, and call again; nothing was lost.
+        MOVED: the cold migration of clock[MOVED_CELL] was ready at clock[MOVED_NS]; set MOVED_CELL
+        to -1, stamp, and call again. FINISHED: no window is left to close. GROW_EVENTS, GROW_RING:
+        enlarge the heap of events, or the ring of cycles in flight, and call again; nothing was
+        lost.
     """
     s = Tables(
         ring,
@@ -461,6 +544,8 @@ def advance(
         out_flows,
         site_of,
         route,
+        shadow_parts,
+        state_hops,
         fixed_columns(hops, N_HOP),
         loss_keys,
         layer_rows,
@@ -500,9 +585,10 @@ def advance(
         closed,
         log,
         log_outcome,
+        log_arrived,
     )
-    open_cells = _announce_closes(s)
-    while open_cells > 0:
+    waiting = _announce(s)
+    while waiting > 0 and s.clock[N_EVENTS] > 0:
         status = _room(s)
         if status != PAUSED:
             return status
@@ -515,9 +601,13 @@ def advance(
             _close(s, cell, now)
             if s.clock[PAUSE] != 0:
                 return PAUSED
-            open_cells = _announce_closes(s)
+            waiting = _announce(s)
             continue
+        if now > s.clock[END]:
+            break
         _handle(s, kind, cell, (key >> CYCLE_SHIFT) & CYCLE_MASK, key & ITEM_MASK, key, now)
         _settle(s, now)
         flush(s, now)
+        if s.clock[MOVED_CELL] >= 0:
+            return MOVED
     return FINISHED

@@ -13,6 +13,7 @@ from dwell.kernels.layout import (
     CYCLE_SHIFT,
     DEPTH,
     DIRTY,
+    DISCARDED,
     DONE,
     DOWN,
     DROPPED,
@@ -31,9 +32,11 @@ from dwell.kernels.layout import (
     LOST,
     LOST_ON_LINK,
     MISSING,
+    N_CANDIDATES,
     N_CYCLES,
     N_DIRTY,
     N_IN,
+    N_OUT,
     N_READY,
     N_SINKS,
     N_TASKS,
@@ -43,12 +46,19 @@ from dwell.kernels.layout import (
     NODE,
     NODE_DOWN,
     OFFSET_NS,
+    OUT_0,
+    PAIR,
+    PAIR_0,
+    PARENT,
     READY,
     READY_AT,
     RELEASE,
     REPLACED,
     SCHEDULER,
     SERVER,
+    SHADOW,
+    SHADOWED,
+    SHARED,
     SINKS_LEFT,
     SITE,
     SOURCE,
@@ -62,7 +72,7 @@ from dwell.kernels.layout import (
     WAITING,
     Tables,
 )
-from dwell.kernels.links import lose, slot_row
+from dwell.kernels.links import lose, send, slot_row
 from dwell.kernels.nodes import dispatch, job_row, leave, schedule
 
 __all__ = [
@@ -73,12 +83,14 @@ __all__ = [
     "drop_waiting",
     "finish",
     "flush",
+    "fork",
     "free_worker",
     "hand_over",
     "hop_of",
     "job_key",
     "note_ready",
     "release",
+    "release_shadow",
 ]
 
 
@@ -230,14 +242,25 @@ def _flow_row(s: Tables, cell: int, flow: int) -> int:
 
 
 @phase
+def _discarded(s: Tables, cell: int, cycle: int, local: int) -> bool:
+    """Whether a task is one that the shadow of a cycle stops before."""
+    if s.cells[cell, PARENT] < 0:
+        return False
+    pair = index(s.slots[slot_row(s.ring, cell, cycle), PAIR])
+    return bool(s.shadow_parts[pair, local] == DISCARDED)
+
+
+@phase
 def hand_over(s: Tables, cell: int, cycle: int, flow: int, now: int) -> None:
     """Count an input in; the last one makes the job ready and names its critical path."""
     ends = _flow_row(s, cell, flow)
     local = s.flows[ends, TARGET]
     row = job_row(s.ring, s.stride, cell, cycle, local)
+    if s.log_arrived.shape[0] > 0:
+        s.log_arrived[cell * s.latency_ns.shape[1] + cycle, flow] = now
     missing = s.jobs[row, MISSING] - 1
     s.jobs[row, MISSING] = missing
-    if missing == 0:
+    if missing == 0 and not _discarded(s, cell, cycle, local):
         sender = job_row(s.ring, s.stride, cell, cycle, s.flows[ends, SOURCE])
         s.jobs[row, COMPUTE] = s.jobs[sender, COMPUTE]
         s.jobs[row, NETWORK] = now - s.jobs[sender, NETWORK]
@@ -287,6 +310,62 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
         key = (RELEASE << KIND_SHIFT) | job_key(cell, following, FIRST)
         t = s.release_ns[cell, following]
         push_event(s.clock, s.event_t, s.event_key, t, key)
+
+
+@phase
+def release_shadow(s: Tables, cell: int, cycle: int, now: int) -> None:
+    """Release the shadow of a cycle, if it has one; only sources that it does not share start."""
+    shadow = s.cells[cell, SHADOW]
+    if shadow < 0 or s.stamps[shadow, cycle] < 0:
+        return
+    other = s.stamps[shadow, cycle]
+    candidate = s.cells[shadow, CANDIDATE_0] + other
+    active = s.stamps[cell, cycle]
+    pair = index(s.cells[shadow, PAIR_0] + active * s.cells[shadow, N_CANDIDATES] + other)
+    sources = 0
+    for local in range(s.cells[shadow, N_TASKS]):
+        row = job_row(s.ring, s.stride, shadow, cycle, local)
+        n_in = s.tasks[index(s.cells[shadow, TASK_0] + local), N_IN]
+        s.jobs[row, MISSING] = n_in
+        s.jobs[row, STARTED] = -1
+        s.jobs[row, SITE] = s.site_of[index(candidate), local]
+        s.jobs[row, COMPUTE] = 0
+        s.jobs[row, NETWORK] = 0
+        if n_in == 0 and s.shadow_parts[pair, local] == SHADOWED:
+            sources += 1
+            offset = s.tasks[index(s.cells[shadow, TASK_0] + local), OFFSET_NS]
+            key = (START << KIND_SHIFT) | job_key(shadow, cycle, local)
+            push_event(s.clock, s.event_t, s.event_key, now + offset, key)
+    slot = slot_row(s.ring, shadow, cycle)
+    s.slots[slot, CYCLE] = cycle
+    s.slots[slot, CANDIDATE] = candidate
+    s.slots[slot, PAIR] = pair
+    s.slots[slot, LIVE] = sources
+    s.slots[slot, LOST] = 0
+
+
+@phase
+def fork(s: Tables, cell: int, cycle: int, local: int, now: int) -> None:
+    """Send the output of a completed job to those tasks of the cycle's shadow that share it."""
+    shadow = s.cells[cell, SHADOW]
+    if shadow < 0 or s.stamps[shadow, cycle] < 0:
+        return
+    slot = slot_row(s.ring, shadow, cycle)
+    pair = index(s.slots[slot, PAIR])
+    if s.shadow_parts[pair, local] != SHARED:
+        return
+    task = index(s.cells[cell, TASK_0] + local)
+    first = s.tasks[task, OUT_0]
+    for i in range(first, first + s.tasks[task, N_OUT]):
+        flow = s.out_flows[index(i)]
+        if s.shadow_parts[pair, s.flows[_flow_row(s, cell, flow), TARGET]] == SHARED:
+            continue
+        s.slots[slot, LIVE] += 1
+        hop = hop_of(s, shadow, cycle, flow)
+        if hop < 0:
+            hand_over(s, shadow, cycle, flow, now)
+        else:
+            send(s, shadow, cycle, flow, hop, FIRST, now)
 
 
 @phase

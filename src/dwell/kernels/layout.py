@@ -1,5 +1,9 @@
 """Columns of the kernels' tables and the packing of event keys.
 
+A cell may have a *shadow*: another row of `cells` with sites and hops of its own, on the same
+servers and links, whose cycles are released by those of its parent. A *pair* of candidates (active,
+other) is row ``PAIR_0 + active * N_CANDIDATES + other`` of `shadow_parts` and `state_hops`.
+
 Entities (cells, tasks, sites, servers, hops, links) are rows of two-dimensional int64 tables; the
 names below are their columns. A *site* is a task on one feasible node of one cell; a *server* is
 what executes jobs: the CPU of a node, or one kind of its accelerators; a *hop* is a flow on a link.
@@ -14,6 +18,12 @@ from numpy.typing import NDArray
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
+
+
+def _number(value: int) -> int:
+    """Return an integer that is no literal to Numba, which compiles functions anew for each."""
+    return cast(int, np.int64(value))
+
 
 # Kinds of events in the order in which equal times are handled.
 COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, CLOSE, RELEASE = range(8)
@@ -33,12 +43,7 @@ CYCLE_MASK = (1 << CYCLE_BITS) - 1
 CELL_MASK = (1 << CELL_BITS) - 1
 
 # What `advance` returns.
-PAUSED, FINISHED, GROW_EVENTS, GROW_RING = range(4)
-
-
-def _number(value: int) -> int:
-    """Return an integer that is no literal to Numba, which compiles functions anew for each."""
-    return cast(int, np.int64(value))
+PAUSED, FINISHED, GROW_EVENTS, GROW_RING, MOVED = range(5)
 
 
 # Outcomes of cycles and jobs.
@@ -49,7 +54,19 @@ FIRST, UNKNOWN = _number(0), _number(-1)
 FAIR, FIFO, PRIORITY = range(3)
 
 # clock: scalars that outlive a call.
-N_EVENTS, N_DIRTY, N_READY, NEXT_CHANGE, PAUSE, CLOSED_CELL, N_CLOCK = range(7)
+# END is the instant of the last close that any cell can have.
+(
+    N_EVENTS,
+    N_DIRTY,
+    N_READY,
+    NEXT_CHANGE,
+    PAUSE,
+    CLOSED_CELL,
+    MOVED_CELL,
+    MOVED_NS,
+    END,
+    N_CLOCK,
+) = range(10)
 
 # cells
 (
@@ -65,11 +82,36 @@ N_EVENTS, N_DIRTY, N_READY, NEXT_CHANGE, PAUSE, CLOSED_CELL, N_CLOCK = range(7)
     CLOSE_PENDING,
     WINDOW_CYCLES,
     GRACE_NS,
+    N_CANDIDATES,
+    PAIR_0,
+    SHADOW,
+    PARENT,
+    ORDER,
+    ORDER_NS,
+    ORDER_CYCLE,
+    ORDER_PAIR,
+    MOVES_LEFT,
     N_CELL,
-) = range(13)
+) = range(22)
+
+# What a cell does about an order for a cold migration: nothing, told by the caller, under way.
+NO_ORDER, ORDERED, MIGRATING = range(3)
+
+# Steps of a cold migration, told apart by the lowest bits of a RESTART event's cycle field; above
+# them stands the attempt. 0 is the restart of a node's workers.
+STEP_BITS = 2
+ORDER_ARRIVED, WORKER_STARTED, STATE_ARRIVED = (_number(step) for step in range(1, 4))
+# Where a link has no timeout of its own, state that was lost is sent again after Linux's least
+# TCP retransmission timeout.
+STATE_TIMEOUT_NS = 200_000_000
+
+# shadow_parts: what a task is to the shadow of a cycle.
+SHARED, SHADOWED, DISCARDED = range(3)
+# state_hops: a task that stays, or one that moves without state; otherwise its hop.
+STAYS, STATELESS = -2, -1
 
 # tasks
-N_IN, N_OUT, OUT_0, OFFSET_NS, N_TASK = range(5)
+N_IN, N_OUT, OUT_0, OFFSET_NS, TASK_START_NS, N_TASK = range(6)
 
 # flows
 SOURCE, TARGET, N_FLOW = range(3)
@@ -140,8 +182,9 @@ CHANGE_AT, CHANGE_NODE, CHANGE_STRESS, CHANGE_DOWN, N_CHANGE = range(5)
 READY, STARTED, COMPUTE, NETWORK, SITE, NEXT, MISSING, N_JOB = range(8)
 
 # cycles in the ring
-# LIVE counts the jobs and messages of the cycle that are still under way.
-CYCLE, CANDIDATE, LIVE, SINKS_LEFT, LOST, N_SLOT = range(6)
+# LIVE counts the jobs and messages of the cycle that are still under way; PAIR is the row of
+# shadow_parts, in the shadow of a cell.
+CYCLE, CANDIDATE, LIVE, SINKS_LEFT, LOST, PAIR, N_SLOT = range(7)
 
 # job log
 LOG_READY, LOG_START, LOG_END, N_LOG = range(4)
@@ -165,6 +208,8 @@ class Tables(NamedTuple):
     out_flows: Ints  # flows out of each task, in the order of the file
     site_of: Ints  # (candidates, tasks of a cell) -> site
     route: Ints  # (candidates, flows of a cell) -> hop, or -1 on the same node
+    shadow_parts: Ints  # (pairs of candidates, tasks of a cell)
+    state_hops: Ints  # (pairs of candidates, tasks of a cell)
     hops: Ints  # (hops, N_HOP)
     loss_keys: NDArray[np.uint64]  # (hops,)
     layer_rows: Ints  # (hops, layers) -> row of extra_ns, or -1
@@ -175,7 +220,7 @@ class Tables(NamedTuple):
     exec_ns: Ints  # (sites, N)
     delay_ns: Ints  # (hops, N)
     extra_ns: Ints  # (layers, N)
-    stamps: NDArray[np.int16]  # (cells, N), candidate of each cycle
+    stamps: NDArray[np.int16]  # (cells, N), candidate of each cycle; -1 where a shadow has none
     # state
     clock: Ints  # (N_CLOCK,)
     cells: Ints  # (cells, N_CELL)
@@ -202,7 +247,8 @@ class Tables(NamedTuple):
     compute_ns: Ints
     network_ns: Ints
     outcome: NDArray[np.int8]
-    opened: Floats  # (cells, windows, 2, nodes) busy and own at the window's first release
-    closed: Floats  # (cells, windows, 2, nodes) busy and own at its close
+    opened: Floats  # (cells, windows, 3, nodes) busy, own and shadow at the first release
+    closed: Floats  # (cells, windows, 3, nodes) busy, own and shadow at the close
     log: Ints  # (cells * N * tasks, N_LOG), or empty
     log_outcome: NDArray[np.int8]
+    log_arrived: Ints  # (cells * N, flows of a cell), or empty

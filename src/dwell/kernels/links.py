@@ -32,11 +32,13 @@ from dwell.kernels.layout import (
     SEGMENT_LAYERS,
     SEGMENT_LOSS,
     SEGMENT_RATE,
+    STATE_TIMEOUT_NS,
+    UNKNOWN,
     Tables,
 )
 from dwell.kernels.streams import attempt_uniform
 
-__all__ = ["lose", "send", "slot_row"]
+__all__ = ["lose", "send", "send_state", "slot_row"]
 
 
 @phase
@@ -121,6 +123,38 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
         arrival = max(arrival, s.links[link, LAST_ARRIVAL])
         s.links[link, LAST_ARRIVAL] = arrival
     push_event(s.clock, s.event_t, s.event_key, arrival, (ARRIVAL << KIND_SHIFT) | name)
+
+
+@phase
+def send_state(s: Tables, hop: int, cycle: int, attempt: int, now: int) -> tuple[int, bool]:
+    """Send the state of a task that moves; it is carried reliably, whatever the link does.
+
+    Returns
+    -------
+    t : int
+        Instant of its arrival, or of the next attempt; -1 where the link is down for good.
+    arrived : bool
+    """
+    link = index(s.hops[index(hop), LINK])
+    start = _begin(s, link, now)
+    segment = index(s.links[link, SEGMENT])
+    if s.segments[segment, SEGMENT_DOWN] != 0:
+        last = s.links[link, SEGMENT_END] - 1
+        while segment < last and s.segments[segment, SEGMENT_DOWN] != 0:
+            segment = index(segment + 1)
+        if s.segments[segment, SEGMENT_DOWN] != 0:
+            return UNKNOWN, False
+        return s.segments[segment, SEGMENT_AT], False
+    sent = start
+    rate = s.segments_f[segment, SEGMENT_RATE]
+    if rate < math.inf:
+        sent += int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+    s.links[link, FREE] = sent
+    loss = s.segments_f[segment, SEGMENT_LOSS]
+    if loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss:
+        timeout = s.links[link, RETRANSMIT_NS]
+        return sent + (timeout if timeout >= 0 else STATE_TIMEOUT_NS), False
+    return sent + _propagation(s, hop, segment, cycle), True
 
 
 @phase

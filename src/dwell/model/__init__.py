@@ -19,7 +19,14 @@ from dwell.model.process import (
     Uniform,
 )
 from dwell.model.qos import Decision, QoS, Reason
-from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance, Scenario
+from dwell.model.scenario import (
+    Disturbance,
+    Episodes,
+    LinkDisturbance,
+    NodeDisturbance,
+    Scenario,
+)
+from dwell.model.servo import MovingTarget, Servo
 
 __all__ = [
     "AR1",
@@ -29,6 +36,7 @@ __all__ = [
     "ControllerSettings",
     "Decision",
     "Disturbance",
+    "Episodes",
     "Execution",
     "Exponential",
     "Fabric",
@@ -38,6 +46,7 @@ __all__ = [
     "Link",
     "LinkDisturbance",
     "LogNormal",
+    "MovingTarget",
     "Node",
     "NodeDisturbance",
     "Normal",
@@ -50,6 +59,7 @@ __all__ = [
     "Quota",
     "Reason",
     "Scenario",
+    "Servo",
     "Targets",
     "Task",
     "Tier",

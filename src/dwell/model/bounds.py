@@ -118,12 +118,20 @@ RETRANSMIT_MS = Bound(1e-3, LARGEST)
 # Scenario.
 AT_S = Bound(0, LARGEST, below=True)
 FOR_S = Bound(0, above=True)
+RAMP_S = Bound(0, LARGEST)
+EPISODE_MEAN_S = Bound(1e-5, LARGEST)
 ADDED_LOSS = Bound(0, 1)
 
 # Objective: bounded so that J is finite whatever a window shows.
 WEIGHT = Bound(0, LARGEST)
 TARGET = Bound(1e-9, LARGEST)
 CAP = Bound(0, above=True)
+
+# Servo.
+SERVO_GAIN = Bound(0, MAX_COUNT, above=True)
+DAMPING = Bound(0, MAX_COUNT)
+AMPLITUDE_MM = Bound(1e-6, MAX_COUNT)
+TARGET_PERIOD_S = Bound(1e-5, LARGEST)
 
 # Controller and windows.
 WINDOW_CYCLES = Bound(1, MAX_COUNT, whole=True)
@@ -134,3 +142,4 @@ GUARD_CYCLES = Bound(2, MAX_COUNT, whole=True)
 LEAD_CYCLES = Bound(0, MAX_COUNT, whole=True)
 SHADOW_FRACTION = Bound(0, 1, above=True)
 HALF_LIFE_WINDOWS = Bound(0, MAX_COUNT, above=True)
+CUSUM_MEMORY = Bound(0, 1, above=True)

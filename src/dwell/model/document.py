@@ -24,7 +24,8 @@ from dwell.model.process import (
     Trace,
     Uniform,
 )
-from dwell.model.scenario import Disturbance, NodeDisturbance
+from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
+from dwell.model.servo import Servo
 
 __all__ = ["VERSION", "digest", "to_document"]
 
@@ -90,6 +91,7 @@ def to_document(problem: Problem) -> Document:
             },
             "objective": _objective(problem),
             "controller": _controller(problem.controller),
+            "servo": _servo(problem.servo),
         }
     )
 
@@ -217,7 +219,13 @@ def _execution(task: Task, node: str, execution: Execution) -> Document:
 
 
 def _disturbance(path: str, item: Disturbance) -> Document:
-    interval = {"at_s": item.at_s, "for_s": item.for_s, "down": item.down}
+    interval = {
+        "at_s": item.at_s,
+        "for_s": item.for_s,
+        "down": item.down,
+        "episodes": _episodes(f"{path}.episodes", item.episodes),
+        "ramp_s": item.ramp_s,
+    }
     if isinstance(item, NodeDisturbance):
         return _filled({"node": item.node, "stress_threads": item.stress_threads, **interval})
     extra = item.add_delay_ms
@@ -230,6 +238,14 @@ def _disturbance(path: str, item: Disturbance) -> Document:
             **interval,
         }
     )
+
+
+def _episodes(path: str, episodes: Episodes | None) -> Document | None:
+    if episodes is None:
+        return None
+    every_s = _process(f"{path}.every_s", episodes.every_s)
+    for_s = _process(f"{path}.for_s", episodes.for_s)
+    return {"name": episodes.name, "every_s": every_s, "for_s": for_s}
 
 
 def _objective(problem: Problem) -> Document:
@@ -247,6 +263,12 @@ def _objective(problem: Problem) -> Document:
 
 def _controller(settings: ControllerSettings) -> Document:
     return {**_dataclass(settings), "fallbacks": list(settings.fallbacks)}
+
+
+def _servo(servo: Servo | None) -> Document | None:
+    if servo is None:
+        return None
+    return {**_dataclass(servo), "target": _dataclass(servo.target)}
 
 
 def _dataclass(part: Any) -> Document:

@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING
 from dwell.errors import Fault
 from dwell.model.fabric import Link, Node
 from dwell.model.pipeline import Flow, Task
-from dwell.model.scenario import Disturbance, NodeDisturbance
+from dwell.model.scenario import (
+    MAX_LAYERS,
+    RAMP_LAYERS,
+    Disturbance,
+    LinkDisturbance,
+    NodeDisturbance,
+)
 
 if TYPE_CHECKING:
     from dwell.model.problem import ControllerSettings
@@ -91,12 +97,18 @@ def _names(parts: Parts) -> Iterator[Fault]:
     }
     for section, names in sections.items():
         for name in names:
-            if NAME.fullmatch(name) is None or len(name) > LONGEST_NAME:
-                yield Fault(
-                    f"{section}.{name or repr(name)}",
-                    f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, "
-                    f"a letter, a digit or _ first, at most {LONGEST_NAME} characters",
-                )
+            if message := _bad_name(name):
+                yield Fault(f"{section}.{name or repr(name)}", message)
+
+
+def _bad_name(name: str) -> str:
+    """Return what is wrong with a name, or nothing."""
+    if NAME.fullmatch(name) is not None and len(name) <= LONGEST_NAME:
+        return ""
+    return (
+        f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, "
+        f"a letter, a digit or _ first, at most {LONGEST_NAME} characters"
+    )
 
 
 def _links(parts: Parts) -> Iterator[Fault]:
@@ -260,6 +272,43 @@ def _scenarios(parts: Parts) -> Iterator[Fault]:
                 yield from _unknown(f"{path}.node", "node", item.node, parts.nodes)
             elif parts.links_complete:
                 yield from _unknown(f"{path}.link", "link", item.link, links)
+        yield from _episodes(items)
+        yield from _layers(parts, items)
+
+
+def _episodes(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
+    """Disturbances whose episodes have one name must be able to come and go together."""
+    first: dict[str, tuple[str, Disturbance]] = {}
+    for path, item in items:
+        if item.episodes is None:
+            continue
+        name = item.episodes.name
+        if _bad_name(name):
+            yield Fault(f"{path}.episodes.name", _bad_name(name))
+        where, other = first.setdefault(name, (path, item))
+        if (item.at_s, item.episodes) != (other.at_s, other.episodes):
+            yield Fault(
+                f"{path}.episodes",
+                f"{name!r} is declared otherwise at {where}; what shares a name comes and goes "
+                "together: make `at_s` and `episodes` equal, or give these another name",
+            )
+
+
+def _layers(parts: Parts, items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
+    """Extra delays of a link are bits of a number."""
+    bursts = {link.name for _, link in parts.links if link.bursts is not None}
+    taken: dict[str, int] = {}
+    for path, item in items:
+        if isinstance(item, LinkDisturbance) and item.layers:
+            before = taken.get(item.link, int(item.link in bursts))
+            taken[item.link] = before + item.layers
+            if before <= MAX_LAYERS < taken[item.link]:
+                yield Fault(
+                    f"{path}.add_delay_ms",
+                    f"one too many on {item.link}: its extra delays count {taken[item.link]} and "
+                    f"may count {MAX_LAYERS} (1 each, {RAMP_LAYERS} with a `ramp_s`, 1 for its "
+                    "`bursts`)",
+                )
 
 
 def _objective(parts: Parts) -> Iterator[Fault]:

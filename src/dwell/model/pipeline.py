@@ -152,6 +152,18 @@ class Pipeline:
         """Flows out of a task."""
         return tuple(flow for flow in self.flows if flow.source == task)
 
+    def diverging(self, active: Mapping[str, str], other: Mapping[str, str]) -> frozenset[str]:
+        """Tasks that run elsewhere under `other`, or have such a task before them.
+
+        What a cycle that runs under `active` cannot share with a shadow sent through `other`.
+        """
+        found: set[str] = set()
+        for name in self.topological():
+            behind = any(flow.source in found for flow in self.inputs(name))
+            if active[name] != other[name] or behind:
+                found.add(name)
+        return frozenset(found)
+
     def topological(self) -> tuple[str, ...]:
         """Tasks so that every flow points forward; tasks on a cycle are left out."""
         waiting = {name: len(self.inputs(name)) for name in self.tasks}

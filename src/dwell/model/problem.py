@@ -25,10 +25,11 @@ from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.scenario import Scenario
+from dwell.model.servo import Servo
 
 __all__ = ["ESTIMATORS", "MIGRATIONS", "POLICIES", "ControllerSettings", "Problem"]
 
-POLICIES = ("dtp", "atp", "latency-first", "work-function")
+POLICIES = ("dtp", "atp", "latency-first", "work-function", "cusum")
 ESTIMATORS = ("profile", "shadow", "scaling", "corrected")
 MIGRATIONS = ("warm", "cold")
 
@@ -123,6 +124,8 @@ class Problem:
         W.
     warmup_windows : int
         First windows of a run, recorded but left out of statistics.
+    servo : Servo, optional
+        Loop that every run's commands are tried on; none, and no tracking error, where None.
 
     Raises
     ------
@@ -139,10 +142,13 @@ class Problem:
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     window_cycles: int = 50
     warmup_windows: int = 0
+    servo: Servo | None = None
 
     def __post_init__(self) -> None:
         WINDOW_CYCLES.check("window_cycles", self.window_cycles)
         WARMUP_WINDOWS.check("warmup_windows", self.warmup_windows)
+        if self.servo is not None:
+            self.servo.require_seen(self.pipeline.period_ms)
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
         scenarios = {"baseline": (), **declared}
         object.__setattr__(self, "scenarios", FrozenDict(scenarios))

@@ -1,4 +1,8 @@
-"""Scenario: what happens to the fabric over time, one disturbance an item."""
+"""Scenario: what happens to the fabric over time, one disturbance an item.
+
+A disturbance is on from `at_s` for `for_s` seconds: all the time, in drawn `episodes`, or growing
+and falling along a ramp of `ramp_s`.
+"""
 
 from __future__ import annotations
 
@@ -6,38 +10,94 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from dwell.model.bounds import ADDED_LOSS, AT_S, FOR_S, FOREIGN_THREADS, RATE_MBPS
+from dwell.model.bounds import (
+    ADDED_LOSS,
+    AT_S,
+    EPISODE_MEAN_S,
+    FOR_S,
+    FOREIGN_THREADS,
+    RAMP_S,
+    RATE_MBPS,
+    require,
+)
 from dwell.model.process import Process
 
-__all__ = ["Disturbance", "LinkDisturbance", "NodeDisturbance", "Scenario"]
+__all__ = [
+    "MAX_LAYERS",
+    "RAMP_LAYERS",
+    "RAMP_STEPS",
+    "Disturbance",
+    "Episodes",
+    "LinkDisturbance",
+    "NodeDisturbance",
+    "Scenario",
+]
+
+# Equal steps in which a ramp reaches its full strength. Their number has that many binary digits,
+# and every digit of the strength is a layer of extra delay that is on or off.
+RAMP_LAYERS = 5
+RAMP_STEPS = 2**RAMP_LAYERS - 1
+# Layers of extra delay on one link: bits of a whole number of 64 that is not negative.
+MAX_LAYERS = 63
 
 
-def _interval(at_s: float, for_s: float) -> None:
-    AT_S.check("at_s", at_s)
-    FOR_S.check("for_s", for_s)
+@dataclass(frozen=True, slots=True)
+class Episodes:
+    """An alternating renewal process: off for `every_s` seconds, then on for `for_s`, and so on.
+
+    Disturbances whose episodes have one name come and go together.
+    """
+
+    name: str
+    every_s: Process
+    for_s: Process
+
+    def __post_init__(self) -> None:
+        for path, process in (("every_s", self.every_s), ("for_s", self.for_s)):
+            mean = process.expectation
+            bound = f"a process whose mean is {EPISODE_MEAN_S}"
+            require(EPISODE_MEAN_S.holds(mean), f"episodes.{path}", mean, bound)
 
 
 @dataclass(frozen=True, slots=True)
 class NodeDisturbance:
-    """Foreign CPU load on a node, or the node down, from `at_s` for `for_s` seconds."""
+    """Foreign CPU load on a node, or the node down.
+
+    Parameters
+    ----------
+    node : str
+    at_s, for_s : float
+        Begin and duration, seconds.
+    stress_threads : int
+        Foreign threads; along a ramp, rounded to whole ones.
+    down : bool
+    episodes : Episodes, optional
+        When it is on within that time; all the time where None.
+    ramp_s : float
+        Time in which it grows to its full strength, and in which it falls to nothing at its end.
+    """
 
     node: str
     at_s: float = 0.0
     for_s: float = math.inf
     stress_threads: int = 0
     down: bool = False
+    episodes: Episodes | None = None
+    ramp_s: float = 0.0
 
     def __post_init__(self) -> None:
-        _interval(self.at_s, self.for_s)
+        _check_time(self)
         FOREIGN_THREADS.check("stress_threads", self.stress_threads)
 
 
 @dataclass(frozen=True, slots=True)
 class LinkDisturbance:
-    """Extra delay, loss or another rate on a directed link, or the link down, for a while.
+    """Extra delay, loss or another rate on a directed link, or the link down.
 
     Loss probabilities of disturbances at the same time, and the link's own, combine as
-    independent; extra delays add up; the lowest rate counts.
+    independent; extra delays add up; the lowest rate counts. Time, episodes and ramp are those of
+    `NodeDisturbance`; along a ramp the extra delay, the loss, and the time that a bit takes at
+    `rate_mbps` beyond what it takes at the link's own rate are what grows.
     """
 
     source: str
@@ -48,9 +108,11 @@ class LinkDisturbance:
     loss: float = 0.0
     rate_mbps: float = math.inf
     down: bool = False
+    episodes: Episodes | None = None
+    ramp_s: float = 0.0
 
     def __post_init__(self) -> None:
-        _interval(self.at_s, self.for_s)
+        _check_time(self)
         ADDED_LOSS.check("loss", self.loss)
         RATE_MBPS.check("rate_mbps", self.rate_mbps)
 
@@ -59,6 +121,25 @@ class LinkDisturbance:
         """``R1->E``."""
         return f"{self.source}->{self.target}"
 
+    @property
+    def layers(self) -> int:
+        """Layers of extra delay that it takes of the link's `MAX_LAYERS`."""
+        if self.add_delay_ms is None:
+            return 0
+        return RAMP_LAYERS if self.ramp_s else 1
+
 
 Disturbance: TypeAlias = NodeDisturbance | LinkDisturbance
 Scenario: TypeAlias = tuple[Disturbance, ...]
+
+
+def _check_time(item: Disturbance) -> None:
+    AT_S.check("at_s", item.at_s)
+    FOR_S.check("for_s", item.for_s)
+    RAMP_S.check("ramp_s", item.ramp_s)
+    if item.ramp_s == 0:
+        return
+    half = f"at most half of for_s = {item.for_s:g}: it grows, and it falls"
+    require(2 * item.ramp_s <= item.for_s, "ramp_s", item.ramp_s, half)
+    require(item.episodes is None, "ramp_s", item.ramp_s, "left out where there are `episodes`")
+    require(not item.down, "ramp_s", item.ramp_s, "left out of what is `down`: it has no strength")

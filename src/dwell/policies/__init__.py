@@ -2,6 +2,7 @@
 
 from dwell.policies.atp import ATP
 from dwell.policies.check import check_policy
+from dwell.policies.cusum import Cusum
 from dwell.policies.dtp import DTP
 from dwell.policies.latency_first import LatencyFirst
 from dwell.policies.protocol import MinimalPolicy, Policy
@@ -12,6 +13,7 @@ from dwell.policies.work_function import WorkFunction
 __all__ = [
     "ATP",
     "DTP",
+    "Cusum",
     "LatencyFirst",
     "MinimalPolicy",
     "Policy",

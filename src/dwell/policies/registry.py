@@ -8,6 +8,7 @@ from dwell.errors import PolicyError
 from dwell.model.meaning import nearest
 from dwell.model.problem import Problem
 from dwell.policies.atp import ATP, Pair, find_pairs
+from dwell.policies.cusum import Cusum
 from dwell.policies.dtp import DTP
 from dwell.policies.latency_first import LatencyFirst
 from dwell.policies.protocol import Policy
@@ -90,10 +91,20 @@ def _work_function(problem: Problem) -> WorkFunction:
     )
 
 
+def _cusum(problem: Problem) -> Cusum:
+    return Cusum(
+        candidates=problem.candidates,
+        initial=problem.initial,
+        objective=problem.objective,
+        slack=problem.controller.min_improvement,
+    )
+
+
 #: Makers by name; the same names as ``dwell.model.problem.POLICIES``.
 REGISTRY: dict[str, Callable[[Problem], Policy]] = {
     "dtp": _dtp,
     "atp": _atp,
     "latency-first": _latency_first,
     "work-function": _work_function,
+    "cusum": _cusum,
 }

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from dwell.control import NEVER_NS
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
-from dwell.model import Pipeline, Problem, Task
+from dwell.model import Flow, Pipeline, Placement, Problem, Task
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 __all__ = ["Arrays", "lay_out"]
@@ -51,11 +51,13 @@ class Arrays:
         attempts = np.zeros((2 * len(t.slots), t.attempts.shape[1]), np.int64)
         stride = t.stride
         old = np.arange(cells * ring)
-        cycle = t.slots[:, k.CYCLE]
+        # A slot that was never used names cycle 0; only one of them can be its slot.
+        old = old[t.slots[:, k.CYCLE] % ring == old % ring]
+        cycle = t.slots[old, k.CYCLE]
         new = (old // ring) * 2 * ring + (cycle & (2 * ring - 1))
-        slots[new] = t.slots
-        attempts[new] = t.attempts
-        jobs.reshape(-1, stride, k.N_JOB)[new] = t.jobs.reshape(-1, stride, k.N_JOB)
+        slots[new] = t.slots[old]
+        attempts[new] = t.attempts[old]
+        jobs.reshape(-1, stride, k.N_JOB)[new] = t.jobs.reshape(-1, stride, k.N_JOB)[old]
         self.tables = t._replace(ring=2 * ring, jobs=jobs, slots=slots, attempts=attempts)
 
 
@@ -64,6 +66,7 @@ def lay_out(
     *,
     shared: Collection[str] = (),
     log_jobs: bool = False,
+    shadows: Realisation | None = None,
 ) -> Arrays:
     """Build the tables of one or more cells.
 
@@ -75,17 +78,26 @@ def lay_out(
         that of the first cell. Links are never shared.
     log_jobs : bool
         Whether every job's instants are kept.
+    shadows : Realisation, optional
+        What the shadow jobs of a single cell meet (see `dwell.sim.drawing.draw_shadows`); it gets
+        a shadow then.
     """
-    return _Layout(cells, shared, log_jobs).arrays()
+    return _Layout(cells, shared, log_jobs, shadows).arrays()
 
 
 class _Layout:
     """Rows being laid out, cell after cell."""
 
     def __init__(
-        self, cells: Sequence[tuple[Problem, Realisation]], shared: Collection[str], log: bool
+        self,
+        cells: Sequence[tuple[Problem, Realisation]],
+        shared: Collection[str],
+        log: bool,
+        shadows: Realisation | None,
     ) -> None:
         self.cells, self.shared, self.log = cells, frozenset(shared), log
+        self.shadows = shadows
+        self.reals = [real for _, real in cells]
         self.single = len(cells) == 1
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
@@ -107,6 +119,8 @@ class _Layout:
         self.segments_f = [np.empty((0, k.N_SEGMENT_F))]
         self.site_of: list[list[int]] = []
         self.route: list[list[int]] = []
+        self.shadow_parts: list[list[int]] = []
+        self.state_hops: list[list[int]] = []
         self.changes = [np.empty((0, k.N_CHANGE), np.int64)]
         self.extra_rows = 0
 
@@ -114,6 +128,9 @@ class _Layout:
         for index, (problem, real) in enumerate(self.cells):
             self._add_nodes(index, problem)
             self._add_cell(index, problem, real)
+        if self.shadows is not None:
+            ((problem, _),) = self.cells
+            self._add_shadow(problem, self.shadows)
         self._check_keys()
         return Arrays(self._tables(), tuple(self.node_row))
 
@@ -156,17 +173,27 @@ class _Layout:
         row[k.N_CYCLES] = real.cycles
         row[k.CLOSE_CYCLE] = row[k.WINDOW_CYCLES] = problem.window_cycles
         row[k.GRACE_NS] = round(problem.controller.close_grace_ms * 1e6)
+        row[k.N_CANDIDATES], row[k.PAIR_0] = len(problem.candidates), len(self.shadow_parts)
+        row[k.SHADOW] = row[k.PARENT] = -1
         self.cell_rows.append(row)
-        # Flows are ordered by target, so that arrivals at one instant order by task.
-        flows = sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
+        flows = ordered_flows(pipeline)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         for flow in flows:
             self.flows.append([names.index(flow.source), names.index(flow.target)])
         for name in names:
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
             self._add_task(pipeline, pipeline.tasks[name], outputs)
+        link_row = self._add_links(problem, real)
+        self._add_hops(problem, real, link_row)
+        self._add_candidates(index, problem, real, hop_0)
+        if self.shadows is not None or problem.controller.migration == "cold":
+            self._add_pairs(problem, {hop: hop_0 + i for i, hop in enumerate(real.hops)})
+        self._add_changes(index, NodeChanges.of(real.node_changes))
+
+    def _add_candidates(self, index: int, problem: Problem, real: Realisation, hop_0: int) -> None:
+        """Add where the tasks run and the flows cross under every candidate."""
+        names = list(problem.pipeline.tasks)
         site_row = self._add_sites(index, problem, real, names)
-        self._add_links(problem, real, hop_0)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
@@ -175,10 +202,39 @@ class _Layout:
                 hop_row.get(
                     (f.source, f.target, f"{placement[f.source]}->{placement[f.target]}"), -1
                 )
-                for f in flows
+                for f in ordered_flows(problem.pipeline)
             ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
-        self._add_changes(index, NodeChanges.of(real.node_changes))
+
+    def _add_pairs(self, problem: Problem, hop_row: Mapping[tuple[str, str, str], int]) -> None:
+        """Add what the tasks are to a shadow, and how their state moves, by pair of candidates."""
+        pipeline = problem.pipeline
+        for active in problem.candidates.values():
+            for other in problem.candidates.values():
+                parts = shadow_parts(pipeline, active, other)
+                moves = [
+                    k.STAYS
+                    if active[name] == other[name]
+                    else hop_row.get((name, name, f"{active[name]}->{other[name]}"), k.STATELESS)
+                    for name in pipeline.tasks
+                ]
+                padding = self.max_tasks - len(moves)
+                self.shadow_parts.append([*parts, *[k.SHARED] * padding])
+                self.state_hops.append([*moves, *[k.STAYS] * padding])
+
+    def _add_shadow(self, problem: Problem, real: Realisation) -> None:
+        """Add the shadow of the only cell: workers and draws of its own, all else shared."""
+        parent = self.cell_rows[0]
+        shadow = list(parent)
+        parent[k.SHADOW], shadow[k.PARENT] = 1, 0
+        shadow[k.CANDIDATE_0] = len(self.site_of)
+        # Its windows never close.
+        shadow[k.CLOSE_CYCLE] = real.cycles + 1
+        self.cell_rows.append(shadow)
+        self.reals.append(real)
+        hop_0 = len(self.hops)
+        self._add_hops(problem, real, {name: i for i, name in enumerate(problem.fabric.links)})
+        self._add_candidates(1, problem, real, hop_0)
 
     def _add_changes(self, index: int, changes: NodeChanges) -> None:
         """Add the changes of a cell's nodes; those of a shared node are the first cell's."""
@@ -194,6 +250,7 @@ class _Layout:
         row[k.N_IN], row[k.N_OUT] = len(pipeline.inputs(task.name)), len(outputs)
         row[k.OUT_0] = len(self.out_flows)
         row[k.OFFSET_NS] = round(task.offset_ms * 1e6)
+        row[k.TASK_START_NS] = round(task.start_ms * 1e6)
         self.tasks.append(row)
         self.out_flows += outputs
 
@@ -224,7 +281,7 @@ class _Layout:
             self.sites.append(row)
         return rows
 
-    def _add_links(self, problem: Problem, real: Realisation, hop_0: int) -> None:
+    def _add_links(self, problem: Problem, real: Realisation) -> dict[str, int]:
         pieces = LinkSegments.of(real.link_segments)
         link_row: dict[str, int] = {}
         for name, link in problem.fabric.links.items():
@@ -241,8 +298,16 @@ class _Layout:
                 self.n_segments += int(mine.sum())
             row[k.SEGMENT_END] = self.n_segments
             self.links.append(row)
+        return link_row
+
+    def _add_hops(self, problem: Problem, real: Realisation, link_row: Mapping[str, int]) -> None:
+        hop_0 = len(self.hops)
         payload = {
             (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
+        }
+        # The state of a task is a flow to itself.
+        payload |= {
+            (task.name, task.name): task.state_bytes for task in problem.pipeline.tasks.values()
         }
         for source, target, link_name in real.hops:
             self.hops.append([link_row[link_name], payload[source, target]])
@@ -264,7 +329,7 @@ class _Layout:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
 
     def _tables(self) -> k.Tables:
-        cells, nodes, cycles = len(self.cells), len(self.node_row), self.cycles
+        cells, nodes, cycles = len(self.cell_rows), len(self.node_row), self.cycles
         capacity = [max(workers, 1) for workers in self.server_workers]
         base = np.concatenate(([0], np.cumsum(capacity)[:-1]))
         servers = _table(self.servers, k.N_SERVER)
@@ -272,7 +337,7 @@ class _Layout:
         room = int(sum(capacity))
         margin = 64 + len(self.sites) + len(self.flows) + len(self.tasks) + len(servers)
         windows = max(real.windows for _, real in self.cells)
-        reals = [real for _, real in self.cells]
+        reals = self.reals
         jobs_logged = cells * cycles * self.max_tasks if self.log else 0
         n_layers = 1 + max((layer for rows in self.layer_rows for layer in rows), default=0)
         layer_rows = np.full((len(self.hops), n_layers), -1, np.int64)
@@ -280,11 +345,18 @@ class _Layout:
             for layer, row in rows.items():
                 layer_rows[hop, layer] = row
         clock = np.zeros(k.N_CLOCK, np.int64)
+        clock[k.MOVED_CELL] = -1
+        clock[k.END] = max(
+            int(real.release_ns[-1]) + row[k.GRACE_NS]
+            for real, row in zip(reals, self.cell_rows, strict=True)
+        )
 
         changes = np.concatenate(self.changes)
         changes = changes[np.argsort(changes[:, 0], kind="stable")]
         speed = np.zeros((len(servers), k.N_SERVER_F))
         speed[:, k.SPEED] = 1.0
+        stamps = np.zeros((cells, cycles), np.int16)
+        stamps[[row[k.PARENT] >= 0 for row in self.cell_rows]] = -1
         tables = k.Tables(
             ring=RING_START,
             stride=self.max_tasks,
@@ -294,6 +366,8 @@ class _Layout:
             out_flows=np.array(self.out_flows, np.int64),
             site_of=_table(self.site_of, self.max_tasks),
             route=_table(self.route, self.max_flows),
+            shadow_parts=_table(self.shadow_parts, self.max_tasks),
+            state_hops=_table(self.state_hops, self.max_tasks),
             hops=_table(self.hops, k.N_HOP),
             loss_keys=np.concatenate([real.loss_keys for real in reals]),
             layer_rows=layer_rows,
@@ -304,7 +378,7 @@ class _Layout:
             exec_ns=_stack([real.exec_ns for real in reals], cycles),
             delay_ns=_stack([real.delay_ns for real in reals], cycles),
             extra_ns=_stack([real.extra_ns for real in reals], cycles),
-            stamps=np.zeros((cells, cycles), np.int16),
+            stamps=stamps,
             clock=clock,
             cells=_table(self.cell_rows, k.N_CELL),
             sites=_table(self.sites, k.N_SITE),
@@ -329,10 +403,11 @@ class _Layout:
             compute_ns=np.zeros((cells, cycles), np.int64),
             network_ns=np.zeros((cells, cycles), np.int64),
             outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, 2, nodes)),
-            closed=np.zeros((cells, windows, 2, nodes)),
+            opened=np.zeros((cells, windows, 3, nodes)),
+            closed=np.zeros((cells, windows, 3, nodes)),
             log=np.full((jobs_logged, k.N_LOG), -1, np.int64),
             log_outcome=np.zeros(jobs_logged, np.int8),
+            log_arrived=np.full((cells * cycles if self.log else 0, self.max_flows), -1, np.int64),
         )
         _announce_first(tables)
         return tables
@@ -343,6 +418,7 @@ def _announce_first(tables: k.Tables) -> None:
     first = [
         (int(tables.release_ns[cell, 0]), (k.RELEASE << k.KIND_SHIFT) | (cell << k.CELL_SHIFT))
         for cell in range(len(tables.cells))
+        if tables.cells[cell, k.PARENT] < 0
     ]
     if len(tables.changes):
         first.append((int(tables.changes[0, k.CHANGE_AT]), k.CHANGE << k.KIND_SHIFT))
@@ -350,6 +426,25 @@ def _announce_first(tables: k.Tables) -> None:
     for i, (at, key) in enumerate(sorted(first)):
         tables.event_t[i], tables.event_key[i] = at, key
     tables.clock[k.N_EVENTS] = len(first)
+
+
+def ordered_flows(pipeline: Pipeline) -> list[Flow]:
+    """Flows by their target, so that arrivals at one instant order by task."""
+    names = list(pipeline.tasks)
+    return sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
+
+
+def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[int]:
+    """What each task is to the shadow of a cycle that runs under `active`, sent through `other`.
+
+    A task is shadowed where it, or any task before it, runs on another node; a sink behind such
+    tasks discards what arrives. All other tasks are shared: their outputs are sent twice.
+    """
+    diverging = pipeline.diverging(active, other)
+    return [
+        k.SHARED if name not in diverging else k.SHADOWED if pipeline.outputs(name) else k.DISCARDED
+        for name in pipeline.tasks
+    ]
 
 
 def _table(rows: Sequence[Sequence[int]], columns: int) -> k.Ints:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,12 @@ from dwell.kernels.compiled import COMPILED
 from dwell.kernels.streams import ar1_path, nanoseconds, standard_normals
 from dwell.model import (
     AR1,
-    Bursts,
     Constant,
+    Disturbance,
+    Link,
     LinkDisturbance,
     LogNormal,
+    Node,
     NodeDisturbance,
     Problem,
     Process,
@@ -25,19 +27,22 @@ from dwell.model import (
     Trace,
     TraceTable,
 )
+from dwell.model.scenario import RAMP_STEPS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
+from dwell.sim.spells import LONGEST_NS, Spells, drawn_spells, ramp, spell
 
-__all__ = ["draw", "stream"]
+__all__ = ["draw", "draw_shadows", "stream"]
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 NS_PER_MS = 1e6
 NS_PER_S = 1e9
-# A duration beyond three years is as good as for ever, and its sums still fit 64 bits.
-LONGEST_NS = 1e17
+# Streams that belong to one job or message, not to the cycle or the fabric.
+OF_A_JOB = ("exec/", "delay/", "extra/", "loss/")
 # Values drawn at a time: a block and its temporaries stay in the second-level cache.
 BLOCK = 16384
+NEVER = Spells(*np.empty((3, 0), np.int64))
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -88,6 +93,20 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
     return _Draw(problem, scenario, disturbances, seed, windows).realisation()
 
 
+def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
+    """Draw what shadow jobs meet in a realisation: times, delays and losses of their own.
+
+    Releases, disturbances, scales and the rows of traces are those of the realisation itself: they
+    belong to the cycle or to the fabric, not to a job.
+    """
+    windows = realisation.windows
+    disturbances = problem.scenario(realisation.scenario)
+    seed = realisation.seed or 0
+    drawing = _Draw(problem, realisation.scenario, disturbances, seed, windows, shadow=True)
+    drawing.release_ns = realisation.release_ns
+    return drawing.realisation()
+
+
 class _Generator(np.random.Generator):
     """NumPy's generator, with normals drawn by compiled code: the same ones, in half the time."""
 
@@ -103,10 +122,17 @@ class _Draw:
     """One drawing in progress: the seed, the releases and the rows that traces share."""
 
     def __init__(
-        self, problem: Problem, name: str, scenario: Scenario, seed: int, windows: int
+        self,
+        problem: Problem,
+        name: str,
+        scenario: Scenario,
+        seed: int,
+        windows: int,
+        shadow: bool = False,
     ) -> None:
         self.problem, self.name, self.scenario = problem, name, scenario
         self.seed, self.windows = seed, windows
+        self.shadow = shadow
         self.cycles = windows * problem.window_cycles
         self.rows: dict[int, Ints] = {}
         self.release_ns = self._releases()
@@ -115,7 +141,7 @@ class _Draw:
         tasks = self.problem.pipeline.tasks
         sites = tuple((task, node) for task in tasks for node in tasks[task].on)
         hops = _hops(self.problem)
-        layers, extra_ns, of_link = self._layers(hops)
+        layers, extra_ns = self._layers(hops)
         return Realisation(
             scenario=self.name,
             seed=self.seed,
@@ -129,14 +155,18 @@ class _Draw:
             layers=layers,
             extra_ns=extra_ns,
             node_changes=self._node_changes(),
-            link_segments=self._link_segments(of_link),
+            link_segments=self._link_segments(),
         )
 
     def _rng(self, name: str) -> np.random.Generator:
-        return _Generator(np.random.SFC64(stream(self.seed, name)))
+        return _Generator(np.random.SFC64(self._stream(name)))
 
     def _key(self, name: str) -> int:
-        return int(stream(self.seed, name).generate_state(1, np.uint64)[0])
+        return int(self._stream(name).generate_state(1, np.uint64)[0])
+
+    def _stream(self, name: str) -> np.random.SeedSequence:
+        own = self.shadow and name.startswith(OF_A_JOB)
+        return stream(self.seed, f"shadow/{name}" if own else name)
 
     def _releases(self) -> Ints:
         pipeline = self.problem.pipeline
@@ -222,51 +252,53 @@ class _Draw:
 
     def _layers(
         self, hops: tuple[tuple[str, str, str], ...]
-    ) -> tuple[tuple[tuple[int, int], ...], Ints, dict[str, list[Bursts | LinkDisturbance]]]:
-        """Extra-delay layers: per link its bursts first, then the scenario's impairments."""
-        of_link: dict[str, list[Bursts | LinkDisturbance]] = {}
+    ) -> tuple[tuple[tuple[int, int], ...], Ints]:
+        """Extra-delay layers: per link its bursts first, then the scenario's items in order."""
+        added: dict[str, list[tuple[Process, int]]] = {}
         for name, link in self.problem.fabric.links.items():
-            if link.bursts is not None:
-                of_link.setdefault(name, []).append(link.bursts)
-        for item in self.scenario:
-            if isinstance(item, LinkDisturbance) and item.add_delay_ms is not None:
-                of_link.setdefault(item.link, []).append(item)
+            items = self._on_link(name)
+            added[name] = [(link.bursts.add_delay_ms, 1)] if link.bursts is not None else []
+            added[name] += [(i.add_delay_ms, i.layers) for i in items if i.add_delay_ms is not None]
         layers = tuple(
             (hop, layer)
             for hop, (_, _, link) in enumerate(hops)
-            for layer in range(len(of_link.get(link, ())))
+            for layer in range(sum(count for _, count in added[link]))
         )
         extra_ns = np.empty((len(layers), self.cycles), np.int64)
-        for row, (hop, layer) in enumerate(layers):
-            process = of_link[hops[hop][2]][layer].add_delay_ms
-            if process is None:
-                continue
-            self._fill(extra_ns[row], process, f"extra/{layer}/{_hop_name(hops[hop])}")
-        return layers, extra_ns, of_link
+        row = 0
+        for hop in hops:
+            for ordinal, (process, count) in enumerate(added[hop[2]]):
+                rows = extra_ns[row : row + count]
+                self._fill(rows[-1], process, f"extra/{ordinal}/{_hop_name(hop)}")
+                _split(rows)
+                row += count
+        return layers, extra_ns
 
-    def _episodes(self, bursts: Bursts, name: str) -> tuple[Ints, Ints]:
-        """Begins and ends of all bursts up to the end of the run, nanoseconds, ascending."""
-        horizon = float(self.release_ns[-1])
-        quiet, active = self._rng(f"bursts/{name}/every"), self._rng(f"bursts/{name}/for")
-        mean_ms = bursts.every_ms.expectation + bursts.for_ms.expectation
-        count = 64 + round(1.1 * horizon / (mean_ms * NS_PER_MS))
-        begins, ends = [np.empty(0)], [np.empty(0)]
-        now = 0.0
-        while now < horizon:
-            end = bursts.every_ms.marginal(quiet, count)
-            end *= NS_PER_MS
-            length = bursts.for_ms.marginal(active, count)
-            length *= NS_PER_MS
-            end += length
-            np.cumsum(end, out=end)
-            end += now
-            now = float(end[-1])
-            begins.append(np.subtract(end, length, out=length))
-            ends.append(end)
-        begin = np.concatenate(begins)
-        begun = int(np.searchsorted(begin, horizon))
-        begin, end = begin[:begun], np.minimum(np.concatenate(ends)[:begun], LONGEST_NS)
-        return np.rint(begin).astype(np.int64), np.rint(end).astype(np.int64)
+    def _on_link(self, link: str) -> list[LinkDisturbance]:
+        return [i for i in self.scenario if isinstance(i, LinkDisturbance) and i.link == link]
+
+    def _bursts(self, part: Node | Link) -> Spells:
+        """Bursts of a node or link, up to the end of the run."""
+        if part.bursts is None:
+            return NEVER
+        every, length = part.bursts.every_ms, part.bursts.for_ms
+        rngs = self._rng(f"bursts/{part.name}/every"), self._rng(f"bursts/{part.name}/for")
+        return drawn_spells(every, length, NS_PER_MS, rngs, 0, int(self.release_ns[-1]))
+
+    def _spells(self, item: Disturbance) -> Spells:
+        """Say when a disturbance is on, up to the end of the run."""
+        begin_ns = round(item.at_s * NS_PER_S)
+        end_ns = round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS))
+        if item.ramp_s:
+            return ramp(begin_ns, end_ns, round(item.ramp_s * NS_PER_S))
+        if item.episodes is None:
+            return spell(begin_ns, end_ns)
+        episodes, horizon_ns = item.episodes, min(end_ns, int(self.release_ns[-1]))
+        # The stream has the name of the episodes alone: what shares it comes and goes together.
+        name, every, length = episodes.name, episodes.every_s, episodes.for_s
+        rngs = self._rng(f"episodes/{name}/every"), self._rng(f"episodes/{name}/for")
+        drawn = drawn_spells(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
+        return drawn.until(end_ns)
 
     def _node_changes(self) -> NodeChanges:
         """Fold stress, bursts and outages of each node into the states it goes through."""
@@ -276,13 +308,12 @@ class _Draw:
         for row, node in enumerate(self.problem.fabric.nodes.values()):
             steps = [np.empty((3, 0), np.int64)]
             if node.bursts is not None and node.bursts.threads:
-                steps.append(_in_turn(*self._episodes(node.bursts, node.name)))
-                steps[-1][1] *= node.bursts.threads
-            for item in self.scenario:
-                if isinstance(item, NodeDisturbance) and item.node == node.name:
-                    begin, end = _interval_ns(item.at_s, item.for_s)
-                    threads, down = item.stress_threads, int(item.down)
-                    steps.append(np.array([[begin, end], [threads, -threads], [down, -down]]))
+                steps.append(_steps(self._bursts(node), node.bursts.threads))
+            steps += [
+                _steps(self._spells(item), item.stress_threads, item.down)
+                for item in self.scenario
+                if isinstance(item, NodeDisturbance) and item.node == node.name
+            ]
             at, threads, down = _accumulate(np.concatenate(steps, axis=1))
             count = int(np.searchsorted(at, horizon, side="right"))
             table = np.empty((count, 4), np.int64)
@@ -292,52 +323,64 @@ class _Draw:
         table = np.concatenate(tables)
         return NodeChanges(nodes, table.take(np.argsort(table[:, 0], kind="stable"), axis=0))
 
-    def _link_segments(self, of_link: dict[str, list[Bursts | LinkDisturbance]]) -> LinkSegments:
+    def _link_segments(self) -> LinkSegments:
         """Cut each link's time where something begins or ends, and sum up what holds in between."""
         links = tuple(self.problem.fabric.links)
         tables = [np.empty((0, 4), np.int64)]
         tables_f = [np.empty((0, 2))]
         for row, link in enumerate(self.problem.fabric.links.values()):
-            active = [
-                (*_interval_ns(item.at_s, item.for_s), item)
-                for item in self.scenario
-                if isinstance(item, LinkDisturbance) and item.link == link.name
-            ]
-            none = np.empty(0, np.int64)
-            begins, ends = (
-                self._episodes(link.bursts, link.name) if link.bursts is not None else (none, none)
-            )
-            edges = [edge for begin, end, _ in active for edge in (begin, end)]
-            cuts = np.unique(np.concatenate(([0], edges, begins, ends))).astype(np.int64)
+            bursts = self._bursts(link)
+            active = [(item, self._spells(item)) for item in self._on_link(link.name)]
+            edges = [edge for _, spells in active for edge in (spells.begin, spells.end)]
+            start = np.zeros(1, np.int64)
+            cuts = np.unique(np.concatenate((start, *edges, bursts.begin, bursts.end)))
             table = np.zeros((len(cuts), 4), np.int64)
             table_f = np.empty((len(cuts), 2))
             table[:, 0], table[:, 1] = cuts, row
             survives = np.full(len(cuts), 1 - link.loss)
             rate = np.full(len(cuts), link.rate_mbps)
-            layers = of_link.get(link.name, [])
-            if link.bursts is not None:
-                # Bursts of one link never overlap: more of them begun than ended means one is on.
-                begun = np.searchsorted(begins, cuts, side="right")
-                table[:, 3] |= begun > np.searchsorted(ends, cuts, side="right")
-            for begin, end, item in active:
-                on = (begin <= cuts) & (cuts < end)
+            table[:, 3] = bursts.levels(cuts) > 0
+            layer = int(link.bursts is not None)
+            for item, spells in active:
+                level = spells.levels(cuts)
+                on = level > 0
                 table[on, 2] |= int(item.down)
-                survives[on] *= 1 - item.loss
-                rate[on] = np.minimum(rate[on], item.rate_mbps)
-                if item.add_delay_ms is not None:
-                    layer = next(i for i, other in enumerate(layers) if other is item)
-                    table[on, 3] |= 1 << layer
+                survives *= 1 - item.loss * (level / RAMP_STEPS)
+                rate = np.minimum(rate, _rates(link.rate_mbps, item.rate_mbps, level))
+                if item.layers:
+                    # The level of a ramp in binary says which of its layers are on.
+                    table[:, 3] |= (level if item.ramp_s else on.astype(np.int64)) << layer
+                    layer += item.layers
             table_f[:, 0], table_f[:, 1] = rate, 1 - survives
             tables.append(table)
             tables_f.append(table_f)
         return LinkSegments(links, np.concatenate(tables), np.concatenate(tables_f))
 
 
-def _in_turn(begins: Ints, ends: Ints) -> Ints:
-    """Steps of episodes that never overlap: rows at, change by one thread, no outage."""
-    steps = np.zeros((3, 2 * len(begins)), np.int64)
-    steps[0, 0::2], steps[0, 1::2] = begins, ends
-    steps[1, 0::2], steps[1, 1::2] = 1, -1
+def _split(rows: Ints) -> None:
+    """Split the last row into layers that weigh 1, 2, 4, ... of `RAMP_STEPS` and sum up to it."""
+    weights = 2 ** np.arange(len(rows) - 1)
+    rows[:-1] = rows[-1] * weights[:, None] // RAMP_STEPS
+    rows[-1] -= rows[:-1].sum(axis=0)
+
+
+def _rates(own_mbps: float, mbps: float, level: Ints) -> Floats:
+    """Rate of a link at each level of a disturbance: the time that a bit takes grows evenly."""
+    share = level[level > 0] / RAMP_STEPS
+    rates = np.full(len(level), math.inf)
+    if mbps < math.inf:
+        rates[level > 0] = 1 / ((1 - share) / own_mbps + share / mbps)
+        rates[level == RAMP_STEPS] = mbps
+    return rates
+
+
+def _steps(spells: Spells, threads: int, down: bool = False) -> Ints:
+    """Steps at the begins and ends of spells: rows at, change of threads, change of outages."""
+    steps = np.empty((3, 2 * len(spells.begin)), np.int64)
+    steps[0, 0::2], steps[0, 1::2] = spells.begin, spells.end
+    steps[1, 0::2] = np.rint(threads * (spells.level / RAMP_STEPS))
+    steps[2, 0::2] = down
+    steps[1:, 1::2] = -steps[1:, 0::2]
     return steps
 
 
@@ -350,11 +393,6 @@ def _accumulate(steps: Ints) -> Ints:
     last = np.ones(steps.shape[1], np.bool_)
     np.not_equal(steps[0, 1:], steps[0, :-1], out=last[:-1])
     return steps if last.all() else steps.compress(last, axis=1)
-
-
-def _interval_ns(at_s: float, for_s: float) -> tuple[int, int]:
-    begin = round(at_s * NS_PER_S)
-    return begin, round(min(begin + for_s * NS_PER_S, LONGEST_NS))
 
 
 def _hop_name(hop: tuple[str, str, str]) -> str:
@@ -373,4 +411,17 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
         for link in problem.fabric.links:
             if link in crossed:
                 hops[flow.source, flow.target, link] = None
+    if problem.controller.migration == "cold":
+        hops |= dict.fromkeys(_state_hops(problem))
     return tuple(hops)
+
+
+def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    """State of tasks on the links it crosses when they move: a flow from a task to itself."""
+    for name, task in problem.pipeline.tasks.items():
+        if task.state_bytes == 0:
+            continue
+        hosts = dict.fromkeys(placement[name] for placement in problem.candidates.values())
+        for link in problem.fabric.links.values():
+            if {link.source, link.target} <= hosts.keys():
+                yield name, name, link.name

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import bisect
 import platform
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any
 
 import numba
@@ -12,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell import __version__
-from dwell.control import ClosedWindow, Controller, Estimator, MinimalPolicy
+from dwell.control import (
+    ClosedWindow,
+    Controller,
+    Estimator,
+    Evidence,
+    Instants,
+    MinimalPolicy,
+    shadow_stamps,
+)
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.kernels.advance import advance
@@ -20,8 +30,8 @@ from dwell.kernels.compiled import COMPILED
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import Run
-from dwell.sim.arrays import Arrays, lay_out
-from dwell.sim.drawing import draw
+from dwell.sim.arrays import Arrays, lay_out, ordered_flows
+from dwell.sim.drawing import draw, draw_shadows
 from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.tables import Played, make_tables
 
@@ -88,13 +98,15 @@ def simulate_realisation(
     """
     _check_fit(problem, realisation)
     controller = Controller(problem, policy, estimator)
-    arrays = lay_out([(problem, realisation)], log_jobs=jobs)
+    shadows = draw_shadows(problem, realisation) if controller.shadow_fraction > 0 else None
+    log_jobs = jobs or controller.learns
+    arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
     sees_all = not _host_changes(problem, realisation)[:, 3].any()
     if controller.fixed_profile is not None and sees_all and not by_window:
         played = _play_static(problem, realisation, controller, arrays)
     else:
         played = _play_windows(problem, realisation, controller, arrays)
-    return Run(_meta(problem, realisation, controller), make_tables(played))
+    return Run(_meta(problem, realisation, controller), make_tables(played, jobs=jobs))
 
 
 def play(arrays: Arrays) -> int:
@@ -103,7 +115,7 @@ def play(arrays: Arrays) -> int:
     Returns
     -------
     int
-        ``PAUSED`` or ``FINISHED`` (see `dwell.kernels.advance`).
+        ``PAUSED``, ``MOVED`` or ``FINISHED`` (see `dwell.kernels.advance`).
     """
     while True:
         status = advance(*arrays.tables)
@@ -161,8 +173,11 @@ def _play_windows(
     """Play window by window; the controller looks at each and stamps what follows."""
     stamper = _Stamper(problem, realisation, controller, arrays)
     with _quiet():
-        while play(arrays) == k.PAUSED:
-            stamper.close_window()
+        while (status := play(arrays)) != k.FINISHED:
+            if status == k.MOVED:
+                stamper.moved()
+            else:
+                stamper.close_window()
     return Played(problem, realisation, controller, arrays, np.array(stamper.first, np.int64))
 
 
@@ -184,12 +199,23 @@ class _Stamper:
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
-        self.stamped = self._reach(self.window_cycles)
+        self.cold = settings.migration == "cold"
+        self.fraction = controller.shadow_fraction
         self.placement = controller.incumbent
-        tables = arrays.tables
-        tables.clock[k.PAUSE] = 1
-        tables.stamps[0, : self.stamped] = self.code[self.placement]
         self.next_first = 0
+        self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
+        arrays.tables.clock[k.PAUSE] = 1
+        self.stamped = self._reach(self.window_cycles)
+        self._stamp(0, self.stamped)
+
+    def _stamp(self, start: int, stop: int) -> None:
+        """Stamp cycles with the placement, and with what they are also sent through."""
+        tables, code = self.arrays.tables, self.code[self.placement]
+        tables.stamps[0, start:stop] = code
+        stop = min(stop, self.cycles)
+        if self.fraction > 0 and start < stop:
+            plan = shadow_stamps(start, stop, code, len(self.code), self.fraction)
+            tables.stamps[1, start:stop] = plan
 
     def _reach(self, boundary: int) -> int:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
@@ -210,35 +236,106 @@ class _Stamper:
         if self._host_down(close_ns):
             self.controller.miss()
         else:
-            order = self.controller.close(
-                ClosedWindow(
-                    latency_ns=tables.latency_ns[0, first:boundary],
-                    release_ns=self.release_ns[first:boundary],
-                    close_ns=close_ns,
-                    open_ns=int(self.release_ns[first]),
-                    core_ns=tables.closed[0, index] - tables.opened[0, index],
-                )
+            used = tables.closed[0, index] - tables.opened[0, index]
+            window = ClosedWindow(
+                latency_ns=tables.latency_ns[0, first:boundary],
+                release_ns=self.release_ns[first:boundary],
+                close_ns=close_ns,
+                open_ns=int(self.release_ns[first]),
+                core_ns=used,
             )
-        start = self.stamped
-        following = boundary
-        if order != self.placement:
-            start = following = self._takes_effect(boundary, close_ns)
-            self.placement = order
-            tables.cells[0, k.WINDOW_FIRST] = following
-            tables.cells[0, k.CLOSE_CYCLE] = following + self.window_cycles
-            tables.stamps[0, self.stamped : start] = tables.stamps[0, self.stamped - 1]
-        self.next_first = following
+            if self.evidence is not None:
+                window.evidence = partial(self.evidence, first, boundary, close_ns)
+            order = self.controller.close(window)
+        if order == self.placement:
+            self._go_on(boundary)
+        elif self.cold:
+            self._order(order, boundary, close_ns)
+        else:
+            self._move(order, self._takes_effect(boundary, close_ns))
+
+    def _go_on(self, boundary: int) -> None:
+        """Stamp the next window with the placement that stays."""
+        self.next_first = boundary
+        start, self.stamped = self.stamped, self._reach(boundary + self.window_cycles)
+        self._stamp(start, self.stamped)
+
+    def _move(self, order: str, following: int) -> None:
+        """Begin the next window under another placement; cycles before it keep the old one."""
+        self._stamp(self.stamped, following)
+        self.placement = order
+        cell = self.arrays.tables.cells[0]
+        cell[k.WINDOW_FIRST] = self.next_first = following
+        cell[k.CLOSE_CYCLE] = following + self.window_cycles
         self.stamped = self._reach(following + self.window_cycles)
-        tables.stamps[0, start : self.stamped] = self.code[order]
+        self._stamp(following, self.stamped)
+
+    def _order(self, order: str, boundary: int, close_ns: int) -> None:
+        """Give an order that takes effect when what it moves is ready (see `moved`)."""
+        cell, count = self.arrays.tables.cells[0], len(self.code)
+        self.ordered = (order, boundary)
+        pair = self.code[self.placement] * count + self.code[order]
+        cell[k.ORDER], cell[k.ORDER_PAIR] = k.ORDERED, cell[k.PAIR_0] + pair
+        # The state of the last window's order draws on the column of the last cycle.
+        cell[k.ORDER_CYCLE] = min(boundary, self.cycles - 1)
+        cell[k.ORDER_NS] = close_ns + self.delay_ns
+        # No window closes before the migration is over.
+        cell[k.WINDOW_FIRST] = cell[k.CLOSE_CYCLE] = self.cycles + 1
+        self._stamp(self.stamped, self.cycles)
+
+    def moved(self) -> None:
+        """Carry out an order whose tasks are ready now."""
+        clock = self.arrays.tables.clock
+        clock[k.MOVED_CELL] = -1
+        order, boundary = self.ordered
+        self.stamped = self._takes_effect(boundary, int(clock[k.MOVED_NS]) - self.delay_ns)
+        self._move(order, self.stamped)
 
     def _takes_effect(self, boundary: int, close_ns: int) -> int:
-        """First cycle that an order given at a close stamps."""
+        """First cycle that an order given at a close stamps; those before are out already."""
         arrived = np.searchsorted(self.release_ns[: self.cycles], close_ns + self.delay_ns)
         return max(boundary + self.lead, int(arrived))
 
     def _host_down(self, at_ns: int) -> bool:
         i = bisect.bisect_right(self.host_at_ns, at_ns) - 1
         return i >= 0 and bool(self.host_down[i])
+
+
+def _evidence(
+    problem: Problem, realisation: Realisation, arrays: Arrays
+) -> Callable[[int, int, int], Evidence]:
+    """Return the function that cuts a window's evidence out of the logs."""
+    tasks = len(problem.pipeline.tasks)
+    order = ordered_flows(problem.pipeline)
+    column = [order.index(flow) for flow in problem.pipeline.flows]
+    tables = arrays.tables
+    cells = len(tables.cells)
+    log = tables.log.reshape(cells, realisation.cycles, tasks, k.N_LOG)
+    arrived_ns = tables.log_arrived.reshape(cells, realisation.cycles, -1)
+    outcome = tables.log_outcome.reshape(cells, realisation.cycles, tasks)
+
+    def instants(cell: int, first: int, last: int) -> Instants:
+        jobs = log[cell, first:last]
+        return Instants(
+            ready_ns=jobs[:, :, k.LOG_READY].copy(),
+            end_ns=np.where(outcome[cell, first:last] == k.DONE, jobs[:, :, k.LOG_END], -1),
+            arrived_ns=arrived_ns[cell, first:last][:, column],
+        )
+
+    def cut(first: int, last: int, close_ns: int) -> Evidence:
+        shadowed = cells > 1
+        return Evidence(
+            close_ns=close_ns,
+            release_ns=realisation.release_ns[first:last],
+            placement=tables.stamps[0, first:last].copy(),
+            cycles=instants(0, first, last),
+            shadow_placement=(
+                tables.stamps[1, first:last].copy() if shadowed else np.full(last - first, -1)
+            ),
+            shadows=instants(1, first, last) if shadowed else None,
+        )
+
+    return cut
 
 
 def _meta(problem: Problem, realisation: Realisation, controller: Controller) -> dict[str, Any]:

@@ -108,8 +108,8 @@ class Played:
         return missed
 
 
-def make_tables(played: Played) -> dict[str, Callable[[], pl.DataFrame]]:
-    """Functions that make each table when it is first asked for."""
+def make_tables(played: Played, *, jobs: bool = False) -> dict[str, Callable[[], pl.DataFrame]]:
+    """Functions that make each table when it is first asked for; `jobs` asks for that of jobs."""
     controller = played.controller
     profile = None if controller.log.seen else controller.fixed_profile
     seen: tuple[dict[str, Floats], dict[str, dict[str, Floats]]] | None = None
@@ -127,7 +127,7 @@ def make_tables(played: Played) -> dict[str, Callable[[], pl.DataFrame]]:
             _decisions(controller) if profile is None else _static_decisions(played, columns()[1])
         ),
     }
-    if len(played.arrays.tables.log):
+    if jobs:
         tables["jobs"] = lambda: _jobs(played)
     return tables
 
@@ -183,8 +183,49 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
+            **_shadow_columns(played),
         }
     ).with_columns(pl.col("seen_l95_ms", "seen_violation_rate", "cost").fill_nan(None))
+
+
+def _shadow_columns(played: Played) -> dict[str, NDArray[np.generic]]:
+    """What shadow jobs cost in each window: cycles sent twice, bytes, and share of the cores."""
+    tables = played.arrays.tables
+    if len(tables.cells) < 2:
+        return {}
+    controller = played.controller
+    used = controller.utilisation(played.closed_windows())[:, 2]
+    other = played.by_window(tables.stamps[1])
+    sent = played.by_window(_shadow_bytes(played))
+    return {
+        "shadow_cycles": (other >= 0).sum(axis=1),
+        "shadow_bytes": sent.sum(axis=1),
+        **{f"shadow_{node}": used[:, i] for i, node in enumerate(controller.nodes)},
+    }
+
+
+def _shadow_bytes(played: Played) -> Ints:
+    """Bytes that the shadow of every cycle put on links, shape (N,)."""
+    problem, tables = played.problem, played.arrays.tables
+    pipeline, cycles = problem.pipeline, played.realisation.cycles
+    names = list(pipeline.tasks)
+    candidates = list(problem.candidates.values())
+    log = tables.log.reshape(len(tables.cells), cycles, len(names), k.N_LOG)
+    done = tables.log_outcome.reshape(len(tables.cells), cycles, len(names)) == k.DONE
+    done &= log[:, :, :, k.LOG_END] >= 0
+    active, other = tables.stamps[0].astype(np.int64), tables.stamps[1].astype(np.int64)
+    shadowed = other >= 0
+    pair = np.where(shadowed, active * len(candidates) + other, 0)
+    parts = tables.shadow_parts[pair]
+    total = np.zeros(cycles, np.int64)
+    for flow in pipeline.flows:
+        source, target = names.index(flow.source), names.index(flow.target)
+        crosses = np.array([place[flow.source] != place[flow.target] for place in candidates])
+        own = parts[:, source] != k.SHARED
+        ended = np.where(own, done[1, :, source], done[0, :, source])
+        sent = shadowed & (parts[:, target] != k.SHARED) & crosses[other] & ended
+        total += sent * flow.payload_bytes
+    return total
 
 
 def _seen(played: Played) -> dict[str, Floats]:
@@ -216,7 +257,7 @@ def _decision_frame(columns: Mapping[str, object], candidates: tuple[str, ...]) 
 
 def _decisions(controller: Controller) -> pl.DataFrame:
     candidates = tuple(controller.problem.candidates)
-    names = controller.log.columns(candidates)
+    names = controller.log.columns(candidates, support=controller.supports)
     rows = controller.log.decisions
     columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
     return _decision_frame(columns, candidates)
@@ -249,7 +290,7 @@ def _log_running(played: Played, log: Ints) -> None:
     tables = played.arrays.tables
     jobs = tables.jobs.reshape(len(tables.slots), -1, k.N_JOB)
     for slot in np.nonzero(tables.slots[:, k.LIVE] > 0)[0]:
-        mine = log[tables.slots[slot, k.CYCLE]]
+        mine = log[slot // tables.ring, tables.slots[slot, k.CYCLE]]
         running = (mine[:, k.LOG_READY] >= 0) & (mine[:, k.LOG_END] < 0)
         mine[running, k.LOG_START] = jobs[slot, : len(mine), k.STARTED][running]
 
@@ -260,24 +301,27 @@ def _jobs(played: Played) -> pl.DataFrame:
     problem, tables = played.problem, played.arrays.tables
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
-    cycles = played.realisation.cycles
-    log = tables.log.reshape(cycles, len(tasks), k.N_LOG)
+    cells, cycles = len(tables.cells), played.realisation.cycles
+    log = tables.log.reshape(cells, cycles, len(tasks), k.N_LOG)
     _log_running(played, log)
-    outcome = tables.log_outcome.reshape(cycles, len(tasks))
-    site_node = np.array([nodes.index(node) for _, node in played.realisation.sites])
-    node = site_node[tables.site_of[tables.stamps[0].astype(np.int64)]]
-    cycle, task = np.nonzero(log[:, :, k.LOG_READY] >= 0)
-    picked = log[cycle, task]
+    outcome = tables.log_outcome.reshape(cells, cycles, len(tasks))
+    # Sites of a shadow follow those of its cell in the same order.
+    site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
+    site = tables.site_of[: len(problem.candidates)]
+    node = site_node[site[np.maximum(tables.stamps, 0).astype(np.int64)]]
+    cycle, cell, task = np.nonzero(log[:, :, :, k.LOG_READY].transpose(1, 0, 2) >= 0)
+    picked = log[cell, cycle, task]
     ended = picked[:, k.LOG_END] >= 0
     return pl.DataFrame(
         {
             "cycle": cycle,
             "task": _names(task, tasks),
-            "node": _names(node[cycle, task], nodes),
+            "node": _names(node[cell, cycle, task], nodes),
             "ready_ns": picked[:, k.LOG_READY],
             "start_ns": pl.Series(picked[:, k.LOG_START]),
             "end_ns": pl.Series(picked[:, k.LOG_END]),
-            "outcome": _names(np.where(ended, outcome[cycle, task], 0), OUTCOMES),
+            "outcome": _names(np.where(ended, outcome[cell, cycle, task], 0), OUTCOMES),
+            **({"shadow": cell > 0} if cells > 1 else {}),
         }
     ).with_columns(
         pl.when(pl.col("start_ns") >= 0).then(pl.col("start_ns")),

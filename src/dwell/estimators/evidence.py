@@ -1,0 +1,65 @@
+"""Evidence: what the messages of a closed window said about jobs and links.
+
+Every message carries the instants of the jobs and hops it went through, so that a window shows more
+than its metrics: how long each task took on the node it ran on, and each message on its link. The
+simulator and the live runtime hand over the same instants.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["UNKNOWN", "Evidence", "Instants"]
+
+Ints: TypeAlias = NDArray[np.int64]
+
+#: Stands for an instant that had not come, or was not known, when the window closed.
+UNKNOWN = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Instants:
+    """When the jobs and messages of a window's cycles did what, nanoseconds; `UNKNOWN` if never.
+
+    Parameters
+    ----------
+    ready_ns, end_ns : int64 array, shape (W, tasks)
+        When all inputs of a job were there, and when it had completed.
+    arrived_ns : int64 array, shape (W, flows)
+        When the message of a flow was handed to its target; it was sent when its source's job
+        ended. On one node it is handed over at once.
+    """
+
+    ready_ns: Ints
+    end_ns: Ints
+    arrived_ns: Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """One window's instants, as known at its close; tasks and flows in the pipeline's order.
+
+    Parameters
+    ----------
+    close_ns : int
+    release_ns : int64 array, shape (W,)
+    placement : int array, shape (W,)
+        Index of the candidate that each cycle ran under.
+    cycles : Instants
+    shadow_placement : int array, shape (W,)
+        Index of the candidate that a cycle was also sent through; -1 for none.
+    shadows : Instants or None
+        Of the jobs and messages that the shadow did not share with the cycle itself. A shadow
+        stops before the sinks: its last messages arrive there and are discarded.
+    """
+
+    close_ns: int
+    release_ns: Ints
+    placement: NDArray[np.integer]
+    cycles: Instants
+    shadow_placement: NDArray[np.integer]
+    shadows: Instants | None

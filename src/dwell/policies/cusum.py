@@ -1,0 +1,149 @@
+"""CUSUM: moves once the advantage of another candidate has added up to enough.
+
+A single window says little about a small difference of J and much about a large one. Instead of a
+threshold on one window's difference and a minimum dwell, each candidate s has a cumulative sum of
+what it would have saved, as in Page's test for a change of the mean (Biometrika 41, 1954,
+DOI 10.1093/biomet/41.1-2.100)::
+
+    g(s) < -max(0, memory * g(s) + J(incumbent) - J(s) - slack)
+
+J(incumbent) is the measured one without its switching term, J(s) the estimated one against the
+incumbent, switching term included. If any eligible g(s) exceeds the threshold, the cheapest of
+those candidates becomes the incumbent, if it is cheaper in this window too, and all sums begin
+again at 0.
+
+An advantage above ``threshold + slack`` moves the cell at once, whatever the last move's date; one
+below ``slack + (1 - memory) * threshold`` never does, however long it lasts. Every migration is
+therefore preceded by estimated savings of more than the threshold since the migration before it:
+K windows with a total estimated advantage A hold at most A / threshold migrations. There is no
+minimum dwell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dwell.model.bounds import CUSUM_MEMORY, MIN_IMPROVEMENT
+from dwell.model.objective import Objective
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.qos import Decision, QoS
+from dwell.policies.dtp import cheapest
+from dwell.policies.incumbent import Incumbent, check_candidates, check_name, check_parameter
+from dwell.policies.pricing import Pricing
+
+__all__ = ["Cusum"]
+
+
+class Cusum:
+    """Moves to the cheapest candidate whose advantage over the incumbent has added up.
+
+    A candidate over a cap is not eligible, as in DTP; if none is eligible, those closest to their
+    caps are compared, and the reason is ``infeasible``. Sums of candidates over a cap go on.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+        Pi_cand, over the same tasks; the order breaks ties.
+    initial : str, optional
+        The candidate it starts on; the first where None.
+    objective : Objective
+        Weights, targets, caps and tiers of J.
+    threshold : float
+        Sum that an advantage must exceed, in units of J.
+    slack : float
+        Advantage of a window that counts as none, in units of J.
+    memory : float
+        Share of a sum that outlives a window, in (0, 1].
+
+    Raises
+    ------
+    PolicyError
+        If a parameter is out of its range, `initial` is no candidate, or candidates place
+        different tasks.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: Mapping[str, Placement],
+        initial: str | None = None,
+        objective: Objective,
+        threshold: float = 0.4,
+        slack: float = 0.05,
+        memory: float = 0.7,
+    ) -> None:
+        self.candidates = check_candidates(candidates)
+        self.initial = check_name("initial", initial, self.candidates)
+        self.objective = objective
+        self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
+        self.slack = check_parameter("slack", slack, MIN_IMPROVEMENT)
+        self.memory = check_parameter("memory", memory, CUSUM_MEMORY)
+        self._pricing = Pricing(self.candidates, objective)
+        self._incumbent = Incumbent(self.candidates, self.initial)
+        self._sums = dict.fromkeys(self.candidates, 0.0)
+
+    def __repr__(self) -> str:
+        return (
+            f"Cusum(initial={self.initial!r}, threshold={self.threshold:g}, "
+            f"slack={self.slack:g}, memory={self.memory:g})"
+        )
+
+    @property
+    def incumbent(self) -> str:
+        """Name of the active candidate."""
+        return self._incumbent.name
+
+    @property
+    def sums(self) -> Mapping[str, float]:
+        """G of every candidate; the incumbent's is 0."""
+        return dict(self._sums)
+
+    def start(self, problem: Problem) -> None:
+        """Begin again: the initial candidate, all sums 0."""
+        self._incumbent.begin(self.initial)
+        self._sums = dict.fromkeys(self.candidates, 0.0)
+
+    def adopt(self, name: str) -> None:
+        """Take over `name` as the incumbent, all sums 0: somebody else moved the cell there."""
+        self._incumbent.adopt(name)
+        self._sums = dict.fromkeys(self.candidates, 0.0)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
+        """Add a window to the sums and decide the placement for the next one.
+
+        Parameters
+        ----------
+        observed : QoS
+            Metrics of the window under the incumbent.
+        estimates : mapping of str to QoS
+            Metrics by candidate.
+
+        Returns
+        -------
+        Decision
+            `delta_j` is the advantage of this window over the cheapest candidate whose sum is over
+            the threshold, 0 where there is none.
+
+        Raises
+        ------
+        MetricError
+            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        """
+        incumbent, pricing = self._incumbent, self._pricing
+        now = incumbent.name
+        costs = pricing.estimated(estimates, now)
+        measured = pricing.observed(observed, now, now)
+        eligible, within_caps = pricing.eligible(estimates)
+        for name, value in self._sums.items():
+            gain = measured - costs[name] - self.slack
+            self._sums[name] = 0.0 if name == now else max(0.0, self.memory * value + gain)
+        due = [name for name in eligible if self._sums[name] > self.threshold]
+        if not due:
+            return incumbent.stay("hold" if within_caps else "infeasible", costs, 0.0)
+        best = cheapest(costs, due, now)
+        delta_j = measured - costs[best]
+        if delta_j <= 0:
+            return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
+        self._sums = dict.fromkeys(self.candidates, 0.0)
+        return incumbent.move(best, "migrate" if within_caps else "infeasible", costs, delta_j)
