@@ -18,6 +18,7 @@ BENCHMARKS = {
     "canonical": ("canonical", "measure"),
     "length": ("canonical", "length"),
     "closing": ("closing", "measure"),
+    "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "memory": ("memory", "measure"),
     "draw": ("drawing", "measure"),

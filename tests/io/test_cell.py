@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from dwell.io import from_document, load
 from dwell.model import (
@@ -17,20 +19,25 @@ from dwell.model import (
     Caps,
     Constant,
     ControllerSettings,
+    Episodes,
     Exponential,
     Flow,
     LinkDisturbance,
     LogNormal,
+    MovingTarget,
     NodeDisturbance,
     Normal,
     Placement,
     Quota,
+    Servo,
     Targets,
     Uniform,
     Weights,
 )
+from dwell.model.document import to_document
 
 EXAMPLE = Path(__file__).parent / "cell.yaml"
+ROOT = Path(__file__).parents[2]
 
 # One task on one node: the least a cell can be.
 LEAST: dict[str, Any] = {
@@ -63,6 +70,7 @@ def test_the_example_becomes_a_problem() -> None:
     assert problem.objective.caps == Caps(120, 0.98)
     assert problem.objective.tiers == {"R1": "robot", "E": "edge", "R2": "robot"}
     assert problem.controller == ControllerSettings(on="E", initial="LOC", fallbacks=("LOC", "HYB"))
+    assert problem.servo == Servo("double-integrator", 30, MovingTarget(50, 2), damping=8)
 
 
 def test_both_ways_makes_two_links_and_two_disturbances_of_one_process() -> None:
@@ -78,6 +86,30 @@ def test_both_ways_makes_two_links_and_two_disturbances_of_one_process() -> None
     assert (back.at_s, back.for_s, back.loss) == (0, math.inf, 0.02)
     assert problem.scenarios["edge-crash"] == (NodeDisturbance("E", 20, 10, down=True),)
     assert problem.scenarios["baseline"] == ()
+
+
+def test_episodes_are_shared_and_ramps_are_read() -> None:
+    problem = load(EXAMPLE)
+    radio = Episodes("radio", Exponential(20), Constant(5))
+    assert problem.scenarios["radio"] == (
+        LinkDisturbance("R1", "E", rate_mbps=20, episodes=radio),
+        LinkDisturbance("E", "R1", rate_mbps=20, episodes=radio),
+        NodeDisturbance("R1", stress_threads=1, episodes=radio),
+    )
+    assert problem.scenarios["rush-hour"] == (
+        NodeDisturbance("E", 20, 60, stress_threads=12, ramp_s=20),
+    )
+
+
+def test_the_scenarios_of_the_manual_can_be_read() -> None:
+    text = (ROOT / "docs" / "cells.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(scenarios:\n.*?)```", text, re.DOTALL)
+    scenarios = yaml.safe_load(block)["scenarios"]
+    cell = to_document(load(EXAMPLE))
+    problem = from_document({**cell, "scenarios": scenarios})
+    slow, _, lossy, _ = problem.scenarios["radio"]
+    assert slow.episodes == lossy.episodes
+    assert problem.scenarios["rush-hour"][0].ramp_s == 300
 
 
 def test_loading_twice_gives_equal_problems() -> None:
@@ -96,6 +128,7 @@ def test_the_least_cell_has_the_defaults_of_the_model() -> None:
     assert problem.objective.caps == Caps()
     assert problem.controller == ControllerSettings()
     assert problem.scenarios == {"baseline": ()}
+    assert problem.servo is None
 
 
 def test_a_cell_without_a_name_has_that_of_its_file(tmp_path: Path) -> None:

@@ -49,6 +49,8 @@ def _one(value: object, *steps: str | int) -> Fault:
     return fault
 
 
+TARGET = {"amplitude_mm": 50, "period_s": 2}
+
 # Where, what, and the words that must be in the message: the value, the bound, the remedy.
 VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("dwell",), 2, "dwell", ("2", "newer", "1", "upgrade")),
@@ -268,6 +270,46 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
         "scenarios.x[0].loss",
         ("1.01", "from 0 to 1"),
     ),
+    (("scenarios", "x"), [{"node": "E", "ramp_s": -1}], "scenarios.x[0].ramp_s", ("-1", "from 0")),
+    (
+        ("scenarios", "x"),
+        [{"node": "E", "for_s": 8, "ramp_s": 5}],
+        "scenarios.x[0].ramp_s",
+        ("5", "at most half of for_s = 8"),
+    ),
+    (
+        ("scenarios", "x"),
+        [{"node": "E", "episodes": {"every_s": 1, "for_s": 1}}],
+        "scenarios.x[0].episodes.name",
+        ("missing",),
+    ),
+    (
+        ("scenarios", "x"),
+        [{"node": "E", "episodes": {"name": "a", "every_s": 0, "for_s": 1}}],
+        "scenarios.x[0].episodes.every_s",
+        ("0", "a process whose mean is", "from 1e-5 to 1e9"),
+    ),
+    (
+        ("scenarios", "x"),
+        [{"link": "R1->E", "both_ways": True, "episodes": {"name": "", "every_s": 1, "for_s": 1}}],
+        "scenarios.x[0].episodes.name",
+        ("'' is not a name",),
+    ),
+    (
+        ("scenarios", "x"),
+        [
+            {"node": "E", "episodes": {"name": "a", "every_s": 1, "for_s": 1}},
+            {"node": "R1", "episodes": {"name": "a", "every_s": 1, "for_s": 2}},
+        ],
+        "scenarios.x[1].episodes",
+        ("'a' is declared otherwise at scenarios.x[0]", "another name"),
+    ),
+    (
+        ("scenarios", "x"),
+        [{"link": "R1->E", "add_delay_ms": 1, "ramp_s": 1}] * 13,
+        "scenarios.x[12].add_delay_ms",
+        ("one too many on R1->E", "65", "63"),
+    ),
     (("objective", "weights", "edge"), -1, "objective.weights.edge", ("-1", "from 0 to 1e9")),
     (
         ("objective", "weights"),
@@ -292,6 +334,17 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("controller", "order_delay_ms"), 1e10, "controller.order_delay_ms", ("10000000000", "1e9")),
     (("controller", "order_lead_cycles"), 0.5, "controller.order_lead_cycles", ("0.5", "whole")),
     (("controller", "close_grace_ms"), math.nan, "controller.close_grace_ms", ("NaN", "from 0")),
+    (("servo",), [], "servo", ("a list", "a mapping of plant, gain, damping, target")),
+    (("servo",), {"gain": 1, "target": TARGET}, "servo.plant", ("missing",)),
+    (("servo",), {"plant": "integrator", "gain": 1}, "servo.target", ("missing",)),
+    (("servo", "plant"), "integrater", "servo.plant", ("integrater", "'integrator'?")),
+    (("servo", "gain"), 0, "servo.gain", ("0", "above 0 and at most 1000000")),
+    (("servo", "damping"), -1, "servo.damping", ("-1", "from 0 to 1000000")),
+    (("servo", "damping"), 0, "servo.damping", ("0", "above 0 with a double-integrator")),
+    (("servo", "plant"), "integrator", "servo.damping", ("8", "left out with an integrator")),
+    (("servo", "target", "amplitude_mm"), 0, "servo.target.amplitude_mm", ("0", "from 1e-6")),
+    (("servo", "target", "period_s"), 0.079, "servo.target.period_s", ("0.079", "at least 0.08")),
+    (("servo", "target", "phase"), 1, "servo.target.phase", ("phase",)),
     (("task",), {}, "task", ("unknown key 'task'", "'tasks'?")),
 ]
 
@@ -487,3 +540,14 @@ def test_faults_stay_on_one_line_and_can_be_printed() -> None:
     (fault,) = _faults(document)
     assert "\n" not in str(fault)
     assert str(fault).encode()
+
+
+def test_a_fault_in_episodes_is_no_difference_to_what_shares_their_name() -> None:
+    good = {"name": "a", "every_s": 1, "for_s": {"exponential": {"mean": 2}}}
+    bad = {**good, "for_s": {"exponential": {"mean": -2}}}
+    document = copy.deepcopy(DOCUMENT)
+    document["scenarios"]["x"] = [{"node": "E", "episodes": each} for each in (good, bad, good)]
+    with pytest.raises(ProblemError) as caught:
+        from_document(document)
+    (fault,) = caught.value.faults
+    assert fault.path == "scenarios.x[1].episodes.for_s.exponential.mean"

@@ -71,6 +71,10 @@ def test_every_key_says_what_it_is() -> None:
         (("tasks", "perception", "scale"), None),
         (("scenarios", "x"), [{"at_s": 1}]),
         (("scenarios", "x"), [{"node": "E", "link": "R1->E"}]),
+        (("scenarios", "x"), [{"node": "E", "ramp_s": -1}]),
+        (("scenarios", "x"), [{"node": "E", "episodes": {"every_s": 1, "for_s": 1}}]),
+        (("servo",), {"plant": "integrator", "gain": 1}),
+        (("servo", "gain"), 0),
         (("dwell",), 2),
     ],
 )

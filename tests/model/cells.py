@@ -14,6 +14,7 @@ from dwell.model import (
     Constant,
     ControllerSettings,
     Disturbance,
+    Episodes,
     Execution,
     Exponential,
     Fabric,
@@ -22,6 +23,7 @@ from dwell.model import (
     Link,
     LinkDisturbance,
     LogNormal,
+    MovingTarget,
     Node,
     NodeDisturbance,
     Normal,
@@ -31,6 +33,7 @@ from dwell.model import (
     Problem,
     Process,
     Quota,
+    Servo,
     Targets,
     Task,
     Uniform,
@@ -38,6 +41,7 @@ from dwell.model import (
 )
 from dwell.model.objective import TIERS
 from dwell.model.problem import POLICIES
+from dwell.model.servo import PLANTS
 
 # Names that YAML 1.1, numbers or paths might trip over.
 NAMES = (
@@ -168,9 +172,15 @@ def _disturbance(draw: st.DrawFn, nodes: list[str], links: list[str]) -> Disturb
     at_s = draw(_reals(0, 1e8))
     for_s = draw(st.just(math.inf) | _reals(0, 1e12, exclude_min=True))
     down = draw(st.booleans())
+    every, length = draw(durations), draw(durations)
+    # Two of one name must be equal.
+    name = f"{hash((at_s, every, length)) & 0xFFFFFFFF:x}"
+    episodes = draw(st.sampled_from((None, Episodes(name, every, length))))
+    ramp_s = 0.0 if down or episodes is not None else draw(_reals(0, min(for_s / 2, 1e9)))
     if not links or draw(st.booleans()):
         stress = draw(_whole(0, 1_000_000))
-        return NodeDisturbance(draw(st.sampled_from(nodes)), at_s, for_s, stress, down)
+        node = draw(st.sampled_from(nodes))
+        return NodeDisturbance(node, at_s, for_s, stress, down, episodes, ramp_s)
     source, target = draw(st.sampled_from(links)).split("->")
     return LinkDisturbance(
         source,
@@ -181,6 +191,8 @@ def _disturbance(draw: st.DrawFn, nodes: list[str], links: list[str]) -> Disturb
         draw(_reals(0, 1)),
         draw(st.just(math.inf) | _reals(1e-4, 1e12)),
         down,
+        episodes,
+        ramp_s,
     )
 
 
@@ -225,6 +237,19 @@ def _controller(draw: st.DrawFn, nodes: list[str], candidates: list[str]) -> Con
 
 
 @st.composite
+def _servo(draw: st.DrawFn, period_ms: float) -> Servo:
+    plant = draw(st.sampled_from(PLANTS))
+    damping = draw(_reals(1e-9, 1e6)) if plant == "double-integrator" else 0.0
+    period_s = draw(_reals(max(2 * period_ms / 1e3, 1e-5), 1e9))
+    return Servo(
+        plant,
+        draw(_reals(0, 1e6, exclude_min=True)),
+        MovingTarget(draw(_reals(1e-6, 1e6)), period_s),
+        damping,
+    )
+
+
+@st.composite
 def problems(draw: st.DrawFn) -> Problem:
     """Valid problems; every pair of nodes has its links, so that any placement can be chosen."""
     nodes = {name: draw(_node(name)) for name in draw(_names(1, 3))}
@@ -260,4 +285,5 @@ def problems(draw: st.DrawFn) -> Problem:
         controller=draw(_controller(list(nodes), list(candidates))),
         window_cycles=draw(_whole(1, 1_000_000)),
         warmup_windows=draw(_whole(0, 1_000_000)),
+        servo=draw(st.none() | _servo(period_ms)),
     )

@@ -15,18 +15,21 @@ from dwell.model import (
     Bursts,
     Constant,
     ControllerSettings,
+    Episodes,
     Execution,
     Fabric,
     Flow,
     FrozenDict,
     Link,
     LinkDisturbance,
+    MovingTarget,
     Node,
     NodeDisturbance,
     Objective,
     Pipeline,
     Placement,
     Problem,
+    Servo,
     Targets,
     Task,
     Weights,
@@ -34,6 +37,7 @@ from dwell.model import (
 from tests.model.cells import problems
 
 EXECUTION = Execution(Constant(1.0))
+EPISODES = Episodes("storm", Constant(30.0), Constant(10.0))
 
 
 def _problem() -> Problem:
@@ -63,6 +67,7 @@ def _faults(make: Callable[[], object]) -> list[Fault]:
 
 
 BURSTS = Bursts(Constant(1.0), Constant(1.0), threads=1, add_delay_ms=Constant(1.0))
+TARGET = MovingTarget(1.0, 1.0)
 PLACED = {"a": "R", "b": "R"}
 
 
@@ -90,12 +95,54 @@ PLACED = {"a": "R", "b": "R"}
         (lambda: Pipeline({}, (), 1, 2), "deadline_ms", "at most period_ms = 1"),
         (lambda: NodeDisturbance("R", for_s=0), "for_s", "above 0"),
         (lambda: LinkDisturbance("R", "E", loss=2), "loss", "from 0 to 1"),
+        (lambda: NodeDisturbance("R", ramp_s=-1), "ramp_s", "from 0 to 1e9"),
+        (lambda: NodeDisturbance("R", for_s=3, ramp_s=2), "ramp_s", "at most half of for_s = 3"),
+        (lambda: NodeDisturbance("R", down=True, ramp_s=2), "ramp_s", "left out of what is `down`"),
+        (
+            lambda: LinkDisturbance("R", "E", ramp_s=2, episodes=EPISODES),
+            "ramp_s",
+            "left out where there are `episodes`",
+        ),
+        (lambda: Episodes("x", Constant(1), Constant(0)), "episodes.for_s", "mean is a number"),
+        (
+            lambda: replace(
+                _problem(),
+                scenarios={"s": (NodeDisturbance("R", episodes=replace(EPISODES, name="a/b")),)},
+            ),
+            "scenarios.s[0].episodes.name",
+            "is not a name",
+        ),
+        (
+            lambda: replace(
+                _problem(),
+                scenarios={
+                    "s": (
+                        NodeDisturbance("R", at_s=1, episodes=EPISODES),
+                        NodeDisturbance("E", episodes=replace(EPISODES, name="wind")),
+                        NodeDisturbance("E", episodes=EPISODES),
+                    )
+                },
+            ),
+            "scenarios.s[2].episodes",
+            "'storm' is declared otherwise at scenarios.s[0]",
+        ),
         (lambda: Weights(0, 0, 0, 0, 0), "weights", "all weights are 0"),
         (lambda: Weights(latency=1e300), "weights.latency", "from 0 to 1e9"),
         (lambda: Targets(0), "targets.latency_ms", "from 1e-9"),
         (lambda: Objective(Weights(cloud=1), Targets(1)), "targets.cloud", "missing"),
         (lambda: ControllerSettings(guard_cycles=1), "guard_cycles", "from 2"),
         (lambda: ControllerSettings(estimator="x"), "estimator", "profile"),
+        (lambda: Servo("arm", 1.0, TARGET), "plant", "double-integrator"),  # type: ignore[arg-type]
+        (lambda: Servo("integrator", 0.0, TARGET), "gain", "above 0"),
+        (lambda: Servo("integrator", 1.0, TARGET, 1.0), "damping", "left out"),
+        (lambda: Servo("double-integrator", 1.0, TARGET), "damping", "above 0"),
+        (lambda: MovingTarget(0.0, 1.0), "target.amplitude_mm", "from 1e-6"),
+        (lambda: MovingTarget(1.0, 0.0), "target.period_s", "from 1e-5"),
+        (
+            lambda: replace(_problem(), servo=Servo("integrator", 1.0, MovingTarget(1.0, 0.019))),
+            "servo.target.period_s",
+            "at least 0.02",
+        ),
         (lambda: replace(_problem(), window_cycles=0), "window_cycles", "from 1"),
         (lambda: replace(_problem(), warmup_windows=-1), "warmup_windows", "from 0"),
         (

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dwell.errors import SimulationError
+from dwell.model import MovingTarget, Servo
 from dwell.record import OUTCOMES, Run
+from dwell.study.quality import NEVER_NS, actuations, track
 from dwell.study.summary import (
     count_in,
+    count_within,
     latency_grid_ms,
     longest_streak,
     order_statistic,
@@ -22,6 +28,20 @@ from tests.study.cell import make_problem
 
 W = 4
 LABELS: dict[str, str | int] = {"scenario": "baseline", "policy": "dtp", "seed": 1}
+# Age at the actuator in the run below, from the release of cycle 4 (132 ms) to 33 ms after that of
+# cycle 15: at its begin cycle 2 was the newest in effect.
+TEETH = (
+    (66, 70),
+    (4, 38),
+    (5, 39),
+    (6, 74),
+    (8, 42),
+    (9, 43),
+    (10, 78),
+    (12, 46),
+    (13, 47),
+    (14, 66),
+)
 
 
 def make_run(
@@ -124,6 +144,16 @@ def test_a_row_holds_what_the_tables_show() -> None:
         "cost": 2.0,
         "lost": 3,
         "longest_misses": 1,
+        # There are 12 cycles: the whole run is the only stretch.
+        "misses_in_20": 3,
+        "over_1_in_20": 1.0,
+        "misses_in_100": 3,
+        "over_5_in_100": 0.0,
+        "aoi_mean_ms": pytest.approx(sum(b * b - a * a for a, b in TEETH) / 2 / 396),
+        # 5 % of 396 ms are spent above: (78 - a) + (74 - a) + (70 - a) = 19.8.
+        "aoi_p95_ms": pytest.approx(67.4),
+        "aoi_peak_ms": 78.0,
+        "aoi_mean_peak_ms": pytest.approx(53.0),
         "compute_ms": pytest.approx(0.6),
         "queue_ms": 0.0,
         "network_ms": pytest.approx(0.4),
@@ -145,6 +175,39 @@ def test_a_distribution_counts_what_finished() -> None:
     grid = latency_grid_ms(33.0)
     finished = [i for i in range(4, 16) if i % W != W - 1]
     assert summary.within.tolist() == [sum(i <= at for i in finished) for at in grid]
+
+
+@given(
+    st.lists(st.one_of(st.just(NEVER_NS), st.integers(0, 200_000_000)), min_size=1, max_size=50),
+    st.floats(1e-3, 1e3),
+)
+def test_a_distribution_is_that_of_comparing_with_every_point(
+    latencies: list[int], deadline_ms: float
+) -> None:
+    points_ns = np.rint(latency_grid_ms(deadline_ms) * 1e6).astype(np.int64)
+    # The points themselves too, and what is beside them.
+    near = [int(ns) + offset for ns in points_ns[::37] for offset in (-1, 0, 1)]
+    latency_ns = np.array(latencies + near, np.int64)
+    within = count_within(latency_ns, deadline_ms)
+    assert within.tolist() == [int((latency_ns <= ns).sum()) for ns in points_ns]
+
+
+def test_tracking_is_shown_where_the_cell_has_a_servo() -> None:
+    problem = make_problem(warmup_windows=1, window_cycles=W)
+    servo = Servo("integrator", 4.0, MovingTarget(40.0, 1.6))
+    run = make_run()
+    with_servo = summarise(run, replace(problem, servo=servo), LABELS).row
+    without = summarise(run, problem, LABELS).row
+    assert {**without, **with_servo} == with_servo
+    assert set(with_servo) - set(without) == {"tracking_rms_mm", "tracking_iae_mm"}
+    # The loop runs from cycle 0; cycles 4 to 15 count.
+    cycles = run.cycles.head(16)
+    actuated = actuations(
+        cycles["release_ns"].to_numpy(), cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
+    )
+    found = track(servo, actuated, 132_000_000, 528_000_000)
+    assert with_servo["tracking_rms_mm"] == found.rms_mm
+    assert with_servo["tracking_iae_mm"] == found.mean_mm
 
 
 def test_the_deadline_is_a_point_of_the_grid() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike, fspath
 from pathlib import Path
@@ -28,10 +28,7 @@ if TYPE_CHECKING:
     from dwell.io.study_entries import StudyEntry
     from dwell.io.traces import Tables
 
-__all__ = ["REFERENCES", "DeclaredPoint", "DeclaredPolicy", "DeclaredStudy", "Value", "read_study"]
-
-#: Names in tables of the references that know the whole run in advance.
-REFERENCES = ("clairvoyant", "clairvoyant-dwell")
+__all__ = ["DeclaredPoint", "DeclaredPolicy", "DeclaredStudy", "Value", "read_study"]
 
 WINDOWS = 300
 SEEDS = tuple(range(1, 21))
@@ -72,13 +69,15 @@ class DeclaredStudy:
     references: bool
 
 
-def read_study(path: str | PathLike[str]) -> DeclaredStudy:
+def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -> DeclaredStudy:
     """Read a study file, and the cell that it names.
 
     Parameters
     ----------
     path : str or path
         A YAML 1.2 (or JSON) file.
+    references : collection of str
+        Names that no policy may have where the study asks for references.
 
     Raises
     ------
@@ -98,7 +97,7 @@ def read_study(path: str | PathLike[str]) -> DeclaredStudy:
     if isinstance(document, dict) and "dwell" in document and STUDY.key not in document:
         faults.refuse("dwell", f"this is a cell; a study file begins with `{STUDY.begin}`")
     entry = read_structure(document, faults, STUDY)
-    study = _Reading(entry, Path(source), faults).study()
+    study = _Reading(entry, Path(source), faults, references).study()
     if study is None or faults:
         raise faults.error()
     return study
@@ -150,6 +149,7 @@ class _Reading:
     entry: StudyEntry
     path: Path
     faults: Faults
+    reserved: Collection[str]
 
     def study(self) -> DeclaredStudy | None:
         """Return the study, or None beside at least one fault."""
@@ -335,7 +335,7 @@ class _Reading:
         for name, given in self.entry.policies.items():
             path = f"policies.{name}"
             self._check_name(path, name)
-            if self.entry.references and name in REFERENCES:
+            if self.entry.references and name in self.reserved:
                 self.faults.add(path, f"{name!r} is a reference's name; choose another")
             keys = {"policy": given} if isinstance(given, str) else given
             if isinstance(keys, dict):

@@ -113,7 +113,6 @@ from dwell.kernels.layout import (
     SITE_TASK,
     START,
     START_NS,
-    STATE_ARRIVED,
     STATELESS,
     STAYS,
     STEP_BITS,
@@ -121,6 +120,7 @@ from dwell.kernels.layout import (
     TAKEN,
     TASK_0,
     TASK_START_NS,
+    UNKNOWN,
     VIRTUAL,
     WAITING,
     WINDOW,
@@ -142,15 +142,26 @@ NEVER = 1 << 30
 
 
 @phase
-def _progress(s: Tables, server: int, at: int) -> float:
-    """Own core-nanoseconds that a running job has received so far."""
-    key = s.run_key[s.servers[server, BASE] + at]
+def _progress(s: Tables, key: int, left: float) -> float:
+    """Core-nanoseconds that a job which has `left` nanoseconds of work has received so far."""
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
     site = s.jobs[job_row(s.ring, s.stride, cell, cycle, key & ITEM_MASK), SITE]
-    left = s.run_v[s.servers[server, BASE] + at] - s.servers_f[server, VIRTUAL]
     received: float = s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
     return received
+
+
+@phase
+def _begun(s: Tables, server: int, at: int) -> tuple[int, float]:
+    """Key of a job on a server, and its progress: first those that run, then those that wait."""
+    base = s.servers[server, BASE]
+    running = s.servers[server, N_RUN]
+    if at < running:
+        key = s.run_key[base + at]
+        return key, _progress(s, key, s.run_v[base + at] - s.servers_f[server, VIRTUAL])
+    # One that waits for cores may have been preempted.
+    key = s.wait_key[base + at - running]
+    return key, _progress(s, key, s.wait_left[base + at - running])
 
 
 @phase
@@ -165,12 +176,13 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
         shadow = s.cells[cell, SHADOW]
         own = s.own[cell, node]
         extra = s.own[shadow, node] if shadow >= 0 else 0.0
-        for i in range(s.servers[server, N_RUN]):
-            whose = (s.run_key[s.servers[server, BASE] + i] >> CELL_SHIFT) & CELL_MASK
+        for i in range(s.servers[server, N_RUN] + s.servers[server, N_WAIT]):
+            key, received = _begun(s, server, i)
+            whose = (key >> CELL_SHIFT) & CELL_MASK
             if whose == cell:
-                own += _progress(s, server, i)
+                own += received
             elif whose == shadow:
-                extra += _progress(s, server, i)
+                extra += received
         out[cell, row, 0, node] = float(s.servers[server, BUSY])
         out[cell, row, 1, node] = own
         out[cell, row, 2, node] = extra
@@ -219,16 +231,14 @@ def _lose_key(s: Tables, key: int, now: int) -> None:
 @phase
 def _crash(s: Tables, server: int, now: int) -> None:
     """Lose what runs or waits for cores on a server whose node goes down."""
-    base = s.servers[server, BASE]
-    while s.servers[server, N_RUN] > 0:
-        key = s.run_key[base]
-        cell = (key >> CELL_SHIFT) & CELL_MASK
+    for i in range(s.servers[server, N_RUN] + s.servers[server, N_WAIT]):
+        key, received = _begun(s, server, i)
         if s.servers[server, IS_CPU] != 0:
-            s.own[cell, s.servers[server, NODE_OF]] += _progress(s, server, FIRST)
+            s.own[(key >> CELL_SHIFT) & CELL_MASK, s.servers[server, NODE_OF]] += received
         _lose_key(s, key, now)
+    while s.servers[server, N_RUN] > 0:
+        key = s.run_key[s.servers[server, BASE]]
         leave(s, server, index(s.jobs[key_row(s.ring, s.stride, key), SITE]), now)
-    for i in range(s.servers[server, N_WAIT]):
-        _lose_key(s, s.wait_key[base + i], now)
     s.servers[server, N_WAIT] = 0
 
 
@@ -314,9 +324,24 @@ def _announce_change(s: Tables) -> None:
 
 
 @phase
+def _opens(s: Tables, cell: int, cycle: int) -> int:
+    """Window that a cycle is the first of, as far as is known; -1 for none."""
+    beyond = cycle - s.cells[cell, CLOSE_CYCLE]
+    window = UNKNOWN
+    if beyond < 0:
+        if cycle == s.cells[cell, WINDOW_FIRST]:
+            window = s.cells[cell, WINDOW]
+    elif beyond % s.cells[cell, WINDOW_CYCLES] == 0:
+        # The window before has a grace and has not closed yet.
+        window = s.cells[cell, WINDOW] + 1 + beyond // s.cells[cell, WINDOW_CYCLES]
+    return window
+
+
+@phase
 def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
-    if cycle == s.cells[cell, WINDOW_FIRST] and s.cells[cell, WINDOW] < s.opened.shape[1]:
-        _snapshot(s, s.opened, cell, s.cells[cell, WINDOW], now)
+    window = _opens(s, cell, cycle)
+    if 0 <= window < s.opened.shape[1]:
+        _snapshot(s, s.opened, cell, window, now)
     release(s, cell, cycle, now)
     release_shadow(s, cell, cycle, now)
 
@@ -415,11 +440,9 @@ def _migrate(s: Tables, cell: int, step: int, attempt: int, local: int, now: int
                 _announce_step(s, cell, WORKER_STARTED, FIRST, task, started)
     elif step == WORKER_STARTED and s.state_hops[pair, local] != STATELESS:
         hop = s.state_hops[pair, local]
-        t, arrived = send_state(s, hop, s.cells[cell, ORDER_CYCLE], attempt, now)
-        if arrived:
-            _announce_step(s, cell, STATE_ARRIVED, FIRST, local, t)
-        elif t >= 0:
-            _announce_step(s, cell, WORKER_STARTED, attempt + 1, local, t)
+        t, following, attempt = send_state(s, hop, s.cells[cell, ORDER_CYCLE], attempt, now)
+        if t >= 0:
+            _announce_step(s, cell, following, attempt, local, t)
     else:
         s.cells[cell, MOVES_LEFT] -= 1
     if s.cells[cell, MOVES_LEFT] == 0:

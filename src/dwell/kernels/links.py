@@ -32,8 +32,10 @@ from dwell.kernels.layout import (
     SEGMENT_LAYERS,
     SEGMENT_LOSS,
     SEGMENT_RATE,
+    STATE_ARRIVED,
     STATE_TIMEOUT_NS,
     UNKNOWN,
+    WORKER_STARTED,
     Tables,
 )
 from dwell.kernels.streams import attempt_uniform
@@ -98,12 +100,9 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     transmission = 0
     lost = s.segments[segment, SEGMENT_DOWN] != 0
     if not lost:
-        rate = s.segments_f[segment, SEGMENT_RATE]
-        if rate < math.inf:
-            transmission = int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+        transmission = _transmission(s, hop, segment)
         s.links[link, FREE] = start + transmission
-        loss = s.segments_f[segment, SEGMENT_LOSS]
-        lost = loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss
+        lost = _is_lost(s, hop, segment, cycle, attempt)
     sent = start + transmission
     name = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | flow
     if lost:
@@ -118,43 +117,66 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
             key = (RETRY << KIND_SHIFT) | name
             push_event(s.clock, s.event_t, s.event_key, sent + timeout, key)
         return
-    arrival = sent + _propagation(s, hop, segment, cycle)
-    if s.links[link, IN_ORDER] != 0:
-        arrival = max(arrival, s.links[link, LAST_ARRIVAL])
-        s.links[link, LAST_ARRIVAL] = arrival
+    arrival = _arrival(s, hop, segment, cycle, sent)
     push_event(s.clock, s.event_t, s.event_key, arrival, (ARRIVAL << KIND_SHIFT) | name)
 
 
 @phase
-def send_state(s: Tables, hop: int, cycle: int, attempt: int, now: int) -> tuple[int, bool]:
+def send_state(s: Tables, hop: int, cycle: int, attempt: int, now: int) -> tuple[int, int, int]:
     """Send the state of a task that moves; it is carried reliably, whatever the link does.
 
     Returns
     -------
     t : int
-        Instant of its arrival, or of the next attempt; -1 where the link is down for good.
-    arrived : bool
+        Instant of the next step; -1 where the link is down for good.
+    step : int
+        STATE_ARRIVED, or WORKER_STARTED where the state must be sent once more.
+    attempt : int
+        Number of the next attempt; waiting for the end of an outage is none.
     """
     link = index(s.hops[index(hop), LINK])
     start = _begin(s, link, now)
-    segment = index(s.links[link, SEGMENT])
-    if s.segments[segment, SEGMENT_DOWN] != 0:
-        last = s.links[link, SEGMENT_END] - 1
-        while segment < last and s.segments[segment, SEGMENT_DOWN] != 0:
-            segment = index(segment + 1)
-        if s.segments[segment, SEGMENT_DOWN] != 0:
-            return UNKNOWN, False
-        return s.segments[segment, SEGMENT_AT], False
-    sent = start
-    rate = s.segments_f[segment, SEGMENT_RATE]
-    if rate < math.inf:
-        sent += int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+    segment = s.links[link, SEGMENT]
+    while s.segments[index(segment), SEGMENT_DOWN] != 0:
+        segment += 1
+        if segment == s.links[link, SEGMENT_END]:
+            return UNKNOWN, WORKER_STARTED, attempt
+        if s.segments[index(segment), SEGMENT_DOWN] == 0:
+            return s.segments[index(segment), SEGMENT_AT], WORKER_STARTED, attempt
+    sent = start + _transmission(s, hop, segment)
     s.links[link, FREE] = sent
-    loss = s.segments_f[segment, SEGMENT_LOSS]
-    if loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss:
+    if _is_lost(s, hop, segment, cycle, attempt):
         timeout = s.links[link, RETRANSMIT_NS]
-        return sent + (timeout if timeout >= 0 else STATE_TIMEOUT_NS), False
-    return sent + _propagation(s, hop, segment, cycle), True
+        again = sent + (timeout if timeout >= 0 else STATE_TIMEOUT_NS)
+        return again, WORKER_STARTED, attempt + 1
+    return _arrival(s, hop, segment, cycle, sent), STATE_ARRIVED, attempt
+
+
+@phase
+def _transmission(s: Tables, hop: int, segment: int) -> int:
+    """Time that a message takes at the rate of a link."""
+    rate = s.segments_f[index(segment), SEGMENT_RATE]
+    if rate < math.inf:
+        return int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+    return 0
+
+
+@phase
+def _is_lost(s: Tables, hop: int, segment: int, cycle: int, attempt: int) -> bool:
+    """Whether an attempt to send a message is lost."""
+    loss = s.segments_f[index(segment), SEGMENT_LOSS]
+    return bool(loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss)
+
+
+@phase
+def _arrival(s: Tables, hop: int, segment: int, cycle: int, sent: int) -> int:
+    """Instant at which a message arrives whose transmission has ended."""
+    link = index(s.hops[index(hop), LINK])
+    arrival = sent + _propagation(s, hop, segment, cycle)
+    if s.links[link, IN_ORDER] != 0:
+        arrival = max(arrival, s.links[link, LAST_ARRIVAL])
+        s.links[link, LAST_ARRIVAL] = arrival
+    return int(arrival)
 
 
 @phase

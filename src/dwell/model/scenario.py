@@ -45,7 +45,13 @@ MAX_LAYERS = 63
 class Episodes:
     """An alternating renewal process: off for `every_s` seconds, then on for `for_s`, and so on.
 
-    Disturbances whose episodes have one name come and go together.
+    Parameters
+    ----------
+    name : str
+        Of the streams it is drawn from: disturbances of one scenario whose episodes have one name
+        come and go together.
+    every_s, for_s : Process
+        Seconds, independent of each other; their means are above 1e-5.
     """
 
     name: str

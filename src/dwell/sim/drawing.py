@@ -288,7 +288,7 @@ class _Draw:
     def _spells(self, item: Disturbance) -> Spells:
         """Say when a disturbance is on, up to the end of the run."""
         begin_ns = round(item.at_s * NS_PER_S)
-        end_ns = round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS))
+        end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS)))
         if item.ramp_s:
             return ramp(begin_ns, end_ns, round(item.ramp_s * NS_PER_S))
         if item.episodes is None:
@@ -411,9 +411,8 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
         for link in problem.fabric.links:
             if link in crossed:
                 hops[flow.source, flow.target, link] = None
-    if problem.controller.migration == "cold":
-        hops |= dict.fromkeys(_state_hops(problem))
-    return tuple(hops)
+    # Whether migrations are cold or warm, so that both meet the same realisation.
+    return (*hops, *_state_hops(problem))
 
 
 def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:

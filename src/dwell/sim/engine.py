@@ -99,7 +99,7 @@ def simulate_realisation(
     _check_fit(problem, realisation)
     controller = Controller(problem, policy, estimator)
     shadows = draw_shadows(problem, realisation) if controller.shadow_fraction > 0 else None
-    log_jobs = jobs or controller.learns
+    log_jobs = jobs or controller.learns or shadows is not None
     arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
     sees_all = not _host_changes(problem, realisation)[:, 3].any()
     if controller.fixed_profile is not None and sees_all and not by_window:

@@ -11,6 +11,10 @@ L95 is given twice, because the two answer different questions:
   cycle counts with its age, so that it is always finite.
 * ``p95_ms``: the 95th percentile of the final latencies of all cycles together, an order
   statistic. A lost cycle counts as infinite, and so does this where more than 5 % are lost.
+
+Misses in any K consecutive cycles are counted for K = 20 and K = 100: 20 is the least K of which
+5 %, the aim, is a whole number of misses, and 100 is about as long as a window. Unlike windows,
+these stretches begin at every cycle.
 """
 
 from __future__ import annotations
@@ -26,6 +30,13 @@ from numpy.typing import NDArray
 from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
 from dwell.model import Problem
+from dwell.study.quality import (
+    NEVER_NS,
+    actuations,
+    age_of_information,
+    misses_in,
+    track,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -34,9 +45,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "GRID_PER_DEADLINE",
+    "STRETCHES",
     "Counted",
     "Summary",
     "count_in",
+    "count_within",
     "latency_grid_ms",
     "latency_ms",
     "longest_streak",
@@ -51,6 +64,9 @@ Row: TypeAlias = dict[str, float | int | str]
 #: Points of the latency distributions: so many to a deadline, up to four deadlines.
 GRID_PER_DEADLINE = 80
 DEADLINES = 4
+
+#: K, the lengths of stretches of cycles, with m, the misses that are 5 % of one.
+STRETCHES = {20: 1, 100: 5}
 
 
 class Counted(NamedTuple):
@@ -108,11 +124,18 @@ def count_in(run: Run, window_cycles: int) -> Counted:
             f"none of {run.windows.height} windows is left after the warm-up; ask for more windows"
         )
     begin, end = windows["first_cycle"][0], windows["first_cycle"][-1] + window_cycles
+    decisions = run.decisions
     return Counted(
         windows,
-        run.decisions.filter(pl.col("window") >= windows["window"][0]),
-        run.cycles.filter((pl.col("cycle") >= begin) & (pl.col("cycle") < end)),
+        decisions.filter(decisions["window"] >= windows["window"][0]),
+        run.cycles.slice(*_rows(run.cycles, begin, end)),
     )
+
+
+def _rows(cycles: pl.DataFrame, begin: int, end: int) -> tuple[int, int]:
+    """Return where cycles from begin to before end are in a table, and how many there are."""
+    first, after = (int(cycles["cycle"].search_sorted(number)) for number in (begin, end))
+    return first, after - first
 
 
 def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
@@ -132,26 +155,28 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         If the run has no window after its warm-up.
     """
     windows, decisions, cycles = count_in(run, problem.window_cycles)
-    final_ms = latency_ms(cycles)
+    missed = cycles["missed"].to_numpy()
+    latency_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
     row: Row = {
         **labels,
         "windows": windows.height,
         "cycles": cycles.height,
-        "violation_rate": _mean(cycles["missed"]),
+        "violation_rate": float(missed.mean()),
         "l95_ms": _mean(windows["seen_l95_ms"]),
-        **_percentiles(final_ms),
+        **_percentiles(latency_ns),
         **_utilisation(windows, problem),
         **_migrations(decisions),
         **_shares(windows["placement"], tuple(problem.candidates)),
         "cost": _mean(windows["cost"]),
         "lost": int((~cycles["outcome"].is_in(["done", "in_flight"])).sum()),
-        "longest_misses": longest_streak(cycles["missed"].to_numpy()),
+        "longest_misses": longest_streak(missed),
+        **_misses(missed),
+        **_actuator(run.cycles, cycles, problem),
         "compute_ms": _mean(cycles["compute_ns"]) / 1e6,
         "queue_ms": _mean(cycles["queue_ns"]) / 1e6,
         "network_ms": _mean(cycles["network_ns"]) / 1e6,
     }
-    grid = latency_grid_ms(problem.pipeline.deadline_ms)
-    within = np.searchsorted(np.sort(final_ms), grid, side="right")
+    within = count_within(latency_ns, problem.pipeline.deadline_ms)
     return Summary(row, _costs(windows, decisions, problem, labels), within)
 
 
@@ -162,9 +187,71 @@ def longest_streak(missed: NDArray[np.bool_]) -> int:
     return int(np.diff(ends).max()) - 1
 
 
+def _misses(missed: NDArray[np.bool_]) -> dict[str, float]:
+    """Misses in stretches of K cycles: the most, and the share of stretches with more than 5 %."""
+    row: dict[str, float] = {}
+    for stretch, aim in STRETCHES.items():
+        counts = misses_in(missed, stretch)
+        row[f"misses_in_{stretch}"] = int(counts.max())
+        row[f"over_{aim}_in_{stretch}"] = float((counts > aim).mean())
+    return row
+
+
+def _actuator(played: pl.DataFrame, counted: pl.DataFrame, problem: Problem) -> dict[str, float]:
+    """Age at the actuator and tracking error, until a period after the last counted release.
+
+    What took effect before the first of them may still last, so that every cycle played is needed.
+    """
+    cycles = played[: played["cycle"].search_sorted(counted["cycle"][-1]) + 1]
+    actuated = actuations(
+        cycles["release_ns"].to_numpy(), cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
+    )
+    begin_ns = counted["release_ns"][0]
+    end_ns = counted["release_ns"][-1] + round(problem.pipeline.period_ms * 1e6)
+    age = age_of_information(actuated, begin_ns, end_ns)
+    row = {
+        "aoi_mean_ms": age.mean_ms,
+        "aoi_p95_ms": age.p95_ms,
+        "aoi_peak_ms": age.peak_ms,
+        "aoi_mean_peak_ms": age.mean_peak_ms,
+    }
+    if problem.servo is not None:
+        tracking = track(problem.servo, actuated, begin_ns, end_ns)
+        row |= {"tracking_rms_mm": tracking.rms_mm, "tracking_iae_mm": tracking.mean_mm}
+    return row
+
+
+def count_within(latency_ns: Ints, deadline_ms: float) -> Ints:
+    """Count the cycles that finished within each point of the latency grid.
+
+    Parameters
+    ----------
+    latency_ns : int64 array, shape (n,)
+        `NEVER_NS` where the cycle never finished.
+    deadline_ms : float
+        D.
+
+    Returns
+    -------
+    int64 array
+        One a point of `latency_grid_ms`; a point is rounded to nanoseconds as the deadline is.
+    """
+    grid_ms = latency_grid_ms(deadline_ms)
+    ends_ns = np.append(np.rint(grid_ms * 1e6), np.inf)
+    count = len(grid_ms)
+    # A point's number by division, and then the one beside it where rounding decides.
+    place = latency_ns * (GRID_PER_DEADLINE / (deadline_ms * 1e6))
+    beyond = np.minimum(np.ceil(place), count + 1).astype(np.int64) - 1
+    np.maximum(beyond, 0, out=beyond)
+    beyond += latency_ns > ends_ns[beyond]
+    beyond -= latency_ns <= np.append(ends_ns, -np.inf)[beyond - 1]
+    within: Ints = np.bincount(beyond, minlength=count + 1)[:count].cumsum()
+    return within
+
+
 def _mean(values: pl.Series) -> float:
     """Mean of what is there; NaN where nothing is."""
-    mean = values.cast(float).mean()
+    mean = values.mean()
     return float(mean) if isinstance(mean, float) else float("nan")
 
 
@@ -180,9 +267,11 @@ def order_statistic(values: Floats, percent: int) -> float:
     return float(np.partition(values, rank - 1)[rank - 1])
 
 
-def _percentiles(final_ms: Floats) -> dict[str, float]:
+def _percentiles(latency_ns: Ints) -> dict[str, float]:
     """Percentiles of all cycles together, and how far the 95th is from the median."""
-    p95, p50 = (order_statistic(final_ms, percent) for percent in (95, 50))
+    ranks = [-(-percent * len(latency_ns) // 100) - 1 for percent in (50, 95)]
+    found = np.partition(latency_ns, ranks)[ranks]
+    p50, p95 = (float(ns) / 1e6 if ns < NEVER_NS else np.inf for ns in found)
     # Infinity less infinity is no number: where half of the cycles are lost, the tail has no end.
     return {"p95_ms": p95, "p50_ms": p50, "spread_ms": p95 - p50 if p50 < np.inf else np.inf}
 
@@ -222,15 +311,15 @@ def _costs(
     """Estimated J of every candidate while another was active, and its measured J."""
     rows: list[Row] = []
     for name in problem.candidates:
-        idle = decisions.filter(decisions["incumbent"] != name)
-        active = windows.filter(windows["placement"] == name)
+        idle = decisions[f"j_{name}"].filter(decisions["incumbent"] != name)
+        active = windows["cost"].filter(windows["placement"] == name)
         rows.append(
             {
                 **labels,
                 "candidate": name,
-                "estimated": _mean(idle[f"j_{name}"]),
-                "measured": _mean(active["cost"]),
-                "windows": active.height,
+                "estimated": _mean(idle),
+                "measured": _mean(active),
+                "windows": active.len(),
             }
         )
     return rows

@@ -1,0 +1,246 @@
+"""What the actuator got: misses in a row, the age of its information, and what a loop makes of it.
+
+A cycle *actuates* at its completion, late or not; a lost one never does. What it knows dates from
+its release. A cycle that completes after a newer one is discarded at the actuator, so that its
+information never gets older by an actuation.
+
+References
+----------
+* Bernat, Burns and Llamosí 2001, DOI 10.1109/12.919277; Hamdaoui and Ramanathan 1995, DOI
+  10.1109/12.477249: constraints on the misses in any K consecutive cycles.
+* Kaul, Yates and Gruteser 2012, DOI 10.1109/INFCOM.2012.6195689: the mean age. Costa, Codreanu and
+  Ephremides 2016, DOI 10.1109/TIT.2016.2533395: its peaks.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.model import Servo
+
+__all__ = [
+    "NEVER_NS",
+    "Actuations",
+    "Age",
+    "Tracking",
+    "actuations",
+    "age_of_information",
+    "misses_in",
+    "track",
+]
+
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+
+#: Latency that stands for a cycle that never finished.
+NEVER_NS = 2**62
+#: Percentile of the age that is given.
+PERCENT = 95
+
+
+class Actuations(NamedTuple):
+    """Commands that took effect, in that order, which is also that of their cycles.
+
+    Parameters
+    ----------
+    start_ns : int
+        First release of the run. Before the first actuation, information dates from then.
+    release_ns, at_ns : int64 array, shape (n,)
+        Release of each command's cycle, and the instant at which it took effect.
+    """
+
+    start_ns: int
+    release_ns: Ints
+    at_ns: Ints
+
+
+class Age(NamedTuple):
+    """Age of the actuator's information over a stretch of time, ms.
+
+    Parameters
+    ----------
+    mean_ms, p95_ms, peak_ms : float
+        Mean over time, what it does not exceed for 95 % of the time, and its largest value.
+    mean_peak_ms : float
+        Mean of the ages that actuations ended.
+    """
+
+    mean_ms: float
+    p95_ms: float
+    peak_ms: float
+    mean_peak_ms: float
+
+
+class Tracking(NamedTuple):
+    """Error of the reference loop over a stretch of time; infinite where the loop is unstable.
+
+    Parameters
+    ----------
+    rms_mm : float
+        Root of the mean square.
+    iae_mm_s : float
+        Integral of the absolute error.
+    seconds : float
+        Length of the stretch.
+    """
+
+    rms_mm: float
+    iae_mm_s: float
+    seconds: float
+
+    @property
+    def mean_mm(self) -> float:
+        """Mean absolute error: the IAE of a second."""
+        return self.iae_mm_s / self.seconds
+
+
+def actuations(release_ns: Ints, latency_ns: Ints) -> Actuations:
+    """Find the commands that take effect: those that no newer one precedes.
+
+    Parameters
+    ----------
+    release_ns, latency_ns : int64 array, shape (n,)
+        Of every cycle from the first; at least one. `NEVER_NS` is one that never finished.
+
+    Returns
+    -------
+    Actuations
+        Of several at one instant, the newest alone.
+    """
+    start_ns = int(release_ns[0])
+    done = latency_ns < NEVER_NS
+    if not done.all():
+        release_ns, latency_ns = release_ns[done], latency_ns[done]
+    at_ns = release_ns + latency_ns
+    newer_ns = np.minimum.accumulate(at_ns[::-1])[::-1]
+    fresh = np.ones(len(at_ns), np.bool_)
+    np.less(at_ns[:-1], newer_ns[1:], out=fresh[:-1])
+    if not fresh.all():
+        release_ns, at_ns = release_ns[fresh], at_ns[fresh]
+    return Actuations(start_ns, release_ns, at_ns)
+
+
+def age_of_information(actuated: Actuations, begin_ns: int, end_ns: int) -> Age:
+    """Age at the actuator: t less the release of the newest command in effect at t.
+
+    Parameters
+    ----------
+    actuated : Actuations
+    begin_ns, end_ns : int
+        The stretch of time; the begin not before the first release, the end after the begin.
+
+    Returns
+    -------
+    Age
+        Of a sawtooth that rises by 1 ms a ms and falls at actuations; the percentile is that of its
+        distribution over time, to the nanosecond.
+    """
+    first = int(np.searchsorted(actuated.at_ns, begin_ns, side="right"))
+    last = int(np.searchsorted(actuated.at_ns, end_ns, side="left"))
+    before_ns = actuated.release_ns[first - 1] if first else actuated.start_ns
+    known_ns = np.concatenate(([before_ns], actuated.release_ns[first:last]))
+    since_ns = np.concatenate(([begin_ns], actuated.at_ns[first:last], [end_ns]))
+    low, high = since_ns[:-1] - known_ns, since_ns[1:] - known_ns
+    span = end_ns - begin_ns
+    peaks = high[:-1] if len(high) > 1 else high
+    return Age(
+        mean_ms=float(np.sum((high - low) * 0.5 * (high + low))) / span / 1e6,
+        p95_ms=_age_percentile(low, high, PERCENT) / 1e6,
+        peak_ms=int(high.max()) / 1e6,
+        mean_peak_ms=float(peaks.mean()) / 1e6,
+    )
+
+
+def _age_percentile(low: Ints, high: Ints, percent: int) -> int:
+    """Return the age, ns, under which a sawtooth is for a share of the time.
+
+    The time spent under an age a, the sum over teeth of min(max(a, low), high) - low, grows with a
+    and is linear between whole nanoseconds: Newton's steps, kept inside the bracket of the answer.
+
+    Parameters
+    ----------
+    low, high : int64 array, shape (n,)
+        Ends of every tooth; each age between them takes as long as any other.
+    percent : int
+        The share, less than 100.
+    """
+    floor = int(low.sum())
+    wanted = (int(high.sum()) - floor) * percent / 100
+    under, over = int(low.min()), int(high.max())
+    age = int(high.mean())
+    while over - under > 1:
+        spent = int(np.clip(age, low, high).sum()) - floor
+        if spent < wanted:
+            under = age
+        else:
+            over = age
+        rate = np.count_nonzero((low <= age) & (age < high))
+        lacking = wanted - spent
+        if abs(lacking) <= rate:  # less than a nanosecond away
+            return age + round(lacking / rate) if rate else age
+        step = age + round(lacking / rate) if rate else under
+        age = step if under < step < over else (under + over) // 2
+    return over
+
+
+def misses_in(missed: NDArray[np.bool_], stretch: int) -> NDArray[np.int32]:
+    """Count the misses in every stretch of consecutive cycles.
+
+    Parameters
+    ----------
+    missed : bool array, shape (n,)
+    stretch : int
+        K, cycles of a stretch.
+
+    Returns
+    -------
+    int32 array, shape (n - K + 1,)
+        The largest is the m for which the cycles meet "at most m misses in any K". Where there
+        are fewer than K cycles, one number: all their misses.
+    """
+    total = np.zeros(len(missed) + 1, np.int32)
+    np.cumsum(missed, dtype=np.int32, out=total[1:])
+    return total[stretch:] - total[:-stretch] if len(missed) > stretch else total[-1:]
+
+
+def track(servo: Servo, actuated: Actuations, begin_ns: int, end_ns: int) -> Tracking:
+    """Drive the reference loop by the instants of a run.
+
+    Parameters
+    ----------
+    servo : Servo
+    actuated : Actuations
+        A command is made of what is seen at its cycle's release, and held until the next.
+    begin_ns, end_ns : int
+        The stretch of time whose error counts; the loop runs from the first release.
+
+    Returns
+    -------
+    Tracking
+        See `dwell.kernels.servo` for what is computed and how exactly.
+    """
+    from dwell.kernels import servo as kernel
+
+    start_ns, target = actuated.start_ns, servo.target
+    states = np.empty((len(actuated.at_ns) + 1, kernel.N_STATE))
+    integrals = np.empty(2)
+    status = kernel.follow(
+        (actuated.release_ns - start_ns) / 1e9,
+        (actuated.at_ns - start_ns) / 1e9,
+        (begin_ns - start_ns) / 1e9,
+        (end_ns - start_ns) / 1e9,
+        servo.plant == "double-integrator",
+        float(servo.gain),
+        float(servo.damping),
+        float(target.amplitude_mm),
+        target.omega,
+        states,
+        integrals,
+    )
+    seconds = (end_ns - begin_ns) / 1e9
+    if status == kernel.DIVERGED:
+        return Tracking(np.inf, np.inf, seconds)
+    return Tracking(float(np.sqrt(integrals[0] / seconds)), float(integrals[1]), seconds)

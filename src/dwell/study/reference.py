@@ -1,0 +1,270 @@
+"""What a realisation could have cost: every candidate alone, and the clairvoyant's sequences.
+
+The clairvoyant knows what every candidate, simulated alone, costs in every window of the same
+realisation. It plans the cheapest sequence of them, once with the dwell of Algorithm 1 and once
+without any, and the sequences are simulated. What they cost there counts, not what was promised.
+
+It is no bound. A window that follows one under another candidate does not cost what it costs when
+its candidate runs alone: work still queued comes along, and a node that is left alone recovers, so
+that taking turns may beat two overloaded nodes. Regret is therefore measured against the cheapest
+run of all, candidates alone and sequences, and may be negative.
+
+Whoever knows the future sends orders in time, and has a moved task ready when it is due: the
+sequences move at the boundary of the windows they were planned for, without ``order_delay_ms``,
+``order_lead_cycles`` or a cold start. (Orders that are given late shift all later windows by the
+cycles that they take, and after some tens of migrations the plan is about other cycles than those
+it is applied to.) Where ``close_grace_ms`` is set, a migration still comes that much late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import NEVER_NS
+from dwell.control.windows import seen_l95_ns
+from dwell.cost import hamming, price, tier_nodes
+from dwell.errors import SimulationError
+from dwell.estimators import Profile
+from dwell.model import FrozenDict, Problem
+from dwell.study.clairvoyant import Sequence, clairvoyant, priced
+from dwell.study.script import Script
+
+if TYPE_CHECKING:
+    from dwell.record import Run
+    from dwell.sim import Realisation
+
+__all__ = [
+    "CLAIRVOYANT",
+    "CLAIRVOYANT_DWELL",
+    "References",
+    "mean_cost",
+    "references",
+    "regret",
+    "window_costs",
+]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+CLAIRVOYANT = "clairvoyant"
+CLAIRVOYANT_DWELL = "clairvoyant-dwell"
+
+#: How much J of a warm-up window counts in a plan: enough to choose between sequences that are
+#: equal after the warm-up.
+WARMUP_SHARE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class References:
+    """The runs that regret is measured against.
+
+    Parameters
+    ----------
+    statics : mapping of str to Run
+        Every candidate alone.
+    runs : mapping of str to Run
+        The sequences, simulated: ``clairvoyant`` (no dwell) and ``clairvoyant-dwell``.
+    sequences : mapping of str to Sequence
+        As they were planned; candidates by their place in the order.
+    costs : mapping of str to float
+        Mean J of each static and each sequence (see `mean_cost`).
+    promised : mapping of str to float
+        The same mean of each sequence as it was planned, over windows of candidates alone.
+    """
+
+    statics: Mapping[str, Run]
+    runs: Mapping[str, Run]
+    sequences: Mapping[str, Sequence]
+    costs: Mapping[str, float]
+    promised: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        """The static or sequence that costs least; a static where it ties with a sequence."""
+        return min(self.costs, key=self.costs.__getitem__)
+
+    @property
+    def cost(self) -> float:
+        """What that costs: the reference for regret."""
+        return self.costs[self.name]
+
+    @property
+    def best_static(self) -> str:
+        """The best static placement in hindsight."""
+        return min(self.statics, key=self.costs.__getitem__)
+
+    @property
+    def best_static_cost(self) -> float:
+        """What it costs."""
+        return self.costs[self.best_static]
+
+
+def references(
+    problem: Problem, realisation: Realisation, *, min_dwell: int | None = None
+) -> References:
+    """Simulate every candidate alone, plan with what they cost, and simulate the plans.
+
+    All of it with the estimator ``profile``: nobody here needs estimates, and shadow jobs would be
+    load.
+
+    Parameters
+    ----------
+    problem : Problem
+    realisation : Realisation
+        Of this problem.
+    min_dwell : int, optional
+        N_min of the sequence with a dwell; the problem's where None.
+
+    Raises
+    ------
+    PolicyError
+        If `min_dwell` is out of its range.
+    SimulationError
+        If the controller sees no window after the warm-up, or a candidate has the name of a
+        sequence.
+    """
+    from dwell.sim import simulate_realisation
+
+    dwells = {
+        CLAIRVOYANT: 0,
+        CLAIRVOYANT_DWELL: problem.controller.min_dwell if min_dwell is None else min_dwell,
+    }
+    names = tuple(problem.candidates)
+    if taken := dwells.keys() & set(names):
+        raise SimulationError(
+            f"candidates.{min(taken)} has the name of a reference; call it something else"
+        )
+    in_time = _in_time(problem)
+    profile = Profile(problem)
+
+    def play(policy: Script | str) -> Run:
+        return simulate_realisation(in_time, realisation, policy=policy, estimator=profile)
+
+    statics = {name: play(name) for name in names}
+    costs = {name: mean_cost(run) for name, run in statics.items()}
+    alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
+    switching = _switching(problem)
+    windows = statics[names[0]].windows
+    seen, warmup = windows["cost"].is_not_null().to_numpy(), windows["warmup"].to_numpy()
+    sequences, runs, promised = {}, {}, {}
+    for title, dwell in dwells.items():
+        plan = clairvoyant(
+            alone,
+            switching,
+            initial=names.index(problem.initial),
+            min_dwell=dwell,
+            counts=np.where(warmup, WARMUP_SHARE, 1.0),
+            decides=seen,
+        )
+        script = Script([names[i] for i in plan.choice.tolist()], in_time, realisation)
+        sequences[title], runs[title] = plan, play(script)
+        costs[title] = mean_cost(runs[title])
+        promised[title] = float(np.mean(priced(plan.choice, alone, switching)[seen & ~warmup]))
+    return References(
+        statics=FrozenDict(statics),
+        runs=FrozenDict(runs),
+        sequences=FrozenDict(sequences),
+        costs=FrozenDict(costs),
+        promised=FrozenDict(promised),
+    )
+
+
+def regret(run_cost: float, references: References) -> float:
+    """How much more a run costs than the reference, as a share of what that costs.
+
+    Parameters
+    ----------
+    run_cost : float
+        `mean_cost` of a run of the same realisation.
+    references : References
+
+    Returns
+    -------
+    float
+        0.1 is a tenth more. Negative where the run costs less than the reference, which is no
+        bound.
+    """
+    return run_cost / references.cost - 1.0
+
+
+def mean_cost(run: Run) -> float:
+    """Mean J over the windows after the warm-up, those that the controller did not see left out.
+
+    Raises
+    ------
+    SimulationError
+        If there is none.
+    """
+    windows = run.windows
+    mean = windows.filter(~windows["warmup"])["cost"].mean()
+    if not isinstance(mean, float):
+        raise SimulationError(
+            f"of {windows.height} windows none is left that is after the warm-up and that the "
+            "controller saw; ask for more windows"
+        )
+    return mean
+
+
+def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats:
+    """J of every window of a run that never moves, also of those the controller did not see.
+
+    Such a window has the J that the controller would have seen, had its node been up. Statistics
+    leave it out; a sequence that were planned without it would spend an outage anywhere.
+
+    Parameters
+    ----------
+    run : Run
+    problem, realisation
+        What it is a run of.
+
+    Returns
+    -------
+    float64 array, shape (windows,)
+    """
+    cost = run.windows["cost"]
+    costs: Floats = cost.to_numpy().copy()
+    unseen = cost.is_null().to_numpy()
+    if unseen.any():
+        costs[unseen] = _unseen_costs(run, problem, realisation)
+    return costs
+
+
+def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats:
+    """J of the windows that the controller did not see, in their order."""
+    import polars as pl
+
+    windows = run.windows.filter(run.windows["cost"].is_null())
+    first = windows["first_cycle"].to_numpy()
+    rows = first[:, None] + np.arange(problem.window_cycles)
+    latency_ns = run.cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()[rows]
+    grace_ns = round(problem.controller.close_grace_ms * 1e6)
+    close_ns = realisation.release_ns[first + problem.window_cycles] + grace_ns
+    age_ns = close_ns[:, None] - realisation.release_ns[rows]
+    l95_ms = seen_l95_ns(latency_ns, age_ns, round(problem.censor_ms * 1e6)) / 1e6
+    rate = windows["violation_rate"].to_numpy()
+    used = [
+        windows.select(pl.max_horizontal(0.0, *(f"u_{node}" for node in nodes)))
+        .to_series()
+        .to_numpy()
+        for nodes in tier_nodes(problem.objective)
+    ]
+    return price(l95_ms, rate, used[0], used[1], used[2], 0.0, problem.objective)
+
+
+def _in_time(problem: Problem) -> Problem:
+    """Return the same problem with a controller whose orders take effect as windows close."""
+    settings = replace(
+        problem.controller, order_delay_ms=0.0, order_lead_cycles=0, migration="warm"
+    )
+    return replace(problem, controller=settings)
+
+
+def _switching(problem: Problem) -> Floats:
+    """Price of every move in units of J, from the row's candidate to the column's."""
+    placements = problem.candidates.values()
+    shares = [[hamming(after, before) for after in placements] for before in placements]
+    return problem.objective.weights.switching * np.array(shares, np.float64)
