@@ -1,0 +1,30 @@
+"""The canonical cell with the dynamic scenarios beside its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from dwell.io import from_document
+from dwell.io.faults import Faults
+from dwell.io.yaml_text import read_yaml
+from dwell.model import Problem
+
+__all__ = ["dynamic_problem"]
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def dynamic_problem() -> Problem:
+    """Return the canonical cell with the scenarios of the study ``dynamic``."""
+    cell, study = (_read(EXAMPLES / name) for name in ("canonical.yaml", "studies/dynamic.yaml"))
+    scenarios = {**cell["scenarios"], **study["scenarios"]}
+    return from_document({**cell, "scenarios": scenarios})
+
+
+def _read(path: Path) -> Any:
+    faults = Faults(str(path))
+    document = read_yaml(str(path), faults)
+    if faults:
+        raise faults.error()
+    return document
