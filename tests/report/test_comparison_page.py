@@ -141,6 +141,7 @@ def test_no_miss_at_all_is_said_to_be_no_proof() -> None:
     shown = {("baseline", name): {"violation_rate": 0.0} for name in ("LOC", "SO", "HYB", "dtp")}
     text = verdict(make_comparison(shown))[0]
     assert "8 independent runs limit it at 31.2 % only" in text
+    assert text.startswith("No policy is shown to keep V_D under 5 % in the scenario.")
 
 
 def test_the_verdict_holds_dtp_against_the_cheapest_placement() -> None:

@@ -1,29 +1,111 @@
-"""Intervals against closed forms."""
+"""Intervals against closed forms, and against what they promise."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from dwell.study.intervals import (
+    FEWEST,
     mean_interval,
     median_interval,
     rule_of_three,
     share_interval,
     share_limits,
+    studentised_limits,
+    under,
 )
 
-T_975_2, T_95_2 = 4.302652729749464, 2.919985580355516
+T_975_2 = 4.302652729749464
 
 
-def test_a_mean_has_students_t() -> None:
+def every_t(values: Sequence[float]) -> tuple[list[float], list[float]]:
+    """Return t* of all n^n resamples, and how often each occurs; written out, not vectorised."""
+    count, mean = len(values), math.fsum(values) / len(values)
+    found: dict[float, int] = {}
+    for picks in itertools.product(values, repeat=count):
+        shift = math.fsum(picks) / count - mean
+        spread = math.fsum((pick - math.fsum(picks) / count) ** 2 for pick in picks)
+        error = math.sqrt(spread / (count - 1) / count)
+        t = shift / error if len(set(picks)) > 1 else math.copysign(math.inf, shift)
+        found[t] = found.get(t, 0) + 1
+    order = sorted(found)
+    return order, [found[t] / count**count for t in order]
+
+
+def test_a_mean_has_the_studentised_bootstrap() -> None:
+    values = [1.0, 2.0, 4.0, 8.0, 9.5]
+    mean, low, high = mean_interval(values)
+    error = np.std(values, ddof=1) / math.sqrt(5)
+    ts, weights = every_t(values)
+    below = np.cumsum(weights)
+    assert mean == pytest.approx(4.9)
+    # Resamples are drawn, so that a limit lies between quantiles near those it is to be.
+    for t, tail in (((mean - high) / error, 0.025), ((mean - low) / error, 0.975)):
+        first, last = (int(np.searchsorted(below, tail + step)) for step in (-0.005, 0.005))
+        assert ts[first] - 1e-9 <= t <= ts[last] + 1e-9
+    # What is skewed to the right lies further up than down.
+    assert high - mean > mean - low
+
+
+def test_the_same_values_have_the_same_interval() -> None:
+    values = np.random.default_rng(5).lognormal(size=20)
+    assert studentised_limits(values, 0.05) == studentised_limits(values.copy(), 0.05)
+    assert mean_interval(values, seed=1) == mean_interval(values)
+    other = mean_interval(values, seed=2)
+    assert other != mean_interval(values)
+    assert other == pytest.approx(mean_interval(values), rel=0.03)
+
+
+@given(
+    st.lists(st.floats(-5, 5), min_size=4, max_size=12),
+    st.floats(0.1, 10),
+    st.floats(-10, 10),
+)
+@settings(max_examples=25)
+def test_limits_follow_the_unit(values: Sequence[float], scale: float, shift: float) -> None:
+    assume(np.ptp(values) > 1e-3)
+    low, high = studentised_limits(values, 0.025)
+    moved = studentised_limits(np.asarray(values) * scale + shift, 0.025)
+    assert moved == pytest.approx((low * scale + shift, high * scale + shift), rel=1e-5, abs=1e-5)
+
+
+def test_few_values_have_students_t() -> None:
     half = T_975_2 / math.sqrt(3)
+    assert FEWEST == 4
+    assert studentised_limits([1.0, 2.0, 3.0], 0.025) == (-math.inf, math.inf)
     assert mean_interval([1.0, 2.0, 3.0]) == pytest.approx((2.0, 2.0 - half, 2.0 + half))
+
+
+def test_one_value_that_differs_leaves_one_side_without_limit() -> None:
+    # (19/20)^20 = 36 % of the resamples do not hold it.
+    values = [5.0] * 19 + [4.0]
+    low, high = studentised_limits(values, 0.025)
+    assert low == -math.inf
+    assert 4.95 <= high < 5.05
+    interval = mean_interval(values)
+    half = stats.t.ppf(0.975, 19) * np.std(values, ddof=1) / math.sqrt(20)
+    assert interval == pytest.approx((4.95, 4.95 - half, high))
+
+
+def test_a_value_at_the_mean_is_no_surprise() -> None:
+    # Four in six: 9 % of the resamples hold nothing else. Its distance to the mean is rounding, and
+    # must not make them infinite.
+    values = [0.05, 0.1, 0.1, 0.1, 0.1, 0.15]
+    assert np.mean(values) != 0.1
+    assert np.isfinite(studentised_limits(values, 0.025)).all()
+
+
+def test_what_is_not_finite_has_no_interval() -> None:
+    assert not mean_interval([1.0, math.nan, 2.0, 3.0]).known
+    assert not mean_interval([1.0, math.inf, 2.0, 3.0]).known
 
 
 def test_equal_values_have_no_width() -> None:
@@ -39,15 +121,65 @@ def test_one_value_has_no_interval() -> None:
 
 
 def test_a_share_stays_between_0_and_1() -> None:
-    half = T_975_2 * np.std([0.0, 0.0, 0.3], ddof=1) / math.sqrt(3)
-    assert share_interval([0.0, 0.0, 0.3]) == pytest.approx((0.1, 0.0, 0.1 + half))
+    # Three values have no bootstrap; what they did not show has at most 1 - tail^(1/3).
+    unseen = 1 - 0.025 ** (1 / 3)
+    high = 0.3 * (1 - unseen) + unseen
+    assert share_interval([0.0, 0.0, 0.3]) == pytest.approx((0.1, 0.0, high))
     assert share_interval([1.0, 1.0, 0.9]).high == 1.0
 
 
 def test_limits_are_one_sided() -> None:
-    values = [0.1, 0.2, 0.3]
-    half = T_95_2 * 0.1 / math.sqrt(3)
-    assert share_limits(values) == pytest.approx((0.2 - half, 0.2 + half))
+    unseen = 1 - 0.05 ** (1 / 3)
+    limits = (0.1 * (1 - unseen), 0.3 * (1 - unseen) + unseen)
+    assert share_limits([0.1, 0.2, 0.3]) == pytest.approx(limits)
+    values = np.linspace(0.01, 0.05, 20)
+    assert share_limits(values) == studentised_limits(values, 0.05)
+    _, low, high = share_interval(values)
+    assert low < share_limits(values)[0] < 0.03 < share_limits(values)[1] < high
+
+
+def test_a_hair_of_misses_is_not_better_than_none() -> None:
+    # Student's t would limit a single run with 0.01 % of misses at 0.014 %.
+    limit = share_limits([0.0] * 19 + [1e-4])[1]
+    assert limit == pytest.approx(rule_of_three(20), abs=1e-4)
+    assert limit > rule_of_three(20)
+
+
+def test_limits_of_skewed_rates_keep_their_promise() -> None:
+    """Rates of 2.4 % on average, in most runs less: 19 upper limits of 20 are above that."""
+    shape, runs, samples = 0.5, 20, 300
+    rates = np.random.default_rng(11).beta(shape, 20, size=(samples, runs))
+    mean = shape / (shape + 20)
+    kept = sum(share_limits(row)[1] >= mean for row in rates)
+    quantile = stats.t.ppf(0.95, runs - 1)
+    errors = rates.std(axis=1, ddof=1) / math.sqrt(runs)
+    student = int((rates.mean(axis=1) + quantile * errors >= mean).sum())
+    three_sigma = 3 * math.sqrt(0.95 * 0.05 * samples)
+    assert kept >= 0.95 * samples - three_sigma
+    assert student < 0.95 * samples - three_sigma
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict"),
+    [
+        ([0.0] * 58, "not shown"),
+        ([0.0] * 59, "under"),
+        ([1.0] * 4, "over"),
+        ([0.03], "not shown"),
+        ([0.01, 0.02, 0.03] * 7, "under"),
+        ([0.04, 0.05, 0.06] * 7, "not shown"),
+        ([0.06, 0.07, 0.08] * 7, "over"),
+    ],
+)
+def test_under_is_said_where_the_limit_says_so(values: Sequence[float], verdict: str) -> None:
+    assert under(values) == verdict
+
+
+def test_another_limit_may_be_asked_for() -> None:
+    values = [0.01, 0.02, 0.03] * 7
+    assert under(values, 0.02) == "not shown"
+    assert under(values, 0.01) == "over"
+    assert under([0.0] * 20, 0.14) == "under"
 
 
 @pytest.mark.parametrize("runs", [1, 5, 20, 59])

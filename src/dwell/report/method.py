@@ -58,8 +58,8 @@ def method(comparison: Comparison) -> Iterator[str]:
             f"estimator “{controller.estimator}”; a migration is followed by {controller.min_dwell}"
             " windows without another (N_min), and must promise an improvement of J above "
             f"{controller.min_improvement:g} (Δ_min)",
-            "intervals": "95 %, two-sided, over seeds, by Student's t; of medians, by order "
-            "statistics. None is taken over windows or cycles, which are not independent.",
+            "intervals": "95 %, two-sided, over seeds, by the studentised bootstrap; of medians, "
+            "by order statistics. None is taken over windows or cycles, which are not independent.",
             "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
         }
     )

@@ -2,6 +2,35 @@
 
 from dwell.study.comparison import AIM, Comparison, Example, compare
 from dwell.study.demo import canonical_demo, real_demo
-from dwell.study.intervals import Interval
+from dwell.study.engine import StudyResult, run_study
+from dwell.study.family import Family
+from dwell.study.intervals import Interval, under
+from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
+from dwell.study.sensitivity import Parameter, sobol_design, sobol_indices, sobol_pairs
+from dwell.study.study import Contender, Point, Study, load_study
 
-__all__ = ["AIM", "Comparison", "Example", "Interval", "canonical_demo", "compare", "real_demo"]
+__all__ = [
+    "AIM",
+    "Comparison",
+    "Contender",
+    "Example",
+    "Family",
+    "Interval",
+    "PairedDifference",
+    "PairedMedian",
+    "Parameter",
+    "Point",
+    "Study",
+    "StudyResult",
+    "canonical_demo",
+    "compare",
+    "load_study",
+    "paired_difference",
+    "paired_median",
+    "real_demo",
+    "run_study",
+    "sobol_design",
+    "sobol_indices",
+    "sobol_pairs",
+    "under",
+]

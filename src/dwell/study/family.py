@@ -1,0 +1,153 @@
+"""Families of comparisons: what may be said of many at once.
+
+Twenty comparisons at 5 % find one difference on average where there is none. All comparisons that
+answer one question on one metric are therefore a family, and its p values are adjusted together:
+with a probability of 95 % not one of its verdicts is luck. Neither metrics nor questions share a
+family: the 5 % hold for each, and a report says how many there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from dwell.errors import SimulationError
+from dwell.study.intervals import CONFIDENCE
+from dwell.study.paired import PairedDifference, PairedMedian
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["Difference", "Family", "holm"]
+
+Comparative: TypeAlias = Literal["lower", "higher", "no difference shown"]
+Difference: TypeAlias = PairedDifference | PairedMedian
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """All comparisons that answer one question on one metric.
+
+    Parameters
+    ----------
+    question : str
+        What is asked, for instance ``is DTP cheaper than each static placement?``
+    metric : str
+        Column that is compared.
+    comparisons : mapping of str to PairedDifference or PairedMedian
+        By a name, for instance ``baseline: dtp, LOC``. The first of a pair is what a verdict is
+        about.
+    """
+
+    question: str
+    metric: str
+    comparisons: Mapping[str, Difference]
+
+    @property
+    def adjusted(self) -> dict[str, float]:
+        """Holm's p value of each comparison."""
+        found = holm([item.p for item in self.comparisons.values()])
+        return dict(zip(self.comparisons, found, strict=True))
+
+    @property
+    def verdicts(self) -> dict[str, Comparative]:
+        """Where the first is lower or higher, with 95 % confidence in all of them together.
+
+        "No difference shown" is no proof that there is none: intervals say what is left open. With
+        n pairs and m comparisons nothing can be shown where 2 m / 2^n is above 5 %.
+        """
+        words: dict[int, Comparative] = {-1: "lower", 1: "higher", 0: "no difference shown"}
+        adjusted = self.adjusted
+        return {
+            name: words[item.direction if adjusted[name] <= 1 - CONFIDENCE else 0]
+            for name, item in self.comparisons.items()
+        }
+
+    def verdict(self, name: str) -> Comparative:
+        """Return the verdict of one comparison."""
+        if name not in self.comparisons:
+            known = ", ".join(self.comparisons) or "none"
+            raise SimulationError(
+                f"no comparison {name!r} in the family “{self.question}”; it has {known}"
+            )
+        return self.verdicts[name]
+
+    def table(self) -> pl.DataFrame:
+        """Return one row a comparison, in their order.
+
+        Returns
+        -------
+        DataFrame
+            ``question``, ``metric``, ``comparison``; ``centre`` (mean or median), ``difference``,
+            ``low``, ``high``; ``d_z`` (null for medians), ``superiority``; ``n`` (pairs), ``p``,
+            ``p_holm`` and ``verdict``. What is NaN is null.
+        """
+        import polars as pl
+
+        adjusted, verdicts = self.adjusted, self.verdicts
+        rows = [
+            (self.question, self.metric, name, *_numbers(item), adjusted[name], verdicts[name])
+            for name, item in self.comparisons.items()
+        ]
+        return pl.DataFrame(rows, schema=_schema(), orient="row").fill_nan(None)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p values by Holm's step-down procedure.
+
+    The i-th smallest of m, from 0, is multiplied by m - i, and none becomes smaller than the one
+    before it. The probability that any of those at or below α is wrong is at most α, however they
+    depend on each other (Holm 1979, DOI 10.2307/4615733).
+
+    Parameters
+    ----------
+    p_values : sequence of float
+        In [0, 1].
+
+    Returns
+    -------
+    list of float
+        In the order given, at most 1.
+
+    Raises
+    ------
+    SimulationError
+        If one is not in [0, 1].
+    """
+    values = np.asarray(p_values, np.float64)
+    wrong = values[~((values >= 0) & (values <= 1))]
+    if wrong.size:
+        raise SimulationError(f"a p value is {wrong[0]}; it must be in [0, 1]")
+    order = np.argsort(values, kind="stable")
+    stepped = values[order] * np.arange(len(values), 0, -1)
+    adjusted = np.empty(len(values))
+    adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1.0)
+    return [float(value) for value in adjusted]
+
+
+def _numbers(item: Difference) -> tuple[str | float | int | None, ...]:
+    """Return what a row of `Family.table` shows of a comparison alone."""
+    if isinstance(item, PairedDifference):
+        centre: tuple[str, float] = ("mean", item.mean)
+        d_z: float | None = item.d_z
+    else:
+        centre, d_z = ("median", item.median), None
+    return (*centre, item.low, item.high, d_z, item.superiority, item.n, item.p)
+
+
+def _schema() -> dict[str, pl.DataType]:
+    """Columns of `Family.table`, for a family without comparisons too."""
+    import polars as pl
+
+    text = ("question", "metric", "comparison", "centre", "verdict")
+    order = (
+        *("question", "metric", "comparison", "centre", "difference", "low", "high", "d_z"),
+        *("superiority", "n", "p", "p_holm", "verdict"),
+    )
+    return {
+        name: pl.String() if name in text else pl.Int64() if name == "n" else pl.Float64()
+        for name in order
+    }

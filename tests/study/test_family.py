@@ -1,0 +1,134 @@
+"""Families of comparisons, against hand examples and what Holm's procedure promises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.errors import SimulationError
+from dwell.study.family import Family, holm
+from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
+
+chances = st.lists(st.floats(0, 1), max_size=12)
+
+
+def test_holm_by_hand() -> None:
+    # 0.01 · 4, 0.02 · 3, then 0.03 · 2 = 0.06, and 0.04 · 1 may not be below it.
+    assert holm([0.04, 0.01, 0.03, 0.02]) == pytest.approx([0.06, 0.04, 0.06, 0.06])
+    assert holm([0.5, 0.4]) == pytest.approx([0.8, 0.8])
+    assert holm([0.01]) == [0.01]
+    assert holm([]) == []
+
+
+def test_holm_by_hand_again() -> None:
+    # Sorted: 0.001 · 7, 0.0025 · 6, 0.01 · 5, 0.02 · 4, 0.05 · 3, 0.5 · 2, 0.69.
+    found = holm([0.50, 0.01, 0.001, 0.69, 0.02, 0.05, 0.0025])
+    assert found == pytest.approx([1.0, 0.05, 0.007, 1.0, 0.08, 0.15, 0.015])
+
+
+@pytest.mark.parametrize("bad", [-0.1, 1.1, float("nan")])
+def test_what_is_no_probability_is_refused(bad: float) -> None:
+    with pytest.raises(SimulationError, match=r"p value is .*\[0, 1\]"):
+        holm([0.5, bad])
+
+
+@given(chances)
+def test_holm_keeps_the_order_and_lies_between_raw_and_bonferroni(values: Sequence[float]) -> None:
+    found = holm(values)
+    for raw, adjusted in zip(values, found, strict=True):
+        assert raw <= adjusted <= min(len(values) * raw, 1.0) + 1e-15
+    order = np.argsort(values, kind="stable")
+    assert (np.diff(np.array(found)[order]) >= 0).all()
+
+
+@given(chances, st.randoms(use_true_random=False))
+def test_holm_does_not_know_positions(values: list[float], random: object) -> None:
+    order = list(range(len(values)))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    found = holm(values)
+    assert holm([values[i] for i in order]) == [found[i] for i in order]
+
+
+@given(chances, st.floats(0, 1))
+def test_one_more_comparison_never_makes_another_smaller(
+    values: Sequence[float], more: float
+) -> None:
+    pairs = zip(holm(values), holm([*values, more]), strict=False)
+    assert all(larger >= smaller for smaller, larger in pairs)
+
+
+def make_family() -> Family:
+    rng = np.random.default_rng(1)
+    base = rng.normal(10, 1, size=20)
+    return Family(
+        "is it cheaper?",
+        "cost",
+        {
+            "cheap": paired_difference(base - rng.uniform(1, 2, 20), base),
+            "dear": paired_difference(base + rng.uniform(0, 2, 20), base),
+            "same": paired_difference(base + rng.normal(0, 1, 20), base),
+        },
+    )
+
+
+def test_verdicts_are_about_the_first_of_a_pair() -> None:
+    family = make_family()
+    assert family.verdicts == {"cheap": "lower", "dear": "higher", "same": "no difference shown"}
+    assert family.verdict("dear") == "higher"
+
+
+def test_a_verdict_rests_on_the_adjusted_p() -> None:
+    alone = PairedDifference(-1.0, -2.0, -0.1, -0.6, 0.8, 0.03, 20)
+    assert Family("q", "m", {"a": alone}).verdict("a") == "lower"
+    assert Family("q", "m", {"a": alone, "b": alone}).verdict("a") == "no difference shown"
+
+
+def test_five_seeds_show_nothing() -> None:
+    family = Family("q", "m", {"a": paired_difference([1.0] * 5, [2.0, 2.1, 2.2, 2.3, 2.4])})
+    assert family.verdict("a") == "no difference shown"
+
+
+def test_an_unknown_comparison_is_named() -> None:
+    with pytest.raises(SimulationError, match=r"no comparison 'x'.*cheap, dear, same"):
+        make_family().verdict("x")
+
+
+def test_the_table_has_all_numbers() -> None:
+    family = make_family()
+    table = family.table()
+    assert table["comparison"].to_list() == ["cheap", "dear", "same"]
+    cheap = family.comparisons["cheap"]
+    assert isinstance(cheap, PairedDifference)
+    row = table.row(0, named=True)
+    assert row == {
+        "question": "is it cheaper?",
+        "metric": "cost",
+        "comparison": "cheap",
+        "centre": "mean",
+        "difference": cheap.mean,
+        "low": cheap.low,
+        "high": cheap.high,
+        "d_z": cheap.d_z,
+        "superiority": 1.0,
+        "n": 20,
+        "p": cheap.p,
+        "p_holm": 3 * cheap.p,
+        "verdict": "lower",
+    }
+
+
+def test_the_table_takes_medians_and_nothing() -> None:
+    item = paired_median([1.0, 2.0], [float("inf"), 1.0])
+    assert isinstance(item, PairedMedian)
+    row = Family("q", "p95_ms", {"a": item}).table().row(0, named=True)
+    assert row["centre"] == "median"
+    assert row["difference"] == -float("inf")
+    assert row["d_z"] is None
+    assert row["low"] is None
+    empty = Family("q", "m", {}).table()
+    assert empty.is_empty()
+    assert empty.columns == make_family().table().columns
