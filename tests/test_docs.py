@@ -16,7 +16,7 @@ from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-EXECUTED = ("README.md", "docs/tutorial.md")
+EXECUTED = ("README.md", "docs/profiling.md", "docs/tutorial.md")
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
@@ -76,10 +76,12 @@ def test_examples_run(name: str, folder: Path, capsys: pytest.CaptureFixture[str
 
 
 def options(command: str) -> set[str]:
-    """Return the options of a command."""
+    """Return the options of a command and of its subcommands."""
     group: Any = typer.main.get_command(app)
     assert command in group.commands, f"there is no command {command!r}"
-    return {option for one in group.commands[command].params for option in one.opts}
+    found = group.commands[command]
+    own = [found, *getattr(found, "commands", {}).values()]
+    return {option for one in own for parameter in one.params for option in parameter.opts}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)

@@ -9,10 +9,12 @@ __all__ = [
     "DwellError",
     "Fault",
     "LiveError",
+    "MeasurementError",
     "MetricError",
     "PlacementError",
     "PolicyError",
     "ProblemError",
+    "ProfileError",
     "RunError",
     "SimulationError",
     "TraceError",
@@ -98,6 +100,14 @@ class SimulationError(DwellError, RuntimeError):
 
 class RunError(DwellError, ValueError):
     """A folder is not the record of a run, or not one that this version can read."""
+
+
+class ProfileError(DwellError, ValueError):
+    """What is to be measured is not there, or a file is not a profile of measurements."""
+
+
+class MeasurementError(DwellError, RuntimeError):
+    """A measurement could not be finished: what was measured failed, or a peer went away."""
 
 
 class LiveError(DwellError, RuntimeError):

@@ -9,12 +9,14 @@ import typer
 from typer.core import TyperGroup
 
 from dwell import __version__
+from dwell.cli.profile import profile
 from dwell.errors import (
     DwellError,
     MetricError,
     PlacementError,
     PolicyError,
     ProblemError,
+    ProfileError,
     RunError,
 )
 
@@ -23,7 +25,7 @@ __all__ = ["app"]
 FAILED, WRONG, INTERRUPTED = 1, 2, 130
 
 # A TraceError is a ProblemError.
-MISTAKES = (ProblemError, PolicyError, PlacementError, MetricError, RunError)
+MISTAKES = (ProblemError, PolicyError, PlacementError, MetricError, ProfileError, RunError)
 
 
 class Commands(TyperGroup):
@@ -58,6 +60,7 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Decide, while a robot control pipeline runs, on which computer each stage runs.",
 )
+app.add_typer(profile, name="profile")
 
 Cell = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
 Traces = Annotated[
@@ -131,6 +134,76 @@ def run(
     request = Request(cell, scenario, policy, estimator, seed, windows, out, traces, jobs)
     if not run_cell(request, as_json=as_json):
         raise typer.Exit(FAILED)
+
+
+@app.command()
+def study(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="Study file (YAML), or `paper` for the paper's whole Phase 1."
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Where parts and tables go; studies/NAME if not given."
+        ),
+    ] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="How many to use; one a CPU if not given.")
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that does the work."),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="1 to this; what the file says if not given.")
+    ] = None,
+    windows: Annotated[
+        int | None, typer.Option(min=1, help="Length of each run; what the file says if not given.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Of `paper`: a look, in about a minute.")
+    ] = False,
+    chapter: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Of `paper`: this chapter only; may be repeated."),
+    ] = None,
+    real: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Of `paper`: replay the measurements in this folder, too."
+        ),
+    ] = None,
+    examples: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Of `paper`: where the example cells are, if not found."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Simulate every scenario, policy, parameter and seed of a study.
+
+    What is finished stays in the folder, whatever ends the work: the same command goes on.
+    """
+    if str(file) == "paper":
+        from dwell.cli.paper import Request as PaperRequest
+        from dwell.cli.paper import run_paper
+
+        chapters = tuple(chapter or ())
+        asked = PaperRequest(quick, out, processes, dask, seeds, windows, chapters, real, examples)
+        if not run_paper(asked, as_json=as_json):
+            raise typer.Exit(FAILED)
+        return
+    if quick or chapter or real or examples:
+        raise typer.BadParameter(
+            "--quick, --chapter, --real and --examples are for `dwell study paper`"
+        )
+    from dwell.cli.study import Request, run_study_file
+
+    run_study_file(Request(file, out, processes, dask, seeds, windows), as_json=as_json)
 
 
 @app.command()

@@ -1,0 +1,373 @@
+"""`dwell profile`: samples of what tasks and links take here, for cells to replay."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dwell.cli.output import aligned, print_json
+from dwell.errors import ProfileError
+
+if TYPE_CHECKING:
+    from dwell.profiling.measure import Settings
+    from dwell.profiling.profile_file import Measurement
+
+__all__ = ["profile"]
+
+FOLDER = Path("profiles")
+PORT = 7411
+
+profile = typer.Typer(no_args_is_help=True)
+
+Out = Annotated[Path | None, typer.Option(metavar="FILE", help="Parquet file to write.")]
+Period = Annotated[
+    float | None,
+    typer.Option(metavar="MS", help="Begin one every so often; one after another if not given."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+
+@profile.callback(invoke_without_command=True)
+def measure(
+    context: typer.Context,
+    node: Annotated[
+        str | None, typer.Option(help="Name that this computer has in the cell.")
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TASK=MODULE:FUNCTION", help="What to measure; may be given several times."
+        ),
+    ] = None,
+    inputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[TASK=]MODULE:FUNCTION",
+            help="Called with the number of each run; what it returns is what the task is given "
+            "(all tasks, or the one named).",
+        ),
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Samples of each task.")] = 500,
+    warmup: Annotated[
+        int, typer.Option(min=0, max=1_000_000, help="Runs before them that are left out.")
+    ] = 50,
+    core: Annotated[
+        str | None,
+        typer.Option(metavar="CORES", help="Core to run on, or several: 2, 0,2 or 0-3."),
+    ] = None,
+    period_ms: Period = None,
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Time tasks on this computer, and keep the samples for cells to replay.
+
+    Without a subcommand it measures: every task is a Python function, run again and again on
+    pinned cores. The highest core is taken, and the file is profiles/NODE.parquet, if not given.
+    """
+    if context.invoked_subcommand is not None:
+        _refuse_options(context, context.invoked_subcommand)
+        return
+    if node is None or not task:
+        raise ProfileError(
+            "measuring needs --node and at least one --task; see `dwell profile --help`"
+        )
+    _measure_tasks(
+        node,
+        task,
+        inputs or (),
+        runs=runs,
+        warmup=warmup,
+        core=core,
+        period_ms=period_ms,
+        out=out or FOLDER / f"{_file_name(node)}.parquet",
+        as_json=as_json,
+    )
+
+
+@profile.command()
+def merge(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Profiles.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
+    as_json: Json = False,
+) -> None:
+    """Put the profiles of several nodes and links into one file."""
+    from dwell.profiling.profile_file import merge_profiles, write_profile
+
+    merged = merge_profiles(files)
+    write_profile(out, merged)
+    _print_measured(out, merged, as_json=as_json)
+
+
+@profile.command()
+def listen(
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = PORT,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; this one is reached from this machine only.")
+    ] = "127.0.0.1",
+    once: Annotated[bool, typer.Option("--once", help="End after the first connection.")] = False,
+) -> None:
+    """Answer the messages of `dwell profile link`, until Ctrl-C."""
+    from dwell.profiling.link import listen as answer
+
+    def announce(address: str, taken: int) -> None:
+        typer.echo(f"listening on {address}:{taken}")
+        sys.stdout.flush()
+
+    answer(host, port, announce=announce, log=lambda line: typer.echo(line, err=True), once=once)
+
+
+@profile.command()
+def link(
+    peer: Annotated[
+        str, typer.Argument(metavar="HOST:PORT", help="Where `dwell profile listen` runs.")
+    ],
+    source: Annotated[str, typer.Option("--from", help="Name that this computer has in the cell.")],
+    target: Annotated[str, typer.Option("--to", help="Name that the peer has in the cell.")],
+    payload_bytes: Annotated[
+        int, typer.Option("--bytes", help="Payload of the larger message.")
+    ] = 307_200,
+    count: Annotated[int, typer.Option(min=1, max=1_000_000, help="Samples.")] = 500,
+    warmup: Annotated[
+        int, typer.Option(min=0, max=1_000_000, help="Rounds before them that are left out.")
+    ] = 50,
+    period_ms: Period = None,
+    out: Out = None,
+    as_json: Json = False,
+) -> None:
+    """Time round trips to a peer: a message without payload and one with it, in turns.
+
+    The file is profiles/FROM-TO.parquet if not given.
+    """
+    from dwell.profiling.link import measure_link, parse_address
+    from dwell.profiling.measure import Settings
+    from dwell.profiling.profile_file import link_name, require_free, write_profile
+
+    host, port = parse_address(peer)
+    path = out or FOLDER / f"{_file_name(source)}-{_file_name(target)}.parquet"
+    name = link_name(source, target)
+    require_free(path, [name])
+    _say(f"measuring {name}")
+    measured = measure_link(
+        source,
+        target,
+        host,
+        port,
+        payload_bytes=payload_bytes,
+        settings=Settings(count, warmup, period_ms),
+    )
+    write_profile(path, [measured])
+    _print_measured(path, [measured], as_json=as_json)
+
+
+def _refuse_options(context: typer.Context, command: str) -> None:
+    """Refuse options of measuring before a subcommand, where they would have no effect."""
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if source is not None and source.name == "COMMANDLINE":
+            option = parameter.opts[0]
+            raise ProfileError(f"{option} stands before {command!r}; give it after that, if at all")
+
+
+def _measure_tasks(
+    node: str,
+    declared: Sequence[str],
+    inputs: Sequence[str],
+    *,
+    runs: int,
+    warmup: int,
+    core: str | None,
+    period_ms: float | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Measure one task after another, then write them all."""
+    from dwell.profiling.pinning import choose_cores, pinned
+
+    sources = _sources(declared)
+    factories = _factories(inputs, sources)
+    # First the cores, then everything else: numerical packages start as many threads as they see
+    # cores when they are imported. What the tasks print must not get into the results.
+    with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
+        from dwell.profiling.measure import Settings
+        from dwell.profiling.profile_file import require_free, task_name, write_profile
+
+        settings = Settings(runs, warmup, period_ms)
+        require_free(out, [task_name(task, node) for task in sources])
+        measured = _measured(node, sources, factories, settings)
+    write_profile(out, measured)
+    _print_measured(out, measured, as_json=as_json)
+
+
+def _measured(
+    node: str, sources: Mapping[str, str], factories: Mapping[str, str], settings: Settings
+) -> list[Measurement]:
+    from dwell.profiling.measure import measure_task, undisturbed_collector
+    from dwell.profiling.target import find_callable, importable_from
+
+    measured = []
+    with importable_from(Path.cwd()), undisturbed_collector():
+        calls = {task: find_callable(name, f"--task {task}") for task, name in sources.items()}
+        inputs: dict[str, Callable[[int], object]] = {
+            task: find_callable(name, "--inputs") for task, name in factories.items()
+        }
+        for task, call in calls.items():
+            _say(f"measuring {task}")
+            one = measure_task(
+                task,
+                node,
+                call,
+                settings=settings,
+                inputs=inputs.get(task),
+                source=sources[task],
+                inputs_source=factories.get(task),
+            )
+            measured.append(one)
+    return measured
+
+
+def _factories(declared: Sequence[str], tasks: Collection[str]) -> dict[str, str]:
+    """Return what makes each task's inputs, by the name of the task."""
+    named: dict[str, str] = {}
+    for text in declared:
+        task, equals, name = text.rpartition("=")
+        if equals and task not in tasks:
+            raise ProfileError(f"--inputs: {task!r} is not measured here; give it a --task")
+        for one in [task] if equals else tasks:
+            if one in named:
+                raise ProfileError(f"--inputs: given twice for {one!r}; keep one of them")
+            named[one] = name
+    return named
+
+
+def _sources(declared: Sequence[str]) -> dict[str, str]:
+    """Return what each task is, by name."""
+    sources: dict[str, str] = {}
+    for text in declared:
+        task, equals, name = text.partition("=")
+        if not equals:
+            raise ProfileError(f"--task: {text!r} is not of the form TASK=MODULE:FUNCTION")
+        if task in sources:
+            raise ProfileError(f"--task: {task!r} is given twice; measure one at a time")
+        sources[task] = name
+    return sources
+
+
+def _file_name(name: str) -> str:
+    """Return a name as part of a file's name; it may hold what that may not."""
+    return re.sub(r"[^\w.-]", "_", name)
+
+
+def _say(what: str) -> None:
+    # A line and no spinner: its thread would take part in what is measured.
+    if sys.stderr.isatty():
+        typer.echo(what, err=True)
+
+
+# ------------------------------------------------------------------------------- what is printed
+
+
+def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: bool) -> None:
+    from dwell.profiling.cell_yaml import cell_yaml
+    from dwell.profiling.summary import describe, find_doubts
+
+    yaml = cell_yaml(path, measured)
+    doubts = {one.name: list(find_doubts(one)) for one in measured}
+    if as_json:
+        found: dict[str, Any] = {
+            one.name: {
+                "columns": {name: asdict(describe(one.columns[name])) for name in one.columns},
+                "about": one.about,
+                "warnings": doubts[one.name],
+            }
+            for one in measured
+        }
+        print_json({"profile": path, "measurements": found, "yaml": yaml})
+        return
+    typer.echo(_table(measured))
+    typer.echo("")
+    for one in measured:
+        typer.echo("\n  ".join([one.name, *_remarks(one)]))
+    typer.echo(f"\nsaved to {path}; in a cell (file names start at the cell's own folder):\n")
+    typer.echo(yaml, nl=False)
+    for name, lines in doubts.items():
+        for line in lines:
+            typer.echo(f"warning: {name}: {line}", err=True)
+
+
+def _table(measured: Sequence[Measurement]) -> str:
+    from dwell.profiling.summary import describe
+
+    head = ("ms", "n", "mean", "median", "p95", "p99", "max", "cv", "lag 1", "cores used")
+    rows = []
+    for one in measured:
+        found = describe(one.samples)
+        times = (found.mean, found.median, found.p95, found.p99, found.max)
+        cores = one.about.get("cores_used")
+        rows.append(
+            (
+                one.name,
+                str(found.n),
+                *(f"{value:.3f}" for value in times),
+                f"{found.cv:.3f}",
+                "-" if found.lag1 is None else f"{found.lag1:.2f}",
+                "-" if cores is None else f"{cores:.2f}",
+            )
+        )
+    return aligned(head, rows)
+
+
+def _remarks(one: Measurement) -> list[str]:
+    about = one.about
+    remarks = _of_task(about) if about["kind"] == "task" else _of_link(one)
+    pace = "one after another"
+    if about["period_ms"] is not None:
+        pace = f"one every {about['period_ms']:g} ms"
+    return [*remarks, f"{pace}, after {about['warmup']} (warm-up) left out", _machine(about)]
+
+
+def _of_task(about: Mapping[str, Any]) -> list[str]:
+    cores = ", ".join(map(str, about["cores"]))
+    collections = "/".join(map(str, about["gc_collections"]))
+    collector = "on" if about["gc_enabled"] else "off"
+    return [
+        f"{about['callable']} on core {cores} of {about['processor']}",
+        f"first call {about['first_ms']:.3f} ms; garbage collector {collector}, collections "
+        f"by generation {collections}",
+        f"timing an empty function takes {about['empty_wall_ms'] * 1e3:.2f} µs "
+        f"(CPU {about['empty_cpu_ms'] * 1e3:.2f} µs), not subtracted",
+    ]
+
+
+def _of_link(one: Measurement) -> list[str]:
+    from dwell.profiling.summary import percentile
+
+    minimal = one.columns[f"{one.name}/round_trip_ms"]
+    payload = one.columns[f"{one.name}/payload_round_trip_ms"]
+    rate = one.about["rate_mbps"]
+    more = "no longer than without: no rate to tell" if rate is None else f"{rate:.4g} Mbit/s"
+    return [
+        f"half of the round trip to {one.about['peer']}, as if both ways took equally long",
+        f"round trip {percentile(minimal, 50):.3f} ms in the median, "
+        f"{percentile(payload, 50):.3f} ms with {one.about['bytes']} bytes: {more}",
+    ]
+
+
+def _machine(about: Mapping[str, Any]) -> str:
+    conditions = about["conditions"]
+    first, last = conditions["frequency_mhz"]
+    frequency = "frequency not readable" if first is None else f"{first:.0f} MHz before"
+    if last is not None:
+        frequency += f", {last:.0f} MHz after"
+    steal = "unknown" if conditions["steal"] is None else f"{conditions['steal']:.1%}"
+    return (
+        f"governor {conditions['governor'] or 'not readable'}, {frequency}, load "
+        f"{conditions['load']:.2f}, steal {steal}, involuntary context switches "
+        f"{conditions['preemptions']}"
+    )

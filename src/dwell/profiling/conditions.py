@@ -1,0 +1,123 @@
+"""Conditions: what else the machine did while something was measured, as far as Linux says it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import resource
+import time
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["Conditions", "Watch", "processor"]
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How quiet the machine was; None where Linux does not say.
+
+    Parameters
+    ----------
+    load : float
+        Runnable threads on the whole machine, mean of the minute before.
+    cpus : int
+        How many the machine has online.
+    governor : str or None
+        Who chooses the frequency of the first of the cores.
+    frequency_mhz : tuple of float or None
+        Of that core, before and after.
+    steal : float or None
+        Share of the cores' time that the hypervisor gave to others.
+    preemptions : int
+        How often a thread of ours that wanted to go on was taken off its core.
+    cpu_s : float
+        CPU time of this process meanwhile, all threads, seconds.
+    """
+
+    load: float
+    cpus: int
+    governor: str | None
+    frequency_mhz: tuple[float | None, float | None]
+    steal: float | None
+    preemptions: int
+    cpu_s: float
+
+
+class Watch:
+    """Takes the counters when it is made, and their differences when asked.
+
+    Parameters
+    ----------
+    cores : collection of int
+        Those in use.
+    """
+
+    def __init__(self, cores: Collection[int]) -> None:
+        self._cores = sorted(cores)
+        self._load = os.getloadavg()[0]
+        self._frequency_mhz = _frequency_mhz(self._cores[0])
+        self._ticks = _ticks(self._cores)
+        self._cpu_s = time.process_time()
+        self._preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw
+
+    def conditions(self) -> Conditions:
+        """Return what was the case since this watch was made."""
+        preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw - self._preemptions
+        cpu_s = time.process_time() - self._cpu_s
+        ticks = _ticks(self._cores)
+        steal = None
+        if ticks is not None and self._ticks is not None and ticks[1] > self._ticks[1]:
+            steal = (ticks[0] - self._ticks[0]) / (ticks[1] - self._ticks[1])
+        return Conditions(
+            load=self._load,
+            cpus=os.cpu_count() or 1,
+            governor=_governor(self._cores[0]),
+            frequency_mhz=(self._frequency_mhz, _frequency_mhz(self._cores[0])),
+            steal=steal,
+            preemptions=preemptions,
+            cpu_s=cpu_s,
+        )
+
+
+def processor() -> str:
+    """Return the name of the processor, or its architecture where Linux has none."""
+    match = re.search(r"^(?:model name|Model)\s*:\s*(.+)$", _text("/proc/cpuinfo"), re.MULTILINE)
+    return match[1].strip() if match else platform.machine()
+
+
+def _governor(core: int) -> str | None:
+    return _text(f"/sys/devices/system/cpu/cpu{core}/cpufreq/scaling_governor").strip() or None
+
+
+def _frequency_mhz(core: int) -> float | None:
+    kilohertz = _text(f"/sys/devices/system/cpu/cpu{core}/cpufreq/scaling_cur_freq").strip()
+    if kilohertz.isdigit():
+        return int(kilohertz) / 1e3
+    for block in _text("/proc/cpuinfo").split("\n\n"):
+        if re.search(rf"^processor\s*:\s*{core}$", block, re.MULTILINE):
+            match = re.search(r"^cpu MHz\s*:\s*([\d.]+)$", block, re.MULTILINE)
+            return float(match[1]) if match else None
+    return None
+
+
+def _ticks(cores: Collection[int]) -> tuple[int, int] | None:
+    """Return stolen and all clock ticks of `cores` since the machine started."""
+    stolen = total = 0
+    for core in cores:
+        match = re.search(rf"^cpu{core} ([\d ]+)$", _text("/proc/stat"), re.MULTILINE)
+        # user nice system idle iowait irq softirq steal; guests are in user and nice already
+        ticks = [] if match is None else [int(word) for word in match[1].split()[:8]]
+        if len(ticks) < 8:
+            return None
+        stolen += ticks[7]
+        total += sum(ticks)
+    return stolen, total
+
+
+def _text(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""

@@ -1,0 +1,90 @@
+"""Pinning: the cores that this process runs on, for as long as something is measured."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dwell.errors import ProfileError
+
+__all__ = ["choose_cores", "pinned"]
+
+RANGE = re.compile(r"(\d{1,6})(?:-(\d{1,6}))?")
+
+
+def choose_cores(text: str | None) -> frozenset[int]:
+    """Return the cores that a list as ``2``, ``0,2`` or ``0-3`` names.
+
+    Parameters
+    ----------
+    text : str or None
+        The list; None is the highest core that this process may use (the lowest ones usually
+        serve the interrupts).
+
+    Raises
+    ------
+    ProfileError
+        If it is no list of cores, or this process may not use one of them.
+    """
+    allowed = os.sched_getaffinity(0)
+    if text is None:
+        return frozenset({max(allowed)})
+    cores: set[int] = set()
+    for part in text.split(","):
+        match = RANGE.fullmatch(part.strip())
+        if match is None:
+            raise ProfileError(
+                f"core: {text!r} is no list of cores; write one, as 2, or some, as 0,2 or 0-3"
+            )
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise ProfileError(f"core: {part.strip()!r} goes backwards; write {last}-{first}")
+        cores.update(range(first, last + 1))
+    missing = sorted(cores - allowed)
+    if missing:
+        raise ProfileError(
+            f"core: this process has no core {_shown(missing)}; it may use {_shown(allowed)}"
+        )
+    return frozenset(cores)
+
+
+@contextmanager
+def pinned(cores: Collection[int]) -> Iterator[None]:
+    """Run every thread of this process on `cores` only; afterwards where it ran before.
+
+    Threads that start meanwhile inherit the cores of the one that starts them. They are given
+    back what the calling thread had.
+    """
+    usual = os.sched_getaffinity(0)
+    before = {}
+    for thread in _threads():
+        with contextlib.suppress(ProcessLookupError):  # it has just ended
+            before[thread] = os.sched_getaffinity(thread)
+            os.sched_setaffinity(thread, cores)
+    try:
+        yield
+    finally:
+        for thread in _threads():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(thread, before.get(thread, usual))
+
+
+def _threads() -> list[int]:
+    return [int(item.name) for item in Path("/proc/self/task").iterdir()]
+
+
+def _shown(cores: Collection[int]) -> str:
+    """Return cores as a list with ranges: 0-3,6."""
+    parts: list[str] = []
+    ordered = sorted(cores)
+    begin = 0
+    for index, core in enumerate(ordered):
+        if index + 1 == len(ordered) or ordered[index + 1] != core + 1:
+            first = ordered[begin]
+            parts.append(str(core) if first == core else f"{first}-{core}")
+            begin = index + 1
+    return ",".join(parts)
