@@ -20,6 +20,7 @@ BENCHMARKS = {
     "closing": ("closing", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
+    "study": ("study", "measure"),
     "memory": ("memory", "measure"),
     "draw": ("drawing", "measure"),
     "first-use": ("first_use", "measure"),

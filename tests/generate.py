@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from random import Random
 from typing import Literal
 
@@ -17,6 +17,7 @@ from dwell.model import (
     Constant,
     ControllerSettings,
     Disturbance,
+    Episodes,
     Execution,
     Exponential,
     Fabric,
@@ -111,15 +112,7 @@ def make_realisation(
     if release_ms is None:
         release_ms = [k * pipeline.period_ms for k in range(cycles + 1)]
     sites = tuple((name, node) for name, task in pipeline.tasks.items() for node in task.on)
-    hops = tuple(
-        (flow.source, flow.target, link)
-        for flow in pipeline.flows
-        for link in fabric.links
-        if any(
-            f"{placement[flow.source]}->{placement[flow.target]}" == link
-            for placement in problem.candidates.values()
-        )
-    )
+    hops = (*_flow_hops(problem), *_state_hops(problem))
     given = exec_ms or {}
     exec_rows = [
         given.get((task, node), [pipeline.tasks[task].on[node].exec_ms.expectation] * cycles)
@@ -153,6 +146,26 @@ def make_realisation(
     )
 
 
+def _flow_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    for flow in problem.pipeline.flows:
+        placements = problem.candidates.values()
+        crossed = {f"{placed[flow.source]}->{placed[flow.target]}" for placed in placements}
+        for link in problem.fabric.links:
+            if link in crossed:
+                yield flow.source, flow.target, link
+
+
+def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    """State crosses the links between the nodes that some candidate has its task on."""
+    if problem.controller.migration == "warm":
+        return
+    for name, task in problem.pipeline.tasks.items():
+        nodes = {placement[name] for placement in problem.candidates.values()}
+        for link in problem.fabric.links.values():
+            if task.state_bytes and {link.source, link.target} <= nodes:
+                yield name, name, link.name
+
+
 def _nanoseconds(rows: Sequence[Sequence[float]], columns: int) -> NDArray[np.int64]:
     values = np.array(rows, dtype=np.float64).reshape(len(rows), columns)
     return np.rint(values * MS).astype(np.int64)
@@ -166,6 +179,7 @@ def random_problem(
     *,
     schedulers: Sequence[Scheduler] = ("fair", "fifo", "priority"),
     whole_ms: bool = False,
+    orders: bool = False,
 ) -> Problem:
     """Make a valid Problem with a scenario ``disturbed``.
 
@@ -178,8 +192,11 @@ def random_problem(
         Whether every duration is a constant number of whole milliseconds, and short, so that many
         events fall on the same instant. Otherwise periods are long (0.1 to 1 s) and durations
         continuous, so that events seldom come within a microsecond of each other by chance.
+    orders : bool
+        Whether there are several candidates, between which orders take time: they have a delay, a
+        lead or a grace, and half of the problems migrate cold, with state that takes a while.
     """
-    return _Maker(rng, schedulers, whole_ms).problem()
+    return _Maker(rng, schedulers, whole_ms, orders).problem()
 
 
 def random_stamps(rng: Random, problem: Problem, windows: int) -> list[str]:
@@ -191,14 +208,18 @@ def random_stamps(rng: Random, problem: Problem, windows: int) -> list[str]:
 class _Maker:
     """One problem in the making."""
 
-    def __init__(self, rng: Random, schedulers: Sequence[Scheduler], whole_ms: bool) -> None:
+    def __init__(
+        self, rng: Random, schedulers: Sequence[Scheduler], whole_ms: bool, orders: bool
+    ) -> None:
         self.rng = rng
         self.schedulers = list(schedulers)
         self.whole_ms = whole_ms
+        self.orders = orders
         self.period = float(rng.randint(5, 20)) if whole_ms else rng.uniform(100, 1000)
         self.nodes: list[Node] = []
         self.links: list[Link] = []
         self.scales: dict[str, Process] = {}
+        self.named = 0
 
     def duration(self, low: float, high: float) -> float:
         """Return a number of milliseconds between two shares of the period."""
@@ -257,7 +278,7 @@ class _Maker:
         jitter = not self.whole_ms and rng.random() < 0.3
         candidates = {
             name: {task.name: rng.choice(list(task.on)) for task in tasks}
-            for name in ("A", "B", "C", "D")[: rng.randint(1, 4)]
+            for name in ("A", "B", "C", "D")[: rng.randint(2 if self.orders else 1, 4)]
         }
         return make_problem(
             self.nodes,
@@ -271,7 +292,19 @@ class _Maker:
             scales=self.scales,
             release_jitter_ms=Exponential(0.1 * period) if jitter else None,
             window_cycles=rng.randint(1, 5),
-            controller=ControllerSettings(on=rng.choice(self.nodes).name),
+            controller=self.controller(rng.choice(self.nodes).name),
+        )
+
+    def controller(self, node: str) -> ControllerSettings:
+        rng = self.rng
+        if not self.orders:
+            return ControllerSettings(on=node)
+        return ControllerSettings(
+            on=node,
+            migration=rng.choice(["warm", "cold"]),
+            order_delay_ms=rng.choice([0.0, self.duration(0, 3)]),
+            order_lead_cycles=rng.choice([0, 0, 1, 3]),
+            close_grace_ms=rng.choice([0.0, 0.0, self.duration(0, 1), self.duration(0, 6)]),
         )
 
     def node(self, name: str) -> Node:
@@ -314,6 +347,7 @@ class _Maker:
             scale=rng.choice([None, *self.scales]),
             offset_ms=self.duration(0, 1.5) if source and rng.random() < 0.4 else 0.0,
             start_ms=rng.choice([0.0, self.duration(0, 2)]),
+            state_bytes=rng.choice([0, 1000, 5000, 20_000]) if self.orders else 0,
         )
 
     def link(self, source: str, target: str) -> Link:
@@ -337,16 +371,24 @@ class _Maker:
         at_s = rng.choice([0.0, self.duration(0, 25), self.duration(0, 25)]) / 1e3
         lengths = [max(1.0, self.duration(0, 8)) / 1e3 for _ in range(5)]
         for_s = rng.choice([math.inf, *lengths])
+        episodes, ramp_s = self.episodes(), 0.0
         if not self.links or rng.random() < 0.5:
             down = rng.random() < 0.4
+            if not down and episodes is None:
+                ramp_s = self.ramp_s(for_s)
             return NodeDisturbance(
                 rng.choice(self.nodes).name,
                 at_s,
                 for_s,
                 stress_threads=0 if down and rng.random() < 0.5 else rng.randint(1, 6),
                 down=down,
+                episodes=episodes,
+                ramp_s=ramp_s,
             )
         link = rng.choice(self.links)
+        down = rng.random() < 0.3
+        if not down and episodes is None:
+            ramp_s = self.ramp_s(for_s)
         return LinkDisturbance(
             link.source,
             link.target,
@@ -355,5 +397,19 @@ class _Maker:
             add_delay_ms=rng.choice([None, self.process(rng.uniform(0.01, 1) * self.period)]),
             loss=rng.choice([0.0, rng.uniform(0, 0.8), 1.0]),
             rate_mbps=rng.choice([math.inf, 0.4 if self.whole_ms else rng.uniform(0.5, 20)]),
-            down=rng.random() < 0.3,
+            down=down,
+            episodes=episodes,
+            ramp_s=ramp_s,
         )
+
+    def episodes(self) -> Episodes | None:
+        if self.rng.random() >= 0.2:
+            return None
+        self.named += 1
+        lengths = [self.duration(low, high) / 1e3 for low, high in ((0.5, 5), (0.3, 3))]
+        every_s, for_s = (Constant(max(length, 1e-3)) for length in lengths)
+        return Episodes(f"episodes {self.named}", every_s, for_s)
+
+    def ramp_s(self, for_s: float) -> float:
+        longest_s = min(for_s / 2, self.duration(1, 6) / 1e3)
+        return self.rng.choice([0.0, 0.0, longest_s])

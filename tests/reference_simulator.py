@@ -5,35 +5,48 @@ sentence: every node looks at all of its jobs after every event, remaining work 
 fraction, a link is a SimPy process that takes messages out of a queue. What the page leaves open is
 read as the comments marked "Reading:" say.
 
-Out of its scope: `close_grace_ms`, shadow jobs, fleets.
+Out of its scope: fleets.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
 import simpy
 
-from dwell.model import Execution, Flow, Node, Placement, Problem, Task
+from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Task
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
 __all__ = [
+    "ITSELF",
+    "SHADOW",
     "CycleResult",
     "JobResult",
     "Result",
     "Split",
+    "Usage",
+    "WindowResult",
+    "apart",
     "attempt_uniform",
+    "control",
+    "shadow_stamp",
     "simulate",
     "transmission_ns",
 ]
 
 COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, CLOSE, RELEASE = range(1, 9)
+# Cells: the jobs of a cycle itself, and those of its shadow.
+ITSELF, SHADOW = 0, 1
 MASK = 2**64 - 1
 NEAR_NS = 1000
+STATE_TIMEOUT_MS = 200
+# Behind all that an event does one after another.
+LATE = 10**9
 
 
 # --------------------------------------------------------------------------- what comes out
@@ -76,19 +89,58 @@ class JobResult:
 
 
 @dataclass(frozen=True)
+class Usage:
+    """What a node's CPU has done since time 0, core-nanoseconds.
+
+    `busy` is the integral of min(c, K' + s); `own` and `shadow` are the work that the jobs of the
+    cycles, and those of their shadows, have received.
+    """
+
+    busy: Fraction
+    own: Fraction
+    shadow: Fraction
+
+
+@dataclass(frozen=True)
+class WindowResult:
+    """A window: its first cycle, what nodes had done when it opened and closed, what was known.
+
+    `known` holds the jobs and `arrived` the messages of its cycles, and of their shadows, that the
+    events before the close have brought about.
+    """
+
+    first_cycle: int
+    close_ns: int
+    opened: Mapping[str, Usage]
+    closed: Mapping[str, Usage]
+    known: Mapping[tuple[int, int, str], JobResult]
+    arrived: Mapping[tuple[int, int, str, str], int]
+
+
+@dataclass(frozen=True)
 class Result:
     """The record of a run.
 
-    `busy` holds per node, for the first release and for the close of every window, the integral of
-    min(c, K' + s) since time 0, in core-nanoseconds. `closest_ns` is the least distance, below a
-    microsecond, of two events that have nothing to do with each other (see `closest_unrelated`);
-    None where there is no such pair.
+    `cycles` are those up to the last close. `jobs` and `shadow_jobs` are by cycle and task;
+    `arrived` is when a message was handed to its target, by cell, cycle, source and target.
+    `stamps` are the candidates that every released cycle runs under, and is also sent through.
+    `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
+    with each other (see `closest_unrelated`); None where there is no such pair.
     """
 
     cycles: tuple[CycleResult, ...]
     jobs: Mapping[tuple[int, str], JobResult]
-    busy: Mapping[str, tuple[Fraction, ...]]
+    shadow_jobs: Mapping[tuple[int, str], JobResult]
+    arrived: Mapping[tuple[int, int, str, str], int]
+    windows: tuple[WindowResult, ...]
+    stamps: tuple[tuple[str, str | None], ...]
     closest_ns: int | None
+
+    @property
+    def busy(self) -> Mapping[str, tuple[Fraction, ...]]:
+        """Busy time of every node at the first release and at the close of every window."""
+        times = (self.windows[0].opened, *(window.closed for window in self.windows))
+        return {name: tuple(usage[name].busy for usage in times) for name in times[0]}
 
 
 # ------------------------------------------------------------------------------- small rules
@@ -114,6 +166,29 @@ def nanoseconds(ms: float) -> int:
     return round(ms * 1e6)
 
 
+def apart(pipeline: Pipeline, active: Placement, other: Placement) -> set[str]:
+    """Return the tasks that run on another node under `other`, or behind such a task."""
+
+    def is_apart(task: str) -> bool:
+        before = (flow.source for flow in pipeline.inputs(task))
+        return active[task] != other[task] or any(is_apart(source) for source in before)
+
+    return {task for task in pipeline.tasks if is_apart(task)}
+
+
+def shadow_stamp(cycle: int, active: str, names: Sequence[str], fraction: float) -> str | None:
+    """Return the candidate that a cycle under `active` is also sent through, if any."""
+    if fraction <= 0:
+        return None
+    # The golden ratio to 40 digits.
+    golden = Fraction(math.isqrt(5 * 10**80) - 10**40, 2 * 10**40)
+    place = cycle * golden % 1
+    for i, name in enumerate(name for name in names if name != active):
+        if i * Fraction(fraction) <= place < (i + 1) * Fraction(fraction):
+            return name
+    return None
+
+
 # ---------------------------------------------------------------------------- things that move
 
 
@@ -121,6 +196,7 @@ def nanoseconds(ms: float) -> int:
 class Job:
     """A job that is ready, or further."""
 
+    cell: int
     cycle: int
     task: Task
     index: int
@@ -137,21 +213,39 @@ class Job:
     due: int | None = None
 
     @property
-    def readiness(self) -> tuple[int, int, int]:
-        return self.ready, self.cycle, self.index
+    def readiness(self) -> tuple[int, int, int, int]:
+        return self.ready, self.cell, self.cycle, self.index
+
+    @property
+    def result(self) -> JobResult:
+        return JobResult(self.node, self.ready, self.start, self.end, self.outcome)
 
 
 @dataclass(eq=False)
 class Message:
-    """What a completed job sends along a flow, on a link."""
+    """What crosses a link: an output of a job, or the state of a task that moves.
 
+    `arrive` is what happens when it does. The draws of state are those of `cycle`, too. `flow` is
+    its place in the file, which orders what is for the same job at the same instant.
+    """
+
+    cell: int
     cycle: int
-    flow: Flow
+    target: str
+    payload_bytes: int
     hop: int
-    sender: Job
+    arrive: Callable[[], None]
     sent_at: int
     sent_by: int
+    flow: int = 0
+    is_state: bool = False
     attempt: int = 0
+    number: int = 0
+
+    @property
+    def sent(self) -> tuple[int, int]:
+        """Event that sent it, and its place among what that event did."""
+        return self.sent_by, self.number
 
 
 @dataclass(eq=False)
@@ -205,6 +299,7 @@ class NodeState:
         self.jobs: list[Job] = []
         self.served: dict[str, list[Job]] = {kind: [] for kind in node.accelerators}
         self.busy = Fraction(0)
+        self.work = {ITSELF: Fraction(0), SHADOW: Fraction(0)}
         self.since = 0
         self.period = self.quota = self.left = 0
         if node.quota is not None:
@@ -252,12 +347,21 @@ class NodeState:
         self.since = now
         speed, rate = self.speed, self.rate
         for job in self.running:
+            before = max(job.left, Fraction(0))
             job.left -= speed * elapsed
+            received = before - max(job.left, Fraction(0))
+            # A fair node shares its cores among threads, however many a job has.
+            threads = job.execution.threads if self.node.scheduler == "fair" else job.cores
+            self.work[job.cell] += threads * received
         for jobs in self.served.values():
             for job in jobs:
                 job.left -= elapsed * (job.cores > 0)
         self.busy += rate * elapsed
         self.left -= rate * elapsed
+
+    @property
+    def usage(self) -> Usage:
+        return Usage(self.busy, self.work[ITSELF], self.work[SHADOW])
 
     def runnable(self, job: Job) -> list[Job]:
         """Jobs among which this one runs: the CPU's, or those of its accelerator."""
@@ -311,22 +415,49 @@ def hold_in_order(jobs: Sequence[Job], cores: int, width: int | None = None) -> 
 
 
 class Simulation:
-    """One run of one cell."""
+    """One run of one cell, and of its shadow if it has one.
 
-    def __init__(self, problem: Problem, real: Realisation, stamps: Sequence[str]) -> None:
+    Cycles are stamped as `given` says, or else as a controller does that orders what the `script`
+    says, one name at each close that it sees.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        real: Realisation,
+        shadows: Realisation | None,
+        *,
+        given: Sequence[tuple[str, str | None]] | None = None,
+        script: Sequence[str] = (),
+        fraction: float = 0.0,
+    ) -> None:
         self.env = simpy.Environment()
         self.problem = problem
         self.pipeline = problem.pipeline
-        self.real = real
+        self.settings = problem.controller
+        self.reals = [real] if shadows is None else [real, shadows]
         self.release = [int(ns) for ns in real.release_ns]
-        self.end = self.release[real.cycles]
-        self.placed: list[Placement] = [problem.candidates[name] for name in stamps]
+        self.number = real.cycles
+        self.end = self.release[-1] + nanoseconds(self.settings.close_grace_ms)
         self.index = {task: i for i, task in enumerate(self.pipeline.tasks)}
+        self.sources = [task for task in self.pipeline.tasks if not self.pipeline.inputs(task)]
         self.sinks = [task for task in self.pipeline.tasks if not self.pipeline.outputs(task)]
+
+        self.given = given
+        self.script: Iterator[str] = iter(script)
+        self.fraction = fraction
+        # Candidates that were ordered, with the first cycle that each stamps.
+        self.moves = [(0, problem.initial)]
+        self.stamps: list[tuple[str, str | None]] = []
+        self.first = 0
+        self.over = False
+        self.opened: dict[int, dict[str, Usage]] = {}
+        self.windows: list[WindowResult] = []
 
         self.nodes = {name: NodeState(node) for name, node in problem.fabric.nodes.items()}
         self.pools = {
-            (name, node): Pool(task, execution.workers)
+            (cell, name, node): Pool(task, execution.workers)
+            for cell in range(len(self.reals))
             for name, task in self.pipeline.tasks.items()
             for node, execution in task.on.items()
         }
@@ -336,15 +467,18 @@ class Simulation:
         for segment in real.link_segments:
             self.segments[segment.link].append(segment)
 
-        self.inputs: dict[tuple[int, str], list[tuple[int, Job]]] = {}
-        self.lost_joins: set[tuple[int, str]] = set()
-        self.losses: dict[int, str] = {}
-        self.jobs: dict[tuple[int, str], Job] = {}
-        self.completed: dict[int, list[Job]] = {k: [] for k in range(real.cycles)}
-        self.busy: dict[str, list[Fraction]] = {name: [] for name in self.nodes}
+        # By cell and cycle, then by task.
+        self.placed: dict[tuple[int, int], Placement] = {}
+        self.apart: dict[int, set[str]] = {}
+        self.losses: dict[tuple[int, int], list[tuple[int, int, str]]] = {}
+        self.inputs: dict[tuple[int, int, str], list[tuple[int, Job]]] = {}
+        self.lost_joins: set[tuple[int, int, str]] = set()
+        self.jobs: dict[tuple[int, int, str], Job] = {}
+        self.arrived: dict[tuple[int, int, str, str], int] = {}
 
         self.log: list[LogEntry] = []
         self.current = -1
+        self.numbers = itertools.count()
 
     # ------------------------------------------------------------------ events and their order
 
@@ -360,6 +494,8 @@ class Simulation:
         task: int,
         action: Callable[[], None],
         *,
+        cell: int = ITSELF,
+        flow: int = 0,
         fixed: bool = False,
         cause: int | None = None,
         valid: Callable[[], bool] = lambda: True,
@@ -378,7 +514,7 @@ class Simulation:
                 node.give_out()
                 self.plan(node)
 
-        order = (kind * 10**9 + cycle + 1) * 10**6 + task + 1
+        order = (((kind * 10 + cell) * 10**9 + cycle + 1) * 10**6 + task + 1) * 10**6 + flow
         At(self.env, time - self.now, order, happen)
 
     def note(self, time: int, cause: int, *, kind: int = 0, fixed: bool = False) -> int:
@@ -424,6 +560,7 @@ class Simulation:
             job.cycle,
             job.index,
             lambda: self.complete(job),
+            cell=job.cell,
             cause=job.started_by,
             valid=lambda: job.due == due and job.outcome == "in_flight",
         )
@@ -435,82 +572,233 @@ class Simulation:
             for segment in self.segments[name]:
                 self.note(segment.at_ns, -1, fixed=True)
             self.env.process(self.transmit(name))
-        for i, change in enumerate(self.real.node_changes):
+        for i, change in enumerate(self.reals[ITSELF].node_changes):
             self.at(change.at_ns, DISTURBANCE, -1, i, self.changer(change), fixed=True)
         for node in self.nodes.values():
             for begin in range(node.period, self.end + 1, node.period) if node.quota else ():
                 self.at(begin, DISTURBANCE, -1, 0, self.renewer(node), fixed=True)
-        for k in range(self.real.cycles):
-            if self.release[k] < self.end:
-                self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
-        window = self.problem.window_cycles
-        for k in range(0, self.real.cycles + 1, window):
-            self.at(self.release[k], CLOSE, k, -1, self.close, fixed=True)
-        while self.env.peek() <= self.end:
+        for k in range(self.number):
+            self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
+        self.open_window(0)
+        while not self.over and self.env.peek() <= self.end:
             self.env.step()
+        played = self.windows[-1].first_cycle + self.problem.window_cycles if self.windows else 0
         return Result(
-            cycles=tuple(self.cycle_result(k) for k in range(self.real.cycles)),
-            jobs={
-                key: JobResult(job.node, job.ready, job.start, job.end, job.outcome)
-                for key, job in self.jobs.items()
-            },
-            busy={name: tuple(values) for name, values in self.busy.items()},
+            cycles=tuple(self.cycle_result(k) for k in range(played)),
+            jobs=self.results(ITSELF),
+            shadow_jobs=self.results(SHADOW),
+            arrived=self.arrived,
+            windows=tuple(self.windows),
+            stamps=tuple(self.stamps),
             closest_ns=closest_unrelated(self.log),
         )
 
-    def close(self) -> None:
-        for name, node in self.nodes.items():
-            self.busy[name].append(node.busy)
+    def results(self, cell: int) -> dict[tuple[int, str], JobResult]:
+        return {key[1:]: job.result for key, job in self.jobs.items() if key[0] == cell}
+
+    # ------------------------------------------------------------------- windows and migrations
+
+    @property
+    def usage(self) -> dict[str, Usage]:
+        return {name: node.usage for name, node in self.nodes.items()}
+
+    def open_window(self, first: int) -> None:
+        """Let the next window begin with this cycle; without a whole one left, the run is over."""
+        self.first = first
+        boundary = first + self.problem.window_cycles
+        if boundary > self.number:
+            self.over = True
+            return
+        close = self.release[boundary] + nanoseconds(self.settings.close_grace_ms)
+        self.at(close, CLOSE, boundary, -1, self.close_window, fixed=True)
+
+    def close_window(self) -> None:
+        boundary = self.first + self.problem.window_cycles
+        cycles = range(self.first, boundary)
+        self.windows.append(
+            WindowResult(
+                first_cycle=self.first,
+                close_ns=self.now,
+                opened=self.opened.get(self.first, self.usage),
+                closed=self.usage,
+                known={key: job.result for key, job in self.jobs.items() if key[1] in cycles},
+                arrived={key: at for key, at in self.arrived.items() if key[1] in cycles},
+            )
+        )
+        active = self.moves[-1][1]
+        order = active
+        if self.given is None and not self.nodes[self.problem.controller_node].down:
+            order = next(self.script)
+        if order == active:
+            self.open_window(boundary)
+        elif self.settings.migration == "cold":
+            self.migrate(active, order, boundary)
+        else:
+            delay = nanoseconds(self.settings.order_delay_ms)
+            self.move(order, boundary, self.now + delay)
+
+    def move(self, order: str, boundary: int, ready: int) -> None:
+        """Stamp cycles with what was ordered once it is ready, and open a window with them."""
+        first = self.first_stamped(boundary, ready)
+        self.moves.append((first, order))
+        self.open_window(first)
+
+    def first_stamped(self, boundary: int, ready: int) -> int:
+        """First cycle that an order stamps which takes effect at `ready`."""
+        later = [k for k in range(self.number) if self.release[k] >= ready]
+        return max(boundary + self.settings.order_lead_cycles, [*later, self.number][0])
+
+    def migrate(self, active: str, order: str, boundary: int) -> None:
+        """Give an order for a cold migration."""
+        arrival = self.now + nanoseconds(self.settings.order_delay_ms)
+        if self.first_stamped(boundary, arrival) + self.problem.window_cycles > self.number:
+            self.over = True  # no window can follow, however fast the tasks move
+            return
+        old, new = self.problem.candidates[active], self.problem.candidates[order]
+        moving = {task for task in self.pipeline.tasks if old[task] != new[task]}
+
+        def be_ready(task: str) -> None:
+            moving.remove(task)
+            if not moving:
+                self.move(order, boundary, self.now)
+
+        def arrive() -> None:
+            if not moving:
+                self.move(order, boundary, self.now)
+            for task in moving:
+                started = self.now + nanoseconds(self.pipeline.tasks[task].start_ms)
+                self.step(started, 0, task, lambda task=task: send_state(task))  # type: ignore[misc]
+
+        def send_state(task: str) -> None:
+            payload = self.pipeline.tasks[task].state_bytes
+            if payload == 0:
+                be_ready(task)
+                return
+            link = f"{old[task]}->{new[task]}"
+            self.send(
+                link,
+                Message(
+                    ITSELF,
+                    boundary,
+                    task,
+                    payload,
+                    self.reals[ITSELF].hops.index((task, task, link)),
+                    lambda: be_ready(task),
+                    self.now,
+                    self.current,
+                    is_state=True,
+                ),
+            )
+
+        self.at(arrival, RESTART, 0, -1, arrive, fixed=True)
+
+    def step(
+        self,
+        time: int,
+        attempt: int,
+        task: str,
+        action: Callable[[], None],
+        *,
+        cause: int | None = None,
+    ) -> None:
+        """Let a cold migration go on with a task: after restarts, by attempt and task."""
+        self.at(time, RESTART, attempt + 1, self.index[task], action, cause=cause)
 
     # ---------------------------------------------------------------------------------- cycles
 
+    def stamp(self, cycle: int) -> tuple[str, str | None]:
+        """Return the candidate of a cycle, and the one that it is also sent through."""
+        if self.given is not None:
+            return self.given[cycle]
+        active = [name for first, name in self.moves if first <= cycle][-1]
+        return active, shadow_stamp(cycle, active, list(self.problem.candidates), self.fraction)
+
     def releaser(self, cycle: int) -> Callable[[], None]:
         def release() -> None:
-            for name, task in self.pipeline.tasks.items():
-                if self.pipeline.inputs(name):
-                    continue
-                offset = nanoseconds(task.offset_ms)
+            self.opened[cycle] = self.usage
+            active, other = self.stamp(cycle)
+            self.stamps.append((active, other))
+            self.placed[ITSELF, cycle] = self.problem.candidates[active]
+            for name in self.sources:
+                offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
                 if offset == 0:
-                    self.start_source(cycle, name)
+                    self.start_source(ITSELF, cycle, name)
                 else:
-                    self.at(
-                        self.release[cycle] + offset,
-                        START,
-                        cycle,
-                        self.index[name],
-                        lambda name=name: self.start_source(cycle, name),  # type: ignore[misc]
-                        fixed=True,
-                    )
+                    self.start_later(ITSELF, cycle, name, offset)
+            if other is not None:
+                self.release_shadow(cycle, self.problem.candidates[other])
 
         return release
 
-    def start_source(self, cycle: int, task: str) -> None:
+    def release_shadow(self, cycle: int, other: Placement) -> None:
+        """Release the shadow of a cycle: sources that run elsewhere are started a second time."""
+        self.placed[SHADOW, cycle] = other
+        self.apart[cycle] = apart(self.pipeline, self.placed[ITSELF, cycle], other)
+        for name in self.sources:
+            if name in self.apart[cycle] and name not in self.sinks:
+                offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
+                self.start_later(SHADOW, cycle, name, offset)
+
+    def start_later(self, cell: int, cycle: int, task: str, offset: int) -> None:
+        self.at(
+            self.now + offset,
+            START,
+            cycle,
+            self.index[task],
+            lambda: self.start_source(cell, cycle, task),
+            cell=cell,
+            fixed=True,
+        )
+
+    def start_source(self, cell: int, cycle: int, task: str) -> None:
         # Reading: a source with an offset is released when its offset is over. On a node that is
         # down its job is lost as soon as it is ready.
-        job = self.make_job(cycle, task, ())
+        job = self.make_job(cell, cycle, task, ())
         if self.nodes[job.node].down:
             self.lose_job(job, "node_down")
         else:
             self.queue_up(job)
 
-    def lose(self, cycle: int, outcome: str) -> None:
-        """Something of a cycle is lost; the first such loss names its outcome."""
-        self.losses.setdefault(cycle, outcome)
+    def lose(
+        self, cell: int, cycle: int, outcome: str, since: tuple[int, int] | None = None
+    ) -> None:
+        """Something of a cycle is lost, now or since an event; the first loss names its outcome."""
+        event, number = since or (self.current, next(self.numbers))
+        self.losses.setdefault((cell, cycle), []).append((event, number, outcome))
 
     def lose_job(self, job: Job, outcome: str) -> None:
         job.outcome = outcome
         job.end = self.now
-        self.lose(job.cycle, outcome)
+        # A job that an output makes ready takes another's place when all outputs have been sent.
+        late = (self.current, LATE) if outcome == "replaced" else None
+        self.lose(job.cell, job.cycle, outcome, late)
+
+    def drop(self, message: Message, begun: int) -> None:
+        """Lose a message on its link, in the event that sends it or else as an arrival."""
+        if message.sent_at == self.now:
+            self.lose(message.cell, message.cycle, "dropped", message.sent)
+            return
+        self.at(
+            self.now,
+            ARRIVAL,
+            message.cycle,
+            self.index[message.target],
+            lambda: self.lose(message.cell, message.cycle, "dropped"),
+            cell=message.cell,
+            flow=message.flow,
+            cause=begun,
+        )
 
     def cycle_result(self, cycle: int) -> CycleResult:
-        if cycle in self.losses:
-            return CycleResult(self.losses[cycle])
-        sinks = [job for job in self.completed[cycle] if job.task.name in self.sinks]
-        if len(sinks) < len(self.sinks):
+        if (ITSELF, cycle) in self.losses:
+            return CycleResult(min(self.losses[ITSELF, cycle])[-1])
+        sinks = [self.jobs.get((ITSELF, cycle, name)) for name in self.sinks]
+        done = [job for job in sinks if job is not None and job.outcome == "done"]
+        if len(done) < len(self.sinks):
             return CycleResult("in_flight")
-        end = max(self.end_of(job) for job in sinks)
+        end = max(self.end_of(job) for job in done)
         splits = {
-            split for job in sinks if job.end == end for split in self.splits(job, Split(0, 0, 0))
+            split for job in done if job.end == end for split in self.splits(job, Split(0, 0, 0))
         }
         return CycleResult("done", end - self.release[cycle], frozenset(splits))
 
@@ -534,12 +822,15 @@ class Simulation:
 
     # ----------------------------------------------------------------------- inputs and workers
 
-    def deliver(self, cycle: int, task: str, sender: Job) -> None:
+    def deliver(self, cell: int, cycle: int, flow: Flow, sender: Job) -> None:
         """Bring one input to a task, by a message or by a hand-over on the same node."""
-        key = (cycle, task)
-        if self.nodes[self.placed[cycle][task]].down:
+        task = flow.target
+        key = (cell, cycle, task)
+        if self.nodes[self.placed[cell, cycle][task]].down:
             self.lost_joins.add(key)
-            self.lose(cycle, "node_down")
+            self.lose(cell, cycle, "node_down")
+            return
+        self.arrived[cell, cycle, flow.source, flow.target] = self.now
         if key in self.lost_joins:
             return
         there = self.inputs.setdefault(key, [])
@@ -547,28 +838,31 @@ class Simulation:
         if len(there) == len(self.pipeline.inputs(task)):
             del self.inputs[key]
             last = tuple(job for arrival, job in there if arrival == self.now)
-            self.queue_up(self.make_job(cycle, task, last))
+            # A shadow stops before the sinks.
+            if cell == ITSELF or task not in self.sinks:
+                self.queue_up(self.make_job(cell, cycle, task, last))
 
-    def make_job(self, cycle: int, name: str, senders: tuple[Job, ...]) -> Job:
+    def make_job(self, cell: int, cycle: int, name: str, senders: tuple[Job, ...]) -> Job:
         """Return the job that is ready now."""
         task = self.pipeline.tasks[name]
-        node = self.placed[cycle][name]
-        site = self.real.sites.index((name, node))
+        node = self.placed[cell, cycle][name]
+        real = self.reals[cell]
         job = Job(
+            cell=cell,
             cycle=cycle,
             task=task,
             index=self.index[name],
             execution=task.on[node],
             node=node,
             ready=self.now,
-            left=Fraction(int(self.real.exec_ns[site, cycle])),
+            left=Fraction(int(real.exec_ns[real.sites.index((name, node)), cycle])),
             senders=senders,
         )
-        self.jobs[cycle, name] = job
+        self.jobs[cell, cycle, name] = job
         return job
 
     def queue_up(self, job: Job) -> None:
-        pool = self.pools[job.task.name, job.node]
+        pool = self.pools[job.cell, job.task.name, job.node]
         pool.waiting.append(job)
         self.take(pool, job.node)
         if job.task.depth and len(pool.waiting) > job.task.depth:
@@ -588,18 +882,40 @@ class Simulation:
         job.end = self.now
         job.outcome = "done"
         self.nodes[job.node].runnable(job).remove(job)
-        self.completed[job.cycle].append(job)
         for flow in self.pipeline.outputs(job.task.name):
-            target = self.placed[job.cycle][flow.target]
-            if target == job.node:
-                self.deliver(job.cycle, flow.target, job)
-            else:
-                link = f"{job.node}->{target}"
-                hop = self.real.hops.index((flow.source, flow.target, link))
-                self.send(link, Message(job.cycle, flow, hop, job, self.now, self.current))
-        pool = self.pools[job.task.name, job.node]
+            self.send_output(job.cell, flow, job)
+        if job.cell == ITSELF and (SHADOW, job.cycle) in self.placed:
+            # Where the shadow shares the job, its outputs go to what it does not share, too.
+            away = self.apart[job.cycle]
+            for flow in self.pipeline.outputs(job.task.name):
+                if job.task.name not in away and flow.target in away:
+                    self.send_output(SHADOW, flow, job)
+        pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
+
+    def send_output(self, cell: int, flow: Flow, job: Job) -> None:
+        """Hand an output over, or send it, to where a cell has its target."""
+        cycle = job.cycle
+        target = self.placed[cell, cycle][flow.target]
+        if target == job.node:
+            self.deliver(cell, cycle, flow, job)
+            return
+        link = f"{job.node}->{target}"
+        self.send(
+            link,
+            Message(
+                cell,
+                cycle,
+                flow.target,
+                flow.payload_bytes,
+                self.reals[cell].hops.index((flow.source, flow.target, link)),
+                lambda: self.deliver(cell, cycle, flow, job),
+                self.now,
+                self.current,
+                flow=self.pipeline.flows.index(flow),
+            ),
+        )
 
     # ----------------------------------------------------------------------------- disturbances
 
@@ -622,21 +938,21 @@ class Simulation:
             for job in jobs:
                 self.lose_job(job, "node_down")
             jobs.clear()
-        for (_, site), pool in self.pools.items():
+        for (_, _, site), pool in self.pools.items():
             if site == name:
                 for job in pool.waiting:
                     self.lose_job(job, "node_down")
                 pool.waiting.clear()
                 pool.idle = 0
                 pool.restart += 1
-        for cycle, task in list(self.inputs):
-            if self.placed[cycle][task] == name:
-                del self.inputs[cycle, task]
-                self.lost_joins.add((cycle, task))
-                self.lose(cycle, "node_down")
+        for cell, cycle, task in list(self.inputs):
+            if self.placed[cell, cycle][task] == name:
+                del self.inputs[cell, cycle, task]
+                self.lost_joins.add((cell, cycle, task))
+                self.lose(cell, cycle, "node_down")
 
     def come_up(self, name: str) -> None:
-        for (task, site), pool in self.pools.items():
+        for (cell, task, site), pool in self.pools.items():
             if site == name:
                 self.at(
                     self.now + nanoseconds(pool.task.start_ms),
@@ -644,6 +960,7 @@ class Simulation:
                     -1,
                     self.index[task],
                     self.restarter(pool, name),
+                    cell=cell,
                     fixed=True,
                     valid=lambda pool=pool, restart=pool.restart: pool.restart == restart,  # type: ignore[misc]
                 )
@@ -658,6 +975,7 @@ class Simulation:
     # ------------------------------------------------------------------------------------ links
 
     def send(self, link: str, message: Message) -> None:
+        message.number = next(self.numbers)
         self.queues[link].put(message)
 
     def state(self, link: str) -> LinkSegment:
@@ -676,59 +994,92 @@ class Simulation:
                 begun = self.note(self.now, begun)
             while link.retransmit_ms is not None and self.state(name).down:
                 later = [s.at_ns for s in self.segments[name] if s.at_ns > self.now]
-                if not later:
-                    return
-                yield self.env.timeout(later[0] - self.now)
-                begun = self.note(self.now, -1, fixed=True)
+                if later:
+                    yield self.env.timeout(later[0] - self.now)
+                    begun = self.note(self.now, -1, fixed=True)
+                    continue
+                # It waits for ever, and so do those behind it.
+                if not message.is_state:
+                    self.lose(message.cell, message.cycle, "in_flight", message.sent)
+                message = yield self.queues[name].get()
             state = self.state(name)
             if state.down:
-                # Reading: a message is lost when its transmission begins, or would begin.
-                self.lose(message.cycle, "dropped")
+                self.would_begin(name, message, begun)
                 continue
-            duration = transmission_ns(message.flow.payload_bytes, state.rate_mbps)
-            key = int(self.real.loss_keys[message.hop])
+            duration = transmission_ns(message.payload_bytes, state.rate_mbps)
+            key = int(self.reals[message.cell].loss_keys[message.hop])
             if attempt_uniform(key, message.cycle, message.attempt) >= state.loss:
                 self.propagate(name, message, state, duration, begun)
-            elif link.retransmit_ms is None:
-                self.lose(message.cycle, "dropped")
+            elif link.retransmit_ms is None and not message.is_state:
+                self.drop(message, begun)
             else:
-                again = self.now + duration + nanoseconds(link.retransmit_ms)
-                self.repeat(name, message, again, begun)
+                timeout = link.retransmit_ms
+                timeout_ns = nanoseconds(STATE_TIMEOUT_MS if timeout is None else timeout)
+                again = self.now + duration + timeout_ns
+                self.repeat(name, message, again, message.attempt + 1, begun)
             yield self.env.timeout(duration)
+
+    def would_begin(self, name: str, message: Message, begun: int) -> None:
+        """Deal with a message whose transmission would begin while a link that drops is down."""
+        # Reading: a message is lost when its transmission begins, or would begin.
+        if not message.is_state:
+            self.drop(message, begun)
+            return
+        ends = [s.at_ns for s in self.segments[name] if s.at_ns > self.now and not s.down]
+        if ends:
+            self.repeat(name, message, ends[0], message.attempt, -1)
 
     def propagate(
         self, link: str, message: Message, state: LinkSegment, duration: int, begun: int
     ) -> None:
         """Let a transmission that begins now arrive."""
-        delay = int(self.real.delay_ns[message.hop, message.cycle])
-        for row, (hop, layer) in enumerate(self.real.layers):
+        real = self.reals[message.cell]
+        delay = int(real.delay_ns[message.hop, message.cycle])
+        for row, (hop, layer) in enumerate(real.layers):
             if hop == message.hop and layer in state.layers:
-                delay += int(self.real.extra_ns[row, message.cycle])
+                delay += int(real.extra_ns[row, message.cycle])
         arrival = self.now + duration + delay
         if self.problem.fabric.links[link].in_order:
             last, last_begun = self.last_arrival[link]
             if arrival < last:
                 arrival, begun = last, last_begun
             self.last_arrival[link] = arrival, begun
+        if message.is_state:
+            self.step(arrival, 0, message.target, message.arrive, cause=begun)
+            return
         self.at(
             arrival,
             ARRIVAL,
             message.cycle,
-            self.index[message.flow.target],
-            lambda: self.deliver(message.cycle, message.flow.target, message.sender),
+            self.index[message.target],
+            message.arrive,
+            cell=message.cell,
+            flow=message.flow,
             cause=begun,
         )
 
-    def repeat(self, link: str, message: Message, again: int, begun: int) -> None:
-        """Send a lost message once more at `again`."""
+    def repeat(self, link: str, message: Message, again: int, attempt: int, begun: int) -> None:
+        """Send a message once more at `again`."""
 
         def happen() -> None:
-            message.attempt += 1
+            message.attempt = attempt
             message.sent_at, message.sent_by = self.now, self.current
             self.send(link, message)
 
-        task = self.index[message.flow.target]
-        self.at(again, REPEAT, message.cycle, task, happen, cause=begun)
+        if message.is_state:
+            self.step(again, attempt, message.target, happen, cause=begun)
+            return
+        task = self.index[message.target]
+        self.at(
+            again,
+            REPEAT,
+            message.cycle,
+            task,
+            happen,
+            cell=message.cell,
+            flow=message.flow,
+            cause=begun,
+        )
 
 
 def closest_unrelated(log: Sequence[LogEntry]) -> int | None:
@@ -759,11 +1110,36 @@ def closest_unrelated(log: Sequence[LogEntry]) -> int | None:
     return closest
 
 
-def simulate(problem: Problem, realisation: Realisation, stamps: Sequence[str]) -> Result:
+def simulate(
+    problem: Problem,
+    realisation: Realisation,
+    stamps: Sequence[str],
+    *,
+    shadows: Realisation | None = None,
+    shadow_stamps: Sequence[str | None] | None = None,
+) -> Result:
     """Play a realisation in which cycle k is released with the candidate `stamps[k]`.
 
-    The run ends at the last entry of `release_ns`: completions, arrivals and disturbances of that
+    `shadow_stamps[k]` is the candidate that it is also sent through; its shadow jobs meet
+    `shadows`. The run ends with the last window: completions, arrivals and disturbances of that
     very instant happen, nothing after it does.
     """
-    assert len(stamps) == realisation.cycles
-    return Simulation(problem, realisation, stamps).run()
+    others = shadow_stamps or [None] * realisation.cycles
+    given = list(zip(stamps, others, strict=True))
+    assert len(given) == realisation.cycles
+    return Simulation(problem, realisation, shadows, given=given).run()
+
+
+def control(
+    problem: Problem,
+    realisation: Realisation,
+    script: Sequence[str],
+    *,
+    shadows: Realisation | None = None,
+    fraction: float = 0.0,
+) -> Result:
+    """Play a realisation under a controller that orders one name of a script at each close.
+
+    `fraction` is the share of cycles that are also sent through each alternative.
+    """
+    return Simulation(problem, realisation, shadows, script=script, fraction=fraction).run()

@@ -87,8 +87,10 @@ def test_a_mistake_is_told_without_a_traceback(
     assert list(tmp_path.iterdir()) == []
 
 
-def interrupt_at_first_sign(arguments: list[str], folder: Path) -> tuple[int, str, str]:
-    """Start a command with stderr on a terminal, and press Ctrl-C once it shows progress.
+def interrupt_at_first_sign(
+    arguments: list[str], folder: Path, *, sign: str = "simulating"
+) -> tuple[int, str, str]:
+    """Start a command with stderr on a terminal, and press Ctrl-C once it shows a sign.
 
     Returns
     -------
@@ -107,7 +109,7 @@ def interrupt_at_first_sign(arguments: list[str], folder: Path) -> tuple[int, st
     )
     os.close(its_end)
     shown = b""
-    while b"simulating" not in shown:
+    while sign.encode() not in shown:
         shown += os.read(main_end, 1024)
     # A terminal sends it to the whole group: worker processes as well.
     os.killpg(process.pid, signal.SIGINT)

@@ -13,7 +13,7 @@ from scipy import stats
 
 from dwell.errors import MetricError, ProblemError
 from dwell.estimators import Profile
-from dwell.estimators.profile import order_statistic
+from dwell.estimators.paths import order_statistic
 from dwell.model import (
     AR1,
     Constant,

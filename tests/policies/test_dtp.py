@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -11,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.cost import cost
+from dwell.cost import cost, excess
 from dwell.errors import DwellError, MetricError, PlacementError, PolicyError
 from dwell.model import Caps, Decision, Objective, Placement, QoS
-from dwell.policies import DTP
+from dwell.policies import DTP, check_policy
 from tests.policies.algorithm_1 import algorithm_1
 from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
 
@@ -301,6 +302,78 @@ def test_it_adopts_where_the_guard_moved_the_cell() -> None:
     assert decision.costs == {"LOC": 0.75, "SO": 0.5, "HYB": 0.625}
     with pytest.raises(PolicyError, match="'NOWHERE', which is no candidate"):
         policy.adopt("NOWHERE")
+
+
+# ------------------------------------------------------------------------------------- escape
+
+OVER, FINE, DEAR = qos(130.0, 0.5), qos(20.0), qos(110.0, 1.0)
+
+
+def fleeing(min_dwell: int = 3, min_improvement: float = 0.05) -> DTP:
+    return DTP(
+        candidates=CANDIDATES,
+        objective=OBJECTIVE,
+        min_dwell=min_dwell,
+        min_improvement=min_improvement,
+        escape=True,
+    )
+
+
+def test_an_incumbent_over_its_cap_escapes_from_a_dwell_window() -> None:
+    shown = estimates(OVER, qos(30.0), FINE)
+    stays = run(dtp(3), [shown])[0]
+    assert (stays.name, stays.reason) == ("LOC", "dwell")
+    decision = run(fleeing(), [shown])[0]
+    assert (decision.name, decision.reason, decision.dwell) == ("HYB", "migrate", 0)
+    assert decision.delta_j == pytest.approx(3.25 + 1.5 - 0.5 - 0.125)
+
+
+def test_it_escapes_without_an_improvement_to_the_cheapest_within_the_caps() -> None:
+    # What is within its caps is dearer than the incumbent, and one is dearer still.
+    hot = qos(20.0, 0.0, robot=0.99)
+    shown = estimates(hot, qos(115.0, 1.0), DEAR)
+    decision = run(fleeing(0, 5.0), [shown])[0]
+    assert (decision.name, decision.reason, decision.migrated) == ("HYB", "migrate", True)
+    assert decision.delta_j < 0
+
+
+def test_it_never_escapes_to_a_candidate_over_its_caps() -> None:
+    decisions = run(fleeing(2), [estimates(OVER, qos(121.0), qos(20.0, 0.0, 1.0))] * 3)
+    assert [d.reason for d in decisions] == ["dwell", "dwell", "infeasible"]
+    assert [d.name for d in decisions[:2]] == ["LOC", "LOC"]
+
+
+def test_the_escape_looks_at_what_was_observed_not_at_its_estimate() -> None:
+    shown = estimates(FINE, FINE, FINE)
+    assert fleeing().decide(observed=OVER, estimates=shown).name == "HYB"
+    shown = estimates(OVER, FINE, FINE)
+    assert fleeing().decide(observed=FINE, estimates=shown).reason == "dwell"
+
+
+def test_without_estimates_there_is_nowhere_to_escape_to() -> None:
+    assert fleeing().decide(observed=OVER).reason == "dwell"
+
+
+@given(windows, st.integers(0, 4), st.sampled_from([0.0, 0.5]))
+def test_the_escape_is_all_that_differs(
+    shown: list[dict[str, QoS]], min_dwell: int, min_improvement: float
+) -> None:
+    policy = fleeing(min_dwell, min_improvement)
+    for window in shown:
+        now, twin = policy.incumbent, copy.deepcopy(policy)
+        twin.escape = False
+        usual = twin.decide(observed=window[now], estimates=window)
+        decision = policy.decide(observed=window[now], estimates=window)
+        within = [name for name in CANDIDATES if excess(window[name], OBJECTIVE) <= 0]
+        if now in within or not within:
+            assert repr(decision) == repr(usual)
+        else:
+            assert decision.name == min(within, key=decision.costs.__getitem__)
+            assert (decision.reason, decision.dwell) == ("migrate", 0)
+
+
+def test_with_the_escape_it_keeps_its_word_in_awkward_windows() -> None:
+    assert check_policy(fleeing(), problem()) == ()
 
 
 # ------------------------------------------------------------------------------------- errors

@@ -7,11 +7,11 @@ import pytest
 from dwell.errors import PolicyError
 from dwell.model import ControllerSettings
 from dwell.model.problem import POLICIES
-from dwell.policies import ATP, DTP, LatencyFirst, Policy, Static, WorkFunction, by_name
+from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Policy, Static, WorkFunction, by_name
 from dwell.policies.registry import REGISTRY
 from tests.policies.cell import CANDIDATES, OBJECTIVE, place, problem
 
-SETTINGS = ControllerSettings(initial="HYB", min_dwell=7, min_improvement=0.25)
+SETTINGS = ControllerSettings(initial="HYB", min_dwell=7, min_improvement=0.25, escape=True)
 
 
 def test_the_registry_has_the_names_that_a_cell_may_use() -> None:
@@ -27,6 +27,7 @@ def test_parameters_come_from_the_problem() -> None:
     dtp = by_name("dtp", problem(controller=SETTINGS))
     assert isinstance(dtp, DTP)
     assert (dtp.initial, dtp.min_dwell, dtp.min_improvement) == ("HYB", 7, 0.25)
+    assert dtp.escape
     assert (dtp.candidates, dtp.objective) == (CANDIDATES, OBJECTIVE)
     atp = by_name("atp", problem(controller=SETTINGS))
     assert isinstance(atp, ATP)
@@ -37,6 +38,15 @@ def test_parameters_come_from_the_problem() -> None:
     in_hindsight = by_name("work-function", problem(controller=SETTINGS))
     assert isinstance(in_hindsight, WorkFunction)
     assert (in_hindsight.initial, in_hindsight.objective) == ("HYB", OBJECTIVE)
+    cumulative = by_name("cusum", problem(controller=SETTINGS))
+    assert isinstance(cumulative, Cusum)
+    assert (cumulative.initial, cumulative.slack) == ("HYB", 0.25)
+
+
+def test_dtp_does_not_escape_unless_it_is_told_to() -> None:
+    dtp = by_name("dtp", problem())
+    assert isinstance(dtp, DTP)
+    assert not dtp.escape
 
 
 def test_a_candidate_by_name_is_static_whatever_the_initial_one_is() -> None:
@@ -46,7 +56,7 @@ def test_a_candidate_by_name_is_static_whatever_the_initial_one_is() -> None:
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_all() -> None:
-    known = "dtp, atp, latency-first, work-function, LOC, SO, HYB"
+    known = "dtp, atp, latency-first, work-function, cusum, LOC, SO, HYB"
     expected = f"unknown policy 'dpt'; did you mean 'dtp'.*{known}"
     with pytest.raises(PolicyError, match=expected):
         by_name("dpt", problem())

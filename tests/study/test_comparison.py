@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import multiprocessing
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,7 +15,6 @@ from dwell.policies import Static
 from dwell.study import Comparison, compare
 from dwell.study.intervals import mean_interval, share_limits
 from dwell.study.summary import summarise
-from dwell.study.workers import spread
 from tests.study.cell import make_problem
 
 POLICIES = ("LOC", "SO", "HYB", "dtp")
@@ -171,23 +168,3 @@ def test_wrong_requests_are_refused(
     right = {"scenarios": ("baseline",), "policies": ("LOC",), "seeds": (1,), "windows": 4}
     with pytest.raises(error, match=message):
         compare(PROBLEM, **{**right, **wrong}, processes=1)  # type: ignore[arg-type]
-
-
-def test_work_is_spread_in_order() -> None:
-    assert spread(math.sqrt, [9.0, 1.0, 4.0], processes=2, done=lambda: None) == [3.0, 1.0, 2.0]
-
-
-@pytest.mark.parametrize("processes", [1, 2])
-def test_an_interrupt_leaves_no_process_behind(processes: int) -> None:
-    def interrupt() -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        spread(math.sqrt, [4.0] * 50, processes=processes, done=interrupt)
-    assert not multiprocessing.active_children()
-
-
-def test_an_error_in_a_process_arrives_as_it_is() -> None:
-    with pytest.raises(ValueError, match="math domain"):
-        spread(math.sqrt, [1.0, -1.0], processes=2, done=lambda: None)
-    assert not multiprocessing.active_children()

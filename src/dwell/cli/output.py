@@ -75,8 +75,16 @@ def working(what: str) -> Iterator[None]:
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Progress | None]:
-    """Show on stderr how much is done, where that is a terminal; None elsewhere."""
+def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress | None]:
+    """Show on stderr how much is done, where that is a terminal; None elsewhere.
+
+    Parameters
+    ----------
+    what : str
+        Stands before the bar.
+    cycles : float, optional
+        Cycles of one of what is counted; the rate is shown where it is given.
+    """
     if not sys.stderr.isatty():
         yield None
         return
@@ -88,8 +96,16 @@ def progress(what: str) -> Iterator[Progress | None]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
     with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        row = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(row, completed=done, total=total)
+        row = bar.add_task(what, total=None, rate="")
+
+        def show(done: int, total: int) -> None:
+            bar.update(row, completed=done, total=total)
+            speed = bar.tasks[0].speed
+            if cycles is not None and speed is not None:
+                bar.update(row, rate=f"{speed * cycles / 1e6:.2f} M cycles/s")
+
+        yield show

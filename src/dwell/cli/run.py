@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from dwell.cli.output import print_json, working
 from dwell.errors import RunError
 from dwell.model import Problem
 from dwell.record import require_free
-from dwell.study.summary import Row, summarise
+from dwell.study.summary import STRETCHES, Row, summarise
 
 __all__ = ["Request", "run_cell"]
 
@@ -107,6 +108,7 @@ def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -
         ("cost J, mean of windows", f"{row['cost']:.3f}"),
         ("cycles lost", f"{row['lost']} of {row['cycles']}"),
         ("longest run of misses", f"{row['longest_misses']}"),
+        *_control(row),
         ("migrations", f"{row['migrations']}"),
         ("windows by placement", ", ".join(shares)),
         ("utilisation", ", ".join(used)),
@@ -115,3 +117,14 @@ def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -
     left_out = f", the first {warmup} (warm-up) left out below" if warmup else ""
     body = "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)
     return f"{title}{left_out}\n\n{body}"
+
+
+def _control(row: Row) -> Iterator[tuple[str, str]]:
+    """Yield what the actuator got: misses in any K cycles, ages, and how the servo tracked."""
+    most = ", ".join(f"{row[f'misses_in_{stretch}']} in {stretch}" for stretch in STRETCHES)
+    yield "most misses", f"{most} consecutive cycles"
+    ages = (row[f"aoi_{name}_ms"] for name in ("mean", "p95", "peak"))
+    yield "age at the actuator", "mean {:.2f}, p95 {:.2f}, peak {:.2f} ms".format(*ages)
+    if "tracking_rms_mm" in row:
+        rms, iae = row["tracking_rms_mm"], row["tracking_iae_mm"]
+        yield "tracking error", f"RMS {rms:.2f} mm, mean absolute (IAE / time) {iae:.2f} mm"

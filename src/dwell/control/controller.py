@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ns, utilisation
 from dwell.cost import hamming, price, tier_nodes
-from dwell.errors import PolicyError
+from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Decision, FrozenDict, Problem, QoS
+from dwell.model.bounds import SHADOW_FRACTION
+from dwell.model.meaning import too_many_shadows
 from dwell.policies import MinimalPolicy, Static
 from dwell.policies import by_name as policy_by_name
 
@@ -102,6 +104,8 @@ class Controller:
     ------
     PolicyError
         If the policy is unknown or is no policy.
+    ProblemError
+        If the estimator is unknown, or wants more shadows than there are cycles.
     """
 
     def __init__(
@@ -124,6 +128,8 @@ class Controller:
             self.estimator, "support", None
         )
         self._learner = self.estimator if isinstance(self.estimator, Learner) else None
+        #: Share of the cycles that the estimator wants sent through each alternative.
+        self.shadow_fraction = _shadow_fraction(self.estimator, problem)
         initial = getattr(self.policy, "initial", None)
         known = isinstance(initial, str) and initial in problem.candidates
         self.incumbent = str(initial) if known else problem.initial
@@ -146,11 +152,6 @@ class Controller:
     def learns(self) -> bool:
         """Whether windows have to bring their evidence."""
         return self._learner is not None
-
-    @property
-    def shadow_fraction(self) -> float:
-        """Share of the cycles that the estimator wants sent through each alternative."""
-        return float(getattr(self.estimator, "shadow_fraction", 0.0))
 
     @property
     def fixed_profile(self) -> Profile | None:
@@ -256,7 +257,13 @@ class Controller:
         if self._support is None:
             return []
         support = self._support()
-        behind = [support[name] for name in self._names]
+        behind = [support[name] for name in self._names if name in support]
+        if len(behind) < len(self._names):
+            who, known = type(self.estimator).__name__, ", ".join(support) or "nothing"
+            raise MetricError(
+                f"{who}.support says something of {known}; it must of each of "
+                f"{', '.join(self._names)}"
+            )
         return [known.samples for known in behind] + [known.age_windows for known in behind]
 
     def miss(self) -> None:
@@ -308,6 +315,23 @@ def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> Mi
     if start is not None:
         start(problem)
     return prepared
+
+
+def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
+    """Share of the cycles that an estimator wants sent through each alternative.
+
+    Raises
+    ------
+    ProblemError
+        If it is no share, or all alternatives together would get more than all cycles.
+    """
+    fraction = getattr(estimator, "shadow_fraction", 0.0)
+    who = f"shadow_fraction of {type(estimator).__name__}"
+    SHADOW_FRACTION.check(who, fraction)
+    message = too_many_shadows(fraction, len(problem.candidates))
+    if message:
+        raise ProblemError([Fault(who, message)])
+    return float(fraction)
 
 
 def static_columns(

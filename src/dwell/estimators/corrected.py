@@ -9,27 +9,27 @@ such cycles.
 Change of regime
     Pools forget slowly (`MEMORY` half-lives), which keeps estimates calm; but a stressed node is
     another regime, not a gradual drift. Where the ranks of a window's new times in the pool lie
-    almost wholly on one side (the probability that a new time exceeds an old one is beyond
-    `SHIFT`, the Mann-Whitney statistic, DOI 10.1214/aoms/1177730491), the pool is dropped. Few new
-    times are then filled up with the profile's, stretched (a job) or shifted (a message) to their
-    median.
+    almost wholly on one side (the Mann-Whitney statistic, DOI 10.1214/aoms/1177730491), the pool is
+    dropped. Few new times are then filled up with the profile's, stretched (a job) or shifted (a
+    message) to their median.
 
 What nobody measured
-    A part that no job went through, in the window in which another part of its node or link changed
-    its regime, is corrected with it: the foreign threads that explain a job's slowdown slow the
-    other jobs of the node as they would under processor sharing, and the extra delay of one message
-    is that of the others on its link. A node of which nothing at all was measured is judged by its
-    foreign load.
+    A part that no job went through, in a window in which another part of its node or link changed
+    its regime, is corrected with it: the foreign threads that explain the slowdown of the longest
+    job slow the other jobs of the node, and the extra delay and the losses of one message are those
+    of the others on its link. A node of which nothing at all was measured is judged by its foreign
+    load.
 
 Age
-    A pool that got nothing new for a windows is widened: each of its times is multiplied by a
-    lognormal factor whose deviation grows with the square root of a. Its estimate becomes one of a
-    node or link about which less and less is known.
+    A part that was not measured for a windows is less and less known: each of its times is
+    multiplied by a lognormal factor whose deviation grows with the square root of a. In the end
+    what was measured of it is forgotten, and the profile's times are what is left, so widened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -37,10 +37,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import Message, Part, Site, measured_parts, parts_of
-from dwell.estimators.paths import longest_path, seen_windows
+from dwell.estimators.measured import Message, Meter, Part, Site, message_of
+from dwell.estimators.paths import longest_path, seen_windows, steps_of
+from dwell.estimators.pool import Pool, middle
 from dwell.estimators.profile import SEED, Profile, SampleCycles
 from dwell.estimators.protocol import Support
+from dwell.estimators.slowdown import explaining_threads, slowdown
+from dwell.model.bounds import HALF_LIFE_WINDOWS
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
@@ -51,60 +54,59 @@ Floats: TypeAlias = NDArray[np.float64]
 
 #: Half-lives after which a measured time is forgotten.
 MEMORY = 6.0
-#: Most times that a pool holds, and how many of the profile's it begins with.
-LARGEST = 400
+#: How many of the profile's times a pool begins with.
 PRIOR = 256
-#: P(new > old) outside [1 - SHIFT, SHIFT], with at least LEAST new times, is another regime.
-SHIFT = 0.85
-LEAST = 2
-LEAST_DEVIATIONS = 2.2
-#: New times below which the profile's shape is added to them.
-ENOUGH = 12
 #: Deviation of the logarithm of a pool's times after one window without a new one.
 WIDENING = 0.03
-#: Cycles that a candidate's estimate is composed of, at least.
+#: Cycles that a candidate's estimate is composed of: at least, and at most in one window.
 COMPOSED = 1000
+LONGEST_WINDOW = 10_000
 #: Change of a node's foreign load that means another regime where nothing else was measured.
 LOAD_STEP = 0.25
 SATURATED = 0.95
+#: Half a nanosecond: sums of milliseconds that differ by less are equal.
+ROUNDING_MS = 5e-7
 
 
 @dataclass(slots=True)
-class _Pool:
-    """Times of one part in its present regime, ascending in `ordered`."""
+class _Route:
+    """The pools of a candidate's parts: by task, by flow (None on one node), and all of them."""
 
-    prior: Floats
-    times: Floats
-    window: Floats
-    ordered: Floats
-    last: int = 0
-    foreign: float = 0.0
+    jobs: list[Pool]
+    messages: list[Pool | None]
+    pools: list[Pool]
 
-    @classmethod
-    def of(cls, prior: Floats) -> _Pool:
-        ordered = np.sort(prior[np.isfinite(prior)])
-        return cls(ordered, ordered, np.zeros(len(ordered)), ordered)
 
-    def replace(self, times: Floats, window: int) -> None:
-        self.times, self.window = times, np.full(len(times), float(window))
-        self.ordered = np.sort(times)
+class _Maker:
+    """Makes the pools of candidates, those that no candidate before has."""
 
-    def add(self, times: Floats, window: int, memory: float) -> None:
-        kept = self.window > window - memory
-        now = np.full(len(times), float(window))
-        self.times = np.concatenate((self.times[kept], times))[-LARGEST:]
-        self.window = np.concatenate((self.window[kept], now))[-LARGEST:]
-        self.ordered = np.sort(self.times)
+    def __init__(self, problem: Problem, pools: dict[Part, Pool], draws: int, seed: int) -> None:
+        self.pipeline, self.pools = problem.pipeline, pools
+        self.sampled = SampleCycles(problem, PRIOR, seed)
+        self.rng = np.random.default_rng(seed)
+        self.places = (np.arange(draws) + 0.5) / draws
 
-    def shifted(self, times: Floats) -> bool:
-        """Whether new times are of another regime than the old ones."""
-        new, old = len(times), len(self.ordered)
-        below = np.searchsorted(self.ordered, times, "left")
-        above = np.searchsorted(self.ordered, times, "right")
-        exceeds = float((below + above).mean()) / (2 * old)
-        deviations = abs(exceeds - 0.5) / np.sqrt((1 / new + 1 / old) / 12)
-        beyond = not 1 - SHIFT <= exceeds <= SHIFT
-        return bool(new >= LEAST and deviations > LEAST_DEVIATIONS and beyond)
+    def route(self, placement: Placement) -> _Route:
+        """Return the pools of a candidate."""
+        jobs: list[Pool] = []
+        messages: list[Pool | None] = []
+        for name in self.pipeline.tasks:
+            site = Site(name, placement[name])
+            if site not in self.pools:
+                self.pools[site] = self.pool(self.sampled.executed(*site), additive=False)
+            jobs.append(self.pools[site])
+        for flow in self.pipeline.flows:
+            message = message_of(flow.source, flow.target, placement)
+            if message is not None and message not in self.pools:
+                self.pools[message] = self.pool(self.sampled.sent(flow, placement), additive=True)
+            messages.append(None if message is None else self.pools[message])
+        return _Route(jobs, messages, [*jobs, *(pool for pool in messages if pool is not None)])
+
+    def pool(self, prior: Floats, additive: bool) -> Pool:
+        """Return the pool of a part, with pairings of its own."""
+        places, normals = self.rng.permutation(self.places), self.rng.standard_normal
+        # To whole nanoseconds, as everything is measured: equal times must be ties.
+        return Pool(np.round(prior, 6), additive, places, normals(len(places)))
 
 
 class Corrected:
@@ -125,6 +127,11 @@ class Corrected:
     ----------
     regimes : int
         Changes of regime seen since the start.
+
+    Raises
+    ------
+    ProblemError
+        If `half_life_windows` is out of its range.
     """
 
     def __init__(
@@ -138,61 +145,69 @@ class Corrected:
         given = settings.shadow_fraction if shadow_fraction is None else shadow_fraction
         self.shadow_fraction = given
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
+        HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
         self.memory = MEMORY * half_life
         self.seed = seed
-        self.profile = Profile(problem)
         self.start(problem)
 
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
         self.problem = problem
+        self.profile = Profile(problem)
         self.regimes, self._window = 0, 0
-        sampled = SampleCycles(problem, PRIOR, self.seed)
-        windows = -(-COMPOSED // problem.window_cycles)
-        count = windows * problem.window_cycles
-        rng = np.random.default_rng(self.seed)
-        places = (np.arange(count) + 0.5) / count
-        self._pools: dict[Part, _Pool] = {}
-        self._places: dict[Part, Floats] = {}
-        self._normals: dict[Part, Floats] = {}
-        for placement in problem.candidates.values():
-            for part in parts_of(problem.pipeline, placement):
-                if part in self._pools:
-                    continue
-                self._pools[part] = _Pool.of(_sampled(sampled, part, placement, problem))
-                self._places[part] = rng.permutation(places)
-                self._normals[part] = rng.standard_normal(count)
-        span_ms = problem.window_cycles * problem.pipeline.period_ms
-        self._age_ms = rng.permutation(places) * span_ms
-        self._fresh: dict[Part, Floats] = {}
+        self._steps = steps_of(problem.pipeline)
+        self._meter = Meter(problem)
+        self._pools: dict[Part, Pool] = {}
+        self._row = min(problem.window_cycles, LONGEST_WINDOW)
+        rows = -(-COMPOSED // self._row)
+        make = _Maker(problem, self._pools, rows * self._row, self.seed)
+        self._routes = {name: make.route(placed) for name, placed in problem.candidates.items()}
+        # A lost cycle counts with its age at the close of its window: W to 1 periods.
+        places = np.tile((np.arange(self._row) + 0.5) / self._row, rows)
+        ages = 1 + np.floor(places * problem.window_cycles)
+        self._age_ms = ages * problem.pipeline.period_ms
+        self._foreign = dict.fromkeys(problem.fabric.nodes, 0.0)
+        self._seen: frozenset[str] = frozenset()
+        self._forgotten: frozenset[Part] = frozenset()
 
     def learn(self, evidence: Evidence) -> None:
         """Take in what a window measured of each part."""
         self._window += 1
-        self._fresh = measured_parts(self.problem, evidence)
-        changed: list[Part] = []
-        for part, times in self._fresh.items():
-            pool = self._pools[part]
-            pool.last = self._window
-            if pool.shifted(times):
-                changed.append(part)
-                pool.replace(_filled_up(pool.prior, times, part), self._window)
-            else:
-                pool.add(times, self._window, self.memory)
+        measured = self._meter.times(evidence)
+        tested, changed = set(), set()
+        for part, times in measured.items():
+            verdict = self._pools[part].learn(times, self._window, self.memory)
+            if verdict is not None:
+                tested.add(part)
+            if verdict:
+                changed.add(part)
         self.regimes += len(changed)
-        for part in changed:
-            self._correct_others(part)
+        self._forgotten = frozenset(self._forget())
+        self._seen = frozenset(_place(part) for part in measured)
+        places = {_place(part) for part in changed}
+        if not places and not self._forgotten:
+            return
+        for part in self._pools:
+            here = _place(part)
+            if part not in tested and (here in places or part in self._forgotten):
+                self._correct(part, [w for w in measured if _place(w) == here and w != part])
 
     def support(self) -> dict[str, Support]:
         """How much stands behind each candidate's estimate: that of its weakest part."""
-        found = {}
-        for name, placement in self.problem.candidates.items():
-            pools = [self._pools[part] for part in parts_of(self.problem.pipeline, placement)]
-            found[name] = Support(
-                min(int(np.count_nonzero(pool.window)) for pool in pools),
-                float(max(self._window - pool.last for pool in pools)),
+        return {
+            name: Support(
+                min([pool.measured for pool in route.pools]),
+                self._window - min([pool.last for pool in route.pools]),
             )
-        return found
+            for name, route in self._routes.items()
+        }
+
+    def deviation(self) -> dict[str, float]:
+        """Deviation of the logarithm by which the stalest part of each candidate is widened."""
+        return {
+            name: max(self._widening(pool) for pool in route.pools)
+            for name, route in self._routes.items()
+        }
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
@@ -200,130 +215,104 @@ class Corrected:
         """Estimate every candidate's metrics (see `Estimator`)."""
         known = self.profile.estimate(observed=observed, incumbent=incumbent, own=own)
         self._judge_by_load(observed, own)
-        draws: dict[Part, Floats] = {}
-        return {
-            name: self._composed(placement, known[name], draws)
-            for name, placement in self.problem.candidates.items()
-        }
+        for pool in self._pools.values():
+            pool.draw(self._widening(pool))
+        return {name: self._composed(route, known[name]) for name, route in self._routes.items()}
 
-    def _composed(self, placement: Placement, known: QoS, draws: dict[Part, Floats]) -> QoS:
+    def _composed(self, route: _Route, known: QoS) -> QoS:
         """L95 and V_D of cycles composed from the pools of a candidate's parts."""
         problem = self.problem
-
-        def drawn(part: Part) -> Floats:
-            if part not in draws:
-                draws[part] = self._drawn(part)
-            return draws[part]
-
         latency_ms = longest_path(
-            problem.pipeline,
-            lambda task: drawn(Site(task, placement[task])),
-            lambda flow: (
-                drawn(
-                    Message(
-                        flow.source,
-                        flow.target,
-                        f"{placement[flow.source]}->{placement[flow.target]}",
-                    )
-                )
-                if placement[flow.source] != placement[flow.target]
-                else np.zeros(len(self._age_ms))
-            ),
+            self._steps,
+            [pool.drawn for pool in route.jobs],
+            [0.0 if pool is None else pool.drawn for pool in route.messages],
         )
-        missed = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
-        l95_ms = seen_windows(latency_ms, problem.window_cycles, self._age_ms, problem.censor_ms)
-        return QoS(l95_ms, missed / len(latency_ms), known.utilisation)
+        late = latency_ms > problem.pipeline.deadline_ms + ROUNDING_MS
+        l95_ms = seen_windows(latency_ms, self._row, self._age_ms, problem.censor_ms)
+        missed = int(np.count_nonzero(late)) / len(latency_ms)
+        return QoS(l95_ms, missed, known.utilisation)
 
-    def _drawn(self, part: Part) -> Floats:
-        """Draw times of a part from its pool, wider the older it is."""
-        pool = self._pools[part]
-        times = pool.ordered[(self._places[part] * len(pool.ordered)).astype(np.int64)]
-        age = self._window - pool.last
-        if age > 0:
-            times = times * np.exp(WIDENING * np.sqrt(age) * self._normals[part])
-        return times
+    def _widening(self, pool: Pool) -> float:
+        """Deviation of the logarithm of a pool's times, from the windows since it was measured."""
+        age = min(self._window - pool.last, self.memory)
+        return WIDENING * math.sqrt(age) if age > 0 else 0.0
 
-    def _correct_others(self, changed: Part) -> None:
-        """Correct what nobody measured by a part of the same node or link that changed."""
+    def _forget(self) -> Iterator[Part]:
+        """Let parts of which nothing was learnt for long be what the profile says."""
         for part, pool in self._pools.items():
-            if part in self._fresh:
-                continue
-            if isinstance(part, Message) and isinstance(changed, Message):
-                if part.link == changed.link:
-                    extra = np.median(self._pools[changed].ordered)
-                    extra -= np.median(self._pools[changed].prior)
-                    pool.replace(pool.prior + max(float(extra), 0.0), self._window)
-            elif isinstance(part, Site) and isinstance(changed, Site) and part.node == changed.node:
-                threads = self._foreign_threads(changed)
-                if threads is not None:
-                    self._slow(part, threads)
+            if pool.touched and self._window - pool.touched >= max(self.memory, 1.0):
+                pool.reset()
+                yield part
 
-    def _foreign_threads(self, site: Site) -> float | None:
-        """Foreign threads that explain how much slower a site is than its profile."""
-        pool = self._pools[site]
-        node = self.problem.fabric.nodes[site.node]
-        execution = self.problem.pipeline.tasks[site.task].on[site.node]
-        if execution.accelerator is not None:
-            return None
-        slowdown = float(np.median(pool.ordered) / max(np.median(pool.prior), 1e-9))
-        if not np.isfinite(slowdown):
-            return None
-        if node.scheduler != "fair":
-            return max(slowdown - 1.0, 0.0) * node.cores
-        held = max(execution.threads, node.cores)
-        return max(slowdown * held - execution.threads, 0.0) if slowdown > 1.0 else 0.0
-
-    def _slow(self, site: Site, threads: float) -> None:
-        """Set a site's times to its profile's, slowed by foreign threads."""
-        node = self.problem.fabric.nodes[site.node]
-        execution = self.problem.pipeline.tasks[site.task].on[site.node]
-        if execution.accelerator is not None:
+    def _correct(self, part: Part, witnesses: Iterable[Part]) -> None:
+        """Correct a part that nobody measured by those of its node or link that were."""
+        if isinstance(part, Message):
+            known = [w for w in witnesses if self._pools[w].usual < math.inf]
+            if known:
+                surest = max(known, key=lambda w: self._pools[w].measured)
+                pool = self._pools[part]
+                pool.replace(_delayed(pool.prior, self._pools[surest]), self._window)
             return
-        if node.scheduler == "fair":
-            held = max(execution.threads, node.cores)
-            slowdown = max(1.0, (execution.threads + threads) / held)
-        else:
-            slowdown = (node.cores + threads) / node.cores
-        pool = self._pools[site]
-        pool.replace(pool.prior * slowdown, self._window)
+        threads = self._foreign_threads([w for w in witnesses if isinstance(w, Site)])
+        if threads is not None:
+            self._slow(part, threads)
+
+    def _foreign_threads(self, sites: Iterable[Site]) -> float | None:
+        """Foreign threads that explain how much slower a node's longest job is than its profile.
+
+        The longest, because queueing adds to all jobs alike and would pass for a great slowdown of
+        a short one. None where there is no such job on the CPU, or all of its jobs are lost.
+        """
+        pools = {s: self._pools[s] for s in sites if self._on_cpu(s) and self._pools[s].usual > 0}
+        if not pools:
+            return None
+        longest = max(pools, key=lambda site: pools[site].usual)
+        slowed = middle(pools[longest].ordered) / pools[longest].usual
+        if not slowed < math.inf:
+            return None
+        node = self.problem.fabric.nodes[longest.node]
+        return explaining_threads(node, self._threads(longest), slowed)
+
+    def _slow(self, site: Site, foreign_threads: float) -> None:
+        """Set a site's times to its profile's, slowed by foreign threads."""
+        if self._on_cpu(site):
+            node, pool = self.problem.fabric.nodes[site.node], self._pools[site]
+            slowed = slowdown(node, self._threads(site), foreign_threads)
+            pool.replace(pool.prior * slowed, self._window)
+
+    def _on_cpu(self, site: Site) -> bool:
+        return self.problem.pipeline.tasks[site.task].on[site.node].accelerator is None
+
+    def _threads(self, site: Site) -> int:
+        return self.problem.pipeline.tasks[site.task].on[site.node].threads
 
     def _judge_by_load(self, observed: QoS, own: Mapping[str, float]) -> None:
         """Judge by its foreign load a node of which nothing was measured in this window."""
-        seen = {part.node for part in self._fresh if isinstance(part, Site)}
         for name, node in self.problem.fabric.nodes.items():
             foreign = max(observed.utilisation[name] - own[name], 0.0)
+            changed = abs(foreign - self._foreign[name]) > LOAD_STEP
+            if changed or name in self._seen:
+                self._foreign[name] = foreign
+            if name in self._seen or not (changed or self._forgotten):
+                continue
             # What a saturated node's load hides: at least one thread a core.
             threads = node.cores if foreign > SATURATED else foreign * node.capacity
-            for part, pool in self._pools.items():
-                if not isinstance(part, Site) or part.node != name:
-                    continue
-                if name not in seen and abs(foreign - pool.foreign) > LOAD_STEP:
+            for part in self._pools:
+                judged = changed or (part in self._forgotten and foreign > LOAD_STEP)
+                if judged and isinstance(part, Site) and part.node == name:
                     self._slow(part, threads)
-                elif name not in seen:
-                    continue
-                pool.foreign = foreign
 
 
-def _sampled(sampled: SampleCycles, part: Part, placement: Placement, problem: Problem) -> Floats:
-    """Times of a part in the profile's sample cycles."""
-    if isinstance(part, Site):
-        return sampled.executed(part.task, part.node)
-    flow = next(
-        flow
-        for flow in problem.pipeline.flows
-        if (flow.source, flow.target) == (part.source, part.target)
-    )
-    return sampled.sent(flow, placement)
+def _place(part: Part) -> str:
+    """The node or link that a part is on."""
+    return part.node if isinstance(part, Site) else part.link
 
 
-def _filled_up(prior: Floats, times: Floats, part: Part) -> Floats:
-    """New times, and where they are few the profile's moved to their median."""
-    finite = times[np.isfinite(times)]
-    if len(times) >= ENOUGH or len(finite) == 0:
-        return times
-    new, old = float(np.median(finite)), float(np.median(prior))
-    if isinstance(part, Site):
-        moved = prior * (new / max(old, 1e-9))
-    else:
-        moved = np.maximum(prior + (new - old), 0.0)
-    return np.concatenate((times, moved[:: max(len(moved) // ENOUGH, 1)]))
+def _delayed(prior: Floats, witness: Pool) -> Floats:
+    """The profile's times of a message, with the extra delay and the losses of another one."""
+    extra_ms = max(middle(witness.ordered) - witness.usual, 0.0)
+    times = prior + extra_ms
+    lost = np.isinf(witness.ordered).mean() - np.isinf(prior).mean()
+    if lost > 0:
+        times[np.flatnonzero(np.isfinite(times))[: round(lost * len(times))]] = np.inf
+    return times

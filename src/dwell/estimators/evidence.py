@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 __all__ = ["UNKNOWN", "Evidence", "Instants"]
 
 Ints: TypeAlias = NDArray[np.int64]
+Rows: TypeAlias = slice | NDArray[np.bool_] | NDArray[np.int64]
 
 #: Stands for an instant that had not come, or was not known, when the window closed.
 UNKNOWN = -1
@@ -37,6 +38,10 @@ class Instants:
     ready_ns: Ints
     end_ns: Ints
     arrived_ns: Ints
+
+    def at(self, rows: Rows) -> Instants:
+        """Instants of some of the cycles."""
+        return Instants(self.ready_ns[rows], self.end_ns[rows], self.arrived_ns[rows])
 
 
 @dataclass(frozen=True, slots=True)

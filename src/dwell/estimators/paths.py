@@ -2,52 +2,121 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeAlias
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model.pipeline import Flow, Pipeline
 
-__all__ = ["longest_path", "order_statistic", "seen_windows"]
+__all__ = [
+    "Input",
+    "Step",
+    "l95_rank",
+    "longest_path",
+    "order_statistic",
+    "seen_windows",
+    "steps_of",
+]
 
 Floats: TypeAlias = NDArray[np.float64]
 
 
+class Input(NamedTuple):
+    """A flow into a task.
+
+    Parameters
+    ----------
+    flow : Flow
+    column : int
+        Place of the flow in the pipeline.
+    source : int
+        Place of its source among the pipeline's tasks.
+    """
+
+    flow: Flow
+    column: int
+    source: int
+
+
+class Step(NamedTuple):
+    """A task with what its start depends on, looked up once for a pipeline.
+
+    Parameters
+    ----------
+    task : str
+    column : int
+        Place of the task in the pipeline.
+    offset_ms : float
+        Start of a source after the release.
+    inputs : tuple of Input
+    sink : bool
+        Whether it has no outputs.
+    """
+
+    task: str
+    column: int
+    offset_ms: float
+    inputs: tuple[Input, ...]
+    sink: bool
+
+
+def steps_of(pipeline: Pipeline) -> tuple[Step, ...]:
+    """Return the tasks of a pipeline so that every flow points forward."""
+    place = {name: column for column, name in enumerate(pipeline.tasks)}
+    columns = {flow: column for column, flow in enumerate(pipeline.flows)}
+    return tuple(
+        Step(
+            name,
+            place[name],
+            float(pipeline.tasks[name].offset_ms),
+            tuple(Input(f, columns[f], place[f.source]) for f in pipeline.inputs(name)),
+            not pipeline.outputs(name),
+        )
+        for name in pipeline.topological()
+    )
+
+
 def longest_path(
-    pipeline: Pipeline, executed: Callable[[str], Floats], sent: Callable[[Flow], Floats]
+    steps: Sequence[Step], executed: Sequence[Floats], sent: Sequence[Floats | float]
 ) -> Floats:
     """Latency of each cycle, in the unit of its parts (paper, eq. 3, for any DAG).
 
     Parameters
     ----------
-    pipeline : Pipeline
-    executed : callable
-        Time of a task's job in each cycle, shape (n,).
-    sent : callable
-        Time of a flow's message in each cycle, shape (n,); 0 on one node.
+    steps : sequence of Step
+        Of the pipeline (see `steps_of`).
+    executed : sequence of float64 array, shape (n,)
+        Time of every task's job in each cycle, in the pipeline's order.
+    sent : sequence of float64 array of shape (n,), or float
+        Time of every flow's message in each cycle, in the pipeline's order; 0.0 on one node.
 
     Returns
     -------
     float64 array, shape (n,)
     """
-    finish: dict[str, Floats] = {}
-    for name in pipeline.topological():
-        taken = executed(name)
-        ready = np.full(taken.shape, float(pipeline.tasks[name].offset_ms))
-        for flow in pipeline.inputs(name):
-            np.maximum(ready, finish[flow.source] + sent(flow), out=ready)
-        finish[name] = ready + taken
-    sinks = [finish[name] for name in pipeline.tasks if not pipeline.outputs(name)]
-    latency: Floats = np.maximum.reduce(sinks)
+    finish: dict[int, Floats] = {}
+    for step in steps:
+        ready: Floats | float = step.offset_ms
+        for number, entry in enumerate(step.inputs):
+            arrived = finish[entry.source] + sent[entry.column]
+            ready = np.maximum(ready, arrived, out=arrived) if number else arrived
+        finish[step.column] = ready + executed[step.column]
+    sinks = [finish[step.column] for step in steps if step.sink]
+    latency: Floats = np.maximum.reduce(sinks) if len(sinks) > 1 else sinks[0]
     return latency
 
 
 def order_statistic(values: Floats) -> float:
     """L95: the ceil(0.95 n)-th smallest of n values, never interpolated."""
-    rank = (19 * len(values) + 19) // 20  # in integers: 0.95 * n is not exact
+    rank = l95_rank(len(values))
     return float(np.partition(values, rank - 1)[rank - 1])
+
+
+def l95_rank(count: int) -> int:
+    """Return ceil(0.95 n), in integers: 0.95 * n is not exact."""
+    return (19 * count + 19) // 20
 
 
 def seen_windows(latency_ms: Floats, window_cycles: int, age_ms: Floats, censor_ms: float) -> float:
@@ -67,7 +136,10 @@ def seen_windows(latency_ms: Floats, window_cycles: int, age_ms: Floats, censor_
     censor_ms : float
         No latency counts for more.
     """
-    seen = np.minimum(np.where(np.isinf(latency_ms), age_ms, latency_ms), censor_ms)
-    rank = (19 * window_cycles + 19) // 20
+    lost = np.isinf(latency_ms)
+    seen = np.where(lost, age_ms, latency_ms) if lost.any() else latency_ms.copy()
     by_window = seen.reshape(-1, window_cycles)
-    return float(np.partition(by_window, rank - 1, axis=1)[:, rank - 1].mean())
+    by_window.sort(axis=1)
+    # Censoring is monotone, so censoring the order statistic is censoring every latency.
+    l95_ms = np.minimum(by_window[:, l95_rank(window_cycles) - 1], censor_ms)
+    return float(l95_ms.sum()) / len(l95_ms)

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import MetricError
-from dwell.estimators.paths import longest_path, order_statistic
+from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.model.fabric import Link, Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.pipeline import Execution, Flow, Task
@@ -125,16 +125,18 @@ class SampleCycles:
         self.problem = problem
         self.samples = samples
         self.seed = seed
+        self._steps = steps_of(problem.pipeline)
         self._rows: dict[str, NDArray[np.int64]] = {}
         self._exec: dict[tuple[str, str], Floats] = {}
         self._message: dict[tuple[Flow, str], Floats] = {}
 
     def latency_ms(self, placement: Placement) -> Floats:
         """Latency of every sample cycle, censored; shape (samples,), milliseconds."""
+        pipeline = self.problem.pipeline
         latency = longest_path(
-            self.problem.pipeline,
-            lambda task: self.executed(task, placement[task]),
-            lambda flow: self.sent(flow, placement),
+            self._steps,
+            [self.executed(task, placement[task]) for task in pipeline.tasks],
+            [self.sent(flow, placement) for flow in pipeline.flows],
         )
         # To whole nanoseconds, as everything is timed: 0.1 + 0.2 must not miss a deadline of 0.3.
         return np.minimum(np.round(latency, 6), self.problem.censor_ms)

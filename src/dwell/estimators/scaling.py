@@ -2,29 +2,52 @@
 
 Cycle by cycle, a job that a candidate runs where it runs now counts with what it took; one that the
 candidate runs elsewhere counts with that times the known ratio of the two nodes' compute times. A
-message on the link that it crosses now counts with what it took; on any other link with the
-declared bound of that link plus its transmission. What is not known of a cycle, because it was
-lost, counts as infinite. L95 and V_D are those of the cycles so bounded.
+message that crosses the same link as now counts with what it took; on any other link with the
+declared bound of that link plus its transmission. What is not known of a cycle, because it was lost
+or had not ended when the window closed, counts as infinite. L95 and V_D are those of the cycles so
+bounded.
 
-A job's measured time holds its queueing and contention, so it is never less than its execution
-time: with ratios that are true (exec there <= ratio * exec here, in every cycle) and bounds that
-hold, the bound on each cycle's latency holds on the same realisation, and so does the one on the
-queue-free L95. With ratios of a distribution it holds in distribution only.
+What is bounded
+    The latency of each cycle as it would be *queue-free* under the candidate: the longest path of
+    its execution times, each alone on a node without stress and quota, and of its messages, each
+    alone on its link. What was measured holds queueing, contention and stress, waits for a worker,
+    an accelerator or an earlier message of an `in_order` link, and is never less than that. So the
+    bound holds, cycle by cycle on the same realisation, where
+
+    * ratios are true: exec there <= ratio * exec here in every cycle (a task with more threads than
+      a `fair` node has cores takes threads / cores times as long there, which counts);
+    * declared bounds hold: no message takes longer on a link that its flow does not use now,
+      repeated attempts included, nor is one lost there;
+    * a link that its flow does use is no worse for the message at the instant at which the
+      candidate would send it. Where it is as it was declared, that is so.
+
+    And so it does for the L95 and the V_D of the window's cycles, up to the censoring of L95 at
+    ``problem.censor_ms``.
+
+What is not
+    What the candidate would really show: its own queueing and contention, stress on nodes that are
+    not in use and the utilisation are not in it.
+
+    Ratios that are not given are taken from the profile: its 95th percentile there over its median
+    here. That is no bound on a cycle, only a cautious factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.errors import Fault, ProblemError
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import PATIENCE
-from dwell.estimators.paths import longest_path, order_statistic
+from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.estimators.profile import SEED, Profile, SampleCycles
-from dwell.estimators.spans import Spans, measure
+from dwell.estimators.spans import Spans, patience_ns, spans_of
+from dwell.model.bounds import VALUE, shown
+from dwell.model.meaning import nearest
 from dwell.model.pipeline import Flow
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -50,6 +73,11 @@ class Scaling:
     bounds_ms : mapping of str to float, optional
         Largest delay of each link (``R1->E``), transmission not included, milliseconds; what is
         missing is the largest in the profile's sample cycles.
+
+    Raises
+    ------
+    ProblemError
+        If a ratio or bound is negative or not finite, or is of something that does not exist.
     """
 
     def __init__(
@@ -58,25 +86,31 @@ class Scaling:
         ratios: Mapping[tuple[str, str, str], float] | None = None,
         bounds_ms: Mapping[str, float] | None = None,
     ) -> None:
-        self.profile = Profile(problem)
         self._given, self._bounds = dict(ratios or {}), dict(bounds_ms or {})
         self.start(problem)
 
     def start(self, problem: Problem) -> None:
         """Forget the last window."""
+        faults = [*_unknown_ratios(self._given, problem), *_unknown_bounds(self._bounds, problem)]
+        if faults:
+            raise ProblemError(faults)
         self.problem = problem
+        self.profile = Profile(problem)
         self._sampled = SampleCycles(problem, SAMPLES, SEED)
+        self._steps = steps_of(problem.pipeline)
+        names = list(problem.pipeline.tasks)
+        self._sources = [names.index(flow.source) for flow in problem.pipeline.flows]
         self._ratios = dict(self._given)
         self._spans: Spans | None = None
         self._active: Placement | None = None
 
     def learn(self, evidence: Evidence) -> None:
         """Take in what the cycles of a window took; those of an earlier placement are left out."""
-        pipeline = self.problem.pipeline
-        own, _ = measure(evidence, pipeline, PATIENCE * pipeline.period_ms)
-        newest = evidence.placement == evidence.placement[-1]
-        self._spans = Spans(own.job_ms[newest], own.message_ms[newest])
-        self._active = tuple(self.problem.candidates.values())[int(evidence.placement[-1])]
+        newest = int(evidence.placement[-1])
+        cycles = evidence.cycles.at(evidence.placement == newest)
+        limit_ns = evidence.close_ns - patience_ns(self.problem)
+        self._spans = spans_of(cycles, cycles.end_ns[:, self._sources], limit_ns)
+        self._active = tuple(self.problem.candidates.values())[newest]
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
@@ -92,44 +126,88 @@ class Scaling:
         }
 
     def _bounded(self, placement: Placement, known: QoS, spans: Spans, active: Placement) -> QoS:
-        problem = self.problem
-        columns = {name: i for i, name in enumerate(problem.pipeline.tasks)}
-        order = {flow: i for i, flow in enumerate(problem.pipeline.flows)}
-
-        def executed(task: str) -> Floats:
-            here, there = active[task], placement[task]
-            taken = spans.job_ms[:, columns[task]]
-            ratio = 1.0 if here == there else self._ratio(task, here, there)
-            bounded: Floats = np.where(np.isnan(taken), np.inf, taken * ratio)
-            return bounded
-
-        def sent(flow: Flow) -> Floats:
-            source, target = placement[flow.source], placement[flow.target]
-            if source == target:
-                return np.zeros(len(spans.job_ms))
-            if (source, target) != (active[flow.source], active[flow.target]):
-                return np.full(len(spans.job_ms), self._bound_ms(flow, placement))
-            taken = spans.message_ms[:, order[flow]]
-            bounded: Floats = np.where(np.isnan(taken), np.inf, taken)
-            return bounded
-
-        latency_ms = longest_path(problem.pipeline, executed, sent)
-        missed = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
-        l95_ms = min(order_statistic(latency_ms), problem.censor_ms)
+        pipeline = self.problem.pipeline
+        executed = [
+            self._executed(name, spans.job_ms[:, column], active, placement)
+            for column, name in enumerate(pipeline.tasks)
+        ]
+        sent = [
+            self._sent(flow, spans.message_ms[:, column], active, placement)
+            for column, flow in enumerate(pipeline.flows)
+        ]
+        # To whole nanoseconds, as everything is timed.
+        latency_ms = np.round(longest_path(self._steps, executed, sent), 6)
+        missed = int(np.count_nonzero(latency_ms > pipeline.deadline_ms))
+        l95_ms = min(order_statistic(latency_ms), self.problem.censor_ms)
         return QoS(l95_ms, missed / len(latency_ms), known.utilisation)
 
+    def _executed(
+        self, task: str, taken_ms: Floats, active: Placement, placement: Placement
+    ) -> Floats:
+        """Bound the time of a task's job in each cycle."""
+        here, there = active[task], placement[task]
+        if here == there:
+            return _or_infinite(taken_ms)
+        ratio = self._ratio(task, here, there)
+        if ratio in (0.0, math.inf):  # whatever it took here
+            return np.full(len(taken_ms), ratio)
+        return _or_infinite(taken_ms * ratio)
+
+    def _sent(
+        self, flow: Flow, taken_ms: Floats, active: Placement, placement: Placement
+    ) -> Floats | float:
+        """Bound the time of a flow's message in each cycle."""
+        source, target = placement[flow.source], placement[flow.target]
+        if source == target:
+            return 0.0
+        if (source, target) == (active[flow.source], active[flow.target]):
+            return _or_infinite(taken_ms)
+        return self._bound_ms(flow, placement)
+
     def _ratio(self, task: str, here: str, there: str) -> float:
+        """Compute time there over that here; infinite where there is none here."""
         key = (task, here, there)
         if key not in self._ratios:
-            mine = self._sampled.executed(task, here)
-            other = self._sampled.executed(task, there)
-            self._ratios[key] = order_statistic(other) / max(float(np.median(mine)), 1e-9)
+            usual = float(np.median(self._sampled.executed(task, here)))
+            longest = order_statistic(self._sampled.executed(task, there))
+            none = math.inf if longest > 0 else 0.0
+            self._ratios[key] = longest / usual if usual > 0 else none
         return self._ratios[key]
 
     def _bound_ms(self, flow: Flow, placement: Placement) -> float:
+        """Longest time that a flow's message takes on a link that it does not use now."""
         link = self.problem.fabric.links[f"{placement[flow.source]}->{placement[flow.target]}"]
         if link.name in self._bounds:
             return self._bounds[link.name] + 8 * flow.payload_bytes / (link.rate_mbps * 1e3)
         times = self._sampled.sent(flow, placement)
         finite = times[np.isfinite(times)]
-        return float(finite.max()) if len(finite) else self.problem.censor_ms
+        return float(finite.max()) if len(finite) else math.inf
+
+
+def _or_infinite(times_ms: Floats) -> Floats:
+    """Let what is not known be infinite."""
+    return np.where(np.isnan(times_ms), math.inf, times_ms)
+
+
+def _unknown_ratios(
+    ratios: Mapping[tuple[str, str, str], float], problem: Problem
+) -> Iterator[Fault]:
+    sites = [(name, node) for name, task in problem.pipeline.tasks.items() for node in task.on]
+    known = ", ".join(f"{task} on {node}" for task, node in sites)
+    for key, ratio in ratios.items():
+        path = f"ratios[{', '.join(map(repr, key))}]"
+        task, here, there = key
+        if not {(task, here), (task, there)} <= set(sites):
+            yield Fault(path, f"is of no task on two of its nodes (known: {known})")
+        elif not VALUE.holds(ratio):
+            yield Fault(path, f"{shown(ratio)} is not allowed; it must be {VALUE}")
+
+
+def _unknown_bounds(bounds_ms: Mapping[str, float], problem: Problem) -> Iterator[Fault]:
+    links = problem.fabric.links
+    for name, bound_ms in bounds_ms.items():
+        path = f"bounds_ms[{name!r}]"
+        if name not in links:
+            yield Fault(path, f"is of no link; {nearest(name, links)}")
+        elif not VALUE.holds(bound_ms):
+            yield Fault(path, f"{shown(bound_ms)} is not allowed; it must be {VALUE}")

@@ -1,9 +1,13 @@
 """Shadow: online emulation, the estimate from cycles also sent through each alternative.
 
 A shadow shares with its cycle whatever runs on the same nodes, has jobs and messages of its own for
-the rest, and stops before the sinks. Its latency is completed with the sinks' jobs of the cycle
-itself. Samples lose half their weight every half-life; a candidate with samples for less than
-`ENOUGH` whole ones is estimated by the profile.
+the rest, and stops before the sinks, whose commands would reach the actuator. What a sink would
+have added is what the cycle's own sink took, where both run on one node; elsewhere, and where the
+cycle never came to its sink, a time of the profile.
+
+Cycles and shadows count as they do in a window's metrics: one that has not come to its end when the
+window closes has missed, and counts with its age. Samples lose half their weight every half-life; a
+candidate whose samples weigh less than `ENOUGH` is estimated by the profile.
 """
 
 from __future__ import annotations
@@ -14,23 +18,62 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import stretches
-from dwell.estimators.profile import Profile
+from dwell.estimators.evidence import UNKNOWN, Evidence, Instants
+from dwell.estimators.measured import groups
+from dwell.estimators.paths import Step, steps_of
+from dwell.estimators.profile import SEED, Profile, SampleCycles
 from dwell.estimators.protocol import Support
-from dwell.estimators.spans import Spans
-from dwell.model.placement import Placement
+from dwell.model.bounds import HALF_LIFE_WINDOWS
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
-__all__ = ["Shadow"]
+__all__ = ["ENOUGH", "Shadow"]
 
 Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
 
-#: Weight of samples from which a 95th percentile is more than their maximum.
-ENOUGH = 20.0
-#: Weight below which a sample is dropped.
+#: Weight of the samples that an estimate needs. Their largest is then about the 91st percentile; a
+#: fraction of 0.05 reaches it in the third window of 100 cycles, at a half-life of two.
+ENOUGH = 10.0
+#: Weight below which a sample is dropped, and how many samples are kept at most.
 FORGOTTEN = 1e-3
+LARGEST = 5000
+#: Sample cycles of the profile from which a sink's times are taken.
+SINK_SAMPLES = 1000
+
+NS_PER_MS = 1e6
+#: Latency of what has not come to its end.
+NEVER_NS = 1 << 62
+
+
+class _Samples:
+    """Latencies of a candidate: what each counts as, whether it missed, and its weight."""
+
+    __slots__ = ("age", "missed", "seen_ms", "weight")
+
+    def __init__(self) -> None:
+        self.seen_ms = self.weight = np.empty(0)
+        self.missed = np.empty(0, np.bool_)
+        self.age = 0
+
+    def decay(self, factor: float) -> None:
+        """Let a window pass."""
+        weight = self.weight * factor
+        # They are in the order of their windows: the lightest come first.
+        first = int(np.searchsorted(weight, FORGOTTEN, side="right"))
+        self.weight = weight[first:]
+        self.seen_ms, self.missed = self.seen_ms[first:], self.missed[first:]
+        self.age += 1
+
+    def add(self, seen_ms: Floats, missed: NDArray[np.bool_]) -> None:
+        """Add the samples of a window; the oldest beyond `LARGEST` are dropped."""
+        step = -(-len(seen_ms) // LARGEST)
+        seen_ms, missed = seen_ms[::step], missed[::step]
+        ones = np.ones(len(seen_ms))
+        self.seen_ms = np.concatenate((self.seen_ms, seen_ms))[-LARGEST:]
+        self.missed = np.concatenate((self.missed, missed))[-LARGEST:]
+        self.weight = np.concatenate((self.weight, ones))[-LARGEST:]
+        self.age = 0
 
 
 class Shadow:
@@ -43,6 +86,11 @@ class Shadow:
         Share of the cycles sent through each alternative; the cell file's where None.
     half_life_windows : float, optional
         The cell file's where None.
+
+    Raises
+    ------
+    ProblemError
+        If `half_life_windows` is out of its range.
     """
 
     def __init__(
@@ -55,48 +103,107 @@ class Shadow:
         given = settings.shadow_fraction if shadow_fraction is None else shadow_fraction
         self.shadow_fraction = given
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
+        HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
         self.decay = 0.5 ** (1 / half_life)
-        self.profile = Profile(problem)
         self.start(problem)
 
     def start(self, problem: Problem) -> None:
         """Forget all samples."""
         self.problem = problem
-        none = np.empty(0)
-        self._samples = dict.fromkeys(problem.candidates, none)
-        self._weights = dict.fromkeys(problem.candidates, none)
-        self._age = dict.fromkeys(problem.candidates, 0.0)
+        self.profile = Profile(problem)
+        self._sinks = [step for step in steps_of(problem.pipeline) if step.sink]
+        self._sampled = SampleCycles(problem, SINK_SAMPLES, SEED)
+        self._taken = 0
+        self._placements = tuple(problem.candidates.values())
+        self._diverging: dict[tuple[int, int], frozenset[str]] = {}
+        self._deadline_ns = round(problem.pipeline.deadline_ms * NS_PER_MS)
+        self._samples = {name: _Samples() for name in problem.candidates}
+        # Candidates of one placement share its samples.
+        self._named = [
+            [self._samples[name] for name, other in problem.candidates.items() if other == placed]
+            for placed in self._placements
+        ]
 
     def learn(self, evidence: Evidence) -> None:
         """Take in the latencies that cycles and shadows of a window had."""
-        problem = self.problem
-        for name in problem.candidates:
-            weights = self._weights[name] * self.decay
-            kept = weights > FORGOTTEN
-            self._weights[name], self._samples[name] = weights[kept], self._samples[name][kept]
-            self._age[name] += 1
-        pieces = list(stretches(problem, evidence))
-        own = pieces[0].spans
-        for placement, rows, spans, tasks in pieces:
-            latency_ms = _latency_ms(problem, placement, spans, own, tasks)[rows]
-            latency_ms = latency_ms[~np.isnan(latency_ms)]
-            if len(latency_ms) == 0:
+        for samples in self._samples.values():
+            samples.decay(self.decay)
+        for active, rows in groups(evidence.placement):
+            cycles, release_ns = evidence.cycles.at(rows), evidence.release_ns[rows]
+            age_ns = evidence.close_ns - release_ns
+            self._add(active, self._latency_ns(cycles, release_ns), age_ns)
+            if evidence.shadows is None:
                 continue
-            for name, placed in problem.candidates.items():
-                if placed == placement:
-                    self._add(name, latency_ms)
+            shadows = evidence.shadows.at(rows)
+            for other, mine in groups(evidence.shadow_placement[rows]):
+                if other >= 0 and self._tells(active, other):
+                    latency_ns = self._through(
+                        active, other, cycles.at(mine), shadows.at(mine), release_ns[mine]
+                    )
+                    self._add(other, latency_ns, age_ns[mine])
 
-    def _add(self, name: str, latency_ms: Floats) -> None:
-        weights = np.ones(len(latency_ms))
-        self._samples[name] = np.concatenate((self._samples[name], latency_ms))
-        self._weights[name] = np.concatenate((self._weights[name], weights))
-        self._age[name] = 0.0
+    def _tells(self, active: int, other: int) -> bool:
+        """Whether shadows of one candidate through another say anything that is not known."""
+        apart = self._apart(active, other)
+        # A sink without inputs is never run: a pipeline of such sinks has no shadows at all.
+        measured = [step for step in self._sinks if step.inputs or step.task not in apart]
+        return bool(apart and measured)
+
+    def _add(self, index: int, latency_ns: Ints, age_ns: Ints) -> None:
+        """Add latencies of a window to a candidate, and to others of its placement."""
+        missed = latency_ns > np.minimum(age_ns, self._deadline_ns)
+        seen_ms = np.minimum(latency_ns, age_ns) / NS_PER_MS
+        for samples in self._named[index]:
+            samples.add(seen_ms, missed)
+
+    def _apart(self, active: int, other: int) -> frozenset[str]:
+        """Tasks that shadows of cycles under one candidate through another have for themselves."""
+        key = active, other
+        if key not in self._diverging:
+            placements = self._placements[active], self._placements[other]
+            self._diverging[key] = self.problem.pipeline.diverging(*placements)
+        return self._diverging[key]
+
+    def _latency_ns(self, cycles: Instants, release_ns: Ints) -> Ints:
+        """Latency of cycles; `NEVER_NS` where not all of their sinks have completed."""
+        end_ns = _latest(cycles.end_ns[:, [step.column for step in self._sinks]])
+        return np.where(end_ns >= 0, end_ns - release_ns, NEVER_NS)
+
+    def _through(
+        self, active: int, other: int, cycles: Instants, shadows: Instants, release_ns: Ints
+    ) -> Ints:
+        """Latency of shadows; `NEVER_NS` where not all of their last messages have arrived."""
+        apart, latency_ns = self._apart(active, other), np.zeros(len(release_ns), np.int64)
+        for step in self._sinks:
+            end_ns = cycles.end_ns[:, step.column]
+            ready_ns = end_ns
+            if step.task in apart:
+                ready_ns = release_ns + round(step.offset_ms * NS_PER_MS)
+                if step.inputs:
+                    arrived_ns = shadows.arrived_ns[:, [entry.column for entry in step.inputs]]
+                    ready_ns = _latest(arrived_ns)
+                end_ns = ready_ns + self._executed_ns(step, active, other, cycles)
+            done_ns = np.where(ready_ns >= 0, end_ns - release_ns, NEVER_NS)
+            latency_ns = np.maximum(latency_ns, done_ns)
+        return latency_ns
+
+    def _executed_ns(self, step: Step, active: int, other: int, cycles: Instants) -> Ints:
+        """Time that a sink would have taken: the cycle's own, or one of the profile's."""
+        here, there = self._placements[active][step.task], self._placements[other][step.task]
+        end_ns = cycles.end_ns[:, step.column]
+        rows = (self._taken + np.arange(len(end_ns))) % SINK_SAMPLES
+        self._taken += len(rows)
+        times_ms = self._sampled.executed(step.task, there)[rows]
+        usual_ns = np.rint(times_ms * NS_PER_MS).astype(np.int64)
+        if here != there:
+            return usual_ns
+        return np.where(end_ns >= 0, end_ns - cycles.ready_ns[:, step.column], usual_ns)
 
     def support(self) -> dict[str, Support]:
         """Weight of the samples behind each candidate's estimate, and the age of the newest."""
         return {
-            name: Support(float(weights.sum()), self._age[name])
-            for name, weights in self._weights.items()
+            name: Support(float(samples.weight.sum()), samples.age)
+            for name, samples in self._samples.items()
         }
 
     def estimate(
@@ -104,71 +211,24 @@ class Shadow:
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics (see `Estimator`)."""
         known = self.profile.estimate(observed=observed, incumbent=incumbent, own=own)
-        return {
-            name: self._measured(name, known[name])
-            if self._weights[name].sum() >= ENOUGH
-            else known[name]
-            for name in self.problem.candidates
-        }
+        return {name: self._measured(known[name], s) for name, s in self._samples.items()}
 
-    def _measured(self, name: str, known: QoS) -> QoS:
+    def _measured(self, known: QoS, samples: _Samples) -> QoS:
         """L95 and V_D of a candidate's samples, by weight."""
-        problem, weights = self.problem, self._weights[name]
-        latency_ms = self._samples[name]
-        missed = float(weights[latency_ms > problem.pipeline.deadline_ms].sum() / weights.sum())
-        seen = np.minimum(_lost_as_ages(latency_ms, problem), problem.censor_ms)
-        order = np.argsort(seen, kind="stable")
-        reached = np.cumsum(weights[order]) >= 0.95 * weights.sum() * (1 - 1e-12)
-        l95_ms = float(seen[order][np.argmax(reached)])
+        total = float(samples.weight.sum())
+        if total < ENOUGH:
+            return known
+        order = np.argsort(samples.seen_ms)
+        reached = np.cumsum(samples.weight[order])
+        # Sums of weights that are equal in theory differ by their rounding.
+        rank = int(np.searchsorted(reached, 0.95 * total * (1 - 1e-12)))
+        l95_ms = min(float(samples.seen_ms[order[rank]]), self.problem.censor_ms)
+        missed = float(samples.weight[samples.missed].sum()) / total
         return QoS(l95_ms, min(missed, 1.0), known.utilisation)
 
 
-def _lost_as_ages(latency_ms: Floats, problem: Problem) -> Floats:
-    """Let lost cycles count with ages spread evenly over a window, as a controller sees them."""
-    lost = np.isinf(latency_ms)
-    count = int(np.count_nonzero(lost))
-    seen = latency_ms.copy()
-    span_ms = problem.window_cycles * problem.pipeline.period_ms
-    seen[lost] = (np.arange(count) + 0.5) / max(count, 1) * span_ms
-    return seen
-
-
-def _latency_ms(
-    problem: Problem, placement: Placement, spans: Spans, own: Spans, tasks: frozenset[str]
-) -> Floats:
-    """Latency of every cycle of a window through a placement, NaN where it was not sent there.
-
-    Parameters
-    ----------
-    spans : Spans
-        Of the jobs and messages in `tasks`; all others, and the sinks' jobs, are the cycles' own.
-    """
-    pipeline = problem.pipeline
-    columns = {name: i for i, name in enumerate(pipeline.tasks)}
-    finish: dict[str, Floats] = {}
-    for name in pipeline.topological():
-        ready = np.full(len(own.job_ms), float(pipeline.tasks[name].offset_ms))
-        for column, flow in enumerate(pipeline.flows):
-            if flow.target != name:
-                continue
-            sent = spans if name in tasks else own
-            crosses = placement[flow.source] != placement[name]
-            taken = sent.message_ms[:, column] if crosses else np.zeros(len(ready))
-            ready = _later(ready, finish[flow.source] + taken)
-        mine = spans if name in tasks and pipeline.outputs(name) else own
-        finish[name] = ready + mine.job_ms[:, columns[name]]
-        if not pipeline.outputs(name):
-            # Where the cycle itself never came to its sink, the shadow is complete without it.
-            bare = np.isnan(own.job_ms[:, columns[name]])
-            finish[name] = np.where(bare, ready, finish[name])
-    sinks = [finish[name] for name in pipeline.tasks if not pipeline.outputs(name)]
-    latency = sinks[0]
-    for sink in sinks[1:]:
-        latency = _later(latency, sink)
-    return latency
-
-
-def _later(first: Floats, second: Floats) -> Floats:
-    """The later of two instants; a lost one (infinite) is later than one that is not known."""
-    later: Floats = np.where(np.isinf(first) | np.isinf(second), np.inf, np.maximum(first, second))
-    return later
+def _latest(instants_ns: Ints) -> Ints:
+    """The last of each row's instants, negative where one of them has not come."""
+    if instants_ns.shape[1] == 1:
+        return instants_ns[:, 0]
+    return np.where((instants_ns < 0).any(axis=1), UNKNOWN, instants_ns.max(axis=1))

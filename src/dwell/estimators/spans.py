@@ -8,15 +8,17 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.evidence import Evidence, Instants
-from dwell.model.pipeline import Pipeline
+from dwell.estimators.evidence import Instants
+from dwell.model.problem import Problem
 
-__all__ = ["Spans", "measure"]
+__all__ = ["Spans", "patience_ns", "spans_of"]
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 
 NS_PER_MS = 1e6
+#: Periods after which a job or message that has not ended counts as lost.
+PATIENCE = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +27,9 @@ class Spans:
 
     Parameters
     ----------
-    job_ms : float64 array, shape (W, tasks)
+    job_ms : float64 array, shape (n, tasks)
         From readiness to completion, queueing and contention included; infinite where it was lost.
-    message_ms : float64 array, shape (W, flows)
+    message_ms : float64 array, shape (n, flows)
         From the completion of the source to the hand-over; infinite where it was lost.
     """
 
@@ -35,32 +37,27 @@ class Spans:
     message_ms: Floats
 
 
-def measure(
-    evidence: Evidence, pipeline: Pipeline, patience_ms: float
-) -> tuple[Spans, Spans | None]:
-    """Durations in a window, of its cycles and of their shadows.
+def patience_ns(problem: Problem) -> int:
+    """Time after which what has not ended at the close of its window counts as lost.
+
+    In windows of one or two cycles nothing is ever that old; there it is what has not ended before
+    the window's last release.
+    """
+    periods = min(PATIENCE, problem.window_cycles - 1)
+    return round(periods * problem.pipeline.period_ms * NS_PER_MS)
+
+
+def spans_of(instants: Instants, sent_ns: Ints, limit_ns: int) -> Spans:
+    """Return the durations between instants.
 
     Parameters
     ----------
-    evidence : Evidence
-    pipeline : Pipeline
-    patience_ms : float
-        What began longer ago than this when the window closed, and has not ended, counts as lost.
+    instants : Instants
+    sent_ns : int64 array, shape (n, flows)
+        When the source of each message completed.
+    limit_ns : int
+        What began before this, and has not ended, counts as lost.
     """
-    names = list(pipeline.tasks)
-    sources = [names.index(flow.source) for flow in pipeline.flows]
-    cycles, shadows = evidence.cycles, evidence.shadows
-    limit_ns = evidence.close_ns - round(patience_ms * NS_PER_MS)
-    own = _spans(cycles, cycles.end_ns[:, sources], limit_ns)
-    if shadows is None:
-        return own, None
-    # A task that the shadow shares never became ready there: its message began with the cycle's.
-    shared = shadows.ready_ns[:, sources] < 0
-    sent_ns = np.where(shared, cycles.end_ns[:, sources], shadows.end_ns[:, sources])
-    return own, _spans(shadows, sent_ns, limit_ns)
-
-
-def _spans(instants: Instants, sent_ns: Ints, limit_ns: int) -> Spans:
     return Spans(
         _between(instants.ready_ns, instants.end_ns, limit_ns),
         _between(sent_ns, instants.arrived_ns, limit_ns),
@@ -68,8 +65,9 @@ def _spans(instants: Instants, sent_ns: Ints, limit_ns: int) -> Spans:
 
 
 def _between(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:
-    span: Floats = np.where(
-        end_ns >= 0, (end_ns - begin_ns) / NS_PER_MS, np.where(begin_ns < limit_ns, np.inf, np.nan)
-    )
-    span[begin_ns < 0] = np.nan
+    span: Floats = (end_ns - begin_ns) / NS_PER_MS
+    open_ended = np.minimum(begin_ns, end_ns) < 0
+    if open_ended.any():
+        lost = (begin_ns >= 0) & (begin_ns < limit_ns)
+        span[open_ended] = np.where(lost[open_ended], np.inf, np.nan)
     return span

@@ -82,14 +82,16 @@ def _names(value: object, what: str) -> list[str]:
 def _scenarios(value: object) -> dict[str, object]:
     """Return what each scenario is: a list of disturbances, or None for the cell's own."""
     if isinstance(value, dict):
-        return _filled(value, "scenario")
+        if not value:
+            raise wrong("the mapping is empty; name at least one scenario")
+        return value
     return dict.fromkeys(_names(value, "scenarios"))
 
 
 def _policies(value: object) -> dict[str, object]:
     """Return what each policy is: its name, or a mapping of what it is."""
     if isinstance(value, dict):
-        return _filled(value, "policy")
+        return value
     return {name: name for name in _names(value, "policies")}
 
 
@@ -103,18 +105,12 @@ def _parameters(value: object) -> dict[str, object]:
     )
 
 
-def _filled(value: dict[str, object], what: str) -> dict[str, object]:
-    if not value:
-        raise wrong(f"the mapping is empty; name at least one {what}")
-    return value
-
-
 class StudyEntry(Entry):
     """Scenarios, policies, parameters and seeds, of which every combination is simulated."""
 
     version: Literal[1] = Field(alias="dwell-study", description="Version of this format.")
     name: str | None = Field(None, description="Name of the study; default: the file's.")
-    cell: str = Field(description="The cell file, relative to this file's folder.", min_length=1)
+    cell: str = Field(description="The cell file, relative to this file's folder.")
     traces: str | None = Field(
         None,
         description="Folder where the cell's trace files are, relative to this file's; default: "
@@ -153,6 +149,7 @@ STUDY: Form[StudyEntry] = Form(
     "study",
     "dwell-study",
     VERSION,
+    # What is at fault is replaced by these, which must therefore be valid here.
     sections={"dwell-study": VERSION, "cell": "", "policies": {}},
     may_be_empty=_own_scenario,
 )

@@ -200,7 +200,9 @@ class _Reading:
         from dwell.io.yaml_text import read_yaml
 
         if not self.entry.cell:
-            return None  # its own fault
+            if not self.faults.at("cell"):
+                self.faults.add("cell", "the text is empty; name the cell's file")
+            return None
         file = self.path.parent / self.entry.cell
         given = self.entry.traces
         folder = file.parent if given is None else self.path.parent / given
@@ -331,7 +333,9 @@ class _Reading:
 
     def _policies(self) -> list[DeclaredPolicy]:
         """Return the policies whose structure is right."""
-        declared = []
+        declared: list[DeclaredPolicy] = []
+        if not self.entry.policies and not self.faults.at("policies"):
+            self.faults.add("policies", "the mapping is empty; name at least one policy")
         for name, given in self.entry.policies.items():
             path = f"policies.{name}"
             self._check_name(path, name)

@@ -26,7 +26,7 @@ from dwell.model.scenario import (
 if TYPE_CHECKING:
     from dwell.model.problem import ControllerSettings
 
-__all__ = ["Parts", "find_faults", "nearest"]
+__all__ = ["Parts", "find_faults", "nearest", "too_many_shadows"]
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -335,17 +335,24 @@ def _controller(parts: Parts) -> Iterator[Fault]:
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:
-    """A cycle is sent through one alternative at most."""
+    """Shadow jobs that the estimator does not ask for cost nothing."""
+    message = too_many_shadows(settings.shadow_fraction, candidates)
+    if message and settings.estimator in SHADOWING:
+        yield Fault("controller.shadow_fraction", message)
+
+
+def too_many_shadows(fraction: float, candidates: int) -> str:
+    """Say what is wrong with a share of the cycles for each alternative, or nothing.
+
+    A cycle is sent through one alternative at most.
+    """
     alternatives = max(candidates - 1, 1)
-    if (
-        settings.estimator in SHADOWING
-        and settings.shadow_fraction * alternatives > 1 + SHARE_TOLERANCE
-    ):
-        yield Fault(
-            "controller.shadow_fraction",
-            f"{settings.shadow_fraction:g} of the cycles through each of {alternatives} "
-            f"alternatives is more than all cycles; at most {1 / alternatives:.4g}",
-        )
+    if fraction * alternatives <= 1 + SHARE_TOLERANCE:
+        return ""
+    return (
+        f"{fraction:g} of the cycles through each of {alternatives} alternatives is more than all "
+        f"cycles; at most {1 / alternatives:.4g}"
+    )
 
 
 def _state_transfers(parts: Parts) -> Iterator[Fault]:

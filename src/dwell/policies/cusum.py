@@ -13,10 +13,11 @@ those candidates becomes the incumbent, if it is cheaper in this window too, and
 again at 0.
 
 An advantage above ``threshold + slack`` moves the cell at once, whatever the last move's date; one
-below ``slack + (1 - memory) * threshold`` never does, however long it lasts. Every migration is
-therefore preceded by estimated savings of more than the threshold since the migration before it:
-K windows with a total estimated advantage A hold at most A / threshold migrations. There is no
-minimum dwell.
+below ``slack + (1 - memory) * threshold`` never does, however long it lasts. There is no minimum
+dwell: what bounds migrations is what they are worth. Before each of them, and after the one before
+it, the advantages of the candidate it goes to, each without the slack and where it is one at all,
+have added up to more than the threshold. So, with A the sum over all windows of the largest such
+advantage, there are fewer than A / threshold migrations.
 """
 
 from __future__ import annotations

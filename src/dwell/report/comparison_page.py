@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 
 import numpy as np
 
 from dwell.report import figures
+from dwell.report.contenders import POLICIES
 from dwell.report.findings import (
     COST,
     DTP,
@@ -29,12 +29,13 @@ from dwell.report.page import (
     figure,
     items,
     marked,
+    named,
     paragraph,
     section,
     swatch,
     table,
 )
-from dwell.report.palette import INK, Palette
+from dwell.report.palette import Palette
 from dwell.report.timeline import timeline
 from dwell.report.wording import (
     Measure,
@@ -68,15 +69,6 @@ MORE = (
     Measure("queue_ms", "waiting", "ms"),
     Measure("network_ms", "network", "ms"),
 )
-POLICY_NOTES = {
-    "dtp": "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
-    "once the dwell time is over and the improvement large enough.",
-    "atp": "ATP, our reconstruction, moves one task to the edge and back by thresholds on L95 and "
-    "utilisation.",
-    "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
-    "work-function": "Work-function follows the optimum in hindsight over all windows so far, one "
-    "window late.",
-}
 TAGS: dict[Answer, tuple[str, str]] = {
     "agrees": ("agrees", "good"),
     "agrees in part": ("agrees in part", "open"),
@@ -150,7 +142,7 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
     statics = [name for name in problem.candidates if name in comparison.policies]
     if statics:
         yield paragraph(f"{placements(problem, statics)} As policies these never move.")
-    notes = [POLICY_NOTES[name] for name in comparison.policies if name in POLICY_NOTES]
+    notes = [POLICIES[name] for name in comparison.policies if name in POLICIES]
     if notes:
         yield paragraph(" ".join(notes))
     yield paragraph(
@@ -219,14 +211,8 @@ def _pair(interval: Interval, measure: Measure, *, best: bool = False) -> list[C
 
 
 def _named(palette: Palette, policy: str) -> str:
-    """Return a policy's name behind its mark: a square for a placement, a ring for the others."""
     colour = palette.policies[policy].colour
-    # What stands in brackets is set smaller: columns are narrow.
-    name = re.sub(r"(\(.*\))$", r"<small>\1</small>", escape(shown_policy(policy)))
-    if policy in palette.placements:
-        return swatch(colour) + name
-    ring = "currentColor" if colour == INK else colour
-    return f'<span class="swatch ring" style="border-color:{ring}"></span>{name}'
+    return named(shown_policy(policy), colour, ring=policy not in palette.placements)
 
 
 # ------------------------------------------------------------------------------- predictions

@@ -24,14 +24,12 @@ from dwell.report.page import definitions, items, paragraph
 from dwell.report.wording import listed, percent, shown_scenario, write_number
 from dwell.study import Comparison
 
-__all__ = ["describe_scenario", "method", "placements"]
+__all__ = ["describe_cell", "describe_scenario", "method", "placements"]
 
 
 def method(comparison: Comparison) -> Iterator[str]:
     """Return the parts of the section that says how the numbers came about."""
     problem = comparison.problem
-    pipeline, controller = problem.pipeline, problem.controller
-    span_s = problem.window_cycles * pipeline.period_ms / 1e3
     yield paragraph(
         "For every scenario and seed one realisation of everything random (execution times, "
         "delays, losses, foreign load) is drawn before any policy acts, and every policy plays "
@@ -41,23 +39,11 @@ def method(comparison: Comparison) -> Iterator[str]:
     )
     yield definitions(
         {
-            "pipeline": f"{' → '.join(pipeline.topological())}; period "
-            f"{write_number(pipeline.period_ms)} ms, deadline "
-            f"{write_number(pipeline.deadline_ms)} ms",
-            "nodes": listed(
-                f"{node.name} ({node.tier}, {node.cores} cores)"
-                for node in problem.fabric.nodes.values()
-            ),
-            "window": f"{problem.window_cycles} cycles, {write_number(span_s)} s",
+            **describe_cell(problem),
+            "estimator": f"“{problem.controller.estimator}”",
             "run": f"{comparison.windows} windows, of which the first {problem.warmup_windows} "
             "are warm-up and count nowhere",
             "seeds": _ranges(comparison.seeds),
-            "cost": _cost(problem),
-            "caps": _caps(problem),
-            "controller": f"on {problem.controller_node}, begins with {problem.initial}, "
-            f"estimator “{controller.estimator}”; a migration is followed by {controller.min_dwell}"
-            " windows without another (N_min), and must promise an improvement of J above "
-            f"{controller.min_improvement:g} (Δ_min)",
             "intervals": "95 %, two-sided, over seeds, by the studentised bootstrap; of medians, "
             "by order statistics. None is taken over windows or cycles, which are not independent.",
             "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
@@ -68,6 +54,26 @@ def method(comparison: Comparison) -> Iterator[str]:
         f"{shown_scenario(name)}: {describe_scenario(problem.scenario(name))}."
         for name in comparison.scenarios
     )
+
+
+def describe_cell(problem: Problem) -> dict[str, str]:
+    """Say what a cell is, and what its controller does, by headings."""
+    pipeline, controller = problem.pipeline, problem.controller
+    span_s = problem.window_cycles * pipeline.period_ms / 1e3
+    return {
+        "pipeline": f"{' → '.join(pipeline.topological())}; period "
+        f"{write_number(pipeline.period_ms)} ms, deadline {write_number(pipeline.deadline_ms)} ms",
+        "nodes": listed(
+            f"{node.name} ({node.tier}, {node.cores} cores)"
+            for node in problem.fabric.nodes.values()
+        ),
+        "window": f"{problem.window_cycles} cycles, {write_number(span_s)} s",
+        "cost": _cost(problem),
+        "caps": _caps(problem),
+        "controller": f"on {problem.controller_node}, begins with {problem.initial}; a migration "
+        f"is followed by {controller.min_dwell} windows without another (N_min), and must promise "
+        f"an improvement of J above {controller.min_improvement:g} (Δ_min)",
+    }
 
 
 def placements(problem: Problem, names: Sequence[str]) -> str:
@@ -111,6 +117,12 @@ def _disturbance(item: Disturbance) -> tuple[str, str]:
     if item.at_s or math.isfinite(item.for_s):
         until = f" for {item.for_s:g} s" if math.isfinite(item.for_s) else ""
         when = f" from {item.at_s:g} s{until}"
+    if item.episodes is not None:
+        off_s, on_s = (one.expectation for one in (item.episodes.every_s, item.episodes.for_s))
+        when += f", in episodes (off {off_s:.3g} s, on {on_s:.3g} s in the mean)"
+    if item.ramp_s:
+        falls = " and falling likewise" if math.isfinite(item.for_s) else ""
+        when += f", growing for {item.ramp_s:g} s{falls}"
     return (listed(what) or "no change") + when, place
 
 

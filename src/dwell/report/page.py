@@ -7,6 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
+from dwell.report.palette import INK, MUTED, RAMP
+from dwell.report.wording import SYMBOL
+
 __all__ = [
     "Cell",
     "definitions",
@@ -14,6 +17,7 @@ __all__ = [
     "figure",
     "items",
     "marked",
+    "named",
     "paragraph",
     "section",
     "swatch",
@@ -39,16 +43,19 @@ class Cell(NamedTuple):
     columns: int = 1
 
 
+RAMPS = " ".join(f"--ramp-{i}: {colour};" for i, colour in enumerate(RAMP))
 STYLE = """
 :root { color-scheme: light dark;
   --paper: #fff; --ink: #1c1c1e; --muted: #66666b; --rule: #dededf;
-  --good: #00694d; --bad: #b04a00; }
+  --good: #00694d; --bad: #b04a00; RAMP }
 @media (prefers-color-scheme: dark) { :root {
   --paper: #17181a; --ink: #e6e6e8; --muted: #a0a0a6; --rule: #38393d;
-  --good: #4cc9a0; --bad: #ff9a52; } }
+  --good: #4cc9a0; --bad: #ff9a52;
+  --ramp-0: #6f4eb0; --ramp-1: #8766c8; --ramp-2: #9f80da; --ramp-3: #b79be8;
+  --ramp-4: #d0b9f3; --ramp-5: #ead9fd; } }
 @media print { :root { color-scheme: light;
   --paper: #fff; --ink: #000; --muted: #444; --rule: #bbb;
-  --good: #00694d; --bad: #b04a00; } }
+  --good: #00694d; --bad: #b04a00; RAMP } }
 * { box-sizing: border-box; }
 html { -webkit-text-size-adjust: 100%; }
 body { margin: 0; background: var(--paper); color: var(--ink);
@@ -77,6 +84,8 @@ figcaption { max-width: 52em; margin-top: 10px; }
 svg { display: block; width: 100%; max-width: 960px; height: auto; color: var(--ink);
   overflow: visible; font-family: inherit; stroke-linejoin: round; }
 .scroll { overflow-x: auto; margin: 20px 0 12px; }
+.drawing { overflow-x: auto; overflow-y: hidden; padding-bottom: 2px; }
+.drawing img { display: block; width: 100%; max-width: 960px; height: auto; }
 table { border-collapse: collapse; font-size: 14px; line-height: 1.35;
   font-variant-numeric: tabular-nums; }
 caption { text-align: left; padding-bottom: 14px; max-width: 52em; }
@@ -94,6 +103,8 @@ thead .pair { text-align: center; padding-left: 24px; white-space: nowrap; }
 thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .begin { padding-left: 36px; }
 .wide { width: 100%; }
+.small { font-size: 13px; } .small th { font-size: 12.5px; } .small .err { font-size: 12px; }
+.small :not(:first-child):is(td, th) { padding-left: 9px; } .small .err.err { padding-left: 4px; }
 .prose { width: 100%; max-width: 52em; }
 .prose :not(:first-child):is(td, th) { padding-left: 20px; }
 .nowrap { white-space: nowrap; }
@@ -107,15 +118,20 @@ tbody tr.group:first-child > * { padding-top: 16px; }
 .ring { background: none; border: 2px solid; border-radius: 5px; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 6px 20px; font-size: 15px; }
 dt { color: var(--muted); } dd { margin: 0; }
+summary { cursor: pointer; color: var(--muted); font-size: 14px; margin: 12px 0; }
+.files { margin-top: 4px; } .files a { color: inherit; }
+a { color: inherit; text-decoration-color: var(--muted); text-underline-offset: 2px; }
 @media (max-width: 640px) { main { padding: 40px 18px 80px; } dl { display: block; }
-  dd { margin-bottom: 8px; } }
+  dd { margin-bottom: 8px; } h1 { font-size: 27px; } h2 { margin-top: 56px; }
+  .drawing svg, .drawing img { width: 760px; max-width: none; } }
 @media print { body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
   h2 { margin-top: 32pt; } h2, h3 { break-after: avoid; }
-  figure, tr, li { break-inside: avoid; } tr.group { break-after: avoid; }
+  figure, tr, li { break-inside: avoid; } .drawing { overflow: visible; }
+  .files { display: none; } tr.group { break-after: avoid; }
   .scroll { overflow: visible; }
   table { font-size: 8.5pt; } th, .err, small { font-size: 8pt; }
   td, th { padding-left: 6px; } .err { padding-left: 3px; } }
-"""
+""".replace("RAMP", RAMPS)
 
 
 def document(title: str, body: Iterable[str]) -> str:
@@ -162,7 +178,10 @@ def definitions(entries: Mapping[str, str]) -> str:
 
 def figure(svg: str, caption: str) -> str:
     """Return a figure with a caption of plain text."""
-    return f"<figure>\n{svg}\n<figcaption>{marked(caption)}</figcaption>\n</figure>"
+    return (
+        f'<figure>\n<div class="drawing">{svg}</div>\n'
+        f"<figcaption>{marked(caption)}</figcaption>\n</figure>"
+    )
 
 
 def swatch(colour: str) -> str:
@@ -170,10 +189,20 @@ def swatch(colour: str) -> str:
     return f'<span class="swatch" style="background:{colour}"></span>'
 
 
+def named(name: str, colour: str, *, ring: bool) -> str:
+    """Return a name behind its mark: a square for a placement, a ring for what moves."""
+    # What stands in brackets is set smaller: columns are narrow.
+    html = re.sub(r"(\(.*\))$", r"<small>\1</small>", escape(name))
+    if not ring:
+        return swatch(colour) + html
+    border = "currentColor" if colour == INK else "var(--muted)" if colour == MUTED else colour
+    return f'<span class="swatch ring" style="border-color:{border}"></span>{html}'
+
+
 def marked(text: str) -> str:
     """Escape a text; set `code` and the symbols with an index."""
     html = re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text, quote=False))
-    html = re.sub(r"(?<!\w)([A-ZΔ])_(D|r|e|min|max)\b", r"\1<sub>\2</sub>", html)
+    html = SYMBOL.sub(r"\1<sub>\2</sub>", html)
     # A number stays on one line with its unit.
     return re.sub(r"(?<=\d) (?=(?:%|ms|s)(?!\w))", "\u00a0", html)
 

@@ -1,16 +1,35 @@
 """Colours: one a placement, the same in every figure, told apart by colour-blind readers too.
 
 The hues are those of Okabe and Ito (2008). Candidates take them from the front, in the order of
-the cell file; policies that move from the back, DTP the colour of the text. Colours of text, rules
-and paper are names that the page gives a value to, light or dark.
+the cell file; a policy that moves has a colour of its own, DTP that of the text, and a marker and
+dashes that say what it believes, so that no two lines differ by their colour alone. Colours of
+text, rules and paper are names that the page gives a value to, light or dark.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
-__all__ = ["INK", "MUTED", "PAPER", "PARTS", "RULE", "Palette", "Style"]
+__all__ = [
+    "BELIEFS",
+    "FAMILIES",
+    "INK",
+    "MUTED",
+    "PAPER",
+    "PARTS",
+    "RAMP",
+    "RULE",
+    "Contended",
+    "Palette",
+    "Style",
+    "contended",
+    "ramp_styles",
+]
+
+Dashes: TypeAlias = "str | tuple[float, tuple[float, ...]]"
 
 HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#b8a800")
 
@@ -19,12 +38,53 @@ INK = "#1a1a1b"
 MUTED = "#6b6b6c"
 RULE = "#d9d9da"
 PAPER = "#fefeff"
+#: Of values that have an order and are neither placements nor policies, the first to the last.
+RAMP = ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862")
 
 #: Where the time of a cycle goes: no placement's colours.
 PARTS = {"compute": "#4d4d4e", "queue": "#9a9a9b", "network": "#cfcfd0"}
 
-MARKERS = ("D", "s", "^", "v", "P", "X")
-DASHES = ("solid", (0, (5, 2)), (0, (1.2, 1.6)), (0, (5, 1.5, 1.2, 1.5)))
+MARKERS = ("D", "s", "^", "v", "P", "X", "o", "<", ">")
+SOLID = "solid"
+DASHED = (0, (5, 2))
+DOTTED = (0, (1.2, 1.6))
+DASHES: tuple[Dashes, ...] = (SOLID, DASHED, DOTTED, (0, (5, 1.5, 1.2, 1.5)), (0, (8, 2, 2, 2)))
+
+#: Hues of the policies that move, from the back of the placements'.
+FAMILIES = {
+    "dtp": INK,
+    "atp": "#e69f00",
+    "latency-first": "#56b4e9",
+    "work-function": MUTED,
+    "cusum": "#b8a800",
+    "clairvoyant": MUTED,
+}
+#: Places of what a policy believes: each has its marker and dashes, whoever else is shown.
+BELIEFS = ("corrected", "profile", "shadow", "scaling")
+
+
+class Contended(NamedTuple):
+    """A contender's name, taken apart.
+
+    Parameters
+    ----------
+    family : str
+        The policy, as ``dtp`` of ``dtp (corrected)`` and of ``dtp-hindsight``.
+    rest : str
+        What tells it from the others of its family: ``corrected``, ``hindsight``, or nothing.
+    """
+
+    family: str
+    rest: str
+
+
+def contended(name: str) -> Contended | None:
+    """Take a contender's name apart; None where no policy is meant."""
+    for family in FAMILIES:
+        found = re.fullmatch(rf"{family}(?:[^\w]+(.{{1,24}}?)\)?)?", name, re.IGNORECASE)
+        if found:
+            return Contended(family, found.group(1) or "")
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +93,7 @@ class Style:
 
     colour: str
     marker: str
-    dashes: str | tuple[float, tuple[float, ...]]
+    dashes: Dashes
     width: float
 
 
@@ -49,18 +109,65 @@ class Palette:
         """Give every candidate a colour and every policy a style.
 
         A policy with a candidate's name is that placement and has its colour.
+
+        Parameters
+        ----------
+        candidates : iterable of str
+        policies : iterable of str
+            With what they believe in brackets, where that tells them apart.
         """
         placements = {name: HUES[i % len(HUES)] for i, name in enumerate(candidates)}
-        styles: dict[str, Style] = {}
-        spare = [hue for hue in HUES if hue not in placements.values()] or [MUTED]
+        policies = tuple(dict.fromkeys(policies))
         moving = [name for name in policies if name not in placements]
-        # DTP first, whatever its place in the tables: it has the colour of the text.
-        moving.sort(key=lambda name: name != "dtp")
-        for i, name in enumerate(moving):
-            colour = INK if name == "dtp" else spare[i % len(spare) - 1]
-            dashes = DASHES[i % len(DASHES)]
-            styles[name] = Style(colour, MARKERS[i % len(MARKERS)], dashes, 1.8 if i == 0 else 1.3)
+        spare = [hue for hue in reversed(HUES) if hue not in placements.values()]
+        # Hues that a family has by its name are not given to others while there are more.
+        spare.sort(key=lambda hue: hue in FAMILIES.values())
+        styles: dict[str, Style] = {}
+        variants: dict[str, int] = {}
+        unknown = 0
+        for name in moving:
+            known = contended(name)
+            if known is None:
+                colour = (spare or [MUTED])[unknown % max(len(spare), 1)]
+                place = unknown = unknown + 1
+                styles[name] = _style(colour, place)
+                continue
+            place = _place(known, variants)
+            colour = FAMILIES[known.family]
+            if colour in placements.values():
+                colour = MUTED
+            if known.rest in BELIEFS[2:] and colour == INK:
+                colour = MUTED
+            shift = tuple(FAMILIES).index(known.family)
+            styles[name] = _style(colour, place + shift, strong=known.family == "dtp")
         for name in policies:
             if name in placements:
-                styles[name] = Style(placements[name], "o", "solid", 1.3)
+                styles[name] = Style(placements[name], "o", SOLID, 1.3)
         return cls(placements, styles)
+
+
+def _place(known: Contended, variants: dict[str, int]) -> int:
+    """Return the place of a contender in its family; what it believes has a fixed one."""
+    if not known.rest or known.rest in BELIEFS:
+        return BELIEFS.index(known.rest) if known.rest else 0
+    place = variants.get(known.family, len(BELIEFS))
+    variants[known.family] = place + 1
+    return place
+
+
+def _style(colour: str, place: int, *, strong: bool = False) -> Style:
+    width = 1.8 if strong and place == 0 else 1.3
+    return Style(colour, MARKERS[place % len(MARKERS)], DASHES[place % len(DASHES)], width)
+
+
+def ramp_styles(names: Iterable[str]) -> dict[str, Style]:
+    """Give a style to each of several values that have an order, the last the darkest."""
+    names = tuple(names)
+    last = max(len(names) - 1, 1)
+    # Two are told apart best by the middle and the end.
+    first = 1 if len(names) < len(RAMP) else 0
+    span = len(RAMP) - 1 - first
+    return {
+        name: _style(RAMP[first + round(i / last * span)] if len(names) > 1 else RAMP[-2], i)
+        for i, name in enumerate(names)
+    }

@@ -1,4 +1,7 @@
-"""Figures as SVG that stands in a page: text as text, colours of the page, no outside resource."""
+"""Figures as files, and as SVG that stands in a page: text as text, no outside resource.
+
+In a page a figure has the page's colours and letters; as a file it has its own, on white.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,16 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from html import escape
 from typing import TYPE_CHECKING, Any
 
-from dwell.report.palette import INK, MUTED, PAPER, RULE
+from dwell.report.palette import INK, MUTED, PAPER, RAMP, RULE
+from dwell.report.wording import SYMBOL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["WIDTH", "inline", "new_figure"]
+__all__ = ["WIDTH", "inline", "new_figure", "pdf_file", "svg_file"]
 
 #: Inches; the page shows a figure at most at 4/3 pixels a point, 9-point text at 12 pixels.
 WIDTH = 10.0
@@ -21,6 +26,8 @@ WIDTH = 10.0
 # Keys are literals that only some versions of matplotlib declare, so they have no type here.
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
+    # Letters stay letters: Type 3 fonts are refused by publishers.
+    "pdf.fonttype": 42,
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "axes.titlesize": 9,
@@ -61,8 +68,8 @@ PAGE_COLOURS = {
     MUTED: "var(--muted)",
     RULE: "var(--rule)",
     PAPER: "var(--paper)",
+    **{colour: f"var(--ramp-{i})" for i, colour in enumerate(RAMP)},
 }
-
 
 #: What a page of several figures must not have twice, needs not at all, or says itself.
 CLEANING = tuple(
@@ -72,11 +79,14 @@ CLEANING = tuple(
         # What is referred to has an id made from the salt; the names of groups would repeat.
         (r'<g id="[^"]*"', "<g"),
         (r"xlink:href", "href"),
-        (r"font: (?:(\d+) )?([\d.]+px) [^;\"]*", r"font-weight: \1; font-size: \2"),
-        (r"font-weight: ; | ?font-family: [^;\"]*;", ""),
         (r' transform="rotate\(-?0 [^)]*\)"', ""),
         (r"(\d\.\d\d)\d+", r"\1"),
     )
+)
+#: The letters of a figure in a page are the page's.
+LETTERS = (
+    (re.compile(r"font: (?:(\d+) )?([\d.]+px) [^;\"]*"), r"font-weight: \1; font-size: \2"),
+    (re.compile(r"font-weight: ; | ?font-family: [^;\"]*;"), ""),
 )
 
 
@@ -107,6 +117,58 @@ def inline(figure: Figure, name: str, description: str) -> str:
     description : str
         For who cannot see it.
     """
+    text = _drawn(figure, name)
+    for pattern, replacement in LETTERS:
+        text = pattern.sub(replacement, text)
+    for placeholder, colour in PAGE_COLOURS.items():
+        text = text.replace(placeholder, colour)
+    head, _, body = text.partition(">")
+    label = escape(description)
+    return f'<svg {_viewbox(head)} role="img" aria-label="{label}">{body}'.rstrip()
+
+
+def svg_file(figure: Figure, name: str, description: str) -> bytes:
+    """Return a figure as an SVG file, on white."""
+    head, _, body = _drawn(figure, name).partition(">")
+    # Widths are those of DejaVu Sans, which is wide: what stands in for it fits.
+    body = re.sub(r"'?DejaVu Sans'?", "'DejaVu Sans', Verdana, Arial, sans-serif", body)
+    size = re.search(r'width="[^"]*" height="[^"]*"', _ordered(head))
+    title = f"<title>{escape(description, quote=False)}</title>"
+    paper = '<rect width="100%" height="100%" fill="#ffffff"/>'
+    return (
+        '<?xml version="1.0" encoding="utf-8"?>\n'
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size.group(0) if size else ""} '
+        f'{_viewbox(head)} stroke-linejoin="round">\n{title}\n{paper}{body}'
+    ).encode()
+
+
+def pdf_file(figure: Figure, description: str) -> bytes:
+    """Return a figure as a PDF file: letters stay letters. The figure is changed by that."""
+    import matplotlib as mpl
+    from matplotlib.text import Text
+    from matplotlib.ticker import FixedFormatter
+
+    for text in figure.findobj(Text):
+        if isinstance(text, Text):
+            text.set_text(_as_mathtext(text.get_text()))
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            formatter = axis.get_major_formatter()
+            if isinstance(formatter, FixedFormatter):
+                formatter.seq = [_as_mathtext(one) for one in formatter.seq]
+    buffer = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        metadata = {"CreationDate": None, "Title": description}
+        figure.savefig(buffer, format="pdf", metadata=metadata)
+    return buffer.getvalue()
+
+
+def _as_mathtext(text: str) -> str:
+    return SYMBOL.sub(r"\1$_{\\mathregular{\2}}$", text)
+
+
+def _drawn(figure: Figure, name: str) -> str:
+    """Return the SVG of a figure as matplotlib draws it, with little of what nobody needs."""
     import matplotlib as mpl
 
     buffer = io.StringIO()
@@ -116,11 +178,27 @@ def inline(figure: Figure, name: str, description: str) -> str:
     text = text[text.index("<svg") :]
     for pattern, replacement in CLEANING:
         text = pattern.sub(replacement, text)
-    for placeholder, colour in PAGE_COLOURS.items():
-        text = text.replace(placeholder, colour)
-    head, _, body = text.partition(">")
+    text = re.sub(r"(?<=>)[^<>]+(?=</text>)", lambda found: _indexed(found.group(0)), text)
+    return re.sub(r"\n\s*", "\n", text)
+
+
+def _indexed(text: str) -> str:
+    """Set the indices of symbols lower and smaller; what follows one comes back up."""
+    first, *rest = SYMBOL.split(text)
+    parts = [first]
+    for letter, index, after in zip(rest[::3], rest[1::3], rest[2::3], strict=True):
+        parts.append(f'{letter}<tspan dy="0.22em" font-size="75%">{index}</tspan>')
+        if after:
+            parts.append(f'<tspan dy="-0.165em">{after}</tspan>')
+    return "".join(parts)
+
+
+def _viewbox(head: str) -> str:
     box = re.search(r'viewBox="[^"]*"', head)
-    label = description.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
-    viewbox = box.group(0) if box else ""
-    body = re.sub(r"\n\s*", "\n", body)
-    return f'<svg {viewbox} role="img" aria-label="{label}">{body}'.rstrip()
+    return box.group(0) if box else ""
+
+
+def _ordered(head: str) -> str:
+    """Return the attributes of an element, width before height."""
+    found = dict(re.findall(r'(\w+)="([^"]*)"', head))
+    return " ".join(f'{name}="{found[name]}"' for name in ("width", "height") if name in found)

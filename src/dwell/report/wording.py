@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from dwell.report.palette import contended
 from dwell.study import Interval
 
 __all__ = [
+    "OURS",
+    "SYMBOL",
     "Measure",
     "Written",
     "listed",
     "percent",
+    "shown_contender",
+    "shown_in_sentence",
     "shown_policy",
     "shown_scenario",
     "write_interval",
@@ -24,7 +30,15 @@ POLICY_NAMES = {
     "atp": "ATP (our reconstruction)",
     "latency-first": "Latency-first",
     "work-function": "Work-function",
+    "cusum": "CUSUM",
+    "clairvoyant": "Clairvoyant",
 }
+#: Names where what ATP is stands beside the table or figure.
+SHORT_NAMES = {**POLICY_NAMES, "atp": "ATP"}
+#: What has to stand beside everything that shows ATP.
+OURS = "ATP is our reconstruction: its rule has no public numbers."
+#: A symbol with its index: V_D, N_min, α_L.
+SYMBOL = re.compile(r"(?<![\w.])([A-ZΔα-ωdp])_(D|L|V|S|r|e|z|min|max|loss)(?!\w)")
 ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}
 
 
@@ -44,6 +58,8 @@ class Measure(NamedTuple):
     decimals : int
     ends : bool
         Whether the interval is always written by its ends.
+    signed : bool
+        Whether a plus stands before what is above 0.
     """
 
     column: str
@@ -52,6 +68,7 @@ class Measure(NamedTuple):
     factor: float = 1.0
     decimals: int = 1
     ends: bool = False
+    signed: bool = False
 
     @property
     def heading(self) -> str:
@@ -70,16 +87,17 @@ class Written(NamedTuple):
         return f"{self.value} {self.error}".strip()
 
 
-def write_number(value: float, decimals: int = 1) -> str:
+def write_number(value: float, decimals: int = 1, *, signed: bool = False) -> str:
     """Write a number with three digits that count, or fewer decimals where it is large.
 
     Thousands are parted by thin spaces, infinity is ∞, and what is not known is a dash.
     """
     if math.isnan(value):
         return "–"
+    plus = "+" if signed and value > 0 else ""
     if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
-    return _fixed(value, _places(value, decimals))
+        return f"{plus}∞" if value > 0 else "−∞"
+    return plus + _fixed(value, _places(value, decimals))
 
 
 def write_interval(interval: Interval, measure: Measure) -> Written:
@@ -89,13 +107,13 @@ def write_interval(interval: Interval, measure: Measure) -> Written:
     number, or the same extreme of a share, nothing stands beside it.
     """
     value, low, high = (end * measure.factor for end in interval)
-    text = write_number(value, measure.decimals)
+    text = write_number(value, measure.decimals, signed=measure.signed)
     if not interval.known or low == high or (value in (low, high) and interval.value in (0, 1)):
         return Written(text if value else "0", "")
     half = high - value
     even = math.isfinite(half) and abs(half - (value - low)) <= 0.02 * (high - low)
     if measure.ends or not even:
-        return Written(text, _between(low, high, measure.decimals))
+        return Written(text, _between(low, high, measure))
     places = _places(value, measure.decimals)
     least = 10.0**-places
     if half < least / 2:
@@ -105,7 +123,7 @@ def write_interval(interval: Interval, measure: Measure) -> Written:
 
 def _places(value: float, decimals: int) -> int:
     """Decimals that leave three digits, at most `decimals`."""
-    whole = len(str(int(abs(value))))
+    whole = 1 + math.floor(math.log10(abs(value))) if value else 1
     return max(0, min(decimals, 3 - whole))
 
 
@@ -113,8 +131,9 @@ def _fixed(value: float, places: int) -> str:
     return f"{value:,.{places}f}".replace(",", "\u2009").replace("-", "−")
 
 
-def _between(low: float, high: float, decimals: int) -> str:
-    return f"[{write_number(low, decimals)}, {write_number(high, decimals)}]"
+def _between(low: float, high: float, measure: Measure) -> str:
+    ends = (write_number(end, measure.decimals, signed=measure.signed) for end in (low, high))
+    return f"[{', '.join(ends)}]"
 
 
 def percent(share: float, decimals: int = 0) -> str:
@@ -127,11 +146,27 @@ def shown_policy(name: str) -> str:
     return POLICY_NAMES.get(name, name)
 
 
+def shown_contender(name: str) -> str:
+    """``dtp (corrected)`` as ``DTP (corrected)``; what is no policy of ours stays what it is.
+
+    What ATP is has to be said beside what shows this name (see `OURS`).
+    """
+    known = contended(name)
+    if known is None:
+        return name
+    shown = SHORT_NAMES[known.family]
+    return f"{shown} ({known.rest})" if known.rest else shown
+
+
 def shown_scenario(name: str) -> str:
     """``robot-cpu-stress`` as ``Robot CPU stress``."""
-    words = [ABBREVIATIONS.get(word, word) for word in name.replace("_", "-").split("-")]
-    text = " ".join(words)
+    text = shown_in_sentence(name)
     return text[:1].upper() + text[1:]
+
+
+def shown_in_sentence(name: str) -> str:
+    """``robot-cpu-stress`` as ``robot CPU stress``."""
+    return " ".join(ABBREVIATIONS.get(word, word) for word in name.replace("_", "-").split("-"))
 
 
 def listed(items: Iterable[str], last: str = "and") -> str:

@@ -249,10 +249,13 @@ class _Stamper:
             order = self.controller.close(window)
         if order == self.placement:
             self._go_on(boundary)
-        elif self.cold:
+            return
+        earliest = self._takes_effect(boundary, close_ns)
+        # Where no window can follow, the run is over, and it does not matter when tasks are ready.
+        if self.cold and earliest + self.window_cycles <= self.cycles:
             self._order(order, boundary, close_ns)
         else:
-            self._move(order, self._takes_effect(boundary, close_ns))
+            self._move(order, earliest)
 
     def _go_on(self, boundary: int) -> None:
         """Stamp the next window with the placement that stays."""
@@ -276,9 +279,8 @@ class _Stamper:
         self.ordered = (order, boundary)
         pair = self.code[self.placement] * count + self.code[order]
         cell[k.ORDER], cell[k.ORDER_PAIR] = k.ORDERED, cell[k.PAIR_0] + pair
-        # The state of the last window's order draws on the column of the last cycle.
-        cell[k.ORDER_CYCLE] = min(boundary, self.cycles - 1)
-        cell[k.ORDER_NS] = close_ns + self.delay_ns
+        # State has the draws of the first cycle after the window.
+        cell[k.ORDER_CYCLE], cell[k.ORDER_NS] = boundary, close_ns + self.delay_ns
         # No window closes before the migration is over.
         cell[k.WINDOW_FIRST] = cell[k.CLOSE_CYCLE] = self.cycles + 1
         self._stamp(self.stamped, self.cycles)

@@ -43,6 +43,7 @@ __all__ = [
     "CLAIRVOYANT_DWELL",
     "References",
     "mean_cost",
+    "play_alone",
     "references",
     "regret",
     "window_costs",
@@ -103,6 +104,24 @@ class References:
         return self.costs[self.best_static]
 
 
+def play_alone(problem: Problem, realisation: Realisation) -> dict[str, Run]:
+    """Simulate every candidate alone, with the estimator ``profile``: shadow jobs would be load.
+
+    Parameters
+    ----------
+    problem : Problem
+    realisation : Realisation
+        Of this problem.
+    """
+    from dwell.sim import simulate_realisation
+
+    in_time, profile = _in_time(problem), Profile(problem)
+    return {
+        name: simulate_realisation(in_time, realisation, policy=name, estimator=profile)
+        for name in problem.candidates
+    }
+
+
 def references(
     problem: Problem, realisation: Realisation, *, min_dwell: int | None = None
 ) -> References:
@@ -139,12 +158,7 @@ def references(
             f"candidates.{min(taken)} has the name of a reference; call it something else"
         )
     in_time = _in_time(problem)
-    profile = Profile(problem)
-
-    def play(policy: Script | str) -> Run:
-        return simulate_realisation(in_time, realisation, policy=policy, estimator=profile)
-
-    statics = {name: play(name) for name in names}
+    statics = play_alone(problem, realisation)
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
     switching = _switching(problem)
@@ -161,7 +175,8 @@ def references(
             decides=seen,
         )
         script = Script([names[i] for i in plan.choice.tolist()], in_time, realisation)
-        sequences[title], runs[title] = plan, play(script)
+        sequences[title] = plan
+        runs[title] = simulate_realisation(in_time, realisation, policy=script, estimator="profile")
         costs[title] = mean_cost(runs[title])
         promised[title] = float(np.mean(priced(plan.choice, alone, switching)[seen & ~warmup]))
     return References(

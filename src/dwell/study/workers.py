@@ -1,8 +1,10 @@
 """The same task on many units, spread over processes.
 
-Results come back in the order of the units, so that nothing depends on how many processes there
-are or which one was faster. Processes are spawned, never forked (a fork of a process with threads
-may lock up), and share nothing but the task, which is sent to each of them once.
+Every result is handed over with its unit, in whatever order they are ready: whoever takes them
+puts them in order, so that nothing depends on how many processes there are or which one was
+faster. Processes are spawned, never forked (a fork of a process with threads may lock up), and
+share nothing but the task, which is sent to each of them once. They end with the process that
+began them, even where that is killed.
 """
 
 from __future__ import annotations
@@ -37,8 +39,8 @@ def spread(
     units: Sequence[Unit],
     *,
     processes: int,
-    done: Callable[[], None],
-) -> list[Result]:
+    take: Callable[[Unit, Result], None],
+) -> None:
     """Do a task on every unit.
 
     Parameters
@@ -46,16 +48,12 @@ def spread(
     task : callable
         It, the units and the results must pickle.
     units : sequence
+        They hash, and each is there once.
     processes : int
         How many to use; 1 stays in this one. A script that asks for more has to begin its work
         under ``if __name__ == "__main__":``, as every process imports it again.
-    done : callable
-        Called in this process after each unit.
-
-    Returns
-    -------
-    list
-        One result a unit, in their order.
+    take : callable
+        Called in this process with each unit and its result, as soon as that is ready.
 
     Raises
     ------
@@ -63,11 +61,9 @@ def spread(
         If a process ended before its work was done.
     """
     if min(processes, len(units)) <= 1:
-        results = []
         for unit in units:
-            results.append(task(unit))
-            done()
-        return results
+            take(unit, task(unit))
+        return
     pool = ProcessPoolExecutor(
         max_workers=min(processes, len(units)),
         mp_context=multiprocessing.get_context("spawn"),
@@ -76,11 +72,10 @@ def spread(
     )
     try:
         with _interrupts_ignored():
-            futures = [pool.submit(_work, unit) for unit in units]
-        for future in as_completed(futures):
-            future.result()
-            done()
-        return [cast("Result", future.result()) for future in futures]
+            waiting = {pool.submit(_work, unit): unit for unit in units}
+        for future in as_completed(waiting):
+            # A future keeps its result: it is let go, so that only what is taken is kept.
+            take(waiting.pop(future), cast("Result", future.result()))
     except BrokenProcessPool:
         raise SimulationError(
             "a worker process ended before its work was done: out of memory, killed, or a script "
@@ -102,6 +97,15 @@ def _begin(task: Callable[..., object]) -> None:
     # One process a CPU: threads inside would only get into each other's way.
     os.environ["POLARS_MAX_THREADS"] = "1"
     _Worker.task = task
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that began it has ended without saying so."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _work(unit: object) -> object:

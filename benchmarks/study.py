@@ -1,0 +1,94 @@
+"""A study of hours: draw, play, sum up and write, on two cores; the workers start cold."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from benchmarks.figures import Figure, Goal, Section
+from benchmarks.timing import ROOT, run_module
+
+__all__ = ["measure"]
+
+STUDY = ROOT / "benchmarks" / "study.yaml"
+CORES = 2
+QUICK = 4
+
+
+def measure(quick: bool) -> Section:
+    """Seconds of a study of 4 scenarios, 6 policies and 30 seeds of one hour."""
+    arguments = [str(QUICK)] if quick else []
+    said = [
+        json.loads(run_module("benchmarks.study", *arguments)[0]) for _ in range(1 if quick else 2)
+    ]
+    cycles = said[0]["cycles"]
+    goal = None if quick else Goal(high=60)
+    figures = [
+        Figure("elapsed", [one["wall_s"] for one in said], "s", goal),
+        Figure("  CPU time a core", [one["cpu_s"] / CORES for one in said], "s", goal),
+        Figure("  cycles a second, elapsed", [cycles / one["wall_s"] for one in said], "cycles/s"),
+        Figure(
+            "  cycles a second of CPU time, both cores",
+            [CORES * cycles / one["cpu_s"] for one in said],
+            "cycles/s",
+        ),
+        Figure("  of the CPU time: the process that asks", [one["own_s"] for one in said], "s"),
+        Figure("again, with all parts there", [one["again_s"] for one in said], "s"),
+    ]
+    share = sum(one["cpu_s"] for one in said) / sum(one["wall_s"] for one in said) / CORES
+    busy = "" if share > 0.9 else ": others used them, or they waited"
+    notes = [
+        f"{cycles / 1e6:.1f} million cycles in {said[0]['runs']} runs, each summed up",
+        f"{share:.0%} of the elapsed time of {CORES} cores was CPU time{busy}",
+        "processes, imports and loading of compiled kernels included, compiling them not",
+    ]
+    return Section(f"Study of one hour, {CORES} processes", figures, notes)
+
+
+def _run_alone(seeds: int | None) -> None:
+    import dwell
+    from dwell.study import load_study, run_study
+
+    if hasattr(os, "sched_setaffinity"):
+        # The parent is pinned to one core.
+        os.sched_setaffinity(0, range(os.cpu_count() or 1))
+    study = load_study(STUDY)
+    if seeds is not None:
+        study = replace(study, seeds=study.seeds[:seeds])
+    dwell.simulate(study.points[0].problem, policy="dtp", seed=0, windows=1)  # compiles
+    with tempfile.TemporaryDirectory() as folder:
+        before, begin = _spent(), time.perf_counter()
+        result = run_study(study, folder=Path(folder) / "study", processes=CORES)
+        middle, spent = time.perf_counter(), _spent()
+        run_study(study, folder=Path(folder) / "study", processes=CORES)
+        end = time.perf_counter()
+    own, children = (after - was for after, was in zip(spent, before, strict=True))
+    print(
+        json.dumps(
+            {
+                "cycles": study.cycles,
+                "runs": result.runs.height,
+                "wall_s": middle - begin,
+                "cpu_s": own + children,
+                "own_s": own,
+                "again_s": end - middle,
+            }
+        )
+    )
+
+
+def _spent() -> tuple[float, float]:
+    """CPU time of this process, and of those it started and that have ended."""
+    both = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    own, children = (resource.getrusage(who) for who in both)
+    return own.ru_utime + own.ru_stime, children.ru_utime + children.ru_stime
+
+
+if __name__ == "__main__":
+    _run_alone(int(sys.argv[1]) if len(sys.argv) > 1 else None)

@@ -1,0 +1,223 @@
+"""Tables of a chapter: as a part of a page, as CSV, and for LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+from dwell.report.latex import tabular
+from dwell.report.look import CONTENDERS, Look, key
+from dwell.report.page import Cell, marked, named, swatch, table
+from dwell.report.palette import contended
+from dwell.report.units import labelled, write, write_over_seeds
+from dwell.report.wording import OURS, SYMBOL, Written
+from dwell.study import Interval
+from dwell.study.paper.chapter import Figure, Table, Unit
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["csv", "html", "latex", "noted"]
+
+HEADINGS = {
+    "violation_rate": "V_D",
+    "l95_ms": "L95",
+    "cost": "J",
+    "u_robot": "U_r",
+    "u_edge": "U_e",
+}
+#: Words that say how it came out, and how they are shown.
+WORDS = {
+    **dict.fromkeys(("under", "agrees", "met", "holds", "yes"), "good"),
+    **dict.fromkeys(("over", "above", "differs", "missed", "no"), "bad"),
+    **dict.fromkeys(
+        ("open", "not shown", "in part", "agrees in part", "not asked", "no difference shown"),
+        "open",
+    ),
+}
+# A table that is longer is folded away.
+FOLDED = 60
+# A text that is longer may break into lines.
+SHORT = 22
+# Columns from which on letters are smaller.
+SMALL = 8
+
+
+class Column(NamedTuple):
+    """A column as it is shown.
+
+    Parameters
+    ----------
+    name : str
+        In the frame.
+    heading : str
+        With its unit.
+    unit : Unit
+    interval : bool
+        Whether the frame has an interval for any of its numbers.
+    """
+
+    name: str
+    heading: str
+    unit: Unit
+    interval: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A table without its first column where that becomes the headings of groups.
+
+    Parameters
+    ----------
+    columns : tuple of Column
+    rows : list of dict
+        The frame's.
+    group : str
+        Column of the groups; empty where there are none.
+    """
+
+    columns: tuple[Column, ...]
+    rows: list[dict[str, object]]
+    group: str
+
+    @classmethod
+    def of(cls, item: Table) -> Shown:
+        """Find out what of a table is shown, and how."""
+        names = [name for name in item.units if name in item.frame.columns]
+        columns = tuple(_column(item, name) for name in names)
+        group = columns[0].name if columns and _is_grouped(item.frame, columns) else ""
+        rest = tuple(column for column in columns if column.name != group)
+        return cls(rest, item.frame.to_dicts(), group)
+
+    def lines(self) -> Iterator[tuple[object, dict[str, object]]]:
+        """Yield every row with the group that begins with it, None where none does."""
+        before: object = object()
+        for row in self.rows:
+            mine = row[self.group] if self.group else before
+            yield (mine if self.group and mine != before else None), row
+            before = mine
+
+
+def html(item: Table, look: Look) -> str:
+    """Return a table of a page: numbers with their intervals, long tables folded away."""
+    shown = Shown.of(item)
+    head, width = [], 0
+    for i, column in enumerate(shown.columns):
+        text = marked(column.heading)
+        kind = "pair" if column.interval else "" if column.unit == "text" else "num"
+        head.append(Cell(text, kind if i else "", 2 if column.interval else 1))
+        width += 2 if column.interval else 1
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for group, row in shown.lines():
+        if group is not None:
+            rows.append(("group", [Cell(marked(look.shown(group)), columns=width)]))
+        cells: list[Cell] = []
+        for column in shown.columns:
+            cells += _cells(row, column, look)
+        rows.append(("", cells))
+    note = noted(item, look)
+    size = "wide small" if len(shown.columns) > SMALL else "wide"
+    text = table(head, rows, kind=size)
+    if len(shown.rows) > FOLDED:
+        text = f"<details><summary>{len(shown.rows)} rows</summary>\n{text}\n</details>"
+    caption = f'<p class="note">{marked(note)}</p>' if note else ""
+    return f"<h3>{marked(look.prose(item.title))}</h3>\n{caption}\n{text}"
+
+
+def csv(item: Table) -> str:
+    """Return the whole frame as CSV, with everything that is not shown."""
+    return item.frame.write_csv()
+
+
+def latex(item: Table, look: Look, label: str) -> str:
+    """Return a table for LaTeX, with the package booktabs; intervals stand in brackets."""
+    shown = Shown.of(item)
+    rows: list[tuple[str, Sequence[str]]] = []
+    for group, row in shown.lines():
+        if group is not None:
+            rows.append((look.shown(group), ()))
+        rows.append(("", [str(_written(row, column, look, ends=True)) for column in shown.columns]))
+    return tabular(
+        [column.heading for column in shown.columns],
+        "".join("l" if column.unit == "text" else "r" for column in shown.columns),
+        rows,
+        caption=f"{look.prose(item.title)}. {noted(item, look)}".strip(),
+        label=f"tab:{label}",
+        comments=("needs \\usepackage{booktabs,graphicx}",),
+    )
+
+
+def noted(item: Table | Figure, look: Look) -> str:
+    """Return what has to be known of a table or figure, and what ATP is where it is in it."""
+    own = look.prose(item.note).strip()
+    own += "" if not own or own.endswith((".", "!", "?")) else "."
+    return f"{own} {OURS}".strip() if shows_atp(item) and OURS not in own else own
+
+
+def shows_atp(item: Table | Figure) -> bool:
+    """Whether ATP is in a table or figure: what shows it has to say what it is."""
+    frame = item.frame
+    texts = [name for name, kind in frame.schema.items() if not kind.is_numeric()]
+    names = (str(value) for name in texts for value in frame[name].unique().drop_nulls())
+    return any((known := contended(name)) is not None and known.family == "atp" for name in names)
+
+
+def _column(item: Table, name: str) -> Column:
+    unit = item.units[name]
+    plain = name if SYMBOL.fullmatch(name) else name.replace("_", " ")
+    heading = item.headings.get(name) or HEADINGS.get(name) or plain
+    low = f"{name}_low"
+    interval = unit != "text" and low in item.frame.columns and item.frame[low].is_not_null().any()
+    return Column(name, labelled(heading, unit), unit, interval)
+
+
+def _is_grouped(frame: pl.DataFrame, columns: Sequence[Column]) -> bool:
+    """Whether the first column names groups of rows: texts that repeat, row after row."""
+    if len(columns) < 3 or columns[0].unit != "text" or columns[1].unit != "text":
+        return False
+    values = frame[columns[0].name].to_list()
+    changes = sum(before != after for before, after in pairwise(values))
+    once = changes + 1 == len(set(values))
+    return len(values) > 3 and once and changes + 1 <= len(values) / 2
+
+
+def _cells(row: dict[str, object], column: Column, look: Look) -> list[Cell]:
+    written = _written(row, column, look, ends=False)
+    if column.unit == "text":
+        kind = "nowrap" if len(written.value) <= SHORT else ""
+        return [Cell(_text(row.get(column.name), column, look), kind)]
+    number = Cell(escape(written.value), "num")
+    return [number, Cell(escape(written.error), "err")] if column.interval else [number]
+
+
+def _text(value: object, column: Column, look: Look) -> str:
+    """Return a text: a contender with its mark, a word that says how it came out in its colour."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    name = key(value)
+    if name in WORDS:
+        return f'<span class="{WORDS[name]} nowrap">{escape(name)}</span>'
+    if name in look.placements:
+        return swatch(look.placements[name]) + escape(name)
+    if column.name in CONTENDERS and name in look.palette.policies:
+        return named(look.shown(name), look.palette.policies[name].colour, ring=True)
+    return marked(look.prose(look.shown(value)))
+
+
+def _written(row: dict[str, object], column: Column, look: Look, *, ends: bool) -> Written:
+    value = row.get(column.name)
+    if value is None:
+        return Written("–", "")
+    if isinstance(value, bool):
+        return Written("yes" if value else "no", "")
+    if column.unit == "text" or not isinstance(value, int | float):
+        return Written(look.prose(look.shown(value)), "")
+    low, high = row.get(f"{column.name}_low"), row.get(f"{column.name}_high")
+    if isinstance(low, int | float) and isinstance(high, int | float):
+        return write_over_seeds(Interval(value, low, high), column.unit, ends=ends)
+    return Written(write(value, column.unit), "")

@@ -1,0 +1,74 @@
+"""Contenders in words: what each policy does, and what each estimator believes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from dwell.model import Problem
+from dwell.report.method import placements
+from dwell.report.palette import contended
+from dwell.report.wording import OURS, shown_contender
+
+__all__ = ["POLICIES", "describe_contenders"]
+
+#: By the family of the policy.
+POLICIES = {
+    "dtp": "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
+    "once the dwell time is over and the improvement large enough.",
+    "atp": "ATP, our reconstruction, moves one task to the edge and back by thresholds on L95 and "
+    "utilisation.",
+    "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
+    "work-function": "Work-function follows the optimum in hindsight over all windows so far, one "
+    "window late.",
+    "cusum": "CUSUM adds up what another placement would have saved, window after window, and "
+    "moves once that is enough; it has no dwell time.",
+    "clairvoyant": "Clairvoyant is no policy but a reference: it knows what every placement, run "
+    "alone, costs in every window to come, and plays the cheapest sequence.",
+}
+#: By what stands in brackets behind a policy.
+BELIEFS = {
+    "profile": "prices what is not active by a static profile, as if nothing disturbed it; only "
+    "the utilisation follows what is seen. This is how we read the paper's static profiling.",
+    "shadow": "sends some cycles through the other placements as well, and prices these by what "
+    "the copies took. The copies cost compute time and bandwidth, which are paid for here.",
+    "scaling": "prices the other placements by upper bounds: what was measured where the pipeline "
+    "runs, times the known ratio of the nodes' compute times, plus the links' declared bounds.",
+    "corrected": "keeps the times of every task on every node and of every message on every link, "
+    "begins with the profile's, corrects them by what active and shadow jobs reveal, and forgets "
+    "them with age. It is ours.",
+    "hindsight": "is told, one window late, what every placement would have cost: what the rule "
+    "does with estimates that are right.",
+    "dwell": "under the dwell time of Algorithm 1.",
+    "tuned": "with thresholds that were tuned on seeds that nothing else is done on.",
+}
+
+
+def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str]:
+    """Say what each of several contenders is.
+
+    Parameters
+    ----------
+    problem : Problem
+    names : iterable of str
+        As in tables; those that nothing is known of are left out.
+
+    Returns
+    -------
+    dict of str to str
+        Every policy and every estimator once, by the name that is shown.
+    """
+    names = list(dict.fromkeys(names))
+    found: dict[str, str] = {}
+    statics = [name for name in problem.candidates if name in names]
+    if statics:
+        text = f"{placements(problem, statics)} As policies these never move."
+        found[", ".join(statics)] = text
+    known = [one for one in map(contended, names) if one is not None]
+    for family, text in POLICIES.items():
+        if any(one.family == family for one in known):
+            found[shown_contender(family)] = f"{text} {OURS}" if family == "atp" else text
+    rests = {one.rest for one in known}
+    for belief, text in BELIEFS.items():
+        if belief in rests:
+            found[f"… ({belief})"] = text
+    return found

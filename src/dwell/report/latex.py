@@ -1,0 +1,146 @@
+"""LaTeX: text and numbers escaped, tables with the rules of the package booktabs."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+
+from dwell.report.wording import SYMBOL
+
+__all__ = ["escaped", "tabular"]
+
+SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    **{letter: f"\\{letter}" for letter in "&%$#_{}"},
+}
+#: What is no letter of the engines that read the file as it is, and is written in its place.
+SIGNS = {
+    "−": "$-$",
+    "±": r"$\pm$",
+    "×": r"$\times$",
+    "·": r"$\cdot$",
+    "∞": r"$\infty$",
+    "→": r"$\rightarrow$",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "⌊": r"$\lfloor$",
+    "⌋": r"$\rfloor$",
+    "⌈": r"$\lceil$",
+    "⌉": r"$\rceil$",
+    "–": "--",
+    "—": "---",
+    "“": "``",
+    "”": "''",
+    "’": "'",
+    "…": r"\dots{}",
+    "\u00a0": "~",
+    "\u2009": r"\,",
+    **{
+        letter: f"$\\{name}$"
+        for letter, name in {
+            "α": "alpha",
+            "β": "beta",
+            "Δ": "Delta",
+            "λ": "lambda",
+            "μ": "mu",
+            "ρ": "rho",
+            "σ": "sigma",
+            "ω": "omega",
+            "Π": "Pi",
+            "π": "pi",
+        }.items()
+    },
+}
+#: Unicode has two of these.
+SIGNS["µ"] = SIGNS["μ"]
+
+
+def escaped(text: str) -> str:
+    """Return plain text as LaTeX; symbols with an index, such as V_D, become mathematics."""
+    first, *rest = SYMBOL.split(text)
+    parts = [_plain(first)]
+    for letter, index, after in zip(rest[::3], rest[1::3], rest[2::3], strict=True):
+        base = SIGNS[letter].strip("$") if letter in SIGNS else letter
+        parts += [rf"${base}_{{\mathrm{{{index}}}}}$", _plain(after)]
+    return "".join(parts)
+
+
+def _plain(text: str) -> str:
+    """Escape every letter; those that nobody has heard of lose what makes them so."""
+    # An interval at the begin of a line would be taken for the argument of \\.
+    return "".join(map(_letter, text.replace("`", "")))
+
+
+def _letter(letter: str) -> str:
+    if letter in SPECIAL:
+        return SPECIAL[letter]
+    if letter in SIGNS:
+        return SIGNS[letter]
+    if letter.isascii() or (letter.isalpha() and ord(letter) < 0x180):
+        return letter if letter.isprintable() else " "
+    bare = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
+    return "".join(SPECIAL.get(one, one) for one in bare) or "?"
+
+
+def tabular(
+    head: Sequence[str],
+    columns: str,
+    rows: Iterable[tuple[str, Sequence[str]]],
+    *,
+    caption: str,
+    label: str,
+    comments: Sequence[str] = (),
+) -> str:
+    """Return a floating table.
+
+    Parameters
+    ----------
+    head : sequence of str
+        Plain texts.
+    columns : str
+        A letter for each: ``l`` or ``r``.
+    rows : iterable of (group, cells)
+        Plain texts. A row with a group is its name, across the table, and has no cells.
+    caption : str
+        Plain text.
+    label : str
+        For references.
+    comments : sequence of str
+        Lines for who opens the file.
+    """
+    lines = [f"% {re.sub(r'[^ -~]', '?', line)}" for line in comments]
+    lines += [
+        r"\begin{table}",
+        r"\centering",
+        rf"\caption{{{escaped(caption)}}}",
+        rf"\label{{{label}}}",
+        r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{@{{}}{columns}@{{}}}}",
+        r"\toprule",
+        " & ".join(map(_cell, head)) + r" \\",
+        r"\midrule",
+    ]
+    first = True
+    for group, cells in rows:
+        if group:
+            lines += [] if first else [r"\addlinespace"]
+            lines.append(
+                rf"\multicolumn{{{len(columns)}}}{{@{{}}l}}{{\textit{{{escaped(group)}}}}} \\"
+            )
+        else:
+            lines.append(" & ".join(map(_cell, cells)) + r" \\")
+        first = False
+    lines += [r"\bottomrule", r"\end{tabular}%", "}", r"\end{table}", ""]
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    shown = escaped(text)
+    # After \\, a bracket would be taken for a length.
+    return f"{{{shown}}}" if shown.startswith("[") else shown

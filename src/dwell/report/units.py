@@ -1,0 +1,80 @@
+"""Numbers of a chapter as they are written, by the unit of their column."""
+
+from __future__ import annotations
+
+import math
+
+from dwell.report.wording import Measure, Written, write_interval, write_number
+from dwell.study import Interval
+from dwell.study.paper.chapter import Unit
+
+__all__ = ["factor", "labelled", "measure_of", "write", "write_over_seeds"]
+
+#: What stands behind a heading; the numbers below it have none.
+SIGNS: dict[Unit, str] = {"percent": "%", "change": "%", "ms": "ms"}
+LEAST_P = 0.001
+
+
+def factor(unit: Unit) -> float:
+    """From a column's numbers to those that are shown."""
+    return 100.0 if unit in ("percent", "change") else 1.0
+
+
+def labelled(name: str, unit: Unit) -> str:
+    """Return a heading with its unit: ``V_D`` in percent as ``V_D (%)``; once, if it has it."""
+    sign = SIGNS.get(unit, "")
+    if not sign or not name or f"({sign}" in name or f" {sign}" in name:
+        return name
+    return f"{name} ({sign})"
+
+
+def measure_of(unit: Unit, *values: float) -> Measure:
+    """Return how numbers of a unit are written.
+
+    Parameters
+    ----------
+    unit : Unit
+    *values : float
+        Numbers that stand together: ``number`` has as many decimals as the largest needs.
+    """
+    decimals = {"percent": 1, "change": 1, "ms": 1, "cost": 2, "count": 1, "p": 3}
+    if unit in decimals:
+        return Measure("", "", "", factor(unit), decimals[unit], signed=unit == "change")
+    finite = [abs(value) for value in values if math.isfinite(value) and value]
+    places = 2 - math.floor(math.log10(max(finite))) if finite else 0
+    return Measure("", "", "", 1.0, min(max(places, 0), 6))
+
+
+def write(value: float, unit: Unit) -> str:
+    """Write a number without its unit."""
+    if unit == "p":
+        small = 0 <= value < LEAST_P
+        return f"<{LEAST_P:g}" if small else write_number(value, 3)
+    if unit == "count" and value == round(value, 6) and float(value).is_integer():
+        return write_number(value, 0)
+    measure = measure_of(unit, value)
+    text = write_number(value * measure.factor, measure.decimals, signed=measure.signed)
+    # What was set to 0.05 is not measured to be 0.050.
+    return text.rstrip("0").rstrip(".") if unit == "number" and "." in text else text
+
+
+def write_over_seeds(interval: Interval, unit: Unit, *, ends: bool = False) -> Written:
+    """Write a number over seeds with its interval, without the unit.
+
+    Parameters
+    ----------
+    interval : Interval
+    unit : Unit
+    ends : bool
+        Whether the interval is always written by its ends.
+    """
+    if not interval.known:
+        return Written(write(interval.value, unit), "")
+    measure = measure_of(unit, *interval)
+    if not ends:
+        return write_interval(interval, measure)
+    value, *limits = (
+        write_number(end * measure.factor, measure.decimals, signed=measure.signed)
+        for end in interval
+    )
+    return Written(value, f"[{', '.join(limits)}]")

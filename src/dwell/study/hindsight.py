@@ -1,0 +1,157 @@
+"""Hindsight: an estimator that is told what every candidate would have shown, one window late.
+
+At the close of a window it knows the latencies that the very cycles of that window have in the runs
+of every candidate alone on the same realisation, and makes of them what the controller would have
+seen. Whatever a rule loses with it is the rule's doing, and that of a decision that comes a window
+late; whatever it loses beyond that with a real estimator is the estimate's.
+
+It is not the best of all estimators for a rule that looks at one window: it brings the luck of
+that window along, which an estimate over several windows does not. So a real one may do better.
+
+The metrics are exact, except utilisation where windows do not begin with those of the static runs
+(after a migration whose order took time): then it is that of the windows that overlap, by how much
+they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import NEVER_NS
+from dwell.control.windows import missed_cycles, seen_l95_ns
+from dwell.errors import SimulationError
+from dwell.estimators import Evidence
+from dwell.model import FrozenDict, Problem, QoS
+
+if TYPE_CHECKING:
+    from dwell.record import Run
+
+__all__ = ["Hindsight"]
+
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Alone:
+    """What a candidate alone showed.
+
+    Parameters
+    ----------
+    release_ns, latency_ns : int64 array, shape (cycles,)
+    open_ns : int64 array, shape (windows + 1,)
+        Begin of every window, and the end of the last.
+    busy_ns : dict of str to float64 array, shape (windows + 1,)
+        Time for which each node was busy until then, as if all of it were one core.
+    """
+
+    release_ns: Ints
+    latency_ns: Ints
+    open_ns: Ints
+    busy_ns: dict[str, Floats]
+
+
+class Hindsight:
+    """Estimates every candidate by what it showed alone in the same cycles.
+
+    Parameters
+    ----------
+    statics : mapping of str to Run, optional
+        Every candidate's run that never moves, of the realisation to be played. Where None it is
+        to be given them before it is asked (see `of`): a study does so for every realisation.
+    """
+
+    def __init__(self, statics: Mapping[str, Run] | None = None) -> None:
+        self._alone = {name: _alone(run) for name, run in (statics or {}).items()}
+        self._seen: dict[str, QoS] = {}
+
+    def __repr__(self) -> str:
+        return "Hindsight()"
+
+    def of(self, statics: Mapping[str, Run]) -> Hindsight:
+        """Return the same for a realisation of which every candidate's run is known."""
+        return Hindsight(statics)
+
+    def start(self, problem: Problem) -> None:
+        """Take the deadline and the censoring of the problem that will be played.
+
+        Raises
+        ------
+        SimulationError
+            If it has not been told what every candidate of the problem showed.
+        """
+        missing = [name for name in problem.candidates if name not in self._alone]
+        if missing:
+            raise SimulationError(
+                f"hindsight knows no run of {', '.join(missing)} alone; a study gives it those, "
+                "and elsewhere `Hindsight(statics)` does"
+            )
+        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._censor_ns = round(problem.censor_ms * 1e6)
+        self._grace_ns = round(problem.controller.close_grace_ms * 1e6)
+        self._cycles = problem.window_cycles
+        self._candidates = tuple(problem.candidates)
+
+    def learn(self, evidence: Evidence) -> None:
+        """Look up the cycles of a window."""
+        self._seen = self._told(evidence.release_ns, evidence.close_ns)
+
+    def metrics(self, first_cycle: int) -> dict[str, QoS]:
+        """Return what every candidate alone showed in the window that begins with a cycle."""
+        alone = next(iter(self._alone.values()))
+        release_ns = alone.release_ns[first_cycle : first_cycle + self._cycles]
+        after = first_cycle + self._cycles
+        ended = after >= len(alone.release_ns)
+        close_ns = int(alone.open_ns[-1] if ended else alone.release_ns[after])
+        return self._told(release_ns, close_ns + self._grace_ns)
+
+    def _told(self, release_ns: Ints, close_ns: int) -> dict[str, QoS]:
+        return {
+            name: self._metrics(self._alone[name], release_ns, close_ns)
+            for name in self._candidates
+        }
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> dict[str, QoS]:
+        """Return what every candidate alone showed in the window (see `Estimator`)."""
+        return dict(self._seen)
+
+    def _metrics(self, alone: _Alone, release_ns: Ints, close_ns: int) -> QoS:
+        first = int(np.searchsorted(alone.release_ns, release_ns[0]))
+        latency_ns = alone.latency_ns[first : first + len(release_ns)]
+        age_ns = close_ns - release_ns
+        l95_ms = int(seen_l95_ns(latency_ns, age_ns, self._censor_ns)) / 1e6
+        missed = int(missed_cycles(latency_ns, age_ns, self._deadline_ns))
+        span_ns = float(close_ns - release_ns[0])
+        at_ns = np.array([release_ns[0], close_ns])
+        used = {
+            node: min(float(np.diff(np.interp(at_ns, alone.open_ns, busy_ns))[0]) / span_ns, 1.0)
+            for node, busy_ns in alone.busy_ns.items()
+        }
+        return QoS(l95_ms, missed / len(release_ns), FrozenDict(used))
+
+
+def _alone(run: Run) -> _Alone:
+    """Take what is needed of a static run."""
+    windows, cycles = run.windows, run.cycles
+    release_ns = cycles["release_ns"].to_numpy()
+    first = windows["first_cycle"].to_numpy()
+    # The release that closes the last window is in no table: a window is taken to be as long as
+    # the one before it.
+    opened = release_ns[first]
+    last = 2 * opened[-1] - opened[-2] if len(opened) > 1 else release_ns[-1]
+    open_ns = np.append(opened, last)
+    span_ns = np.diff(open_ns)
+    names = [name.removeprefix("u_") for name in windows.columns if name.startswith("u_")]
+    busy_ns = {
+        name: np.concatenate(([0.0], np.cumsum(windows[f"u_{name}"].to_numpy() * span_ns)))
+        for name in names
+    }
+    latency_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
+    return _Alone(release_ns, latency_ns, open_ns, busy_ns)

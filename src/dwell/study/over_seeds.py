@@ -1,0 +1,81 @@
+"""Tables over seeds: every column of runs with its 95 % interval."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.study.intervals import (
+    Interval,
+    mean_interval,
+    median_interval,
+    share_interval,
+    share_limits,
+)
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.study.summary import Row
+
+__all__ = ["interval_of", "over_seeds"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def over_seeds(
+    runs: pl.DataFrame, keys: Sequence[str], columns: Sequence[str] | None = None
+) -> pl.DataFrame:
+    """Return one row a group of runs: columns over seeds with their intervals.
+
+    Parameters
+    ----------
+    runs : DataFrame
+        One row a run, with a column ``seed``.
+    keys : sequence of str
+        Columns that runs of one group share; groups come in the order of their first runs.
+    columns : sequence of str, optional
+        All others that hold numbers where None.
+
+    Returns
+    -------
+    DataFrame
+        The keys, ``seeds``, and for each column x: ``x``, ``x_low`` and ``x_high`` (see
+        `interval_of`; null ends where one seed gives none); with the violation rate, also its
+        one-sided limits ``violation_rate_at_least`` and ``violation_rate_at_most``.
+    """
+    import polars as pl
+
+    if columns is None:
+        numbers = runs.select(pl.selectors.numeric()).columns
+        columns = [name for name in numbers if name not in (*keys, "seed")]
+    rows: list[Row] = []
+    for labels, mine in runs.group_by(keys, maintain_order=True):
+        row: Row = {**dict(zip(keys, labels, strict=True)), "seeds": mine.height}
+        for column in columns:
+            over = interval_of(column)(_floats(mine, column))
+            row |= {column: over.value, f"{column}_low": over.low, f"{column}_high": over.high}
+        if "violation_rate" in columns:
+            at_least, at_most = share_limits(_floats(mine, "violation_rate"))
+            row["violation_rate_at_least"] = at_least
+            row["violation_rate_at_most"] = at_most
+        rows.append(row)
+    return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
+
+
+def interval_of(column: str) -> Callable[[Floats], Interval]:
+    """Which interval a column of runs takes: of a median where it may be infinite, or a mean."""
+    if column in ("p95_ms", "p50_ms", "spread_ms") or column.startswith("tracking_"):
+        return median_interval
+    if column == "violation_rate" or column.startswith(("share_", "over_")):
+        return share_interval
+    return mean_interval
+
+
+def _floats(runs: pl.DataFrame, column: str) -> Floats:
+    import polars as pl
+
+    return runs[column].cast(pl.Float64).to_numpy()

@@ -1,0 +1,674 @@
+"""Dwell and threshold: what they bound, what they buy in calm, and what they cost in reaction.
+
+N_min windows without a decision after each move bound the migrations of K windows by
+⌊K / (N_min + 1)⌋, whatever the metrics do; that is a property of the rule and is checked in every
+run. What it buys is not: a policy that may not move cannot chatter, and cannot react either.
+
+Two settings beside them are tried: ``escape`` (an incumbent over a cap may leave early) and cold
+migrations (a moved task waits for its state and its start), which make every move dearer.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING
+
+from dwell.model import FrozenDict, Problem
+from dwell.study.engine import StudyResult
+from dwell.study.family import Comparative, Family
+from dwell.study.over_seeds import over_seeds
+from dwell.study.paper.cell import by_length
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.contenders import PAPERS_DTP, believing
+from dwell.study.paper.contrasts import Contrast, family_of, values
+from dwell.study.paper.running import Runner, Scale
+from dwell.study.paper.sentences import counted, listed, number, percent
+from dwell.study.study import Contender, Point, Study
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["Bounds", "chapter", "verdict"]
+
+DWELLS = (0, 1, 3, 6, 12)
+THRESHOLDS = (0.0, 0.05, 0.2, 0.8)
+FEW_DWELLS, FEW_THRESHOLDS = (0, 3, 12), (0.0, 0.05, 0.8)
+SCENARIOS = ("baseline", "flapping", "bursts", "mixture", "step")
+
+#: What is compared to no hysteresis at all; the first is the cell's.
+NONE = (0, 0.0)
+SETTINGS = {
+    (3, 0.05): "both, as in the cell",
+    (3, 0.0): "dwell alone",
+    (0, 0.05): "threshold alone",
+    (12, 0.8): "both, strong",
+}
+CELLS = next(iter(SETTINGS))
+
+ESCAPE_SCENARIOS = ("edge-cpu-stress", "network-impairment", "bursts", "mixture", "step")
+COLD_SCENARIOS = ("flapping", "mixture", "step")
+#: A process that loads a model, and what it hands over: 0.17 s on a gigabit link.
+START_MS, STATE_BYTES = 500.0, 20_000_000
+COLD_DWELLS = (0, 3, 12)
+
+METRICS: Mapping[str, str] = {
+    "migrations": "migrations",
+    "cost": "J",
+    "violation_rate": "V_D",
+}
+UNITS: Mapping[str, Unit] = {
+    "migrations": "number",
+    "returns": "number",
+    "cost": "cost",
+    "regret": "change",
+    "violation_rate": "percent",
+    "l95_ms": "ms",
+}
+HEADINGS = FrozenDict(
+    {
+        "min_dwell": "N_min",
+        "min_improvement": "Δ_min",
+        "cost": "J",
+        "violation_rate": "V_D",
+        "l95_ms": "L95 (ms)",
+        "p_holm": "p (Holm)",
+        "superiority": "first is lower in",
+        "n": "pairs",
+    }
+)
+
+
+def chapter(problem: Problem, scale: Scale, runner: Runner) -> Chapter:
+    """Vary N_min and Δ_min; try escape and cold migrations."""
+    dwells = FEW_DWELLS if scale.coarse else DWELLS
+    thresholds = FEW_THRESHOLDS if scale.coarse else THRESHOLDS
+    grid = [
+        runner.run(study)
+        for study in studies(
+            "hysteresis", problem, scale, SCENARIOS, gridded(dwells, thresholds), scale.some_seeds
+        )
+    ]
+    escape = [
+        runner.run(study)
+        for study in studies(
+            "hysteresis-escape", problem, scale, ESCAPE_SCENARIOS, escaping(), scale.all_seeds
+        )
+    ]
+    cold = [
+        runner.run(study)
+        for study in studies(
+            "hysteresis-cold", heavy(problem), scale, COLD_SCENARIOS, moving(), scale.all_seeds
+        )
+    ]
+    return written(grid, escape, cold)
+
+
+def studies(
+    name: str,
+    problem: Problem,
+    scale: Scale,
+    scenarios: Sequence[str],
+    contenders: Sequence[Contender],
+    seeds: Sequence[int],
+) -> list[Study]:
+    """Return one study for each length that runs have."""
+    return [
+        Study(
+            name=name + suffix,
+            points=(Point({}, problem),),
+            scenarios=mine,
+            contenders=tuple(contenders),
+            seeds=tuple(seeds),
+            windows=windows,
+            references=True,
+        )
+        for suffix, mine, windows in by_length(
+            problem, scenarios, scale.windows, scale.dynamic_windows
+        )
+    ]
+
+
+def gridded(
+    dwells: Sequence[int] = DWELLS, thresholds: Sequence[float] = THRESHOLDS
+) -> list[Contender]:
+    """Return a DTP for every dwell and threshold."""
+    return [
+        believing(
+            "dtp",
+            "corrected",
+            {"controller.min_dwell": dwell, "controller.min_improvement": threshold},
+            name=grid_name(dwell, threshold),
+        )
+        for dwell, threshold in itertools.product(dwells, thresholds)
+    ]
+
+
+def settings_of(study: Study) -> list[tuple[int, float]]:
+    """Return N_min and Δ_min of every contender of the grid."""
+    return [
+        (
+            int(str(one.settings["controller.min_dwell"])),
+            float(str(one.settings["controller.min_improvement"])),
+        )
+        for one in study.contenders
+    ]
+
+
+def grid_name(dwell: int, threshold: float) -> str:
+    """Name of a contender of the grid."""
+    return f"N_min = {dwell}, Δ_min = {threshold:g}"
+
+
+def escaping() -> list[Contender]:
+    """Return DTP with and without escape."""
+    return [
+        believing("dtp", estimator, {"controller.escape": on}, name=escape_name(estimator, on))
+        for estimator in ("profile", "corrected")
+        for on in (False, True)
+    ]
+
+
+def escape_name(estimator: str, on: bool) -> str:
+    """Name of a contender with or without escape."""
+    return f"dtp+{estimator}, escape {'on' if on else 'off'}"
+
+
+#: Policies whose migrations are tried cold, and their settings.
+MOVERS: Mapping[str, tuple[str, str, Mapping[str, object]]] = FrozenDict(
+    {
+        PAPERS_DTP: ("dtp", "profile", {}),
+        "cusum+corrected": ("cusum", "corrected", {}),
+        **{
+            f"dtp+corrected, N_min = {dwell}": (
+                "dtp",
+                "corrected",
+                {"controller.min_dwell": dwell},
+            )
+            for dwell in COLD_DWELLS
+        },
+    }
+)
+
+
+def moving() -> list[Contender]:
+    """Return every mover with warm and with cold migrations."""
+    return [
+        believing(
+            policy,
+            estimator,
+            {**settings, "controller.migration": migration},
+            name=f"{name}, {migration}",
+        )
+        for name, (policy, estimator, settings) in MOVERS.items()
+        for migration in ("warm", "cold")
+    ]
+
+
+def heavy(problem: Problem) -> Problem:
+    """Return the problem with relocatable tasks that take time to start and have state to move."""
+    tasks = {
+        name: task if task.anchored else replace(task, start_ms=START_MS, state_bytes=STATE_BYTES)
+        for name, task in problem.pipeline.tasks.items()
+    }
+    return replace(problem, pipeline=replace(problem.pipeline, tasks=FrozenDict(tasks)))
+
+
+# ------------------------------------------------------------------------------- reading
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Migrations held against their bound, over many runs.
+
+    Parameters
+    ----------
+    runs, broken : int
+        How many there are, and how many migrate more often than the bound allows.
+    reached : int
+        How many migrate exactly as often.
+    """
+
+    runs: int
+    broken: int
+    reached: int
+
+
+@dataclass(frozen=True, slots=True)
+class Bounded:
+    """A run of the grid: its migrations, and the most that its dwell allows."""
+
+    scenario: str
+    min_dwell: int
+    migrations: int
+    bound: int
+
+
+def bound_of(windows: int, min_dwell: int) -> int:
+    """Most migrations in a run of so many windows from its begin: ⌊K / (N_min + 1)⌋."""
+    return windows // (min_dwell + 1)
+
+
+def against_bound(results: Sequence[StudyResult]) -> list[Bounded]:
+    """Return every run of the grid with its bound.
+
+    Migrations are counted after the warm-up, the bound is that of all windows of the run: a run
+    that breaks it has broken it for certain.
+    """
+    rows = []
+    for result in results:
+        warmup = result.study.points[0].problem.warmup_windows
+        for dwell, threshold in settings_of(result.study):
+            for scenario in result.study.scenarios:
+                labels = {"scenario": scenario, "policy": grid_name(dwell, threshold)}
+                migrations = values(result.runs, "migrations", labels)
+                windows = values(result.runs, "windows", labels)
+                rows += [
+                    Bounded(scenario, dwell, int(moved), bound_of(int(played) + warmup, dwell))
+                    for moved, played in zip(migrations, windows, strict=True)
+                ]
+    return rows
+
+
+def bounds(rows: Sequence[Bounded]) -> Bounds:
+    """Count the runs that break their bound, and those that reach it."""
+    return Bounds(
+        runs=len(rows),
+        broken=sum(row.migrations > row.bound for row in rows),
+        reached=sum(row.migrations == row.bound for row in rows),
+    )
+
+
+def against_none(results: Sequence[StudyResult], metric: str) -> Family:
+    """Compare some settings to no hysteresis at all, in every scenario."""
+    import polars as pl
+
+    pairs: dict[str, Contrast] = {
+        f"{scenario}: {words}": (
+            {"scenario": scenario, "policy": grid_name(*setting)},
+            {"scenario": scenario, "policy": grid_name(*NONE)},
+        )
+        for result in results
+        for scenario in result.study.scenarios
+        for setting, words in SETTINGS.items()
+    }
+    runs = pl.concat([result.runs for result in results])
+    return family_of(runs, "hysteresis against none (N_min = 0, Δ_min = 0)", metric, pairs)
+
+
+def of_escape(results: Sequence[StudyResult], metric: str) -> Family:
+    """Compare DTP with escape to DTP without, in every scenario."""
+    import polars as pl
+
+    pairs: dict[str, Contrast] = {
+        f"{scenario}: dtp+{estimator}": (
+            {"scenario": scenario, "policy": escape_name(estimator, True)},
+            {"scenario": scenario, "policy": escape_name(estimator, False)},
+        )
+        for result in results
+        for scenario in result.study.scenarios
+        for estimator in ("profile", "corrected")
+    }
+    runs = pl.concat([result.runs for result in results])
+    return family_of(runs, "escape on against off", metric, pairs)
+
+
+def of_cold(results: Sequence[StudyResult], metric: str) -> Family:
+    """Compare cold migrations to warm ones, in every scenario."""
+    import polars as pl
+
+    pairs: dict[str, Contrast] = {
+        f"{scenario}: {name}": (
+            {"scenario": scenario, "policy": f"{name}, cold"},
+            {"scenario": scenario, "policy": f"{name}, warm"},
+        )
+        for result in results
+        for scenario in result.study.scenarios
+        for name in MOVERS
+    }
+    runs = pl.concat([result.runs for result in results])
+    return family_of(runs, "cold migrations against warm ones", metric, pairs)
+
+
+# ------------------------------------------------------------------------------- verdict
+
+
+def verdict(
+    held: Bounds, migrations: Mapping[str, Comparative], cost: Mapping[str, Comparative]
+) -> tuple[Answer, str]:
+    """Answer whether hysteresis calms DTP within its bound, and at no price.
+
+    Parameters
+    ----------
+    held : Bounds
+        Of all runs of the grid.
+    migrations, cost : mapping of str to verdict
+        By scenario: of the cell's setting, against no hysteresis at all.
+    """
+    calmer = [name for name, said in migrations.items() if said == "lower"]
+    dearer = [name for name, said in cost.items() if said == "higher"]
+    cheaper = [name for name, said in cost.items() if said == "lower"]
+    answer: Answer
+    if held.broken:
+        answer = "no"
+    elif len(calmer) == len(migrations) and not dearer:
+        answer = "yes"
+    elif calmer:
+        answer = "in part"
+    else:
+        answer = "no" if dearer else "not shown"
+    bound = (
+        f"The bound ⌊K/(N_min + 1)⌋ is broken in {held.broken} of {held.runs} runs"
+        if held.broken
+        else f"No run of {held.runs} migrates more often than ⌊K/(N_min + 1)⌋"
+    )
+    return answer, (
+        f"{bound} ({held.reached} reach it). Against no hysteresis at all, the cell's N_min = "
+        f"{CELLS[0]} and Δ_min = {CELLS[1]:g} are shown to migrate less in "
+        f"{counted(len(calmer), len(migrations), 'scenarios')}, to cost more J in "
+        f"{len(dearer)}{_in(dearer)}, and to cost less in {len(cheaper)}{_in(cheaper)}."
+    )
+
+
+def _in(names: Sequence[str]) -> str:
+    return f" ({listed(names)})" if names else ""
+
+
+# ------------------------------------------------------------------------------- chapter
+
+
+def written(
+    grid: Sequence[StudyResult], escape: Sequence[StudyResult], cold: Sequence[StudyResult]
+) -> Chapter:
+    """Write the chapter of finished runs."""
+    rows = against_bound(grid)
+    calm = {metric: against_none(grid, metric) for metric in METRICS}
+    words = SETTINGS[CELLS]
+    of_cells = {
+        metric: {
+            name.removesuffix(f": {words}"): said
+            for name, said in one.verdicts.items()
+            if name.endswith(f": {words}")
+        }
+        for metric, one in calm.items()
+    }
+    answer, sentence = verdict(bounds(rows), of_cells["migrations"], of_cells["cost"])
+    early = {metric: of_escape(escape, metric) for metric in METRICS}
+    late = {metric: of_cold(cold, metric) for metric in METRICS}
+    numbers = grid_table(grid)
+    return Chapter(
+        slug="hysteresis",
+        title="Does hysteresis calm DTP, within its bound, without making it worse?",
+        design=design(grid, escape, cold),
+        answer=answer,
+        verdict=sentence,
+        findings=(
+            *settings_found(calm),
+            *best_found(numbers),
+            *shown("Escape", early),
+            *shown("A cold migration", late),
+            *price_found(cold),
+        ),
+        tables=(
+            bounds_table(rows),
+            numbers,
+            families_table("hysteresis-none", "Hysteresis, less none at all", tuple(calm.values())),
+            families_table("hysteresis-escape", "Escape on, less off", tuple(early.values())),
+            families_table("hysteresis-cold", "Cold migrations, less warm", tuple(late.values())),
+        ),
+        figures=(
+            grid_figure(numbers, "migrations", rows),
+            grid_figure(numbers, "cost"),
+            grid_figure(numbers, "violation_rate"),
+        ),
+    )
+
+
+def design(
+    grid: Sequence[StudyResult], escape: Sequence[StudyResult], cold: Sequence[StudyResult]
+) -> str:
+    """Say what was varied."""
+
+    def where(results: Sequence[StudyResult]) -> str:
+        return listed(scenario for result in results for scenario in result.study.scenarios)
+
+    settings = settings_of(grid[0].study)
+    dwells = dict.fromkeys(dwell for dwell, _ in settings)
+    thresholds = dict.fromkeys(threshold for _, threshold in settings)
+    lengths = listed(
+        f"{result.study.windows} windows ({', '.join(result.study.scenarios)})" for result in grid
+    )
+    return (
+        f"DTP with the estimator corrected; N_min of {listed(str(one) for one in dwells)} times "
+        f"Δ_min of {listed(f'{one:g}' for one in thresholds)}, {len(grid[0].study.seeds)} seeds of "
+        f"{lengths}. In every run migrations are held against ⌊K/(N_min + 1)⌋. Some settings are "
+        f"compared to none at all, paired by seed (sign-flip test, Holm over scenarios and "
+        f"settings of a metric). Regret is against the reference in hindsight. Beside that, "
+        f"escape on and off ({where(escape)}; {len(escape[0].study.seeds)} seeds; DTP with profile "
+        f"and with corrected), and cold migrations against warm ones ({where(cold)}; "
+        f"{len(cold[0].study.seeds)} seeds; {listed(MOVERS)}): a moved task takes "
+        f"{number(START_MS, 0)} ms to start and has {number(STATE_BYTES / 1e6, 0)} MB of state."
+    )
+
+
+def settings_found(calm: Mapping[str, Family]) -> tuple[str, ...]:
+    """Say what each setting changes against none, over scenarios."""
+    found = []
+    for words in SETTINGS.values():
+        parts = []
+        for metric, one in calm.items():
+            mine = [said for name, said in one.verdicts.items() if name.endswith(f": {words}")]
+            lower, higher = mine.count("lower"), mine.count("higher")
+            parts.append(f"{METRICS[metric]} lower in {lower} and higher in {higher}")
+        found.append(
+            f"{words.capitalize()}, against none: {'; '.join(parts)} of {len(mine)} scenarios."
+        )
+    return tuple(found)
+
+
+def best_found(numbers: Table) -> tuple[str, ...]:
+    """Say which setting had the least J in each scenario."""
+    found = []
+    for (scenario,), mine in numbers.frame.group_by(["scenario"], maintain_order=True):
+        rows = mine.to_dicts()
+        least = min(rows, key=lambda row: row["cost"])
+        most = max(rows, key=lambda row: row["cost"])
+        cells = next(row for row in rows if (row["min_dwell"], row["min_improvement"]) == CELLS)
+        found.append(
+            f"{scenario}: J is least with N_min = {least['min_dwell']}, Δ_min = "
+            f"{least['min_improvement']:g} ({number(least['cost'], 2)}, regret "
+            f"{percent(least['regret'], 0)}), {number(cells['cost'], 2)} in the cell, and at most "
+            f"{number(most['cost'], 2)} (N_min = {most['min_dwell']}, Δ_min = "
+            f"{most['min_improvement']:g}); chosen on the same seeds, so that the least is too low."
+        )
+    return tuple(found)
+
+
+def shown(what: str, families: Mapping[str, Family]) -> tuple[str, ...]:
+    """Say where a setting was shown to change a metric."""
+    parts = []
+    for metric, one in families.items():
+        named = [
+            f"{name} ({said})"
+            for name, said in one.verdicts.items()
+            if said != "no difference shown"
+        ]
+        listed_ = f" ({'; '.join(named)})" if named else ""
+        parts.append(f"{METRICS[metric]} in {len(named)} of {len(one.comparisons)}{listed_}")
+    return (f"{what} is shown to change {'; '.join(parts)}.",)
+
+
+def price_found(cold: Sequence[StudyResult]) -> tuple[str, ...]:
+    """Say how many misses a cold migration adds."""
+    found = []
+    for result in cold:
+        for scenario in result.study.scenarios:
+            added = moved = 0.0
+            for name in MOVERS:
+                labels = {"scenario": scenario, "policy": f"{name}, cold"}
+                warm = {"scenario": scenario, "policy": f"{name}, warm"}
+                rate = values(result.runs, "violation_rate", labels)
+                before = values(result.runs, "violation_rate", warm)
+                cycles = values(result.runs, "cycles", labels)
+                added += float(((rate - before) * cycles).sum())
+                moved += float(values(result.runs, "migrations", labels).sum())
+            if moved:
+                found.append(
+                    f"{scenario}: a cold migration adds {number(added / moved, 1)} missed cycles "
+                    f"(all policies together, {number(moved, 0)} migrations)."
+                )
+    return tuple(found)
+
+
+def bounds_table(rows: Sequence[Bounded]) -> Table:
+    """One row an N_min: migrations against their bound."""
+    import polars as pl
+
+    frame = (
+        pl.DataFrame([asdict(row) for row in rows])
+        .group_by("min_dwell", maintain_order=True)
+        .agg(
+            pl.len().alias("runs"),
+            pl.col("migrations").max().alias("most"),
+            pl.col("bound").min().alias("least_bound"),
+            (pl.col("migrations") / pl.col("bound")).max().alias("nearest"),
+            (pl.col("migrations") == pl.col("bound")).sum().alias("reached"),
+            (pl.col("migrations") > pl.col("bound")).sum().alias("broken"),
+        )
+    )
+    return Table(
+        slug="hysteresis-bound",
+        title="Migrations against ⌊K / (N_min + 1)⌋",
+        frame=frame,
+        units={
+            "min_dwell": "count",
+            "runs": "count",
+            "most": "count",
+            "least_bound": "count",
+            "nearest": "percent",
+            "reached": "count",
+            "broken": "count",
+        },
+        headings={
+            "min_dwell": "N_min",
+            "most": "most migrations",
+            "least_bound": "least bound",
+            "nearest": "nearest to its bound",
+            "reached": "runs at it",
+            "broken": "runs beyond it",
+        },
+        note="Every run of the grid, all scenarios and thresholds.",
+    )
+
+
+def grid_table(results: Sequence[StudyResult]) -> Table:
+    """One row a scenario, dwell and threshold."""
+    import polars as pl
+
+    names = pl.DataFrame(
+        [
+            {
+                "policy": grid_name(dwell, threshold),
+                "min_dwell": dwell,
+                "min_improvement": threshold,
+            }
+            for dwell, threshold in settings_of(results[0].study)
+        ]
+    )
+    runs = pl.concat([result.runs for result in results])
+    # Without the references' own rows.
+    frame = over_seeds(
+        runs.filter(pl.col("policy").is_in(names["policy"].to_list())),
+        ("scenario", "policy"),
+        tuple(UNITS),
+    )
+    study = results[0].study
+    return Table(
+        slug="hysteresis",
+        title="Dwell and threshold",
+        frame=frame.join(names, on="policy", how="left", maintain_order="left"),
+        units={"scenario": "text", "min_dwell": "count", "min_improvement": "number", **UNITS},
+        headings=HEADINGS,
+        note=f"Mean over {len(study.seeds)} seeds, with its 95 % interval.",
+    )
+
+
+def families_table(slug: str, title: str, families: Sequence[Family]) -> Table:
+    """One row a metric and comparison; the columns of differences have their metric's unit."""
+    import polars as pl
+
+    frames = [
+        one.table().with_columns(
+            pl.lit(METRICS[one.metric]).alias("metric"),
+            pl.col("low").alias("difference_low"),
+            pl.col("high").alias("difference_high"),
+        )
+        for one in families
+    ]
+    return Table(
+        slug=slug,
+        title=title,
+        frame=pl.concat(frames),
+        units={
+            "metric": "text",
+            "comparison": "text",
+            "difference": "number",
+            "superiority": "percent",
+            "n": "count",
+            "p_holm": "p",
+            "verdict": "text",
+        },
+        headings=HEADINGS,
+        note=(
+            "Paired by seed; Holm over the comparisons of a metric. Differences of V_D as shares: "
+            "0.01 is a point."
+        ),
+    )
+
+
+def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) -> Figure:
+    """Return a metric over N_min, one line a Δ_min, and one for the bound of migrations."""
+    import polars as pl
+
+    frame = numbers.frame.select(
+        "scenario",
+        pl.format("Δ_min = {}", pl.col("min_improvement")).alias("threshold"),
+        pl.col("min_dwell").alias("x"),
+        *(pl.col(f"{metric}{end}").alias(f"y{end}") for end in ("", "_low", "_high")),
+    )
+    if bounded:
+        frame = pl.concat([frame, _bound_lines(bounded)], how="diagonal_relaxed")
+    return Figure(
+        slug=f"hysteresis-{metric.replace('_', '-')}",
+        title=f"{'Migrations' if bounded else METRICS[metric]} over the dwell",
+        kind="lines",
+        frame=frame,
+        x="x",
+        y="y",
+        series="threshold",
+        facet="scenario",
+        x_label="N_min (windows)",
+        y_label=METRICS[metric],
+        y_unit=UNITS[metric],
+        line_at=0.05 if metric == "violation_rate" else None,
+        line_label="5 %" if metric == "violation_rate" else "",
+        note=numbers.note,
+    )
+
+
+def _bound_lines(rows: Sequence[Bounded]) -> pl.DataFrame:
+    """Return the bound of each scenario's runs, as one more line."""
+    import polars as pl
+
+    return (
+        pl.DataFrame([asdict(row) for row in rows])
+        .group_by("scenario", "min_dwell", maintain_order=True)
+        .agg(pl.col("bound").max().cast(pl.Float64).alias("y"))
+        .select(
+            "scenario",
+            pl.lit("bound").alias("threshold"),
+            pl.col("min_dwell").alias("x"),
+            "y",
+        )
+    )

@@ -1,0 +1,54 @@
+"""Numbers and names as they stand in the sentences of a verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from dwell.study.intervals import Interval
+
+__all__ = ["counted", "listed", "number", "percent", "points", "with_interval"]
+
+
+def percent(share: float, decimals: int = 1) -> str:
+    """``4.2 %``; infinity is ∞, what is not known a dash."""
+    text = number(100 * share, decimals)
+    return f"{text} %"
+
+
+def points(share: float, decimals: int = 1) -> str:
+    """A difference of shares, with its sign: ``+1.3 points``."""
+    text = number(100 * share, decimals)
+    sign = "+" if share > 0 else ""
+    return f"{sign}{text} points"
+
+
+def number(value: float, decimals: int = 1) -> str:
+    """Write a number with a true minus sign and no digits that say nothing."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    text = f"{value:.{decimals}f}"
+    if float(text) == 0:
+        text = text.removeprefix("-")
+    return text.replace("-", "−")
+
+
+def with_interval(known: Interval, *, factor: float = 1.0, decimals: int = 1) -> str:
+    """``4.2 [3.9, 4.6]``; the number alone where there is no interval."""
+    value, low, high = (number(factor * end, decimals) for end in known)
+    return f"{value} [{low}, {high}]" if known.known else value
+
+
+def listed(items: Iterable[str], last: str = "and") -> str:
+    """``a``, ``a and b``, ``a, b and c``; ``none`` where there is nothing."""
+    words = list(items)
+    if len(words) < 2:
+        return "".join(words) or "none"
+    return f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def counted(count: int, of: int, what: str) -> str:
+    """``3 of 5 scenarios``."""
+    return f"{count} of {of} {what}"

@@ -1,0 +1,106 @@
+"""What the numbers of a study depend on beside the study itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+import platform
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.metadata import version
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import Any
+
+from dwell import __version__
+from dwell.errors import SimulationError
+from dwell.model.document import to_document
+from dwell.study.study import Contender, Study
+
+__all__ = ["describe", "software", "versions"]
+
+#: Packages whose versions are noted.
+PACKAGES = ("numpy", "numba", "polars")
+#: Parts of this package that make numbers.
+SOURCES = (
+    *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
+    *(f"study/{name}.py" for name in ("clairvoyant", "engine", "hindsight", "judging", "player")),
+    *(f"study/{name}.py" for name in ("quality", "reference", "script", "summary")),
+)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software that makes numbers."""
+    packages = {name: version(name) for name in PACKAGES}
+    return {"dwell": __version__, **packages, "python": platform.python_version()}
+
+
+@cache
+def _software() -> tuple[tuple[str, str], ...]:
+    digest = hashlib.sha256()
+    for name in SOURCES:
+        for path, text in _sources(files("dwell").joinpath(name), name):
+            digest.update(path.encode())
+            digest.update(text)
+    return (*versions().items(), ("sources", digest.hexdigest()[:16]))
+
+
+def software() -> dict[str, str]:
+    """Return the versions, and a digest of the sources of this package that make numbers."""
+    return dict(_software())
+
+
+def _sources(entry: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
+    """Yield every Python file below an entry, in the order of their paths."""
+    if entry.is_dir():
+        for inner in sorted(entry.iterdir(), key=lambda one: one.name):
+            yield from _sources(inner, f"{path}/{inner.name}")
+    elif path.endswith(".py"):
+        yield path, entry.read_bytes()
+
+
+def describe(study: Study) -> dict[str, Any]:
+    """Return all that the tables of a study depend on, ready for JSON.
+
+    Raises
+    ------
+    SimulationError
+        If a policy or an estimator is an object that does not pickle.
+    """
+    cells = [to_document(point.problem) for point in study.points]
+    return {
+        "name": study.name,
+        "software": software(),
+        "scenarios": list(study.scenarios),
+        "policies": {one.name: _contender(one) for one in study.contenders},
+        "seeds": list(study.seeds),
+        "windows": study.windows,
+        "references": study.references,
+        "parameters": list(study.parameters),
+        "points": [list(point.values.values()) for point in study.points],
+        "cell": cells[0],
+        "cells": hashlib.sha256(json.dumps(cells).encode()).hexdigest(),
+    }
+
+
+def _contender(contender: Contender) -> Mapping[str, Any]:
+    return {
+        "policy": _known_as(contender, contender.policy),
+        "estimator": _known_as(contender, contender.estimator),
+        "settings": dict(contender.settings),
+    }
+
+
+def _known_as(contender: Contender, given: object) -> str | None:
+    """Return what an object will be known by again: its class, and a digest of its state."""
+    if given is None or isinstance(given, str):
+        return given
+    kind = f"{type(given).__module__}.{type(given).__qualname__}"
+    try:
+        state = pickle.dumps(given, protocol=5)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise SimulationError(
+            f"{contender.name} does not pickle ({error}); its state could not be known again"
+        ) from None
+    return f"{kind} {hashlib.sha256(state).hexdigest()[:16]}"

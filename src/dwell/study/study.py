@@ -1,0 +1,280 @@
+"""Study: scenarios × policies × parameters × seeds, of which every combination is simulated."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dwell.errors import SimulationError
+from dwell.io.study_file import Value, read_study
+from dwell.io.study_paths import with_settings
+from dwell.model import FrozenDict, Problem
+from dwell.model.document import to_document
+from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
+
+if TYPE_CHECKING:
+    from dwell.estimators import Estimator
+    from dwell.policies import MinimalPolicy
+
+__all__ = ["Contender", "Item", "Point", "Study", "load_study"]
+
+#: Runs of an item at most, where they can be parted: enough that the time for drawing what they
+#: share does not count, and few enough that little is lost with an item.
+ITEM_RUNS = 64
+
+REFERENCES = (CLAIRVOYANT, CLAIRVOYANT_DWELL)
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """A policy of a study, with what it believes.
+
+    Parameters
+    ----------
+    name : str
+        In tables; a candidate's name is kept for the placement that never moves.
+    policy : policy or str
+        An object with ``decide``, a policy's name, or a candidate's.
+    estimator : Estimator or str, optional
+        What the cell says where None.
+    settings : mapping of str to object
+        Values of the cell below ``controller`` and ``objective``, by their paths. They change what
+        the controller does and how it weighs, and nothing that happens to it; its runs are judged
+        by the objective of the point, like everybody's.
+    """
+
+    name: str
+    policy: MinimalPolicy | str
+    estimator: Estimator | str | None = None
+    settings: Mapping[str, object] = field(default_factory=FrozenDict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "settings", FrozenDict(self.settings))
+
+    def problem(self, problem: Problem) -> Problem:
+        """Return the problem as this contender sees it.
+
+        Raises
+        ------
+        ProblemError
+            If a setting is wrong.
+        """
+        settings = dict(self.settings)
+        if isinstance(self.estimator, str):
+            settings["controller.estimator"] = self.estimator
+        return with_settings(problem, settings) if settings else problem
+
+    def is_candidate(self, problem: Problem) -> bool:
+        """Whether it is a bare candidate's placement, which never moves."""
+        plain = self.estimator is None and not self.settings
+        return plain and isinstance(self.policy, str) and self.policy in problem.candidates
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A point of a study's parameters.
+
+    Parameters
+    ----------
+    values : mapping of str to float, int or str
+        By the parameter's path in the cell.
+    problem : Problem
+        With these values put in.
+    """
+
+    values: Mapping[str, Value]
+    problem: Problem
+
+    def __post_init__(self) -> None:
+        # Numbers of arrays are no numbers to JSON.
+        values = {
+            name: value.item() if isinstance(value, np.generic) else value
+            for name, value in self.values.items()
+        }
+        object.__setattr__(self, "values", FrozenDict(values))
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """What is done, and kept, as a whole: one realisation, played by every contender.
+
+    Parameters
+    ----------
+    points : tuple of int
+        Points whose realisations are the same: they differ in nothing that is drawn.
+    scenario : str
+    seed : int
+    """
+
+    points: tuple[int, ...]
+    scenario: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """What tells it from the other items of its study."""
+        return f"{self.points[0]:05d}-{self.scenario}-{self.seed}"
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What is to be simulated: every point, scenario, contender and seed.
+
+    Parameters
+    ----------
+    name : str
+    points : tuple of Point
+        All with the same parameters, candidates and nodes, and different values.
+    scenarios : tuple of str
+    contenders : tuple of Contender
+    seeds : tuple of int
+    windows : int
+        Length of every run, the warm-up included.
+    references : bool
+        Whether the references in hindsight play as well.
+
+    Raises
+    ------
+    SimulationError
+        If no study can be made of it.
+    ProblemError
+        If a scenario is unknown.
+    """
+
+    name: str
+    points: tuple[Point, ...]
+    scenarios: tuple[str, ...]
+    contenders: tuple[Contender, ...]
+    seeds: tuple[int, ...]
+    windows: int
+    references: bool = False
+
+    def __post_init__(self) -> None:
+        names = tuple(contender.name for contender in self.contenders)
+        _require_each_once("points", [dict(point.values) for point in self.points])
+        _require_each_once("scenarios", self.scenarios)
+        _require_each_once("policies", names)
+        _require_each_once("seeds", self.seeds)
+        for point in self.points:
+            self._check(point)
+        reserved = [name for name in names if self.references and name in REFERENCES]
+        if reserved:
+            raise SimulationError(f"{reserved[0]!r} is a reference's name; choose another")
+
+    def _check(self, point: Point) -> None:
+        first, problem = self.points[0], point.problem
+        for what, mine, others in (
+            ("parameters", point.values, first.values),
+            ("candidates", problem.candidates, first.problem.candidates),
+            ("nodes", problem.fabric.nodes, first.problem.fabric.nodes),
+        ):
+            if tuple(mine) != tuple(others):
+                has, other = ", ".join(mine) or "none", ", ".join(others) or "none"
+                raise SimulationError(f"the points differ in {what}: {other}, and {has}")
+        for scenario in self.scenarios:
+            problem.scenario(scenario)
+        if self.windows <= problem.warmup_windows:
+            raise SimulationError(
+                f"windows is {self.windows}; it must be more than the "
+                f"{problem.warmup_windows} windows of warm-up"
+            )
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names in the tables, the references' last."""
+        names = tuple(contender.name for contender in self.contenders)
+        return (*names, *REFERENCES) if self.references else names
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Paths of the parameters."""
+        return tuple(self.points[0].values)
+
+    @property
+    def runs(self) -> int:
+        """Number of runs, those of the references left out."""
+        pairs = len(self.scenarios) * len(self.seeds)
+        return pairs * len(self.points) * len(self.contenders)
+
+    @property
+    def cycles(self) -> int:
+        """Number of cycles of all these runs."""
+        pairs = len(self.scenarios) * len(self.seeds) * len(self.contenders)
+        return pairs * self.windows * sum(point.problem.window_cycles for point in self.points)
+
+    def items(self) -> tuple[Item, ...]:
+        """Return the items in the order in which they are done: all scenarios of a seed, then on.
+
+        Points that differ in the controller and the objective alone are played in one item, as
+        many as make `ITEM_RUNS`.
+        """
+        size = max(1, ITEM_RUNS // len(self.contenders))
+        groups = [
+            group[begin : begin + size]
+            for group in self._drawn_alike()
+            for begin in range(0, len(group), size)
+        ]
+        return tuple(
+            Item(group, scenario, seed)
+            for seed in self.seeds
+            for scenario in self.scenarios
+            for group in groups
+        )
+
+    def _drawn_alike(self) -> Iterator[tuple[int, ...]]:
+        """Yield points whose realisations are the same."""
+        groups: dict[str, list[int]] = {}
+        for index, point in enumerate(self.points):
+            groups.setdefault(_drawn(point.problem), []).append(index)
+        yield from (tuple(group) for group in groups.values())
+
+
+def _require_each_once(what: str, given: Sequence[object]) -> None:
+    """Refuse nothing at all, and anything twice."""
+    if not given:
+        raise SimulationError(f"{what} is empty; name at least one")
+    seen = set()
+    for one in given:
+        text = repr(one)
+        if text in seen:
+            raise SimulationError(f"{what} holds {text} twice; name each once")
+        seen.add(text)
+
+
+def _drawn(problem: Problem) -> str:
+    """Return all of a problem that a realisation depends on, as a text."""
+    document: dict[str, Any] = to_document(problem)
+    settings = ("name", "controller", "objective", "warmup_windows")
+    return json.dumps({key: value for key, value in document.items() if key not in settings})
+
+
+def load_study(path: str | PathLike[str]) -> Study:
+    """Read a study file.
+
+    Parameters
+    ----------
+    path : str or path
+
+    Raises
+    ------
+    ProblemError
+        With every fault found in it, each with its line and field path.
+    """
+    declared = read_study(path, references=REFERENCES)
+    return Study(
+        name=declared.name,
+        points=tuple(Point(point.values, point.problem) for point in declared.points),
+        scenarios=declared.scenarios,
+        contenders=tuple(
+            Contender(one.name, one.policy, one.estimator, one.settings)
+            for one in declared.policies
+        ),
+        seeds=declared.seeds,
+        windows=declared.windows,
+        references=declared.references,
+    )

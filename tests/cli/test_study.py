@@ -1,0 +1,135 @@
+"""`dwell study`: what it prints, writes and answers."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from dwell.report.wording import shown_policy
+from tests.cli.test_commands import SMALL, call
+from tests.cli.test_process import interrupt_at_first_sign
+
+STUDY = """\
+dwell-study: 1
+name: a small one
+cell: small.yaml
+windows: 20
+seeds: 2
+references: true
+policies: [LOC, dtp]
+parameters:
+  objective.weights.switching: [0, 1]
+"""
+
+
+@pytest.fixture
+def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a small study in a folder of its own, which is the current one."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.yaml").write_text(SMALL, encoding="utf-8")
+    path = tmp_path / "study.yaml"
+    path.write_text(STUDY, encoding="utf-8")
+    return path
+
+
+def test_a_study_prints_tables_and_keeps_them(study: Path) -> None:
+    result = call("study", study, "--processes", "1")
+    assert (result.exit_code, result.stderr) == (0, "")
+    lines = result.stdout.splitlines()
+    assert lines[0] == "Baseline (objective.weights.switching = 0)"
+    assert lines[1].split() == ["V_D", "(%)", "J", "migrations", "regret", "(%)"]
+    policies = ("LOC", "dtp", "clairvoyant", "clairvoyant-dwell")
+    for line, policy in zip(lines[2:6], policies, strict=True):
+        assert line.startswith(f"{shown_policy(policy)} ")
+    assert "Stress (objective.weights.switching = 1)" in lines
+    assert lines[-1] == "tables: studies/a_small_one"
+    runs = pl.read_parquet("studies/a_small_one/runs.parquet")
+    assert runs.height == 2 * 2 * 4 * 2
+    again = call("study", study)
+    assert (again.exit_code, again.stdout) == (0, result.stdout)
+
+
+def test_a_study_as_json(study: Path) -> None:
+    arguments = ("--seeds", "1", "--windows", "10", "--out", "out", "--processes", "1")
+    result = call("study", study, *arguments, "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert (found["study"], found["folder"], found["runs"]) == ("a small one", "out", 16)
+    assert len(found["table"]) == 16
+    row = found["table"][0]
+    assert (row["parameter.objective.weights.switching"], row["policy"]) == (0, "LOC")
+    assert row["seeds"] == 1
+    assert row["regret_low"] is None
+    assert pl.read_parquet("out/runs.parquet")["windows"].unique().to_list() == [10]
+
+
+def test_every_fault_of_a_study_is_printed(study: Path) -> None:
+    text = STUDY.replace("LOC, dtp", "LOC, dpt").replace("[0, 1]", "[0, -1]")
+    study.write_text(text, encoding="utf-8")
+    result = call("study", study)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert [line.split(" ")[1] for line in result.stderr.splitlines()] == [
+        "policies.dpt:",
+        "parameters.objective.weights.switching[1]:",
+    ]
+    assert not Path("studies").exists()
+
+
+def test_a_folder_of_another_study_is_refused(study: Path) -> None:
+    arguments = ("--windows", "5", "--processes", "1", "--out", "out")
+    assert call("study", study, "--seeds", "1", *arguments).exit_code == 0
+    result = call("study", study, "--seeds", "2", *arguments)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: out holds another study")
+    assert "seeds: 1 there, 1, 2 now" in result.stderr
+
+
+def test_a_folder_that_cannot_be_written_fails(study: Path) -> None:
+    result = call("study", study, "--out", study / "out", "--processes", "1")
+    assert result.exit_code == 1
+    assert result.stderr == f"error: {study / 'out'}: cannot be written (Not a directory)\n"
+
+
+def test_a_cluster_that_is_not_there_fails(study: Path) -> None:
+    pytest.importorskip("distributed")
+    result = call("study", study, "--dask", "nowhere")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("error: no Dask scheduler answers at 'nowhere'")
+
+
+def test_without_the_package_a_cluster_is_out_of_reach(
+    study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    result = call("study", study, "--dask", "tcp://127.0.0.1:8786")
+    assert result.exit_code == 1
+    assert "pip install 'dwell[dask]'" in result.stderr
+
+
+def test_many_points_do_not_fill_the_screen(study: Path) -> None:
+    values = ", ".join(str(value / 100) for value in range(25))
+    text = STUDY.replace("[0, 1]", f"[{values}]").replace("references: true", "references: false")
+    study.write_text(text, encoding="utf-8")
+    result = call("study", study, "--seeds", "1", "--windows", "2", "--processes", "1")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.count("V_D") == 40
+    assert "40 of 50 tables are shown; runs.parquet has all runs." in result.stdout
+
+
+def test_an_interrupted_study_says_how_to_go_on(study: Path) -> None:
+    arguments = ["study", str(study), "--seeds", "2000", "--processes", "1", "--out", "out"]
+    code, stdout, shown = interrupt_at_first_sign(arguments, study.parent, sign="cycles/s")
+    assert (code, stdout) == (130, "")
+    assert "Traceback" not in shown
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown)
+    assert re.search(r"\d+/16000 \d\.\d\d M cycles/s +\d:\d\d:\d\d", plain)
+    (said,) = re.findall(r"interrupted: (\d+) of 16000 runs are finished and stay in out; ", plain)
+    # It may come between the writing of an item's part and its counting.
+    finished = 4 * len(list(Path("out/parts").iterdir()))
+    assert finished - int(said) in (0, 4)
+    assert not list(Path("out").rglob(".*"))

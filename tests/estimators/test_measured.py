@@ -1,0 +1,180 @@
+"""A window taken apart: own cycles, shadows, what they share, and what was lost on the way."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+from dwell.estimators import Evidence
+from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of
+from dwell.model import Constant, Execution, Flow, Link, Node, Problem, Task
+from tests.estimators.windows import Row, window
+from tests.generate import make_problem
+
+ONE = Execution(Constant(1.0))
+CHAIN = ("A", "B", "C", "D")
+CLOSE_MS = 1000.0
+
+# Under LOC everything runs on R, under OFF B on E, under FAR B and C.
+MOVES: dict[str, dict[str, str]] = {"LOC": {}, "OFF": {"B": "E"}, "FAR": {"B": "E", "C": "E"}}
+UP, DOWN, ON = Message("A", "B", "R->E"), Message("B", "C", "E->R"), Message("C", "D", "E->R")
+
+
+def chain() -> Problem:
+    """A, B, C, D on R; B and C can run on E."""
+    both = {"R": ONE, "E": ONE}
+    return make_problem(
+        [Node("R", "robot"), Node("E", "edge")],
+        [Task(name, both if name in "BC" else {"R": ONE}) for name in CHAIN],
+        [Flow(a, b) for a, b in itertools.pairwise(CHAIN)],
+        links=[Link("R", "E", Constant(1.0)), Link("E", "R", Constant(1.0))],
+        candidates=MOVES,
+        period_ms=100.0,
+        window_cycles=10,
+    )
+
+
+def times(evidence: Evidence) -> dict[Part, list[float]]:
+    found = Meter(chain()).times(evidence)
+    return {part: values.tolist() for part, values in found.items()}
+
+
+def local(begin_ms: float) -> Row:
+    """A cycle under LOC whose jobs take 1, 2, 3 and 4 ms."""
+    ends = np.array([1.0, 3.0, 6.0, 10.0]) + begin_ms
+    return [begin_ms, *ends[:3]], [*ends], [*ends[:3]]
+
+
+def through_off(begin_ms: float) -> Row:
+    """Its shadow through OFF: 5 ms up, 7 ms on E, 6 ms down, 8 ms of C, discarded before D."""
+    sent = begin_ms + 1.0
+    ready, end = [None, sent + 5, sent + 18, None], [None, sent + 12, sent + 26, None]
+    return ready, end, [sent + 5, sent + 18, sent + 26]
+
+
+# ------------------------------------------------------------------------------------ the parts
+
+
+def test_the_parts_of_a_placement() -> None:
+    problem = chain()
+    assert list(parts_of(problem.pipeline, problem.candidates["OFF"])) == [
+        *(Site(name, "E" if name == "B" else "R") for name in CHAIN),
+        UP,
+        DOWN,
+    ]
+
+
+def test_every_part_of_a_cycle() -> None:
+    assert times(window([local(0.0), local(100.0)], close_ms=CLOSE_MS)) == {
+        Site("A", "R"): [1.0, 1.0],
+        Site("B", "R"): [2.0, 2.0],
+        Site("C", "R"): [3.0, 3.0],
+        Site("D", "R"): [4.0, 4.0],
+    }
+
+
+def test_a_shadow_adds_what_it_does_not_share() -> None:
+    found = times(
+        window([local(0.0), local(100.0)], close_ms=CLOSE_MS, shadows=[None, through_off(100.0)])
+    )
+    assert found == {
+        Site("A", "R"): [1.0, 1.0],
+        Site("B", "R"): [2.0, 2.0],
+        # C runs on R either way, but behind B: the shadow has a job of its own there.
+        Site("C", "R"): [3.0, 3.0, 8.0],
+        Site("D", "R"): [4.0, 4.0],
+        Site("B", "E"): [7.0],
+        # Sent when the cycle's own A ended.
+        UP: [5.0],
+        DOWN: [6.0],
+    }
+
+
+def test_shadows_through_several_candidates() -> None:
+    sent = 1.0
+    far: Row = (
+        [None, sent + 5, sent + 12, None],
+        [None, sent + 12, sent + 21, None],
+        [sent + 5, sent + 12, sent + 30],
+    )
+    found = times(
+        window(
+            [local(0.0), local(100.0), local(200.0)],
+            close_ms=CLOSE_MS,
+            shadows=[far, through_off(100.0), None],
+            through=[2, 1, 0],
+        )
+    )
+    assert found[Site("C", "E")] == [9.0]
+    assert found[Site("B", "E")] == [7.0, 7.0]
+    assert found[UP] == [5.0, 5.0]
+    assert (found[DOWN], found[ON]) == ([6.0], [9.0])
+
+
+def test_a_window_of_two_placements() -> None:
+    off: Row = ([0.0, 6.0, 15.0, 18.0], [1.0, 10.0, 18.0, 22.0], [6.0, 15.0, 18.0])
+    found = times(window([local(0.0), off], close_ms=CLOSE_MS, placement=[0, 1]))
+    assert found[Site("A", "R")] == [1.0, 1.0]
+    assert (found[Site("B", "R")], found[Site("B", "E")]) == ([2.0], [4.0])
+    assert (found[UP], found[DOWN]) == ([5.0], [5.0])
+
+
+# -------------------------------------------------------------------------- lost and in flight
+
+
+def test_what_is_unknown_is_left_out_and_what_is_lost_is_infinite() -> None:
+    lost: Row = ([0.0, 1.0, None, None], [1.0, None, None, None], [1.0, None, None])
+    young: Row = ([900.0, 901.0, None, None], [901.0, None, None, None], [901.0, None, None])
+    found = times(window([lost, young], close_ms=CLOSE_MS))
+    assert found == {Site("A", "R"): [1.0, 1.0], Site("B", "R"): [math.inf]}
+
+
+def test_nothing_is_known_of_a_window_that_has_just_begun() -> None:
+    nothing: Row = ([None] * 4, [None] * 4, [None] * 3)
+    assert times(window([nothing], close_ms=CLOSE_MS)) == {}
+
+
+def test_what_a_lost_shadow_never_came_to_was_not_lost_there() -> None:
+    # Lost on the way up: B and C of the shadow never were, nor did they send anything.
+    gone: Row = ([None] * 4, [None] * 4, [None] * 3)
+    found = times(window([local(0.0)], close_ms=CLOSE_MS, shadows=[gone]))
+    assert found[UP] == [math.inf]
+    assert DOWN not in found
+    assert Site("B", "E") not in found
+    assert found[Site("C", "R")] == [3.0]
+
+
+def test_a_shadow_of_a_cycle_that_was_lost_before_it_says_nothing() -> None:
+    lost: Row = ([0.0, None, None, None], [None] * 4, [None] * 3)
+    gone: Row = ([None] * 4, [None] * 4, [None] * 3)
+    assert times(window([lost], close_ms=CLOSE_MS, shadows=[gone])) == {Site("A", "R"): [math.inf]}
+
+
+def test_a_shadow_in_flight_adds_what_it_has_done() -> None:
+    sent = 900.0 + 1.0
+    half: Row = (
+        [None, sent + 5, None, None],
+        [None, sent + 12, None, None],
+        [sent + 5, None, None],
+    )
+    found = times(window([local(900.0)], close_ms=CLOSE_MS, shadows=[half]))
+    assert (found[UP], found[Site("B", "E")]) == ([5.0], [7.0])
+    assert DOWN not in found
+
+
+# ----------------------------------------------------------------------------------- any window
+
+
+@pytest.mark.parametrize("codes", [[3], [3, 3, 3], [1, 0, 1], [-1, 2, -1, 0], [0, 1, 2]])
+def test_groups_are_every_code_with_its_rows(codes: Sequence[int]) -> None:
+    numbers = np.arange(len(codes))
+    found: Mapping[int, list[int]] = {
+        code: numbers[rows].tolist() for code, rows in groups(np.array(codes, np.int16))
+    }
+    assert found == {
+        code: [i for i, other in enumerate(codes) if other == code] for code in sorted(set(codes))
+    }

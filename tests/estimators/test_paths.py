@@ -1,0 +1,149 @@
+"""The longest path against all paths, and the order statistics of windows."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from random import Random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.estimators.paths import (
+    l95_rank,
+    longest_path,
+    order_statistic,
+    seen_windows,
+    steps_of,
+)
+from dwell.model import Constant, Execution, Flow, Pipeline, Task
+
+CYCLES = 3
+
+
+def random_pipeline(rng: Random) -> Pipeline:
+    """Any DAG of up to seven tasks, declared in any order; sources have offsets."""
+    names = [f"T{i}" for i in range(rng.randint(1, 7))]
+    order = rng.sample(names, len(names))
+    share = rng.random()
+    flows = [Flow(a, b) for a, b in itertools.combinations(order, 2) if rng.random() < share]
+    rng.shuffle(flows)
+    targets = {flow.target for flow in flows}
+    tasks = {
+        name: Task(
+            name,
+            {"R": Execution(Constant(1.0))},
+            offset_ms=0.0 if name in targets else float(rng.randint(0, 9)),
+        )
+        for name in names
+    }
+    return Pipeline(tasks, tuple(flows), period_ms=100.0, deadline_ms=100.0)
+
+
+def every_path(pipeline: Pipeline) -> Iterator[tuple[str, list[Flow]]]:
+    """Yield every way from a source to a sink: the source, and the flows along it."""
+
+    def onward(task: str, walked: list[Flow]) -> Iterator[list[Flow]]:
+        outputs = [flow for flow in pipeline.flows if flow.source == task]
+        if not outputs:
+            yield walked
+        for flow in outputs:
+            yield from onward(flow.target, [*walked, flow])
+
+    for name in pipeline.tasks:
+        if not any(flow.target == name for flow in pipeline.flows):
+            for walked in onward(name, []):
+                yield name, walked
+
+
+@given(st.integers(0, 10**9))
+def test_the_longest_path_is_the_longest_of_all(seed: int) -> None:
+    rng = Random(seed)
+    pipeline = random_pipeline(rng)
+
+    def drawn() -> list[int]:
+        return [rng.randint(0, 20) for _ in range(CYCLES)]
+
+    jobs = {name: drawn() for name in pipeline.tasks}
+    messages = {flow: rng.choice([drawn(), [0] * CYCLES]) for flow in pipeline.flows}
+    latency = longest_path(
+        steps_of(pipeline),
+        [np.array(jobs[name], float) for name in pipeline.tasks],
+        # On one node a message may also be given as the number 0.
+        [np.array(m, float) if any(m) else 0.0 for m in messages.values()],
+    )
+    for cycle in range(CYCLES):
+        lengths = [
+            pipeline.tasks[source].offset_ms
+            + jobs[source][cycle]
+            + sum(messages[flow][cycle] + jobs[flow.target][cycle] for flow in walked)
+            for source, walked in every_path(pipeline)
+        ]
+        assert latency[cycle] == max(lengths)
+
+
+def test_a_part_that_is_lost_loses_the_cycle() -> None:
+    tasks = {n: Task(n, {"R": Execution(Constant(1.0))}) for n in ("A", "B", "C")}
+    flows = (Flow("A", "C"), Flow("B", "C"))
+    pipeline = Pipeline(tasks, flows, period_ms=100.0, deadline_ms=100.0)
+    ones = np.ones(2)
+    latency = longest_path(steps_of(pipeline), [ones, ones, ones], [np.array([1.0, np.inf]), 0.0])
+    assert latency.tolist() == [3.0, math.inf]
+
+
+def test_nothing_that_is_given_is_changed() -> None:
+    tasks = {n: Task(n, {"R": Execution(Constant(1.0))}) for n in ("A", "B", "C", "D")}
+    flows = (Flow("A", "D"), Flow("B", "D"), Flow("C", "D"))
+    pipeline = Pipeline(tasks, flows, period_ms=100.0, deadline_ms=100.0)
+    jobs = [np.array([float(i)]) for i in range(4)]
+    sent = [np.array([float(10 - i)]) for i in range(3)]
+    longest_path(steps_of(pipeline), jobs, sent)
+    assert [float(x[0]) for x in jobs] == [0.0, 1.0, 2.0, 3.0]
+    assert [float(x[0]) for x in sent] == [10.0, 9.0, 8.0]
+
+
+@pytest.mark.parametrize("n", [1, 2, 19, 20, 21, 40, 100, 101, 10**6])
+def test_the_rank_is_exact(n: int) -> None:
+    assert l95_rank(n) == -(-95 * n // 100)
+
+
+# ------------------------------------------------------------------------------------- windows
+
+
+def literal(latency: Sequence[float], W: int, ages: Sequence[float], censor: float) -> float:
+    shown = [min(age if math.isinf(x) else x, censor) for x, age in zip(latency, ages, strict=True)]
+    rows = [sorted(shown[i : i + W]) for i in range(0, len(shown), W)]
+    return sum(row[math.ceil(W * 95 / 100) - 1] for row in rows) / len(rows)
+
+
+@given(
+    st.integers(1, 30).flatmap(
+        lambda W: st.tuples(
+            st.just(W),
+            st.lists(
+                st.tuples(st.integers(0, 99) | st.just(math.inf), st.integers(1, 50)),
+                min_size=3 * W,
+                max_size=3 * W,
+            ),
+        )
+    )
+)
+def test_windows_as_a_controller_sees_them(case: tuple[int, list[tuple[float, int]]]) -> None:
+    W, cycles = case
+    latency, ages = (np.array(x, float) for x in zip(*cycles, strict=True))
+    before: Mapping[str, list[float]] = {"latency": latency.tolist(), "ages": ages.tolist()}
+    shown = seen_windows(latency, W, ages, 60.0)
+    assert shown == pytest.approx(literal(before["latency"], W, before["ages"], 60.0))
+    assert {"latency": latency.tolist(), "ages": ages.tolist()} == before
+
+
+def test_a_mean_of_percentiles_is_no_percentile() -> None:
+    # One window of ten has six losses: no 5 % of all cycles, but the 95th of that window.
+    latency = np.full(1000, 10.0)
+    latency[:6] = np.inf
+    ages = np.full(1000, 110.0)
+    assert order_statistic(np.minimum(latency, ages)) == 10.0
+    assert seen_windows(latency, 100, ages, 1000.0) == 20.0

@@ -1,0 +1,234 @@
+"""What a study finds: the runs of its contenders, by the point's own measure, in one order."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+import dwell.sim
+from dwell import draw, simulate, simulate_realisation
+from dwell.errors import SimulationError
+from dwell.io.study_paths import with_settings
+from dwell.model import FrozenDict, Problem
+from dwell.study import Contender, Point, Study, StudyResult, compare, run_study
+from dwell.study.judging import judged_cost, judged_costs
+from dwell.study.player import Player
+from dwell.study.reference import references
+from dwell.study.summary import summarise
+from tests.study.cell import make_problem
+from tests.study.test_study import grid, make_study
+
+PROBLEM = make_problem()
+CARELESS = {"objective.weights.violations": 0.0, "objective.tiers": {"R2": "robot"}}
+
+
+@pytest.fixture(scope="module")
+def result() -> StudyResult:
+    """Return a study of every kind: points that are drawn alike and not, settings, references."""
+    study = make_study(
+        points=grid(dwells=range(1, 3), delays=range(1, 3)),
+        contenders=(
+            Contender("LOC", "LOC"),
+            Contender("dtp", "dtp"),
+            Contender("careless", "dtp", settings=CARELESS),
+        ),
+        references=True,
+    )
+    return run_study(study, processes=1)
+
+
+def rows(result: StudyResult, **labels: object) -> pl.DataFrame:
+    return result.runs.filter(*(pl.col(name) == value for name, value in labels.items()))
+
+
+def test_runs_are_in_the_order_of_the_study(result: StudyResult) -> None:
+    study = result.study
+    columns = (*result.parameters, "scenario", "policy", "seed")
+    points = [tuple(point.values.values()) for point in study.points]
+    expected = itertools.product(points, study.scenarios, study.policies, study.seeds)
+    assert result.runs.select(columns).rows() == [(*point, *rest) for point, *rest in expected]
+    assert result.runs.columns[: len(columns)] == list(columns)
+    assert result.parameters == ("parameter.controller.min_dwell", "parameter.links[0].delay_ms")
+
+
+def test_a_row_is_the_summary_of_that_run(result: StudyResult) -> None:
+    problem = result.study.points[3].problem
+    run = simulate(problem, scenario="network-impairment", policy="dtp", seed=2, windows=6)
+    labels: Mapping[str, Any] = {"scenario": "network-impairment", "policy": "dtp", "seed": 2}
+    values = dict(zip(result.parameters, (2, 2), strict=True))
+    found = rows(result, **labels, **values).row(0, named=True)
+    expected = summarise(run, problem, labels)
+    assert {name: found[name] for name in expected.row} == expected.row
+    costs = result.costs.filter(
+        *(pl.col(name) == value for name, value in {**labels, **values}.items())
+    )
+    wanted = pl.DataFrame(expected.costs, infer_schema_length=None).fill_nan(None)
+    assert_frame_equal(costs.select(wanted.columns), wanted)
+
+
+def test_distributions_are_those_of_all_seeds(result: StudyResult) -> None:
+    problem = result.study.points[0].problem
+    within, cycles = np.zeros(320, np.int64), 0
+    for seed in (1, 2, 3):
+        run = simulate(problem, scenario="baseline", policy="dtp", seed=seed, windows=6)
+        summary = summarise(run, problem, {})
+        within, cycles = within + summary.within, cycles + int(summary.row["cycles"])
+    first = result.latencies.filter(
+        pl.col(result.parameters[0]) == 1,
+        pl.col(result.parameters[1]) == 1,
+        pl.col("scenario") == "baseline",
+        pl.col("policy") == "dtp",
+    )
+    assert first["share"].to_list() == (within / cycles).tolist()
+    assert result.latencies.height == 4 * 2 * 5 * len(first)
+
+
+def test_a_realisation_is_drawn_once_for_all_that_share_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = []
+
+    def counting(problem: Problem, **request: Any) -> object:
+        drawn.append((request["scenario"], request["seed"], request["windows"]))
+        return draw(problem, **request)
+
+    monkeypatch.setattr(dwell.sim, "draw", counting)
+    study = make_study(points=grid(dwells=range(1, 4), delays=range(1, 2)), seeds=(1, 2))
+    run_study(study, processes=1)
+    whole = [request for request in drawn if request[2] == study.windows]
+    assert sorted(whole) == sorted(
+        (scenario, seed, 6) for scenario in study.scenarios for seed in (1, 2)
+    )
+
+
+def test_a_comparison_is_a_study_of_one_point() -> None:
+    study = make_study()
+    found = run_study(study, processes=1)
+    comparison = compare(
+        PROBLEM,
+        scenarios=study.scenarios,
+        policies=study.policies,
+        seeds=study.seeds,
+        windows=study.windows,
+        processes=1,
+    )
+    for name in ("runs", "costs", "latencies"):
+        assert_frame_equal(getattr(found, name), getattr(comparison, name), check_exact=True)
+    assert_frame_equal(found.table(), comparison.table())
+
+
+def test_progress_counts_runs() -> None:
+    seen: list[tuple[int, int]] = []
+    study = make_study(seeds=(1,))
+    run_study(study, processes=1, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(2, 4), (4, 4)]
+
+
+def test_the_table_has_one_row_a_group(result: StudyResult) -> None:
+    table = result.table(["cost", "regret"])
+    assert table.height == 4 * 2 * 5
+    assert {"cost", "cost_low", "cost_high", "regret", "seeds"} <= set(table.columns)
+    assert table["seeds"].unique().to_list() == [3]
+    assert "best_static" not in result.table().columns
+
+
+# ------------------------------------------------------------------------- contenders, judging
+
+
+def test_settings_change_the_controller_and_not_what_happens(result: StudyResult) -> None:
+    problem = result.study.points[0].problem
+    realisation = draw(problem, scenario="network-impairment", seed=1, windows=6)
+    seen = with_settings(problem, CARELESS)
+    run = simulate_realisation(seen, realisation, policy="dtp")
+    found = rows(result, scenario="network-impairment", policy="careless", seed=1).row(
+        0, named=True
+    )
+    assert found["migrations"] == summarise(run, problem, {}).row["migrations"]
+    assert found["cost"] == judged_cost(run, problem)
+    # By its own measure, misses cost nothing.
+    assert found["cost"] > summarise(run, seen, {}).row["cost"]
+    assert found["u_robot"] == summarise(run, problem, {}).row["u_robot"]
+
+
+@pytest.mark.parametrize("policy", ["dtp", "latency-first", "SO"])
+@pytest.mark.parametrize("scenario", ["baseline", "network-impairment"])
+def test_judging_by_the_own_objective_changes_no_bit(policy: str, scenario: str) -> None:
+    run = simulate(PROBLEM, scenario=scenario, policy=policy, seed=3, windows=40)
+    assert judged_costs(run, PROBLEM).tolist() == run.windows["cost"].to_list()
+
+
+def test_judging_by_another_objective_is_what_its_controller_would_see() -> None:
+    weights = replace(PROBLEM.objective.weights, switching=3.0, edge=0.7)
+    other = replace(PROBLEM, objective=replace(PROBLEM.objective, weights=weights))
+    realisation = draw(PROBLEM, scenario="network-impairment", seed=3, windows=40)
+    # Latency-first looks at no weight: both controllers decide the same.
+    one, two = (
+        simulate_realisation(problem, realisation, policy="latency-first")
+        for problem in (PROBLEM, other)
+    )
+    assert one.decisions["migrated"].any()
+    assert judged_costs(one, other).tolist() == two.windows["cost"].to_list()
+
+
+def test_windows_that_the_controller_did_not_see_are_not_judged() -> None:
+    down = dwell.model.NodeDisturbance("E", at_s=3.0, for_s=2.0, down=True)
+    problem = replace(PROBLEM, scenarios=FrozenDict({**PROBLEM.scenarios, "crash": (down,)}))
+    run = simulate(problem, scenario="crash", policy="dtp", seed=1, windows=40)
+    unseen = run.windows["cost"].is_null()
+    assert unseen.any()
+    assert np.isnan(judged_costs(run, problem)).tolist() == unseen.to_list()
+    assert judged_cost(run, problem) == pytest.approx(summarise(run, problem, {}).row["cost"])
+
+
+# ------------------------------------------------------------------------------- references
+
+
+def test_references_are_rows_and_columns(result: StudyResult) -> None:
+    problem = result.study.points[0].problem
+    realisation = draw(problem, scenario="network-impairment", seed=2, windows=6)
+    known = references(problem, realisation)
+    mine = rows(result, scenario="network-impairment", seed=2).head(5)
+    assert mine["policy"].to_list() == ["LOC", "dtp", "careless", *known.runs]
+    assert mine["reference_cost"].unique().to_list() == [known.cost]
+    assert mine["best_static"].unique().to_list() == [known.best_static]
+    for row in mine.to_dicts():
+        assert row["regret"] == pytest.approx(row["cost"] / known.cost - 1)
+    clairvoyant = mine.filter(pl.col("policy") == "clairvoyant").row(0, named=True)
+    assert clairvoyant["cost"] == known.costs["clairvoyant"]
+
+
+def test_a_candidate_among_the_references_shows_what_it_shows_alone(result: StudyResult) -> None:
+    alone = run_study(replace(result.study, references=False), processes=1)
+    columns = alone.runs.columns
+    for policy in ("LOC", "dtp"):
+        assert_frame_equal(rows(result, policy=policy).select(columns), rows(alone, policy=policy))
+
+
+# --------------------------------------------------------------------------------- failures
+
+
+def test_a_worker_with_other_software_refuses() -> None:
+    study = make_study()
+    player = Player(study, software={**Player(study).software, "numpy": "1.0"})
+    with pytest.raises(SimulationError, match=r"numpy \d.*, not numpy 1\.0"):
+        player(study.items()[0])
+
+
+def test_an_unknown_policy_is_found_before_the_work_begins() -> None:
+    seen: list[int] = []
+    study: Study = make_study(contenders=(Contender("LOC", "LOC"), Contender("dpt", "dpt")))
+    with pytest.raises(dwell.errors.PolicyError, match="did you mean 'dtp'"):
+        run_study(study, processes=1, progress=lambda done, _: seen.append(done))
+    assert seen == []
+
+
+def test_a_point_is_where_its_values_say() -> None:
+    with pytest.raises(TypeError):
+        Point({"a": 1}, PROBLEM).values["a"] = 2  # type: ignore[index]

@@ -1,0 +1,94 @@
+"""The same study on a Dask cluster: a real scheduler, and two workers that are processes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dwell.errors import SimulationError
+from dwell.study import run_study
+from dwell.study.cluster import spread_on_dask
+from tests.study.test_engine_folder import assert_same_files, parts_in
+from tests.study.test_study import make_study
+
+distributed: Any = pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Return a cluster of this machine."""
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=":0",
+        local_directory=str(tmp_path_factory.mktemp("dask")),
+    ) as cluster:
+        yield cluster
+
+
+def test_a_cluster_ends_with_the_same_bytes(cluster: Any, tmp_path: Path) -> None:
+    study = make_study(references=True)
+    run_study(study, folder=tmp_path / "local", processes=1)
+    out = tmp_path / "cluster"
+
+    def stop(done: int, _: int) -> None:
+        if done >= 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_study(study, folder=out, dask=cluster.scheduler_address, progress=stop)
+    known = parts_in(out)
+    assert len(known) == 2
+    run_study(study, folder=out, dask=cluster.scheduler_address)
+    assert parts_in(out).items() >= known.items(), "a finished item was repeated"
+    assert_same_files(out, tmp_path / "local")
+
+
+def test_work_is_spread_over_the_workers(cluster: Any) -> None:
+    address = cluster.scheduler_address
+    found: dict[int, str] = {}
+    spread_on_dask(worker_of, list(range(8)), address=address, take=found.__setitem__)
+    assert found.keys() == set(range(8))
+    assert len(set(found.values())) == 2
+
+
+def worker_of(_: int) -> str:
+    time.sleep(0.02)  # long enough for the other one to take the next
+    name: str = distributed.get_worker().name
+    return name
+
+
+def test_an_error_on_a_worker_arrives_as_it_is(cluster: Any) -> None:
+    with pytest.raises(ZeroDivisionError):
+        spread_on_dask(
+            (1).__truediv__, [0], address=cluster.scheduler_address, take=lambda *_: None
+        )
+
+
+def test_a_worker_is_no_scheduler(cluster: Any) -> None:
+    address = cluster.workers[0].worker_address
+    with pytest.raises(SimulationError, match="is a Dask Worker; name the scheduler"):
+        run_study(make_study(), dask=address)
+
+
+@pytest.mark.parametrize("address", ["nowhere", "strange://x:1", "127.0.0.1:1"])
+def test_an_address_where_no_scheduler_answers(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dwell.study.cluster.ANSWER_S", 0.2)
+    with pytest.raises(SimulationError, match="no Dask scheduler answers at"):
+        run_study(make_study(), dask=address)
+
+
+def test_a_scheduler_without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dwell.study.cluster.WORKER_S", 0.2)
+    with (
+        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0") as empty,
+        pytest.raises(SimulationError, match="has no workers; start one with"),
+    ):
+        run_study(make_study(), dask=empty.scheduler_address)
