@@ -79,6 +79,12 @@ def test_an_unknown_chapter(examples: Path, tmp_path: Path) -> None:
     assert "there is no chapter 'tables'" in result.stderr
 
 
+def test_the_chapter_of_measurements_needs_them(examples: Path, tmp_path: Path) -> None:
+    result = call("--examples", examples, "--out", tmp_path / "out", "--chapter", "real")
+    assert result.exit_code == 2
+    assert "--real FOLDER" in result.stderr
+
+
 def test_options_of_the_paper_are_refused_elsewhere(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["study", str(tmp_path / "study.yaml"), "--quick"])
     assert result.exit_code == 2

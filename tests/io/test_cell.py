@@ -201,6 +201,14 @@ def test_every_key_reaches_the_model() -> None:
                 "targets": {"cloud": 0.5},
                 "tiers": {"n": "edge"},
             },
+            "controller": {
+                "policy": "cusum",
+                "escape": True,
+                "estimator": "corrected",
+                "shadow_fraction": 0.2,
+                "half_life_windows": 3.5,
+                "migration": "cold",
+            },
         }
     )
     node, task = problem.fabric.nodes["n"], problem.pipeline.tasks["t"]
@@ -219,6 +227,14 @@ def test_every_key_reaches_the_model() -> None:
     assert isinstance(task.state_bytes, int)
     assert problem.objective.weights.cloud == 0.1
     assert problem.objective.tiers == {"n": "edge"}
+    assert problem.controller == ControllerSettings(
+        policy="cusum",
+        escape=True,
+        estimator="corrected",
+        shadow_fraction=0.2,
+        half_life_windows=3.5,
+        migration="cold",
+    )
 
 
 def test_importing_the_readers_imports_nothing_heavy() -> None:

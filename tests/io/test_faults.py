@@ -328,6 +328,11 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("controller", "fallbacks"), ["LOC", "HY"], "controller.fallbacks[1]", ("'HY'", "'HYB'?")),
     (("controller", "fallbacks"), "LOC", "controller.fallbacks", ("'LOC'", "a list")),
     (("controller", "estimator"), "oracle", "controller.estimator", ("'oracle'", "profile")),
+    (("controller", "estimator"), "shadows", "controller.estimator", ("'shadows'", "corrected")),
+    (("controller", "escape"), "no", "controller.escape", ("'no'", "true or false")),
+    (("controller", "shadow_fraction"), -1, "controller.shadow_fraction", ("-1", "from 0 to 1")),
+    (("controller", "half_life_windows"), 0, "controller.half_life_windows", ("0", "above 0")),
+    (("controller", "migration"), "hot", "controller.migration", ("'hot'", "warm, cold")),
     (("controller", "guard_cycles"), 1, "controller.guard_cycles", ("1", "from 2 to 1000000")),
     (("controller", "min_dwell"), -1, "controller.min_dwell", ("-1", "from 0 to 1000000")),
     (("controller", "min_improvement"), -0.1, "controller.min_improvement", ("-0.1", "from 0")),
@@ -413,6 +418,29 @@ def test_a_candidate_needs_its_links() -> None:
     faults = _faults(document)
     assert [fault.path for fault in faults] == ["candidates.SO", "candidates.HYB"]
     assert "E->R2 for planning -> actuation" in faults[0].message
+
+
+def test_shadows_of_all_alternatives_are_at_most_all_cycles() -> None:
+    document = copy.deepcopy(DOCUMENT)
+    document["controller"] |= {"estimator": "shadow", "shadow_fraction": 0.6}
+    (fault,) = _faults(document)
+    assert fault.path == "controller.shadow_fraction"
+    assert "each of 2 alternatives is more than all cycles; at most 0.5" in fault.message
+    document["controller"] |= {"shadow_fraction": 0.5}
+    assert from_document(document)
+
+
+def test_state_needs_a_link_to_be_carried_over() -> None:
+    document = copy.deepcopy(DOCUMENT)
+    document["controller"]["migration"] = "cold"
+    document["tasks"]["planning"]["state_bytes"] = 1000
+    assert from_document(document)
+    document["links"] = [
+        link for link in document["links"] if {link["from"], link["to"]} != {"R2", "E"}
+    ]
+    faults = {fault.path: fault.message for fault in _faults(document)}
+    assert "E->R2" in faults["tasks.planning.state_bytes"]
+    assert "R2->E" in faults["tasks.planning.state_bytes"]
 
 
 FIVE = """\

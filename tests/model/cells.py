@@ -40,7 +40,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.objective import TIERS
-from dwell.model.problem import POLICIES
+from dwell.model.problem import ESTIMATORS, MIGRATIONS, POLICIES
 from dwell.model.servo import PLANTS
 
 # Names that YAML 1.1, numbers or paths might trip over.
@@ -222,12 +222,18 @@ def _objective(draw: st.DrawFn, nodes: dict[str, Node]) -> Objective:
 @st.composite
 def _controller(draw: st.DrawFn, nodes: list[str], candidates: list[str]) -> ControllerSettings:
     some = st.sampled_from(candidates)
+    most = 1 / max(len(candidates) - 1, 1)
     return ControllerSettings(
         on=draw(st.none() | st.sampled_from(nodes)),
         policy=draw(st.sampled_from(POLICIES) | some),
         initial=draw(st.none() | some),
         min_dwell=draw(_whole(0, 1_000_000)),
         min_improvement=draw(_reals(0, 1e9)),
+        escape=draw(st.booleans()),
+        estimator=draw(st.sampled_from(ESTIMATORS)),
+        shadow_fraction=draw(_reals(0, most)),
+        half_life_windows=draw(_reals(0, 1e6, exclude_min=True)),
+        migration=draw(st.sampled_from(MIGRATIONS)),
         guard_cycles=draw(_whole(2, 1_000_000)),
         fallbacks=tuple(draw(st.lists(some, max_size=2))),
         order_delay_ms=draw(times),

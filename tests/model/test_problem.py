@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
@@ -131,7 +132,12 @@ PLACED = {"a": "R", "b": "R"}
         (lambda: Targets(0), "targets.latency_ms", "from 1e-9"),
         (lambda: Objective(Weights(cloud=1), Targets(1)), "targets.cloud", "missing"),
         (lambda: ControllerSettings(guard_cycles=1), "guard_cycles", "from 2"),
-        (lambda: ControllerSettings(estimator="x"), "estimator", "profile"),
+        (lambda: ControllerSettings(estimator="x"), "estimator", "shadow, scaling, corrected"),
+        (lambda: ControllerSettings(migration="hot"), "migration", "warm, cold"),
+        (lambda: ControllerSettings(shadow_fraction=-0.1), "shadow_fraction", "from 0 to 1"),
+        (lambda: ControllerSettings(shadow_fraction=1.1), "shadow_fraction", "from 0 to 1"),
+        (lambda: ControllerSettings(half_life_windows=0), "half_life_windows", "above 0"),
+        (lambda: ControllerSettings(half_life_windows=math.nan), "half_life_windows", "above 0"),
         (lambda: Servo("arm", 1.0, TARGET), "plant", "double-integrator"),  # type: ignore[arg-type]
         (lambda: Servo("integrator", 0.0, TARGET), "gain", "above 0"),
         (lambda: Servo("integrator", 1.0, TARGET, 1.0), "damping", "left out"),
@@ -203,6 +209,46 @@ def test_every_fault_of_meaning_is_reported_at_once() -> None:
         "controller.fallbacks[0]",
         "controller.policy",
     ]
+
+
+@pytest.mark.parametrize("estimator", ["shadow", "corrected"])
+def test_all_alternatives_together_get_at_most_all_cycles(estimator: str) -> None:
+    placed = {name: Placement(PLACED) for name in ("LOC", "A", "B", "C")}
+    for fraction in (0.0, 0.1, 1 / 3):
+        settings = ControllerSettings(estimator=estimator, shadow_fraction=fraction)
+        assert replace(_problem(), candidates=placed, controller=settings)
+    settings = ControllerSettings(estimator=estimator, shadow_fraction=0.34)
+    (fault,) = _faults(lambda: replace(_problem(), candidates=placed, controller=settings))
+    assert fault.path == "controller.shadow_fraction"
+    assert fault.message == (
+        "0.34 of the cycles through each of 3 alternatives is more than all cycles; at most 0.3333"
+    )
+    # One candidate has no alternative, and an estimator without shadows asks for none.
+    one = {"LOC": Placement(PLACED)}
+    whole = ControllerSettings(estimator=estimator, shadow_fraction=1.0)
+    assert replace(_problem(), candidates=one, controller=whole)
+    for other in ("profile", "scaling"):
+        unused = ControllerSettings(estimator=other, shadow_fraction=1.0)
+        assert replace(_problem(), candidates=placed, controller=unused)
+
+
+def test_a_cold_migration_needs_links_for_its_state() -> None:
+    good, cold = _problem(), ControllerSettings(migration="cold")
+    # Without state there is nothing to carry.
+    assert replace(good, controller=cold)
+    heavy = replace(good.pipeline.tasks["b"], state_bytes=1000)
+    tasks = {**good.pipeline.tasks, "b": heavy}
+    stateful = replace(good, pipeline=replace(good.pipeline, tasks=tasks))
+    (fault,) = _faults(lambda: replace(stateful, controller=cold))
+    assert fault.path == "tasks.b.state_bytes"
+    for words in ("there is no link E->R;", "declare it", "migration: warm"):
+        assert words in fault.message
+    links = {**good.fabric.links, "E->R": Link("E", "R", Constant(1.0))}
+    linked = replace(stateful, fabric=replace(good.fabric, links=links))
+    assert replace(linked, controller=cold)
+    # A task that every candidate has on one node never moves.
+    staying = {"LOC": good.candidates["LOC"]}
+    assert replace(stateful, candidates=staying, controller=cold)
 
 
 def test_the_baseline_exists_always_and_first() -> None:

@@ -30,6 +30,7 @@ from dwell.sim import Realisation, draw, simulate_realisation
 from dwell.study.reference import (
     CLAIRVOYANT,
     CLAIRVOYANT_DWELL,
+    kept,
     mean_cost,
     references,
     regret,
@@ -261,3 +262,19 @@ def test_what_cannot_be_compared_is_refused() -> None:
     clash = two_nodes(4.0, candidates={"clairvoyant": "A", "B": "B"})
     with pytest.raises(SimulationError, match="clairvoyant has the name of a reference"):
         references(clash, realise(clash, 5))
+
+
+def test_what_is_kept_is_counted_where_the_reference_keeps_it() -> None:
+    # A job takes 5.5 of 10 ms, and 11 with stress on its node: then it is late.
+    problem = two_nodes(5.5, TURNS)
+    found = references(problem, realise(problem, 20))
+    assert found.name == CLAIRVOYANT
+    assert found.run is found.runs[CLAIRVOYANT]
+    assert kept(found.run, found, problem) == 1.0
+    # The reference is late in no window (but where it moves); A is from 6 to 9 and from 12 to 14.
+    reference = found.run.windows["violation_rate"].to_numpy()[2:] <= 0.05
+    alone = found.statics["A"].windows["violation_rate"].to_numpy()[2:] <= 0.05
+    assert 0 < alone[reference].mean() < 1
+    assert kept(found.statics["A"], found, problem) == pytest.approx(alone[reference].mean())
+    # Nothing is asked where the reference keeps nothing.
+    assert kept(found.statics["A"], found, problem, limit=-1.0) == 1.0

@@ -71,7 +71,7 @@ def run_paper(request: Request, *, as_json: bool) -> bool:
     DwellError
         If the cell is missing or wrong.
     typer.BadParameter
-        If a chapter is named that there is not.
+        If a chapter is named that there is not, or not without its measurements.
     typer.Exit
         If it was interrupted.
     """
@@ -79,6 +79,8 @@ def run_paper(request: Request, *, as_json: bool) -> bool:
     if unknown:
         known = ", ".join((*CHAPTERS, REPLAY))
         raise typer.BadParameter(f"there is no chapter {unknown[0]!r}; the chapters are {known}")
+    if REPLAY in request.chapters and request.real is None:
+        raise typer.BadParameter(f"chapter {REPLAY!r} needs the measurements: give --real FOLDER")
     examples = find_examples(request.examples)
     problem = paper_problem(examples)
     real = _real_problems(examples, request.real)

@@ -23,7 +23,8 @@ What nobody measured
 Age
     A part that was not measured for a windows is less and less known: each of its times is
     multiplied by a lognormal factor whose deviation grows with the square root of a. In the end
-    what was measured of it is forgotten, and the profile's times are what is left, so widened.
+    (after `UNSEEN` half-lives) what was measured of it is forgotten, and the profile's times are
+    what is left, so widened.
 """
 
 from __future__ import annotations
@@ -52,8 +53,10 @@ __all__ = ["Corrected"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
-#: Half-lives after which a measured time is forgotten.
+#: Half-lives after which a measured time gives way to newer ones, and after which a part that was
+#: not measured any more is forgotten altogether: going back to look can cost dearly.
 MEMORY = 6.0
+UNSEEN = 60.0
 #: How many of the profile's times a pool begins with.
 PRIOR = 256
 #: Deviation of the logarithm of a pool's times after one window without a new one.
@@ -119,7 +122,7 @@ class Corrected:
         Share of the cycles sent through each alternative; the cell file's where None. 0 learns
         from the active placement alone.
     half_life_windows : float, optional
-        The cell file's where None; times are forgotten after `MEMORY` of them.
+        The cell file's where None; see `MEMORY` and `UNSEEN`.
     seed : int
         Of the profile's sample cycles and of how draws are paired.
 
@@ -147,6 +150,7 @@ class Corrected:
         half_life = settings.half_life_windows if half_life_windows is None else half_life_windows
         HALF_LIFE_WINDOWS.check("half_life_windows", half_life)
         self.memory = MEMORY * half_life
+        self.unseen = UNSEEN * half_life
         self.seed = seed
         self.start(problem)
 
@@ -234,13 +238,13 @@ class Corrected:
 
     def _widening(self, pool: Pool) -> float:
         """Deviation of the logarithm of a pool's times, from the windows since it was measured."""
-        age = min(self._window - pool.last, self.memory)
+        age = min(self._window - pool.last, self.unseen)
         return WIDENING * math.sqrt(age) if age > 0 else 0.0
 
     def _forget(self) -> Iterator[Part]:
         """Let parts of which nothing was learnt for long be what the profile says."""
         for part, pool in self._pools.items():
-            if pool.touched and self._window - pool.touched >= max(self.memory, 1.0):
+            if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
                 pool.reset()
                 yield part
 

@@ -12,8 +12,9 @@ from dwell.report.latex import tabular
 from dwell.report.look import CONTENDERS, Look, key
 from dwell.report.page import Cell, marked, named, swatch, table
 from dwell.report.palette import contended
-from dwell.report.units import labelled, write, write_over_seeds
-from dwell.report.wording import OURS, SYMBOL, Written
+from dwell.report.panels import floats
+from dwell.report.units import labelled, measure_of, write, write_over_seeds
+from dwell.report.wording import OURS, SYMBOL, Measure, Written
 from dwell.study import Interval
 from dwell.study.paper.chapter import Figure, Table, Unit
 
@@ -38,8 +39,8 @@ WORDS = {
         "open",
     ),
 }
-# A table that is longer is folded away.
-FOLDED = 60
+# A table with more rows is folded away, a chapter's main table later than the others.
+LONG, LONGEST = 24, 60
 # A text that is longer may break into lines.
 SHORT = 22
 # Columns from which on letters are smaller.
@@ -58,12 +59,15 @@ class Column(NamedTuple):
     unit : Unit
     interval : bool
         Whether the frame has an interval for any of its numbers.
+    measure : Measure
+        How its numbers are written.
     """
 
     name: str
     heading: str
     unit: Unit
     interval: bool
+    measure: Measure
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +105,16 @@ class Shown:
             before = mine
 
 
-def html(item: Table, look: Look) -> str:
-    """Return a table of a page: numbers with their intervals, long tables folded away."""
+def html(item: Table, look: Look, *, main: bool = False) -> str:
+    """Return a table of a page: numbers with their intervals, long tables folded away.
+
+    Parameters
+    ----------
+    item : Table
+    look : Look
+    main : bool
+        Whether it is what its chapter is about.
+    """
     shown = Shown.of(item)
     head, width = [], 0
     for i, column in enumerate(shown.columns):
@@ -119,9 +131,9 @@ def html(item: Table, look: Look) -> str:
             cells += _cells(row, column, look)
         rows.append(("", cells))
     note = noted(item, look)
-    size = "wide small" if len(shown.columns) > SMALL else "wide"
+    size = "wide of-chapter small" if len(shown.columns) > SMALL else "wide of-chapter"
     text = table(head, rows, kind=size)
-    if len(shown.rows) > FOLDED:
+    if len(shown.rows) > (LONGEST if main else LONG):
         text = f"<details><summary>{len(shown.rows)} rows</summary>\n{text}\n</details>"
     caption = f'<p class="note">{marked(note)}</p>' if note else ""
     return f"<h3>{marked(look.prose(item.title))}</h3>\n{caption}\n{text}"
@@ -171,7 +183,8 @@ def _column(item: Table, name: str) -> Column:
     heading = item.headings.get(name) or HEADINGS.get(name) or plain
     low = f"{name}_low"
     interval = unit != "text" and low in item.frame.columns and item.frame[low].is_not_null().any()
-    return Column(name, labelled(heading, unit), unit, interval)
+    values = floats(item.frame, name).tolist() if unit != "text" else []
+    return Column(name, labelled(heading, unit), unit, interval, measure_of(unit, values))
 
 
 def _is_grouped(frame: pl.DataFrame, columns: Sequence[Column]) -> bool:
@@ -219,5 +232,6 @@ def _written(row: dict[str, object], column: Column, look: Look, *, ends: bool) 
         return Written(look.prose(look.shown(value)), "")
     low, high = row.get(f"{column.name}_low"), row.get(f"{column.name}_high")
     if isinstance(low, int | float) and isinstance(high, int | float):
-        return write_over_seeds(Interval(value, low, high), column.unit, ends=ends)
-    return Written(write(value, column.unit), "")
+        interval = Interval(value, low, high)
+        return write_over_seeds(interval, column.unit, column.measure, ends=ends)
+    return Written(write(value, column.unit, column.measure), "")

@@ -24,6 +24,8 @@ POLICIES = {
     "moves once that is enough; it has no dwell time.",
     "clairvoyant": "Clairvoyant is no policy but a reference: it knows what every placement, run "
     "alone, costs in every window to come, and plays the cheapest sequence.",
+    "best static": "Best static is no policy either: of the placements that never move, the one "
+    "that turns out to be the cheapest on the same realisation.",
 }
 #: By what stands in brackets behind a policy.
 BELIEFS = {
@@ -38,8 +40,13 @@ BELIEFS = {
     "them with age. It is ours.",
     "hindsight": "is told, one window late, what every placement would have cost: what the rule "
     "does with estimates that are right.",
+}
+#: By what stands with a hyphen behind a policy.
+VARIANTS = {
+    "tuned": "with settings that were chosen on seeds that nothing else is done on.",
+    "escape": "with the escape: it may move before the dwell time is over, where the placement it "
+    "is on is over a cap.",
     "dwell": "under the dwell time of Algorithm 1.",
-    "tuned": "with thresholds that were tuned on seeds that nothing else is done on.",
 }
 
 
@@ -67,8 +74,8 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
     for family, text in POLICIES.items():
         if any(one.family == family for one in known):
             found[shown_contender(family)] = f"{text} {OURS}" if family == "atp" else text
-    rests = {one.rest for one in known}
-    for belief, text in BELIEFS.items():
-        if belief in rests:
-            found[f"… ({belief})"] = text
+    said = {part for one in known for part in (one.variant, one.belief)}
+    for name, text in (*BELIEFS.items(), *VARIANTS.items()):
+        if name in said:
+            found[f"… ({name})" if name in BELIEFS else f"…-{name}"] = text
     return found

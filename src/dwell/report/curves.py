@@ -16,6 +16,7 @@ from dwell.report.panels import (
     Scale,
     entries,
     floats,
+    folded,
     keys,
     label_of,
     legend,
@@ -85,6 +86,8 @@ def draw_lines(figure: Figure, look: Look) -> Canvas:
         )
         if not grid.own:
             label = label_of(grid.places[0].panel, scales[id(grid.places[0])])
+            # One line of a panel's height, or of two where there are more.
+            label = folded(label, 24 if len(grid.rows) == 1 else 48)
             canvas.supylabel(label, size=9, color=MUTED)
         legend(canvas, _handles(styles, marked=marked) if labels else [], labels)
     return canvas

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dwell.model import Problem
-from dwell.report.palette import BELIEFS, FAMILIES, Palette, Style, contended, ramp_styles
+from dwell.report.palette import BELIEFS, FAMILIES, VARIANTS, Palette, Style, contended, ramp_styles
 from dwell.report.wording import shown_contender, shown_in_sentence, shown_scenario
 from dwell.study.paper.chapter import Chapter, Figure
 
@@ -19,7 +19,8 @@ __all__ = ["CONTENDERS", "Look", "key"]
 
 #: A contender's name as studies have it, in a sentence.
 CALLED = re.compile(
-    rf"(?<![\w+-])(?:{'|'.join(FAMILIES)})(?:\+(?:{'|'.join(BELIEFS)})|-hindsight|-dwell)?(?![\w+-])"
+    rf"(?<![\w+-])(?:{'|'.join(FAMILIES)})(?:-(?:{'|'.join(VARIANTS)}))?"
+    rf"(?:\+(?:{'|'.join(BELIEFS)}))?(?![\w+-])"
 )
 #: Columns of tables that hold contenders.
 CONTENDERS = ("policy", "contender")
@@ -51,12 +52,14 @@ class Look:
         A candidate that a chapter adds to those of the cell has the next colour, in every chapter.
         """
         chapters = tuple(chapters)
+        known = frozenset(problem.candidates)
         figures = [figure for chapter in chapters for figure in chapter.figures]
-        added = (name for figure in figures for name in _candidates(figure))
+        added = (name for figure in figures for name in _candidates(figure, known))
         candidates = dict.fromkeys((*problem.candidates, *added))
         shown = dict.fromkeys(name for chapter in chapters for name in _texts(chapter))
         policies = [name for name in shown if name in candidates or contended(name)]
-        return cls(Palette.of(candidates, policies), frozenset(problem.scenarios))
+        scenarios = {*problem.scenarios, *_scenarios(chapters)}
+        return cls(Palette.of(candidates, policies), frozenset(scenarios))
 
     @property
     def placements(self) -> Mapping[str, str]:
@@ -103,12 +106,24 @@ class Look:
         return text
 
 
-def _candidates(figure: Figure) -> Iterator[str]:
+def _candidates(figure: Figure, known: frozenset[str]) -> Iterator[str]:
     """Yield the names in a figure that can only be candidates."""
     if figure.kind == "map":
-        yield from _values(figure.frame, figure.series)
+        winners = tuple(_values(figure.frame, figure.series))
+        # A map may also be of something else than winners.
+        yield from winners if known.intersection(winners) else ()
     if figure.kind == "timeline":
         yield from _values(figure.frame, "placement")
+
+
+def _scenarios(chapters: Iterable[Chapter]) -> Iterator[str]:
+    """Yield the scenarios that chapters add to those of the cell: what is called as these are."""
+    for chapter in chapters:
+        frames = [item.frame for item in chapter.figures] + [item.frame for item in chapter.tables]
+        for frame in frames:
+            for name in _values(frame, "scenario"):
+                if re.fullmatch(r"\w+(-\w+)+", name) and contended(name) is None:
+                    yield name
 
 
 def _texts(chapter: Chapter) -> Iterator[str]:

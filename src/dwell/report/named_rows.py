@@ -43,7 +43,7 @@ LINE_INCHES = 0.235
 PART_INCHES = 0.14
 # Share of a line that its series take.
 TAKEN = 0.74
-LONGEST_NAME = 30
+LONGEST_NAME = 36
 # Column of where a bar begins.
 BEGIN = " begin"
 # Of what is a measure and no placement: whiskers are seen on it, in a light and in a dark page.
@@ -85,7 +85,8 @@ class Rows:
     def inches(self) -> float:
         """Height of a panel."""
         parts = 1 if self.single or self.stacked else len(self.series)
-        line = max(LINE_INCHES, PART_INCHES * parts + 0.07)
+        folds = max((math.ceil(len(name) / LONGEST_NAME) for name in self.names), default=1)
+        line = max(LINE_INCHES, PART_INCHES * parts + 0.07, 0.145 * folds + 0.06)
         return max(len(self.names) * line, 0.5)
 
     def at(self, name: str, series: str) -> float:
@@ -113,7 +114,7 @@ def draw_intervals(figure: Figure, look: Look) -> Canvas:
             _dot(ax, scale, style, at, row[figure.y], ends)
 
     handles = [] if rows.single else [_mark(rows.styles[name]) for name in rows.series]
-    return _draw_rows(figure, look, rows, draw, handles, zero=False)
+    return _draw_rows(figure, look, rows, draw, handles, bars=False)
 
 
 def draw_bars(figure: Figure, look: Look) -> Canvas:
@@ -155,7 +156,7 @@ def draw_bars(figure: Figure, look: Look) -> Canvas:
     handles: list[Artist] = []
     if not rows.single or not any(map(look.is_named, rows.series)):
         handles = [Patch(**looks[name]) for name in rows.series]
-    return _draw_rows(figure, look, rows, draw, handles, zero=True)
+    return _draw_rows(figure, look, rows, draw, handles, bars=True)
 
 
 def _are_parts(figure: Figure, look: Look, rows: Rows) -> bool:
@@ -180,12 +181,12 @@ def _draw_rows(
     draw: Callable[[Axes, Place, Scale], None],
     handles: Sequence[Artist],
     *,
-    zero: bool,
+    bars: bool,
 ) -> Canvas:
     """Draw panels that have the same lines."""
     grid = parted(figure, look, MOST_PANELS)
     columns = (figure.y, f"{figure.y}_low", f"{figure.y}_high")
-    scales = spread(grid, columns, zero=zero)
+    scales = spread(grid, columns, zero=bars, linear=bars)
     labels = entries(figure, look, rows.series) if handles else []
     lines = len(grid.rows)
     titles = 0.34 if any(place.title for place in grid.places) else 0.08

@@ -67,6 +67,7 @@ h1 { font-size: 32px; line-height: 1.2; font-weight: 650; letter-spacing: -0.01e
   margin: 0 0 8px; }
 h1.chapter { margin-top: 120px; } h1 + h1.chapter { margin-top: 40px; font-size: 24px; }
 h2 { font-size: 22px; line-height: 1.3; font-weight: 650; margin: 80px 0 16px; }
+h3 + figure { margin-top: 14px; }
 h3 { font-size: 17px; line-height: 1.4; font-weight: 650; margin: 44px 0 8px; }
 p, ul { margin: 0 0 14px; }
 ul { padding-left: 1.2em; }
@@ -103,8 +104,11 @@ thead .pair { text-align: center; padding-left: 24px; white-space: nowrap; }
 thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .begin { padding-left: 36px; }
 .wide { width: 100%; }
+.of-chapter thead .pair { white-space: normal; } .of-chapter thead th { max-width: 11em; }
 .small { font-size: 13px; } .small th { font-size: 12.5px; } .small .err { font-size: 12px; }
 .small :not(:first-child):is(td, th) { padding-left: 9px; } .small .err.err { padding-left: 4px; }
+.summary { width: 100%; } .summary :is(th, td) { padding-top: 8px; padding-bottom: 8px; }
+.summary tbody th { white-space: normal; width: 30%; padding-right: 8px; }
 .prose { width: 100%; max-width: 52em; }
 .prose :not(:first-child):is(td, th) { padding-left: 20px; }
 .nowrap { white-space: nowrap; }

@@ -22,6 +22,7 @@ __all__ = [
     "PARTS",
     "RAMP",
     "RULE",
+    "VARIANTS",
     "Contended",
     "Palette",
     "Style",
@@ -58,33 +59,49 @@ FAMILIES = {
     "work-function": MUTED,
     "cusum": "#b8a800",
     "clairvoyant": MUTED,
+    "best static": MUTED,
 }
 #: Places of what a policy believes: each has its marker and dashes, whoever else is shown.
-BELIEFS = ("corrected", "profile", "shadow", "scaling")
+BELIEFS = ("corrected", "profile", "shadow", "scaling", "hindsight")
+VARIANTS = ("tuned", "escape", "dwell")
 
 
 class Contended(NamedTuple):
-    """A contender's name, taken apart.
+    """A contender's name, taken apart; what it does not have is empty.
 
     Parameters
     ----------
     family : str
-        The policy, as ``dtp`` of ``dtp (corrected)`` and of ``dtp-hindsight``.
+        The policy: ``dtp`` of ``dtp+corrected``.
+    variant : str
+        Of it: ``tuned`` of ``dtp-tuned+corrected``.
+    belief : str
+        Its estimator: ``corrected`` of ``dtp+corrected``, or of ``dtp (corrected)``.
     rest : str
-        What tells it from the others of its family: ``corrected``, ``hindsight``, or nothing.
+        What else tells it from others: ``LOC or SO`` of ``dtp+corrected LOC or SO``.
     """
 
     family: str
-    rest: str
+    variant: str = ""
+    belief: str = ""
+    rest: str = ""
+
+
+NAME = re.compile(
+    rf"(?P<family>{'|'.join(FAMILIES)})(?:-(?P<variant>\w+))?"
+    r"(?:\+(?P<belief>\w+)| \((?P<bracket>\w+)\))?(?:,? (?P<rest>.{1,24}))?",
+    re.IGNORECASE,
+)
 
 
 def contended(name: str) -> Contended | None:
     """Take a contender's name apart; None where no policy is meant."""
-    for family in FAMILIES:
-        found = re.fullmatch(rf"{family}(?:[^\w]+(.{{1,24}}?)\)?)?", name, re.IGNORECASE)
-        if found:
-            return Contended(family, found.group(1) or "")
-    return None
+    found = NAME.fullmatch(name)
+    if found is None:
+        return None
+    part = {key: value or "" for key, value in found.groupdict().items()}
+    belief = part["belief"] or part["bracket"]
+    return Contended(part["family"].lower(), part["variant"], belief, part["rest"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +153,7 @@ class Palette:
             colour = FAMILIES[known.family]
             if colour in placements.values():
                 colour = MUTED
-            if known.rest in BELIEFS[2:] and colour == INK:
+            if known.belief in BELIEFS[2:] and colour == INK:
                 colour = MUTED
             shift = tuple(FAMILIES).index(known.family)
             styles[name] = _style(colour, place + shift, strong=known.family == "dtp")
@@ -148,8 +165,8 @@ class Palette:
 
 def _place(known: Contended, variants: dict[str, int]) -> int:
     """Return the place of a contender in its family; what it believes has a fixed one."""
-    if not known.rest or known.rest in BELIEFS:
-        return BELIEFS.index(known.rest) if known.rest else 0
+    if not known.variant and not known.rest and known.belief in ("", *BELIEFS):
+        return BELIEFS.index(known.belief) if known.belief else 0
     place = variants.get(known.family, len(BELIEFS))
     variants[known.family] = place + 1
     return place

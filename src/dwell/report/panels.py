@@ -53,6 +53,9 @@ HANDLE = 0.52
 BEYOND = 0.6
 # An axis begins at 0 where the least value is below so much of the largest.
 NEAR_ZERO = 0.25
+# An axis is logarithmic where the largest is so many times the middle one; and it is no deeper.
+SQUEEZED = 8.0
+DEEPEST = 3000.0
 
 
 def keys(frame: pl.DataFrame, column: str) -> list[str]:
@@ -267,12 +270,15 @@ class Scale:
         Where what cannot be shown on a logarithmic axis stands; NaN on a linear one.
     factor : float
         From the column's numbers to those that are shown.
+    open : bool
+        Whether anything is less than a logarithmic axis shows.
     """
 
     low: float
     high: float
     floor: float
     factor: float
+    open: bool = False
 
     @property
     def log(self) -> bool:
@@ -318,7 +324,9 @@ class Scale:
         (ax.set_ylim if upright else ax.set_xlim)(self.low, self.high)
 
 
-def scale_of(places: Iterable[Place], columns: Sequence[str], *, zero: bool = False) -> Scale:
+def scale_of(
+    places: Iterable[Place], columns: Sequence[str], *, zero: bool = False, linear: bool = False
+) -> Scale:
     """Return the axis that holds the values of panels, their intervals and their levels.
 
     Parameters
@@ -329,6 +337,8 @@ def scale_of(places: Iterable[Place], columns: Sequence[str], *, zero: bool = Fa
         Of the values, and of the ends of their intervals.
     zero : bool
         Whether 0 belongs to it.
+    linear : bool
+        Whether it is linear whatever the numbers are, unless the panel asks for something else.
     """
     places = list(places)
     panel = places[0].panel
@@ -338,12 +348,15 @@ def scale_of(places: Iterable[Place], columns: Sequence[str], *, zero: bool = Fa
     levels = [place.panel.line_at for place in places if place.panel.line_at is not None]
     shown = _finite([*numbers, np.array(levels, float)]) * times
     limits = _finite([floats(place.frame, end) for place in places for end in ends]) * times
-    if panel.log_y and (shown > 0).any():
+    positive = bool((shown > 0).any())
+    if (panel.log_y and positive) or (not linear and _is_squeezed(panel, shown)):
         return _log_scale(shown[shown > 0], limits, _finite(numbers) * times, times)
     return _linear_scale(shown, limits, times, zero=zero or panel.y_unit == "percent")
 
 
-def spread(grid: Grid, columns: Sequence[str], *, zero: bool = False) -> dict[int, Scale]:
+def spread(
+    grid: Grid, columns: Sequence[str], *, zero: bool = False, linear: bool = False
+) -> dict[int, Scale]:
     """Return the axis of every panel, by its identity: one for those that show the same.
 
     Panels with a measure of their own share it with those of the same facet.
@@ -352,7 +365,7 @@ def spread(grid: Grid, columns: Sequence[str], *, zero: bool = False) -> dict[in
     found = {}
     for place in places:
         alike = [one for one in places if one.panel is place.panel]
-        found[id(place)] = scale_of(alike, columns, zero=zero)
+        found[id(place)] = scale_of(alike, columns, zero=zero, linear=linear)
     return found
 
 
@@ -362,14 +375,26 @@ def _finite(parts: Sequence[Floats]) -> Floats:
     return found
 
 
+def _is_squeezed(panel: Panel, shown: Floats) -> bool:
+    """Whether a linear axis would hide what matters: amounts that span two powers of ten."""
+    if panel.y_unit not in ("percent", "cost", "ms") or not (shown > 0).any():
+        return False
+    high = float(shown.max())
+    middle = float(np.median(shown[shown > 0]))
+    return high > SQUEEZED * middle and shown.min() > -middle
+
+
 def _log_scale(shown: Floats, limits: Floats, numbers: Floats, times: float) -> Scale:
-    low, high = float(shown.min()), float(shown.max())
+    """Return a logarithmic axis; what is very much smaller than the rest stands at its end."""
+    high = float(shown.max())
+    low = max(float(shown.min()), high / DEEPEST)
     limits = limits[(limits > low / 3) & (limits < high * 2)]
     low, high = min([low, *limits]), max([high, *limits])
-    # Room below the smallest value, where zeros stand as open marks.
-    floor = low / 2.2 if (numbers <= 0).any() else low / 1.15
+    # Room below the smallest value, where what is less stands as an open mark.
+    floor = low / 2.2 if (numbers < low).any() else low / 1.15
     margin = (high / floor) ** 0.04
-    return Scale(floor / margin, high * margin * 1.05, floor, times)
+    less = bool((numbers < floor).any())
+    return Scale(floor / margin, high * margin * 1.05, floor, times, less)
 
 
 def _linear_scale(shown: Floats, limits: Floats, times: float, *, zero: bool) -> Scale:
@@ -411,7 +436,8 @@ def mark_level(ax: Axes, panel: Panel, scale: Scale, *, upright: bool) -> None:
 def label_of(panel: Panel, scale: Scale) -> str:
     """Return what an axis shows, whether it is logarithmic, and what is marked on it."""
     text = labelled(panel.y_label, panel.y_unit)
-    text += ", logarithmic" if scale.log else ""
+    if scale.log:
+        text += f", logarithmic{', open marks: less' if scale.open else ''}"
     if panel.line_at is None or not panel.line_label:
         return text
     return f"{text}; dashed: {panel.line_label}" if text else f"dashed: {panel.line_label}"

@@ -65,6 +65,9 @@ LIMITS = (
 )
 
 
+ADDED = "a placement that is not among the cell's: the chapter that shows it says what it is."
+
+
 class Made(NamedTuple):
     """How a study was made.
 
@@ -119,6 +122,7 @@ def paper_html(
     body += _summary(chapters, look, made)
     names = [*look.placements, *look.palette.policies]
     told = describe_contenders(problem, names)
+    told |= {name: ADDED for name in look.placements if name not in problem.candidates}
     if told:
         body.append(section("Who plays", definitions(told)))
     for chapter in chapters:
@@ -205,7 +209,7 @@ def _chapter(
         )
     for item in chapter.tables:
         name = files[f"{chapter.slug}/{item.slug}"]
-        parts.append(chapter_tables.html(item, look))
+        parts.append(chapter_tables.html(item, look, main=item.slug == chapter.slug))
         parts.append(_files("tables", name, ("csv", "tex")))
     if chapter.findings:
         parts += ["<h3>What else came out</h3>", items(map(look.prose, chapter.findings))]

@@ -14,7 +14,7 @@ from dwell.report import chapter_tables
 from dwell.report.drawing import draw
 from dwell.report.look import Look
 from dwell.report.paper_page import Made, paper_html
-from dwell.report.svg import inline, pdf_file, svg_file
+from dwell.report.svg import drawn, in_page, pdf_file, svg_file
 from dwell.study.paper.chapter import Chapter, Figure
 from dwell.study.paper.running import Scale
 from dwell.study.parts import write_whole
@@ -110,10 +110,11 @@ def _write_figure(figure: Figure, look: Look, folder: Path, name: str) -> str:
     # Places are found once, and not again for every file.
     canvas.draw_without_rendering()
     canvas.set_layout_engine("none")
-    shown = inline(canvas, name, figure.title)
+    svg = drawn(canvas, name)
+    shown = in_page(svg, figure.title)
     if len(shown) > LARGEST:
         shown = _picture(canvas, figure.title)
-    _write(folder / f"{name}.svg", svg_file(canvas, name, figure.title))
+    _write(folder / f"{name}.svg", svg_file(svg, figure.title))
     _write(folder / f"{name}.pdf", pdf_file(canvas, figure.title))
     return shown
 

@@ -18,7 +18,7 @@ from dwell.report.wording import SYMBOL
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["WIDTH", "inline", "new_figure", "pdf_file", "svg_file"]
+__all__ = ["WIDTH", "drawn", "in_page", "inline", "new_figure", "pdf_file", "svg_file"]
 
 #: Inches; the page shows a figure at most at 4/3 pixels a point, 9-point text at 12 pixels.
 WIDTH = 10.0
@@ -80,9 +80,9 @@ CLEANING = tuple(
         (r'<g id="[^"]*"', "<g"),
         (r"xlink:href", "href"),
         (r' transform="rotate\(-?0 [^)]*\)"', ""),
-        (r"(\d\.\d\d)\d+", r"\1"),
     )
 )
+PLACE = re.compile(r"(\d\.\d\d)\d+")
 #: The letters of a figure in a page are the page's.
 LETTERS = (
     (re.compile(r"font: (?:(\d+) )?([\d.]+px) [^;\"]*"), r"font-weight: \1; font-size: \2"),
@@ -103,7 +103,10 @@ def new_figure(height: float) -> Iterator[Figure]:
     from matplotlib.figure import Figure
 
     with mpl.rc_context(STYLE):
-        yield Figure(figsize=(WIDTH, height), layout="constrained")
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        # Numbers at the ends of neighbouring axes stand apart.
+        figure.set_layout_engine("constrained", wspace=0.03, w_pad=0.06)
+        yield figure
 
 
 def inline(figure: Figure, name: str, description: str) -> str:
@@ -117,7 +120,12 @@ def inline(figure: Figure, name: str, description: str) -> str:
     description : str
         For who cannot see it.
     """
-    text = _drawn(figure, name)
+    return in_page(drawn(figure, name), description)
+
+
+def in_page(svg: str, description: str) -> str:
+    """Return what `drawn` gives as an element of a page."""
+    text = svg
     for pattern, replacement in LETTERS:
         text = pattern.sub(replacement, text)
     for placeholder, colour in PAGE_COLOURS.items():
@@ -127,9 +135,9 @@ def inline(figure: Figure, name: str, description: str) -> str:
     return f'<svg {_viewbox(head)} role="img" aria-label="{label}">{body}'.rstrip()
 
 
-def svg_file(figure: Figure, name: str, description: str) -> bytes:
-    """Return a figure as an SVG file, on white."""
-    head, _, body = _drawn(figure, name).partition(">")
+def svg_file(svg: str, description: str) -> bytes:
+    """Return what `drawn` gives as an SVG file, on white."""
+    head, _, body = svg.partition(">")
     # Widths are those of DejaVu Sans, which is wide: what stands in for it fits.
     body = re.sub(r"'?DejaVu Sans'?", "'DejaVu Sans', Verdana, Arial, sans-serif", body)
     size = re.search(r'width="[^"]*" height="[^"]*"', _ordered(head))
@@ -167,8 +175,15 @@ def _as_mathtext(text: str) -> str:
     return SYMBOL.sub(r"\1$_{\\mathregular{\2}}$", text)
 
 
-def _drawn(figure: Figure, name: str) -> str:
-    """Return the SVG of a figure as matplotlib draws it, with little of what nobody needs."""
+def drawn(figure: Figure, name: str) -> str:
+    """Return the SVG of a figure as matplotlib draws it, without what nobody needs.
+
+    Parameters
+    ----------
+    figure : Figure
+    name : str
+        Different for every figure of a page: its inner references are made from it.
+    """
     import matplotlib as mpl
 
     buffer = io.StringIO()
@@ -178,6 +193,8 @@ def _drawn(figure: Figure, name: str) -> str:
     text = text[text.index("<svg") :]
     for pattern, replacement in CLEANING:
         text = pattern.sub(replacement, text)
+    # Of places, and not of the numbers that are shown.
+    text = re.sub(r"<[^>]*>", lambda found: PLACE.sub(r"\1", found.group(0)), text)
     text = re.sub(r"(?<=>)[^<>]+(?=</text>)", lambda found: _indexed(found.group(0)), text)
     return re.sub(r"\n\s*", "\n", text)
 

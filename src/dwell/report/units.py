@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from dwell.report.wording import Measure, Written, write_interval, write_number
 from dwell.study import Interval
@@ -28,49 +29,55 @@ def labelled(name: str, unit: Unit) -> str:
     return f"{name} ({sign})"
 
 
-def measure_of(unit: Unit, *values: float) -> Measure:
+def measure_of(unit: Unit, values: Sequence[float]) -> Measure:
     """Return how numbers of a unit are written.
 
     Parameters
     ----------
     unit : Unit
-    *values : float
-        Numbers that stand together: ``number`` has as many decimals as the largest needs.
+    values : sequence of float
+        All that stand together: bare numbers have the same decimals, as many as leave three digits
+        of the larger ones, and no more than any of them needs.
     """
     decimals = {"percent": 1, "change": 1, "ms": 1, "cost": 2, "count": 1, "p": 3}
     if unit in decimals:
         return Measure("", "", "", factor(unit), decimals[unit], signed=unit == "change")
-    finite = [abs(value) for value in values if math.isfinite(value) and value]
-    places = 2 - math.floor(math.log10(max(finite))) if finite else 0
-    return Measure("", "", "", 1.0, min(max(places, 0), 6))
+    finite = sorted(abs(value) for value in values if math.isfinite(value) and value)
+    if not finite:
+        return Measure("", "", "", 1.0, 0)
+    large = finite[min(len(finite) - 1, math.floor(0.9 * len(finite)))]
+    needed = max(len(f"{value:.6f}".rstrip("0").partition(".")[2]) for value in finite)
+    return Measure("", "", "", 1.0, max(0, min(2 - math.floor(math.log10(large)), needed)))
 
 
-def write(value: float, unit: Unit) -> str:
-    """Write a number without its unit."""
+def write(value: float, unit: Unit, measure: Measure | None = None) -> str:
+    """Write a number without its unit; as `measure` says where it stands among others."""
     if unit == "p":
         small = 0 <= value < LEAST_P
         return f"<{LEAST_P:g}" if small else write_number(value, 3)
     if unit == "count" and value == round(value, 6) and float(value).is_integer():
         return write_number(value, 0)
-    measure = measure_of(unit, value)
-    text = write_number(value * measure.factor, measure.decimals, signed=measure.signed)
-    # What was set to 0.05 is not measured to be 0.050.
-    return text.rstrip("0").rstrip(".") if unit == "number" and "." in text else text
+    measure = measure or measure_of(unit, [value])
+    return write_number(value * measure.factor, measure.decimals, signed=measure.signed)
 
 
-def write_over_seeds(interval: Interval, unit: Unit, *, ends: bool = False) -> Written:
+def write_over_seeds(
+    interval: Interval, unit: Unit, measure: Measure | None = None, *, ends: bool = False
+) -> Written:
     """Write a number over seeds with its interval, without the unit.
 
     Parameters
     ----------
     interval : Interval
     unit : Unit
+    measure : Measure, optional
+        How the numbers that it stands among are written.
     ends : bool
         Whether the interval is always written by its ends.
     """
     if not interval.known:
-        return Written(write(interval.value, unit), "")
-    measure = measure_of(unit, *interval)
+        return Written(write(interval.value, unit, measure), "")
+    measure = measure or measure_of(unit, interval)
     if not ends:
         return write_interval(interval, measure)
     value, *limits = (

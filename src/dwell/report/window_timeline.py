@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,8 +28,8 @@ from dwell.report.panels import (
 )
 from dwell.report.scales import is_wide
 from dwell.report.svg import new_figure
-from dwell.report.units import labelled
-from dwell.study.paper.chapter import Figure
+from dwell.report.units import labelled, write
+from dwell.study.paper.chapter import Figure, Unit
 
 if TYPE_CHECKING:
     import polars as pl
@@ -43,8 +44,9 @@ STRIP_INCHES = 0.2
 SPAN_INCHES = 0.15
 # Series that are what a candidate costs when it runs alone, or are otherwise drawn thin and dashed.
 DASHES = (0, (1.5, 1.5))
-MOST_SPANS = 400
 LONGEST_LABEL = 24
+#: Of panels that say no more than their title.
+UNITS: Mapping[str, Unit] = {"V_D": "percent", "L95": "ms", "L95 (ms)": "ms", "J": "cost"}
 
 
 class Span(NamedTuple):
@@ -57,7 +59,7 @@ class Span(NamedTuple):
 
 def draw_timeline(figure: Figure, look: Look) -> Canvas:
     """Draw panels that share their time, below strips of what happened and of the placement."""
-    places = parted(figure, look, 1).places
+    places = [_known(place) for place in parted(figure, look, 1).places]
     x = floats(figure.frame, figure.x)
     first, last = float(np.nanmin(x)), float(np.nanmax(x))
     step = float(np.min(np.diff(np.unique(x[np.isfinite(x)])), initial=1.0))
@@ -87,6 +89,20 @@ def draw_timeline(figure: Figure, look: Look) -> Canvas:
         canvas.align_ylabels(axes)
         legend(canvas, handles, labels)
     return canvas
+
+
+def _known(place: Place) -> Place:
+    """Give a panel whose title is a well-known measure its unit, and the level of its frame."""
+    panel = place.panel
+    if not place.own and place.title in UNITS:
+        panel = replace(panel, y_unit=UNITS[place.title])
+    levels = floats(place.frame, "level")
+    levels = levels[np.isfinite(levels)]
+    if panel.line_at is None and len(levels):
+        level = labelled(write(float(levels[0]), panel.y_unit), panel.y_unit)
+        level = level.replace("(", "").replace(")", "").replace(".0 ", " ")
+        panel = replace(panel, line_at=float(levels[0]), line_label=level)
+    return place._replace(panel=panel)
 
 
 def _placements(ax: Axes, figure: Figure, look: Look, step: float) -> None:
@@ -175,10 +191,8 @@ def _scale(place: Place, column: str) -> Scale:
     wide = place.panel.y_unit not in ("percent", "change") and is_wide(shown)
     panel = place.panel
     if wide and not panel.log_y:
-        from dataclasses import replace
-
         place = place._replace(panel=replace(panel, log_y=True))
-    return scale_of([place], [column], zero=panel.y_unit == "percent")
+    return scale_of([place], [column], linear=True)
 
 
 def _base(name: str, look: Look) -> str | None:
@@ -194,9 +208,23 @@ def _column(frame: pl.DataFrame, name: str) -> Sequence[object]:
 def _spans(figure: Figure, step: float) -> Iterable[Span]:
     """Yield what happened, in the order in which each began first."""
     if figure.spans is None:
+        yield from _noted(figure, step)
         return
     for row in figure.spans.sort("begin", maintain_order=True).iter_rows(named=True):
         yield Span(float(row["begin"]), float(row["end"]), str(row["label"]))
+
+
+def _noted(figure: Figure, step: float) -> Iterable[Span]:
+    """Yield what a column of the windows says that happened in them."""
+    if "disturbance" not in figure.frame.columns:
+        return
+    shown = figure.frame.select(figure.x, "disturbance").unique(figure.x).sort(figure.x)
+    at = floats(shown, figure.x)
+    texts = [str(text or "").split(", ") for text in shown["disturbance"]]
+    for label in dict.fromkeys(label for text in texts for label in text if label):
+        on = [label if label in text else None for text in texts]
+        for begin, end, _ in _stretches(at, on, step):
+            yield Span(begin, end, label)
 
 
 def _legend(figure: Figure, look: Look, places: Sequence[Place]) -> tuple[list[str], list[Artist]]:

@@ -26,6 +26,10 @@ CELL_INCHES = 0.42
 # Opacity of a cell whose winner wins by nothing, and of one that wins by the most: letters in the
 # colour of the text can be read on both, in a light and in a dark page.
 FAINT, STRONG = 0.14, 0.72
+# Of a cell whose colour is that of a value.
+PLAIN = 0.5
+# Share of the points whose winners are not shown to win by more than others.
+MOST = 0.9
 HATCH = "///"
 LETTER_INCHES = 0.07
 
@@ -39,13 +43,19 @@ def draw_map(figure: Figure, look: Look) -> Canvas:
     columns, rows = keys(figure.frame, figure.x), keys(figure.frame, figure.y)
     seen = keys(figure.frame, figure.series)
     winners = [name for name in look.placements if name in seen]
+    winners += sorted(name for name in seen if name not in look.placements)
+    colours = {name: style.colour for name, style in look.styles(winners).items()}
     margin = floats(figure.frame, "margin")
-    largest = float(np.max(margin[np.isfinite(margin)], initial=0.0))
+    margin = np.sort(margin[np.isfinite(margin)])
+    named = all(name in look.placements for name in seen)
+    # Values have no margins, and one point that is far from all others hides none.
+    largest = float(margin[int(MOST * (len(margin) - 1))]) if named and len(margin) else 0.0
+    strong = STRONG if named else PLAIN
     width = (WIDTH - 0.9) / grid.columns - 0.35
     side = min(width / max(len(columns), 1), CELL_INCHES * 1.6)
     tall = min(side, CELL_INCHES)
     room = int(side * 0.9 / LETTER_INCHES)
-    labels, handles = _legend(figure, look, winners, largest)
+    labels, handles = _legend(figure, look, colours, largest, strong)
     height = len(grid.rows) * (len(rows) * tall + 0.62) + 0.35 + 0.22 * legend_lines(labels)
     names = _fitting(winners, room)
     with new_figure(height) as canvas:
@@ -58,10 +68,9 @@ def draw_map(figure: Figure, look: Look) -> Canvas:
                 _cell(
                     ax,
                     at,
-                    key(row[figure.series]),
-                    look,
-                    names,
-                    share=_share(row.get("margin"), largest),
+                    colours[key(row[figure.series])],
+                    names[key(row[figure.series])],
+                    opacity=FAINT + _share(row.get("margin"), largest) * (strong - FAINT),
                     marked=bool(row.get("marked")),
                 )
             ax.set_xlim(-0.5, len(columns) - 0.5)
@@ -90,24 +99,22 @@ def _share(margin: float | None, largest: float) -> float:
 def _cell(
     ax: Axes,
     at: tuple[int, int],
-    winner: str,
-    look: Look,
-    names: dict[str, str],
+    colour: str,
+    text: str,
     *,
-    share: float,
+    opacity: float,
     marked: bool,
 ) -> None:
     from matplotlib.patches import Rectangle
 
     x, y = at
-    colour = look.placements[winner]
     ax.add_patch(
         Rectangle(
             (x - 0.5, y - 0.5),
             1,
             1,
             facecolor=colour,
-            alpha=FAINT + share * (STRONG - FAINT),
+            alpha=opacity,
             edgecolor="none",
         )
     )
@@ -134,8 +141,8 @@ def _cell(
                 hatch=HATCH,
             )
         )
-    if names[winner]:
-        ax.text(x, y, names[winner], ha="center", va="center", size=8, color=INK)
+    if text:
+        ax.text(x, y, text, ha="center", va="center", size=8, color=INK)
 
 
 def _fitting(names: list[str], room: int) -> dict[str, str]:
@@ -148,19 +155,19 @@ def _fitting(names: list[str], room: int) -> dict[str, str]:
 
 
 def _legend(
-    figure: Figure, look: Look, winners: list[str], largest: float
+    figure: Figure, look: Look, colours: dict[str, str], largest: float, strong: float
 ) -> tuple[list[str], list[Artist]]:
     from matplotlib.patches import Patch
 
-    labels = [look.shown(name) for name in winners]
+    labels = [look.shown(name) for name in colours]
     handles: list[Artist] = [
-        Patch(facecolor=look.placements[name], alpha=STRONG, lw=0) for name in winners
+        Patch(facecolor=colour, alpha=strong, lw=0) for colour in colours.values()
     ]
     if largest:
         most = labelled(write(largest, figure.y_unit), figure.y_unit)
         labels += ["wins by nothing", f"by {most.replace('(', '').replace(')', '')} or more"]
         handles += [Patch(facecolor=MUTED, alpha=alpha, lw=0) for alpha in (FAINT, STRONG)]
     if "marked" in figure.frame.columns and figure.frame["marked"].any():
-        labels.append(figure.line_label or "marked")
+        labels.append(figure.line_label or "see the note")
         handles.append(Patch(facecolor="none", edgecolor=MUTED, lw=0.4, hatch=HATCH))
     return labels, handles

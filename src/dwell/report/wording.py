@@ -32,6 +32,7 @@ POLICY_NAMES = {
     "work-function": "Work-function",
     "cusum": "CUSUM",
     "clairvoyant": "Clairvoyant",
+    "best static": "Best static",
 }
 #: Names where what ATP is stands beside the table or figure.
 SHORT_NAMES = {**POLICY_NAMES, "atp": "ATP"}
@@ -128,7 +129,8 @@ def _places(value: float, decimals: int) -> int:
 
 
 def _fixed(value: float, places: int) -> str:
-    return f"{value:,.{places}f}".replace(",", "\u2009").replace("-", "−")
+    # What rounds to nothing has no sign.
+    return f"{round(value, places) + 0.0:,.{places}f}".replace(",", "\u2009").replace("-", "−")
 
 
 def _between(low: float, high: float, measure: Measure) -> str:
@@ -155,7 +157,9 @@ def shown_contender(name: str) -> str:
     if known is None:
         return name
     shown = SHORT_NAMES[known.family]
-    return f"{shown} ({known.rest})" if known.rest else shown
+    shown += f"-{known.variant}" if known.variant else ""
+    shown += f" ({known.belief})" if known.belief else ""
+    return f"{shown}, {known.rest}" if known.rest else shown
 
 
 def shown_scenario(name: str) -> str:

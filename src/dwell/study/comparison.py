@@ -111,7 +111,7 @@ def compare(
     problem: Problem,
     *,
     scenarios: Sequence[str] | None = None,
-    policies: Sequence[str] | Contenders,
+    policies: Sequence[str | Contender] | Contenders,
     seeds: Sequence[int],
     windows: int,
     processes: int | None = None,
@@ -124,9 +124,10 @@ def compare(
     problem : Problem
     scenarios : sequence of str, optional
         All of the problem's where None.
-    policies : sequence of str, or mapping of str to policy or str
-        Names (`dtp`, a candidate's, ...), or policies of your own by the name they shall have in
-        the tables. A policy that is an object must pickle where there are several processes.
+    policies : sequence of str or Contender, or mapping of str to policy or str
+        Names (`dtp`, a candidate's, ...), policies with an estimator of their own, or policies of
+        your own by the name they shall have in the tables. A policy that is an object must pickle
+        where there are several processes.
     seeds : sequence of int
         All different; the result is the same for the same seeds, whatever `processes` is.
     windows : int
@@ -148,12 +149,17 @@ def compare(
         If a number is out of its range, or a worker process ended early.
     """
     scenarios = tuple(problem.scenarios if scenarios is None else scenarios)
-    contenders = policies if isinstance(policies, Mapping) else {name: name for name in policies}
+    if isinstance(policies, Mapping):
+        contenders = [Contender(name, policy) for name, policy in policies.items()]
+    else:
+        contenders = [
+            one if isinstance(one, Contender) else Contender(one, one) for one in policies
+        ]
     study = Study(
         name=problem.name,
         points=(Point({}, problem),),
         scenarios=scenarios,
-        contenders=tuple(Contender(name, contenders[name]) for name in policies),
+        contenders=tuple(contenders),
         seeds=tuple(seeds),
         windows=windows,
     )

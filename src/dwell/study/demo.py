@@ -14,6 +14,7 @@ from typing import TypeAlias
 from dwell.errors import TraceError
 from dwell.model import Problem
 from dwell.study.comparison import Comparison, compare
+from dwell.study.study import Contender
 
 __all__ = [
     "CANONICAL",
@@ -27,7 +28,13 @@ __all__ = [
 ]
 
 #: Policies beside every candidate as a static placement.
-POLICIES = ("atp", "dtp", "latency-first")
+POLICIES = (
+    "atp",
+    "dtp",
+    "latency-first",
+    Contender("dtp+corrected", "dtp", "corrected"),
+    Contender("cusum+corrected", "cusum", "corrected"),
+)
 SEEDS = 20
 WINDOWS = 150
 

@@ -69,7 +69,7 @@ class StudyResult:
         that begin with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and what
         `dwell.study.summary` makes of the run. ``cost`` is J by the objective of the point,
         whatever the settings of the contender. With references, also ``reference_cost``,
-        ``best_static`` and ``regret``.
+        ``best_static``, ``regret``, and ``share_kept`` (see `dwell.study.reference.kept`).
     costs : DataFrame
         One row a run and candidate: mean J ``estimated`` while it was not active, mean J
         ``measured`` while it was, both by the contender's own objective.

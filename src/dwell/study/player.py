@@ -10,7 +10,7 @@ from dwell.errors import SimulationError
 from dwell.model import Problem
 from dwell.study.hindsight import Hindsight
 from dwell.study.judging import judged_cost
-from dwell.study.reference import References, play_alone, references, regret
+from dwell.study.reference import References, kept, play_alone, references, regret
 from dwell.study.software import software
 from dwell.study.study import Contender, Item, Study
 from dwell.study.summary import Summary, summarise
@@ -131,11 +131,11 @@ class Player:
             summary = summarise(run, problem, _labels(item, contender.name))
             if self._problem(contender, point).objective != problem.objective:
                 summary = replace(summary, row={**summary.row, "cost": judged_cost(run, problem)})
-            yield contender.name, run, _compared(summary, known)
+            yield contender.name, run, _compared(summary, run, problem, known)
         if known is not None:
             for name, run in known.runs.items():
                 summary = summarise(run, problem, _labels(item, name))
-                yield name, run, _compared(summary, known)
+                yield name, run, _compared(summary, run, problem, known)
 
     def _simulate(
         self,
@@ -186,7 +186,7 @@ def _labels(item: Item, policy: str) -> dict[str, str | int]:
     return {"scenario": item.scenario, "policy": policy, "seed": item.seed}
 
 
-def _compared(summary: Summary, known: References | None) -> Summary:
+def _compared(summary: Summary, run: Run, problem: Problem, known: References | None) -> Summary:
     """Add what a run costs beside the references, where there are any."""
     if known is None:
         return summary
@@ -195,5 +195,6 @@ def _compared(summary: Summary, known: References | None) -> Summary:
         "reference_cost": known.cost,
         "best_static": known.best_static,
         "regret": regret(float(summary.row["cost"]), known),
+        "share_kept": kept(run, known, problem),
     }
     return replace(summary, row=row)

@@ -42,6 +42,7 @@ __all__ = [
     "CLAIRVOYANT",
     "CLAIRVOYANT_DWELL",
     "References",
+    "kept",
     "mean_cost",
     "play_alone",
     "references",
@@ -92,6 +93,11 @@ class References:
     def cost(self) -> float:
         """What that costs: the reference for regret."""
         return self.costs[self.name]
+
+    @property
+    def run(self) -> Run:
+        """Its run."""
+        return self.statics.get(self.name) or self.runs[self.name]
 
     @property
     def best_static(self) -> str:
@@ -204,6 +210,32 @@ def regret(run_cost: float, references: References) -> float:
         bound.
     """
     return run_cost / references.cost - 1.0
+
+
+def kept(run: Run, references: References, problem: Problem, limit: float = 0.05) -> float:
+    """Share of the windows in which the reference misses no more than a limit and a run neither.
+
+    Parameters
+    ----------
+    run : Run
+        Of the same realisation.
+    references : References
+    problem : Problem
+    limit : float
+        Share of a window's cycles.
+
+    Returns
+    -------
+    float
+        Of W cycles each after the warm-up, the same for both, wherever their own windows begin;
+        1 where the reference misses more in all of them: nothing was asked.
+    """
+    width, first = problem.window_cycles, problem.warmup_windows * problem.window_cycles
+    missed = [one.cycles["missed"].to_numpy()[first:] for one in (references.run, run)]
+    count = min(map(len, missed)) // width
+    theirs, mine = (one[: count * width].reshape(count, width).mean(axis=1) for one in missed)
+    asked = theirs <= limit
+    return float((mine[asked] <= limit).mean()) if asked.any() else 1.0
 
 
 def mean_cost(run: Run) -> float:

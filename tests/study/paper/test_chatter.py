@@ -147,4 +147,4 @@ def test_every_comparison_has_a_row(written: Chapter) -> None:
     tables = {table.slug: table.frame for table in written.tables}
     places = 2 * len(ESTIMATORS) * len(DWELLS)
     assert tables["chatter"].height == places * (1 + 2 * len(FEW_STRENGTHS))
-    assert tables["chatter-differences-returns"].height == places * len(FEW_STRENGTHS)
+    assert tables["chatter-calm"].height == places * len(FEW_STRENGTHS)

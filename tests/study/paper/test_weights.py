@@ -102,7 +102,7 @@ def test_every_scenario_output_and_weight_has_its_indices(written: Chapter) -> N
     tables = {table.slug: table.frame for table in written.tables}
     assert tables["weights-sobol"].height == 2 * 5 * 5
     assert tables["weights-ranges"].height == 2 * 5
-    assert tables["weights-one-violation-rate"].height == 2 * 15
+    assert tables["weights-one"].height == 2 * 15
     ranges = tables["weights-ranges"]
     assert (ranges["low"] <= ranges["high"]).all()
 

@@ -34,11 +34,11 @@ from dwell.model import FrozenDict, Placement, Problem
 from dwell.study.engine import StudyResult
 from dwell.study.family import Comparative, Family
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paired import PairedDifference
 from dwell.study.paper.cell import RANDOM, present
 from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
 from dwell.study.paper.contenders import believing
-from dwell.study.paper.contrasts import Contrast, family_of, values
+from dwell.study.paper.contrasts import Contrast, values
+from dwell.study.paper.differences import centre, difference_table, families
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, number
 from dwell.study.study import Contender, Point, Study
@@ -218,8 +218,8 @@ def label(place: tuple[str, str, int, float]) -> str:
     return f"{scenario}: {estimator}, N_min = {dwell}, α_S = {strength:g}"
 
 
-def family(runs: pl.DataFrame, study: Study, metric: str) -> Family:
-    """Compare the penalty to the threshold in every place."""
+def compared(runs: pl.DataFrame, study: Study) -> dict[str, Family]:
+    """Compare the penalty to the threshold in every place, by every metric."""
     pairs: dict[str, Contrast] = {}
     for place in places(study):
         scenario, estimator, dwell, strength = place
@@ -228,7 +228,8 @@ def family(runs: pl.DataFrame, study: Study, metric: str) -> Family:
             for rule in (PENALTY, THRESHOLD)
         )
         pairs[label(place)] = (first, second)
-    return family_of(runs, "the penalty against a threshold of the same mean", metric, pairs)
+    question = "the penalty against a threshold of the same mean"
+    return families(runs, question, tuple(METRICS), pairs)
 
 
 def identical(check: StudyResult, dwell: int) -> tuple[int, int]:
@@ -344,8 +345,8 @@ def written(result: StudyResult, check: StudyResult) -> Chapter:
     """Write the chapter of finished runs."""
     study = result.study
     runs = with_moves(result)
-    families = {metric: family(runs, study, metric) for metric in METRICS}
-    verdicts = {metric: one.verdicts for metric, one in families.items()}
+    differences = compared(runs, study)
+    verdicts = {metric: one.verdicts for metric, one in differences.items()}
     seen = [
         Seen(
             calm=tuple(verdicts[metric][label(place)] for metric in CALM),
@@ -353,7 +354,7 @@ def written(result: StudyResult, check: StudyResult) -> Chapter:
         )
         for place in places(study)
     ]
-    equivalent = same_migrations(families["migrations"], runs, study)
+    equivalent = same_migrations(differences["migrations"], runs, study)
     answer, sentence = verdict(seen, equivalent=equivalent)
     numbers = numbers_table(runs, study)
     return Chapter(
@@ -364,8 +365,18 @@ def written(result: StudyResult, check: StudyResult) -> Chapter:
         design=design(study),
         answer=answer,
         verdict=sentence,
-        findings=(*two_found(check), *shown(families)),
-        tables=(numbers, *(differences_table(one) for one in families.values())),
+        findings=(*two_found(check), *shown(differences)),
+        tables=(
+            numbers,
+            *(
+                difference_table(
+                    {metric: differences[metric] for metric in metrics},
+                    slug=f"chatter-{what}",
+                    title=f"{title}: the penalty, less a threshold of the same mean",
+                )
+                for what, title, metrics in (("calm", "Calm", CALM), ("price", "Its price", PRICE))
+            ),
+        ),
         figures=(
             strengths_figure(numbers, "migrations"),
             strengths_figure(numbers, "moved"),
@@ -413,20 +424,20 @@ def two_found(check: StudyResult) -> tuple[str, ...]:
     return tuple(found)
 
 
-def shown(families: Mapping[str, Family]) -> tuple[str, ...]:
+def shown(differences: Mapping[str, Family]) -> tuple[str, ...]:
     """Say in which direction each metric was shown to differ, and where."""
     found = []
-    for metric, one in families.items():
+    for metric, one in differences.items():
         verdicts = one.verdicts
         parts = []
         for word in ("lower", "higher"):
             named_ = [name for name, said in verdicts.items() if said == word]
-            widest = max(named_, key=lambda name: abs(_mean(one, name)), default=None)
+            widest = max(named_, key=lambda name: abs(centre(one, name)), default=None)
             text = f"{word} in {len(named_)}"
             if widest is not None:
                 factor = 100 if metric == "violation_rate" else 1
                 unit = " points" if metric == "violation_rate" else ""
-                size = number(factor * abs(_mean(one, widest)), 2)
+                size = number(factor * abs(centre(one, widest)), 2)
                 text += f" (most in {widest}: by {size}{unit})"
             parts.append(text)
         found.append(
@@ -434,11 +445,6 @@ def shown(families: Mapping[str, Family]) -> tuple[str, ...]:
             "comparisons."
         )
     return tuple(found)
-
-
-def _mean(one: Family, name: str) -> float:
-    item = one.comparisons[name]
-    return item.mean if isinstance(item, PairedDifference) else item.median
 
 
 def numbers_table(runs: pl.DataFrame, study: Study) -> Table:
@@ -486,29 +492,6 @@ def numbers_table(runs: pl.DataFrame, study: Study) -> Table:
         note=(
             f"Mean over {len(study.seeds)} seeds of {study.windows} windows with its 95 % interval."
         ),
-    )
-
-
-def differences_table(one: Family) -> Table:
-    """One row a comparison."""
-    import polars as pl
-
-    return Table(
-        slug=f"chatter-differences-{one.metric.replace('_', '-')}",
-        title=f"{METRICS[one.metric]}: with the penalty, less that with the threshold",
-        frame=one.table().with_columns(
-            pl.col("low").alias("difference_low"), pl.col("high").alias("difference_high")
-        ),
-        units={
-            "comparison": "text",
-            "difference": UNITS[one.metric],
-            "d_z": "number",
-            "superiority": "percent",
-            "p_holm": "p",
-            "verdict": "text",
-        },
-        headings={"superiority": "penalty is lower in", "p_holm": "p (Holm)"},
-        note=f"Paired by seed; Holm over these {len(one.comparisons)} comparisons.",
     )
 
 

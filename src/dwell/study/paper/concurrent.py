@@ -139,8 +139,13 @@ def single_stages(problem: Problem) -> dict[str, tuple[str, str]]:
     """Return the pairs of candidates between which one stage alone moves, by its name."""
     found: dict[str, tuple[str, str]] = {}
     for pair in find_pairs(problem.candidates, problem.objective.tiers):
-        found.setdefault(pair.task, (pair.local, pair.offload))
+        found.setdefault(stage_of(problem, pair), (pair.local, pair.offload))
     return found
+
+
+def stage_of(problem: Problem, pair: Pair) -> str:
+    """Name of the stage that moves, as the paper counts them: ``T2``."""
+    return f"T{list(problem.pipeline.tasks).index(pair.task) + 1}"
 
 
 def atp(problem: Problem, pair: Pair, thresholds: tuple[float, float, float, int]) -> ATP:
@@ -177,7 +182,7 @@ def tuning_study(problem: Problem, scale: Scale) -> Study:
     size = max(2, scale.grid // 3)
     grid = [
         Contender(
-            f"{pair.task} {latency:g} {robot:g} {edge:g} {dwell}",
+            f"{stage_of(problem, pair)} {latency:g} {robot:g} {edge:g} {dwell}",
             atp(problem, pair, (latency, robot, edge, dwell)),
         )
         for pair in find_pairs(problem.candidates, problem.objective.tiers)

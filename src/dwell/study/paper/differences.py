@@ -17,9 +17,14 @@ __all__ = ["METRICS", "centre", "difference_table", "families", "shown_as"]
 #: Metrics that policies are compared by: their names, and how differences are written.
 METRICS: Mapping[str, tuple[str, Unit]] = {
     "violation_rate": ("V_D", "change"),
+    "l95_ms": ("L95 (ms)", "ms"),
     "u_robot": ("U_r", "change"),
     "cost": ("J", "cost"),
+    "j_still": ("J without switching", "cost"),
     "migrations": ("migrations", "number"),
+    "returns": ("returns", "number"),
+    "moved": ("tasks moved", "number"),
+    "tracking_rms_mm": ("tracking RMS (mm)", "number"),
     "regret": ("regret", "change"),
 }
 

@@ -11,7 +11,7 @@ migrations (a moved task waits for its state and its start), which make every mo
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -22,7 +22,8 @@ from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import by_length
 from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing
-from dwell.study.paper.contrasts import Contrast, family_of, values
+from dwell.study.paper.contrasts import Contrast, values
+from dwell.study.paper.differences import difference_table, families
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, number, percent
 from dwell.study.study import Contender, Point, Study
@@ -73,9 +74,6 @@ HEADINGS = FrozenDict(
         "cost": "J",
         "violation_rate": "V_D",
         "l95_ms": "L95 (ms)",
-        "p_holm": "p (Holm)",
-        "superiority": "first is lower in",
-        "n": "pairs",
     }
 )
 
@@ -280,55 +278,61 @@ def bounds(rows: Sequence[Bounded]) -> Bounds:
     )
 
 
-def against_none(results: Sequence[StudyResult], metric: str) -> Family:
+def _compared(
+    results: Sequence[StudyResult], question: str, pairs: Callable[[str], Mapping[str, Contrast]]
+) -> dict[str, Family]:
+    """Compare pairs in every scenario, by every metric."""
+    import polars as pl
+
+    named = {
+        f"{scenario}: {name}": pair
+        for result in results
+        for scenario in result.study.scenarios
+        for name, pair in pairs(scenario).items()
+    }
+    runs = pl.concat([result.runs for result in results])
+    return families(runs, question, tuple(METRICS), named)
+
+
+def _policies(scenario: str, first: str, second: str) -> Contrast:
+    return ({"scenario": scenario, "policy": first}, {"scenario": scenario, "policy": second})
+
+
+def against_none(results: Sequence[StudyResult]) -> dict[str, Family]:
     """Compare some settings to no hysteresis at all, in every scenario."""
-    import polars as pl
-
-    pairs: dict[str, Contrast] = {
-        f"{scenario}: {words}": (
-            {"scenario": scenario, "policy": grid_name(*setting)},
-            {"scenario": scenario, "policy": grid_name(*NONE)},
-        )
-        for result in results
-        for scenario in result.study.scenarios
-        for setting, words in SETTINGS.items()
-    }
-    runs = pl.concat([result.runs for result in results])
-    return family_of(runs, "hysteresis against none (N_min = 0, Δ_min = 0)", metric, pairs)
+    return _compared(
+        results,
+        "hysteresis against none (N_min = 0, Δ_min = 0)",
+        lambda scenario: {
+            words: _policies(scenario, grid_name(*setting), grid_name(*NONE))
+            for setting, words in SETTINGS.items()
+        },
+    )
 
 
-def of_escape(results: Sequence[StudyResult], metric: str) -> Family:
+def of_escape(results: Sequence[StudyResult]) -> dict[str, Family]:
     """Compare DTP with escape to DTP without, in every scenario."""
-    import polars as pl
-
-    pairs: dict[str, Contrast] = {
-        f"{scenario}: dtp+{estimator}": (
-            {"scenario": scenario, "policy": escape_name(estimator, True)},
-            {"scenario": scenario, "policy": escape_name(estimator, False)},
-        )
-        for result in results
-        for scenario in result.study.scenarios
-        for estimator in ("profile", "corrected")
-    }
-    runs = pl.concat([result.runs for result in results])
-    return family_of(runs, "escape on against off", metric, pairs)
+    return _compared(
+        results,
+        "escape on against off",
+        lambda scenario: {
+            f"dtp+{estimator}": _policies(
+                scenario, escape_name(estimator, True), escape_name(estimator, False)
+            )
+            for estimator in ("profile", "corrected")
+        },
+    )
 
 
-def of_cold(results: Sequence[StudyResult], metric: str) -> Family:
+def of_cold(results: Sequence[StudyResult]) -> dict[str, Family]:
     """Compare cold migrations to warm ones, in every scenario."""
-    import polars as pl
-
-    pairs: dict[str, Contrast] = {
-        f"{scenario}: {name}": (
-            {"scenario": scenario, "policy": f"{name}, cold"},
-            {"scenario": scenario, "policy": f"{name}, warm"},
-        )
-        for result in results
-        for scenario in result.study.scenarios
-        for name in MOVERS
-    }
-    runs = pl.concat([result.runs for result in results])
-    return family_of(runs, "cold migrations against warm ones", metric, pairs)
+    return _compared(
+        results,
+        "cold migrations against warm ones",
+        lambda scenario: {
+            name: _policies(scenario, f"{name}, cold", f"{name}, warm") for name in MOVERS
+        },
+    )
 
 
 # ------------------------------------------------------------------------------- verdict
@@ -383,7 +387,7 @@ def written(
 ) -> Chapter:
     """Write the chapter of finished runs."""
     rows = against_bound(grid)
-    calm = {metric: against_none(grid, metric) for metric in METRICS}
+    calm = against_none(grid)
     words = SETTINGS[CELLS]
     of_cells = {
         metric: {
@@ -394,8 +398,7 @@ def written(
         for metric, one in calm.items()
     }
     answer, sentence = verdict(bounds(rows), of_cells["migrations"], of_cells["cost"])
-    early = {metric: of_escape(escape, metric) for metric in METRICS}
-    late = {metric: of_cold(cold, metric) for metric in METRICS}
+    early, late = of_escape(escape), of_cold(cold)
     numbers = grid_table(grid)
     return Chapter(
         slug="hysteresis",
@@ -413,9 +416,9 @@ def written(
         tables=(
             bounds_table(rows),
             numbers,
-            families_table("hysteresis-none", "Hysteresis, less none at all", tuple(calm.values())),
-            families_table("hysteresis-escape", "Escape on, less off", tuple(early.values())),
-            families_table("hysteresis-cold", "Cold migrations, less warm", tuple(late.values())),
+            difference_table(calm, slug="hysteresis-none", title="Hysteresis, less none at all"),
+            difference_table(early, slug="hysteresis-escape", title="Escape on, less off"),
+            difference_table(late, slug="hysteresis-cold", title="Cold migrations, less warm"),
         ),
         figures=(
             grid_figure(numbers, "migrations", rows),
@@ -591,39 +594,6 @@ def grid_table(results: Sequence[StudyResult]) -> Table:
         units={"scenario": "text", "min_dwell": "count", "min_improvement": "number", **UNITS},
         headings=HEADINGS,
         note=f"Mean over {len(study.seeds)} seeds, with its 95 % interval.",
-    )
-
-
-def families_table(slug: str, title: str, families: Sequence[Family]) -> Table:
-    """One row a metric and comparison; the columns of differences have their metric's unit."""
-    import polars as pl
-
-    frames = [
-        one.table().with_columns(
-            pl.lit(METRICS[one.metric]).alias("metric"),
-            pl.col("low").alias("difference_low"),
-            pl.col("high").alias("difference_high"),
-        )
-        for one in families
-    ]
-    return Table(
-        slug=slug,
-        title=title,
-        frame=pl.concat(frames),
-        units={
-            "metric": "text",
-            "comparison": "text",
-            "difference": "number",
-            "superiority": "percent",
-            "n": "count",
-            "p_holm": "p",
-            "verdict": "text",
-        },
-        headings=HEADINGS,
-        note=(
-            "Paired by seed; Holm over the comparisons of a metric. Differences of V_D as shares: "
-            "0.01 is a point."
-        ),
     )
 
 

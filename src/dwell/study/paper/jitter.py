@@ -39,6 +39,7 @@ from dwell.study.paper.cell import present
 from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast, family_of, values
+from dwell.study.paper.differences import centre, difference_table
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import listed, number, percent, with_interval
 from dwell.study.study import Contender, Point, Study
@@ -83,8 +84,6 @@ HEADINGS = FrozenDict(
         WIDTH: "w (ms)",
         SPREAD: "delays",
         PERIOD: "P = D (ms)",
-        "p_holm": "p (Holm)",
-        "superiority": "first is lower in",
     }
 )
 
@@ -418,11 +417,15 @@ def written(
             widths,
             named,
             spans,
-            differences_table(
-                tsn, "jitter-tsn", f"V_D, less that at w = {ENVELOPES_MS[0] * 1000:g} µs"
+            difference_table(
+                {"violation_rate": tsn},
+                slug="jitter-tsn",
+                title=f"An envelope, less one of {1000 * ENVELOPES_MS[0]:g} µs",
             ),
-            differences_table(
-                alone, "jitter-variation", "V_D, less that with all delays at their mean"
+            difference_table(
+                {"violation_rate": alone},
+                slug="jitter-variation",
+                title="Delays as they are, less all of them at their mean",
             ),
         ),
         figures=(
@@ -482,11 +485,7 @@ def variation(alone: Family) -> str:
         f"Against the same mean delay without variation, V_D is shown to be higher in "
         f"{len(higher)} and lower in {len(lower)} of {len(verdicts)} comparisons"
     )
-    sizes = {
-        name: item.mean
-        for name, item in alone.comparisons.items()
-        if name in (*higher, *lower) and hasattr(item, "mean")
-    }
+    sizes = {name: centre(alone, name) for name in (*higher, *lower)}
     if not sizes:
         return f"{text}."
     most = max(sizes, key=lambda name: abs(sizes[name]))
@@ -538,28 +537,6 @@ def numbers_table(
             f"Mean over {len(study.seeds)} seeds of {study.windows} windows with its 95 % interval "
             "(tracking: median)."
         ),
-    )
-
-
-def differences_table(one: Family, slug: str, title: str) -> Table:
-    """One row a comparison."""
-    import polars as pl
-
-    return Table(
-        slug=slug,
-        title=title,
-        frame=one.table().with_columns(
-            pl.col("low").alias("difference_low"), pl.col("high").alias("difference_high")
-        ),
-        units={
-            "comparison": "text",
-            "difference": "percent",
-            "superiority": "percent",
-            "p_holm": "p",
-            "verdict": "text",
-        },
-        headings=HEADINGS,
-        note=f"Paired by seed; Holm over these {len(one.comparisons)} comparisons.",
     )
 
 

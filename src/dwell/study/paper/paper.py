@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, cast
 
@@ -19,7 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = ["CHAPTERS", "Paper", "paper_study"]
 
-Write: TypeAlias = Callable[[Problem, Scale, Runner], Chapter]
+#: Takes the cell, or all cells that replay measurements.
+Write: TypeAlias = "Callable[[Problem | Sequence[Problem], Scale, Runner], Chapter]"
 
 #: Modules with a function `chapter`, in the order of the report.
 CHAPTERS = (
@@ -102,7 +102,7 @@ def paper_study(
     failures: dict[str, DwellError] = {}
     for name in _chosen(only, with_real=bool(real)):
         try:
-            chapter = chapter_of(name)(problem, scale, runner)
+            chapter = chapter_of(name)(real if name == REAL else problem, scale, runner)
         except DwellError as error:
             failures[name] = error
             continue
@@ -119,8 +119,7 @@ def chapter_of(name: str) -> Write:
 
 
 def _chosen(only: Iterable[str] | None, *, with_real: bool) -> tuple[str, ...]:
-    names = (*CHAPTERS, REAL) if with_real else CHAPTERS
-    known = tuple(name for name in names if find_spec(f"dwell.study.paper.{name}") is not None)
+    known: tuple[str, ...] = (*CHAPTERS, REAL) if with_real else CHAPTERS
     if only is None:
         return known
     asked = tuple(only)

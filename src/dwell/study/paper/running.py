@@ -96,8 +96,8 @@ class Scale:
             grid=9,
             grid_seeds=12,
             sobol_n=64,
-            sobol_seeds=4,
-            sobol_windows=100,
+            sobol_seeds=3,
+            sobol_windows=60,
             tuning_seeds=10,
         )
 

@@ -18,7 +18,8 @@ from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import steady_scenarios
 from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
-from dwell.study.paper.contrasts import Contrast, family_of, values
+from dwell.study.paper.contrasts import Contrast, values
+from dwell.study.paper.differences import difference_table, families, shown_as
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, number, percent
 from dwell.study.predictions import PAPER, Prediction, applies, judge_claim, judge_placement
@@ -126,7 +127,7 @@ def written(result: StudyResult) -> Chapter:
         }
         for policy in study.policies
     }
-    families = [family(result, metric) for metric in ("violation_rate", "cost")]
+    differences = compared(result)
     answer, sentence = verdict(judged, aims)
     main = main_table(result, aims)
     return Chapter(
@@ -137,7 +138,7 @@ def written(result: StudyResult) -> Chapter:
         verdict=sentence,
         findings=(
             *static_claims(comparison, predictions),
-            *differing(families),
+            *differing(differences),
             *actuator_findings(result),
         ),
         tables=(
@@ -145,7 +146,9 @@ def written(result: StudyResult) -> Chapter:
             claims_table(comparison, predictions),
             main,
             actuator_table(result),
-            *(difference_table(one) for one in families),
+            difference_table(
+                differences, slug="table-differences", title="DTP against the static placements"
+            ),
         ),
         figures=(violations_figure(main), shares_figure(result), latencies_figure(result)),
     )
@@ -254,13 +257,13 @@ def static_claims(comparison: Comparison, predictions: Sequence[Prediction]) -> 
     }
     held = sum(answer == "agrees" for answer in said.values())
     text = f"Of the paper's {len(said)} statements on static placements {held} hold"
-    for answer, words in (("differs", "do not"), ("open", "are left open by the intervals")):
+    for answer, words in (("differs", "not so"), ("open", "left open by the intervals")):
         named = [claim for claim, found in said.items() if found == answer]
-        text += f"; {len(named)} {words} ({'; '.join(named)})" if named else ""
+        text += f"; {words}: {'; '.join(named)}" if named else ""
     return (f"{text}.",)
 
 
-def family(result: StudyResult, metric: str) -> Family:
+def compared(result: StudyResult) -> dict[str, Family]:
     """Compare both DTPs to every static placement, and to each other, in every scenario."""
     study = result.study
     candidates = tuple(study.points[0].problem.candidates)
@@ -268,22 +271,21 @@ def family(result: StudyResult, metric: str) -> Family:
     for scenario in study.scenarios:
         for first, others in (
             (PAPERS_DTP, candidates),
-            (CORRECTED, candidates),
-            (CORRECTED, (PAPERS_DTP,)),
+            (CORRECTED, (*candidates, PAPERS_DTP)),
         ):
             for other in others:
                 pairs[f"{scenario}: {first}, {other}"] = (
                     {"scenario": scenario, "policy": first},
                     {"scenario": scenario, "policy": other},
                 )
-    return family_of(result.runs, "DTP against the static placements", metric, pairs)
+    question = "DTP against the static placements"
+    return families(result.runs, question, ("violation_rate", "cost"), pairs)
 
 
-def differing(families: Sequence[Family]) -> tuple[str, ...]:
+def differing(differences: Mapping[str, Family]) -> tuple[str, ...]:
     """Say in how many comparisons DTP was shown to be better, and to be worse."""
-    names = {"violation_rate": "V_D", "cost": "J"}
     found = []
-    for one in families:
+    for metric, one in differences.items():
         verdicts = one.verdicts
         for policy in DTP:
             mine = {
@@ -295,7 +297,7 @@ def differing(families: Sequence[Family]) -> tuple[str, ...]:
             higher = [name for name, said in mine.items() if said == "higher"]
             beaten = [name.replace(f": {policy},", " by") for name in higher]
             found.append(
-                f"{names[one.metric]} of {policy} is lower than a static placement's in {lower} of "
+                f"{shown_as(metric)} of {policy} is lower than a static placement's in {lower} of "
                 f"{len(mine)} comparisons and higher in {len(higher)}"
                 + (f" ({'; '.join(beaten)})." if beaten else ".")
             )
@@ -457,33 +459,6 @@ def claims_table(comparison: Comparison, predictions: Sequence[Prediction]) -> T
         units=dict.fromkeys(("scenario", "placement", "claim", "reading", "answer"), "text"),
         headings={"claim": "the paper", "reading": "read as"},
         note=f"Open: the interval over {_seeds(comparison.seeds)} allows for either.",
-    )
-
-
-def difference_table(one: Family) -> Table:
-    """One row a comparison of a family."""
-    import polars as pl
-
-    name = {"violation_rate": "V_D", "cost": "J"}[one.metric]
-    unit: Unit = "percent" if one.metric == "violation_rate" else "cost"
-    frame = one.table().with_columns(
-        pl.col("low").alias("difference_low"), pl.col("high").alias("difference_high")
-    )
-    return Table(
-        slug=f"table-differences-{one.metric.replace('_', '-')}",
-        title=f"Differences in {name}: the first less the second",
-        frame=frame,
-        units={
-            "comparison": "text",
-            "difference": unit,
-            "d_z": "number",
-            "superiority": "percent",
-            "n": "count",
-            "p_holm": "p",
-            "verdict": "text",
-        },
-        headings={"superiority": "first is lower in", "p_holm": "p (Holm)", "n": "pairs"},
-        note=f"Paired by seed; Holm over these {len(one.comparisons)} comparisons.",
     )
 
 

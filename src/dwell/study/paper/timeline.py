@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dwell.cost import hamming, price, tier_nodes
 from dwell.model import Disturbance, NodeDisturbance, Problem, QoS
+from dwell.study.comparison import AIM
 from dwell.study.hindsight import Hindsight
-from dwell.study.paper.chapter import Figure
+from dwell.study.paper.chapter import Figure, Panel
 from dwell.study.reference import play_alone
 from dwell.study.study import Contender
 
 if TYPE_CHECKING:
+    import polars as pl
 
     from dwell.record import Run
 
@@ -39,16 +43,9 @@ def timeline_figure(
     Returns
     -------
     Figure
-        Kind ``timeline``. Its frame has one row a window, panel and series, and beside ``y``
-
-        * ``panel``: ``V_D``, ``L95 (ms)``, ``J estimated`` and ``J alone``;
-        * ``series``: the metric's name, or a candidate (with `ALONE` behind it where it is what it
-          costs alone in the very cycles of the window);
-        * ``dashed``: whether it is the latter;
-        * ``level``: what the panel's values are to stay below, null where there is nothing;
-        * ``placement`` of the window, and the ``disturbance`` that is on in its middle.
-
-        J is without the price of a move.
+        Kind ``timeline``, with panels V_D, L95 and J. Series of J are the candidates, as they were
+        believed to be, and with `ALONE` behind their names what each costs alone in the very
+        cycles of the window. J is without the price of a move.
     """
     import polars as pl
 
@@ -64,24 +61,11 @@ def timeline_figure(
     alone = Hindsight(play_alone(problem, realisation))
     alone.start(problem)
     placements = run.windows["placement"].cast(pl.String)
-    on = [
-        _on(problem, scenario, (first + problem.window_cycles / 2) * problem.pipeline.period_ms)
-        for first in run.windows["first_cycle"]
-    ]
-    lines: list[tuple[str, str, bool, float | None, list[float | None]]] = [
-        ("V_D", "V_D", False, 0.05, run.windows["seen_violation_rate"].to_list()),
-        (
-            "L95 (ms)",
-            "L95",
-            False,
-            problem.pipeline.deadline_ms,
-            run.windows["seen_l95_ms"].to_list(),
-        ),
-        *(("J", name, False, None, values) for name, values in _estimated(run, problem).items()),
-        *(
-            ("J", f"{name}{ALONE}", True, None, values)
-            for name, values in _true(run, problem, alone).items()
-        ),
+    lines: list[tuple[str, str, list[float | None]]] = [
+        ("V_D", "V_D", run.windows["seen_violation_rate"].to_list()),
+        ("L95", "L95", run.windows["seen_l95_ms"].to_list()),
+        *(("J", name, values) for name, values in _estimated(run, problem).items()),
+        *(("J", f"{name}{ALONE}", values) for name, values in _true(run, problem, alone).items()),
     ]
     frames = [
         pl.DataFrame(
@@ -90,13 +74,10 @@ def timeline_figure(
                 "panel": [panel] * len(values),
                 "series": [series] * len(values),
                 "y": pl.Series(values, dtype=pl.Float64),
-                "dashed": [dashed] * len(values),
-                "level": pl.Series([level] * len(values), dtype=pl.Float64),
                 "placement": placements,
-                "disturbance": on,
             }
         )
-        for panel, series, dashed, level, values in lines
+        for panel, series, values in lines
     ]
     return Figure(
         slug=slug,
@@ -110,9 +91,15 @@ def timeline_figure(
         x_label=f"window of {problem.window_cycles} cycles",
         note=(
             f"Seed {seed}. J of the active placement is the measured one; of the others, full: as "
-            "estimated, dashed: as each alone costs in the same cycles. Without the price of "
+            "estimated, dashed: as each costs alone in the same cycles. Without the price of "
             "moves. V_D and L95 as the controller saw them."
         ),
+        panels={
+            "V_D": Panel(y_unit="percent", line_at=AIM, line_label="5 %"),
+            "L95": Panel(y_unit="ms", line_at=problem.pipeline.deadline_ms, line_label="D"),
+            "J": Panel(y_unit="cost"),
+        },
+        spans=_spans(run, problem, scenario),
     )
 
 
@@ -152,18 +139,26 @@ def _priced(metrics: QoS, problem: Problem) -> float:
     return float(price(metrics.l95_ms, rate, robot, edge, cloud, 0.0, problem.objective))
 
 
-def _on(problem: Problem, scenario: str, at_ms: float) -> str:
-    """Say what a scenario has on at an instant; episodes, which are drawn, are left out."""
-    at_s = at_ms / 1e3
-    active = [
-        item
-        for item in problem.scenario(scenario)
-        if item.at_s <= at_s < item.at_s + item.for_s and item.episodes is None
-    ]
-    return ", ".join(dict.fromkeys(_named(item) for item in active))
+def _spans(run: Run, problem: Problem, scenario: str) -> pl.DataFrame:
+    """Return what a scenario has on, and when in windows; episodes are drawn, and left out."""
+    import polars as pl
+
+    period_s = problem.pipeline.period_ms / 1e3
+    first = run.windows["first_cycle"].to_numpy()
+    edges = np.append(first, first[-1] + problem.window_cycles) * period_s
+    windows = np.arange(len(edges)) - 0.5
+    rows: dict[tuple[float, float, str], None] = {}
+    for item in problem.scenario(scenario):
+        if item.episodes is None and item.at_s < edges[-1]:
+            begin, end = np.interp((item.at_s, item.at_s + item.for_s), edges, windows)
+            rows[float(begin), float(end), _named(item)] = None
+    schema = {"begin": pl.Float64, "end": pl.Float64, "label": pl.String}
+    return pl.DataFrame(list(rows), schema=schema, orient="row")
 
 
 def _named(item: Disturbance) -> str:
     if isinstance(item, NodeDisturbance):
         return f"{item.node} down" if item.down else f"{item.node}: {item.stress_threads} threads"
-    return f"{item.link} down" if item.down else item.link
+    # Both ways of a link are one line.
+    ends = "-".join(sorted((item.source, item.target)))
+    return f"{ends} down" if item.down else f"link {ends}"

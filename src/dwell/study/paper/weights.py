@@ -29,9 +29,10 @@ from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import Interval
 from dwell.study.paper.cell import RANDOM, STEADY, TIMETABLE, by_length
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Table
 from dwell.study.paper.contenders import believing
-from dwell.study.paper.contrasts import Contrast, family_of
+from dwell.study.paper.contrasts import Contrast
+from dwell.study.paper.differences import difference_table, families
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import listed, number, percent, with_interval
 from dwell.study.sensitivity import Parameter, sobol_design, sobol_indices
@@ -63,13 +64,6 @@ OUTPUTS: Mapping[str, str] = {
     "migrations": "migrations",
     "tracking_rms_mm": "tracking RMS",
     "cost": "J by the cell's weights",
-}
-UNITS: Mapping[str, Unit] = {
-    "violation_rate": "percent",
-    "l95_ms": "ms",
-    "migrations": "number",
-    "tracking_rms_mm": "number",
-    "cost": "cost",
 }
 #: Change of V_D over the weights that is worth speaking of: a fifth of the aim.
 MATERIAL = 0.01
@@ -321,23 +315,19 @@ def written(
     found, reactions = indices(problem, scale, together)
     answer, sentence = verdict(reactions)
     ranges = spread_table(together)
-    families = [
-        family(alone, column)
-        for column in OUTPUTS
-        if all(column in result.runs.columns for result in alone)
-    ]
+    steps = compared(alone)
     return Chapter(
         slug="weights",
         title="RQ4: Does it matter how the five weights are chosen?",
         design=design(problem, scale, together, alone),
         answer=answer,
         verdict=sentence,
-        findings=(*unchanging(found), *judged(ranges), *steps_found(families)),
-        tables=(indices_table(found), ranges, *(steps_table(one) for one in families)),
+        findings=(*unchanging(found), *judged(ranges), *steps_found(steps)),
+        tables=(indices_table(found), ranges, *steps_tables(steps)),
         figures=(
             indices_figure(found, "violation_rate"),
             indices_figure(found, "migrations"),
-            steps_figure(families[0]),
+            steps_figure(steps["violation_rate"]),
         ),
     )
 
@@ -407,10 +397,10 @@ def judged(ranges: Table) -> tuple[str, ...]:
     )
 
 
-def steps_found(families: Sequence[Family]) -> tuple[str, ...]:
+def steps_found(steps: Mapping[str, Family]) -> tuple[str, ...]:
     """Say which steps of one weight were shown to change a metric."""
     found = []
-    for one in families:
+    for one in steps.values():
         shown = {name: said for name, said in one.verdicts.items() if said != "no difference shown"}
         named = "; ".join(f"{name} ({said})" for name, said in shown.items())
         found.append(
@@ -485,7 +475,7 @@ def spread_table(results: Iterable[StudyResult]) -> Table:
     )
 
 
-def family(results: Sequence[StudyResult], column: str) -> Family:
+def compared(results: Sequence[StudyResult]) -> dict[str, Family]:
     """Compare every step of one weight to the cell's weights."""
     import polars as pl
 
@@ -500,30 +490,25 @@ def family(results: Sequence[StudyResult], column: str) -> Family:
         for one in result.study.contenders
         if one.name != AS_IT_IS
     }
-    return family_of(runs, "one weight changed, against the cell's weights", column, pairs)
+    metrics = [name for name in OUTPUTS if name in runs.columns]
+    return families(runs, "one weight changed, against the cell's weights", metrics, pairs)
 
 
-def steps_table(one: Family) -> Table:
-    """One row a scenario and step: the difference from the cell's weights."""
-    import polars as pl
-
-    name = OUTPUTS[one.metric]
-    return Table(
-        slug=f"weights-one-{one.metric.replace('_', '-')}",
-        title=f"One weight changed: {name}, less that with the cell's weights",
-        frame=one.table().with_columns(
-            pl.col("low").alias("difference_low"), pl.col("high").alias("difference_high")
-        ),
-        units={
-            "comparison": "text",
-            "difference": UNITS[one.metric],
-            "superiority": "percent",
-            "n": "count",
-            "p_holm": "p",
-            "verdict": "text",
-        },
-        headings={"superiority": "lower in", "p_holm": "p (Holm)", "n": "pairs"},
-        note=f"Paired by seed; Holm over these {len(one.comparisons)} comparisons.",
+def steps_tables(steps: Mapping[str, Family]) -> tuple[Table, ...]:
+    """One row a scenario and step: the differences from the cell's weights, in two tables."""
+    names = list(steps)
+    return tuple(
+        difference_table(
+            {name: steps[name] for name in mine},
+            slug=f"weights-one{suffix}",
+            title="One weight changed, less the cell's weights",
+            note=note,
+        )
+        for mine, suffix, note in (
+            (names[:3], "", ""),
+            (names[3:], "-more", "J by the cell's weights; tracking: median and sign test."),
+        )
+        if mine
     )
 
 

@@ -1,0 +1,140 @@
+"""The Controller: what it takes from an estimator, and what it writes down of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.control import ClosedWindow, Controller, Evidence
+from dwell.errors import MetricError, ProblemError
+from dwell.estimators import Corrected, Learner, Scaling, Shadow, Support
+from dwell.model import Problem, QoS
+from tests.estimators.cell import MOVES, cell
+
+SETTINGS = {"profile": 0.0, "shadow": 0.1, "scaling": 0.0, "corrected": 0.1}
+
+
+class Copycat:
+    """A learner that expects of every candidate what it saw, and says what stands behind it."""
+
+    def __init__(self, shadow_fraction: float = 0.0, supported: tuple[str, ...] = tuple(MOVES)):
+        self.shadow_fraction = shadow_fraction
+        self.supported = supported
+
+    def start(self, problem: Problem) -> None:
+        """Begin with nothing seen."""
+        self.windows = 0
+
+    def learn(self, evidence: Evidence) -> None:
+        """Count the windows."""
+        self.windows += 1
+
+    def support(self) -> Mapping[str, Support]:
+        """As many samples as windows."""
+        return {name: Support(self.windows, float(i)) for i, name in enumerate(self.supported)}
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> Mapping[str, QoS]:
+        """Expect the same of all."""
+        return dict.fromkeys(MOVES, observed)
+
+
+@pytest.mark.parametrize(("name", "fraction"), SETTINGS.items())
+def test_who_learns_and_who_wants_shadows(name: str, fraction: float) -> None:
+    controller = Controller(cell(estimator=name))
+    assert controller.learns == (name != "profile")
+    assert controller.supports == (name in ("shadow", "corrected"))
+    assert controller.shadow_fraction == fraction
+
+
+@pytest.mark.parametrize("estimator", [Shadow, Corrected])
+def test_what_an_estimator_was_made_with_goes_before_the_cell_file(
+    estimator: type[Shadow] | type[Corrected],
+) -> None:
+    problem = cell(shadow_fraction=0.1)
+    assert Controller(problem, estimator=estimator(problem, 0.2)).shadow_fraction == 0.2
+    assert Controller(problem, estimator=estimator(problem, 0.0)).shadow_fraction == 0.0
+
+
+@pytest.mark.parametrize(
+    ("fraction", "message"),
+    [
+        (0.3, "shadow_fraction of Copycat: 0.3 of the cycles through each of 4 alternatives is"),
+        (-0.1, "shadow_fraction of Copycat: -0.1 is not allowed; it must be a number from 0 to 1"),
+        (float("nan"), "shadow_fraction of Copycat: nan is not allowed"),
+        ("0.1", "shadow_fraction of Copycat: '0.1' is not allowed"),
+    ],
+)
+def test_more_shadows_than_cycles_are_refused(fraction: float, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        Controller(cell(), estimator=Copycat(fraction))
+
+
+def test_every_alternative_may_have_its_even_share() -> None:
+    assert Controller(cell(), estimator=Copycat(0.25)).shadow_fraction == 0.25
+    problem = cell(candidates=("LOC", "FAR", "OFF", "SINK"))
+    assert Controller(problem, estimator=Copycat(1 / 3)).shadow_fraction == 1 / 3
+    assert Controller(cell(candidates=("LOC",)), estimator=Copycat(1.0)).shadow_fraction == 1.0
+
+
+def test_a_learner_is_started_on_a_copy_and_sees_every_window() -> None:
+    mine = Copycat()
+    assert isinstance(mine, Learner)
+    run = dwell.simulate(cell(), policy="LOC", estimator=mine, seed=1, windows=4)
+    assert not hasattr(mine, "windows")
+    for i, name in enumerate(MOVES):
+        assert run.decisions[f"est_samples_{name}"].to_list() == [1.0, 2.0, 3.0, 4.0]
+        assert run.decisions[f"est_age_windows_{name}"].to_list() == [float(i)] * 4
+
+
+def test_an_estimator_without_support_has_no_columns_of_it() -> None:
+    problem = cell()
+    run = dwell.simulate(problem, policy="LOC", estimator=Scaling(problem), seed=1, windows=2)
+    assert not [name for name in run.decisions.columns if name.startswith("est_samples")]
+    assert [name for name in run.decisions.columns if name.startswith("est_l95_ms")]
+
+
+def test_a_support_that_leaves_a_candidate_out_is_named() -> None:
+    with pytest.raises(MetricError, match=r"Copycat.support says something of LOC, OFF; it must"):
+        dwell.simulate(
+            cell(), policy="LOC", estimator=Copycat(supported=("LOC", "OFF")), seed=1, windows=2
+        )
+
+
+def test_neither_own_jobs_nor_shadow_jobs_are_foreign() -> None:
+    seen: list[Mapping[str, float]] = []
+
+    class Listener(Copycat):
+        def __deepcopy__(self, memo: object) -> Listener:
+            return self
+
+        def estimate(
+            self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+        ) -> Mapping[str, QoS]:
+            seen.append(own)
+            return super().estimate(observed=observed, incumbent=incumbent, own=own)
+
+    controller = Controller(cell(), policy="LOC", estimator=Listener())
+    core_ns = np.array([[8.0, 4.0], [3.0, 0.0], [1.0, 4.0]]) * 1e6
+    controller.close(
+        ClosedWindow(
+            latency_ns=np.array([10_000_000, 20_000_000]),
+            release_ns=np.array([0, 40_000_000]),
+            close_ns=80_000_000,
+            open_ns=0,
+            core_ns=core_ns * 16,
+        )
+    )
+    assert seen == [{"R": 4 / 80, "E": 4 / 80}]
+
+
+def test_the_incumbents_estimate_is_what_was_observed() -> None:
+    problem = replace(cell(estimator="corrected"), window_cycles=20)
+    run = dwell.simulate(problem, scenario="disturbed", policy="OFF", seed=1, windows=3)
+    shown = run.decisions.select("est_l95_ms_OFF", "est_violation_rate_OFF").rows()
+    assert shown == run.windows.select("seen_l95_ms", "seen_violation_rate").rows()

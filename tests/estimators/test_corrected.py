@@ -1,0 +1,626 @@
+"""Corrected against cells in which what disturbs a node or link is known exactly."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from random import Random
+
+import numpy as np
+import polars as pl
+import pytest
+
+import dwell
+from dwell.errors import ProblemError
+from dwell.estimators import Corrected, Learner, Profile
+from dwell.estimators import corrected as module
+from dwell.estimators.measured import Message, Site
+from dwell.estimators.pool import LARGEST
+from dwell.model import (
+    Constant,
+    ControllerSettings,
+    Disturbance,
+    Execution,
+    Flow,
+    Link,
+    LinkDisturbance,
+    LogNormal,
+    Node,
+    NodeDisturbance,
+    Problem,
+    QoS,
+    Task,
+)
+from dwell.model.fabric import Scheduler
+from tests.estimators.cell import MOVES, cell, truth
+from tests.estimators.windows import Row, window
+from tests.generate import make_problem, random_problem, random_stamps
+
+SEEN = QoS(1.0, 0.0, {"R": 0.0, "E": 0.0})
+NO_WORK = {"R": 0.0, "E": 0.0}
+
+
+@pytest.fixture
+def exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nothing widen with age, so that what is not measured can be compared exactly."""
+    monkeypatch.setattr(module, "WIDENING", 0.0)
+
+
+def decide(
+    problem: Problem, policy: str, windows: int, estimator: Learner | None = None
+) -> pl.DataFrame:
+    """Return what was estimated in the windows of a run that never moves."""
+    return dwell.simulate(
+        problem,
+        scenario="disturbed",
+        policy=policy,
+        estimator=estimator,
+        seed=1,
+        windows=windows,
+    ).decisions
+
+
+def mean(values: pl.Series) -> float:
+    return float(values.to_numpy().mean())
+
+
+def alone(problem: Problem) -> Corrected:
+    """An estimator that has to do without shadows."""
+    return Corrected(problem, shadow_fraction=0.0)
+
+
+def estimate(corrected: Corrected, foreign: Mapping[str, float] | None = None) -> dict[str, QoS]:
+    seen = QoS(1.0, 0.0, foreign or NO_WORK)
+    return corrected.estimate(observed=seen, incumbent="LOC", own=NO_WORK)
+
+
+# --------------------------------------------------------------------------- constructed truth
+
+
+@pytest.mark.parametrize("scheduler", ["fair", "fifo"])
+def test_a_slow_node_and_a_slow_link_seen_by_shadows_alone(scheduler: Scheduler) -> None:
+    problem = cell(estimator="corrected", scheduler=scheduler)
+    shown = decide(problem, "LOC", 6)
+    for name in ("OFF", "FAR", "TWIN"):
+        l95_ms, missed = truth(problem, name)
+        assert shown[f"est_l95_ms_{name}"].to_list() == pytest.approx([l95_ms] * 6, abs=1e-6)
+        assert set(shown[f"est_violation_rate_{name}"]) == {missed}
+    assert shown["est_samples_OFF"].to_list() == sorted(shown["est_samples_OFF"])
+    assert set(shown["est_age_windows_OFF"]) == {0.0}
+
+
+@pytest.mark.usefixtures("exact")
+def test_a_sink_that_no_shadow_runs_is_corrected_with_its_node() -> None:
+    problem = cell(estimator="corrected")
+    shown = decide(problem, "LOC", 4)
+    assert truth(problem, "SINK")[0] == 2 + 8 + 6 + 1 + 7 + 0.75
+    assert shown["est_l95_ms_SINK"].to_list() == pytest.approx([24.75] * 4, abs=1e-6)
+    assert shown["est_samples_SINK"].to_list() == [0.0] * 4
+    assert shown["est_age_windows_SINK"].to_list() == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_what_comes_and_goes_is_followed_and_counted() -> None:
+    # Windows last 2 s.
+    scenario: list[Disturbance] = [
+        NodeDisturbance("E", at_s=6.0, for_s=8.0, stress_threads=20),
+        LinkDisturbance("R", "E", at_s=6.0, for_s=8.0, add_delay_ms=Constant(7.0)),
+    ]
+    quiet = truth(cell(scenario=()), "OFF")[0]
+    disturbed = truth(cell(), "OFF")[0]
+    shown = decide(cell(estimator="corrected", scenario=scenario), "LOC", 12)
+    l95_ms = shown["est_l95_ms_OFF"].to_list()
+    assert l95_ms[:3] == pytest.approx([quiet] * 3, abs=1e-6)
+    assert l95_ms[3:7] == pytest.approx([disturbed] * 4, abs=1e-6)
+    assert l95_ms[7:] == pytest.approx([quiet] * 5, abs=1e-6)
+    # Gone is what was measured of `act` on E: about ten of a window, through OFF and through FAR.
+    samples = shown["est_samples_OFF"].to_list()
+    assert samples[2] > 12 > samples[3] > 8
+    assert samples[6] > 24
+    assert 12 > samples[7] > 8
+
+
+def test_losses_are_a_share_and_age() -> None:
+    lossy = cell(
+        estimator="corrected",
+        scenario=[LinkDisturbance("R", "E", loss=0.3)],
+        shadow_fraction=0.2,
+        deadline_ms=25.0,
+    )
+    shown = decide(lossy, "LOC", 60)
+    assert mean(shown["est_violation_rate_OFF"][20:]) == pytest.approx(0.3, abs=0.06)
+    assert mean(shown["est_l95_ms_OFF"][20:]) == pytest.approx(truth_of_losses(), rel=0.05)
+    assert set(shown["est_violation_rate_LOC"]) == {0.0}
+
+
+def truth_of_losses() -> float:
+    """Expected 48th of 50 where each is lost with 0.3 and counts with its age, 1 to 50 periods."""
+    rng = np.random.default_rng(1)
+    lost = rng.random((20_000, 50)) < 0.3
+    seen = np.where(lost, 40.0 * np.arange(50, 0, -1), 13.0)
+    return float(np.sort(seen, axis=1)[:, 47].mean())
+
+
+@pytest.mark.parametrize("down", ["R->E", "E->R"])
+def test_a_link_that_is_down_loses_everything_until_it_is_up(down: str) -> None:
+    source, target = down.split("->")
+    problem = cell(
+        estimator="corrected",
+        scenario=[LinkDisturbance(source, target, at_s=4.0, for_s=8.0, down=True)],
+        deadline_ms=25.0,
+    )
+    shown = decide(problem, "LOC", 10)
+    assert shown["est_violation_rate_OFF"].to_list() == [0.0] * 2 + [1.0] * 4 + [0.0] * 4
+    ages = 40.0 * 48
+    assert shown["est_l95_ms_OFF"][3] == pytest.approx(ages)
+    assert shown["est_l95_ms_OFF"][7:].to_list() == pytest.approx([2 + 3 + 6 + 1 + 2] * 3)
+
+
+def test_random_processes_get_the_profile_when_nothing_is_wrong() -> None:
+    """With variation, the estimate agrees with what the candidate shows within a few percent."""
+    problem = dwell.load("examples/canonical.yaml")
+    shown = dwell.simulate(
+        problem, policy="LOC", estimator="corrected", seed=1, windows=60
+    ).decisions
+    for name in ("SO", "HYB"):
+        real = dwell.simulate(problem, policy=name, seed=1, windows=60).windows
+        assert mean(shown[f"est_l95_ms_{name}"][10:]) == pytest.approx(
+            mean(real["seen_l95_ms"]), rel=0.08
+        )
+
+
+# ------------------------------------------------------------------- what nobody measured
+
+
+@pytest.mark.usefixtures("exact")
+@pytest.mark.parametrize("scheduler", ["fair", "fifo", "priority"])
+@pytest.mark.parametrize("threads", [{}, {"plan": 1, "act": 8}, {"sense": 16, "plan": 2}])
+def test_jobs_of_a_node_are_slowed_by_what_slows_the_one_that_was_measured(
+    scheduler: Scheduler, threads: Mapping[str, int]
+) -> None:
+    problem = cell(
+        estimator="corrected",
+        scenario=[NodeDisturbance("R", at_s=2.0, stress_threads=20)],
+        scheduler=scheduler,
+        threads=threads,
+    )
+    shown = decide(problem, "FAR", 4, alone(problem))
+    slowed = truth(
+        cell(
+            scenario=[NodeDisturbance("R", stress_threads=20)],
+            scheduler=scheduler,
+            threads=threads,
+        ),
+        "LOC",
+    )[0]
+    # FAR has `sense` and `control` on R; LOC `act` and `plan` as well.
+    assert shown["est_l95_ms_LOC"].to_list() == pytest.approx([17.0] + [slowed] * 3, abs=1e-6)
+
+
+@pytest.mark.usefixtures("exact")
+def test_messages_of_a_link_get_the_delay_and_the_losses_of_the_one_that_was_measured() -> None:
+    # FAR sends plan -> control over E -> R, OFF would send act -> plan.
+    scenario = [LinkDisturbance("E", "R", at_s=2.0, add_delay_ms=Constant(5.0), loss=0.4)]
+    problem = cell(estimator="corrected", scenario=scenario, deadline_ms=25.0)
+    shown = decide(problem, "FAR", 3, alone(problem))
+    assert shown["est_violation_rate_OFF"][0] == 0.0
+    assert shown["est_violation_rate_OFF"][2] == pytest.approx(0.4, abs=0.15)
+    finite = decide(
+        cell(
+            estimator="corrected",
+            scenario=[LinkDisturbance("E", "R", at_s=2.0, add_delay_ms=Constant(5.0))],
+        ),
+        "FAR",
+        3,
+        alone(problem),
+    )
+    assert finite["est_l95_ms_OFF"].to_list() == pytest.approx([14.0, 19.0, 19.0], abs=1e-6)
+
+
+@pytest.mark.usefixtures("exact")
+def test_a_node_of_which_nothing_is_measured_is_judged_by_its_load() -> None:
+    stress = [NodeDisturbance("E", at_s=4.0, for_s=4.0, stress_threads=8)]
+    # 12 threads beside 8 on 16 cores: 1.25 times as long.
+    problem = cell(estimator="corrected", scenario=stress, threads={"act": 12})
+    shown = decide(problem, "LOC", 6, alone(problem))
+    quiet = 2 + 3 + 6 + 1 + 2
+    expected = [quiet] * 2 + [quiet + 0.75] * 2 + [quiet] * 2
+    assert shown["est_l95_ms_OFF"].to_list() == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.usefixtures("exact")
+def test_a_saturated_node_hides_how_much_there_is() -> None:
+    problem = cell(
+        estimator="corrected",
+        scenario=[NodeDisturbance("E", stress_threads=40)],
+        threads={"act": 12},
+    )
+    shown = decide(problem, "LOC", 3, alone(problem))
+    # It can only be said that there is a thread for each core.
+    assert shown["est_l95_ms_OFF"][-1] == pytest.approx(2 + 3 * 28 / 16 + 6 + 1 + 2)
+    assert truth(problem, "OFF")[0] == pytest.approx(2 + 3 * 52 / 16 + 6 + 1 + 2)
+
+
+@pytest.mark.usefixtures("exact")
+def test_load_says_nothing_where_jobs_were_measured() -> None:
+    corrected = Corrected(cell(estimator="corrected"))
+    before = estimate(corrected)["OFF"].l95_ms
+    rows, sent = local_rows(), [off_row(40.0 * i, 0.0) for i in range(10)]
+    corrected.learn(window(rows, close_ms=400.0, shadows=sent))
+    # E looks busy, and `act` there took what it always takes.
+    assert estimate(corrected, {"R": 0.0, "E": 0.9})["OFF"].l95_ms == pytest.approx(before)
+    corrected.learn(window(rows, close_ms=400.0))
+    assert estimate(corrected, {"R": 0.0, "E": 0.9})["OFF"].l95_ms == pytest.approx(before)
+    corrected.learn(window(rows, close_ms=400.0))
+    assert estimate(corrected, {"R": 0.0, "E": 0.1})["OFF"].l95_ms == pytest.approx(before)
+
+
+def test_what_waits_is_no_slow_node() -> None:
+    """On one core a short job waits for a long one, and says nothing about the node's speed."""
+    tasks = [
+        Task("long", {"R": Execution(Constant(20.0))}),
+        Task("short", {"R": Execution(Constant(0.1))}),
+        Task("other", {"R": Execution(Constant(5.0)), "E": Execution(Constant(5.0))}),
+        Task("last", {"R": Execution(Constant(0.1))}),
+    ]
+    problem = make_problem(
+        [Node("R", "robot", 1, "fifo"), Node("E", "edge", 1, "fifo")],
+        tasks,
+        [Flow("short", "last"), Flow("long", "last"), Flow("other", "last")],
+        links=[Link("E", "R", Constant(1.0))],
+        candidates={"AWAY": {"other": "E"}, "HERE": {}},
+        window_cycles=20,
+    )
+    shown = decide(problem, "AWAY", 3, alone(problem))
+    # `short` takes 20.1 ms instead of 0.1; were R 200 times slower, `other` would take a second.
+    assert shown["est_l95_ms_HERE"].to_numpy().max() < 100.0
+
+
+# ---------------------------------------------------------------------------------------- age
+
+
+def local_rows(count: int = 10) -> list[Row]:
+    """Cycles under LOC that take what the profile says."""
+    rows: list[Row] = []
+    for i in range(count):
+        ends = 40.0 * i + np.array([2.0, 10.0, 16.0, 17.0])
+        rows.append(([40.0 * i, *ends[:3]], [*ends], [*ends[:3]]))
+    return rows
+
+
+def off_row(begin_ms: float, extra_ms: float) -> Row:
+    """The shadow through OFF of such a cycle, with an extra delay on the way up."""
+    up = begin_ms + 2.0 + 1.0 + extra_ms
+    return (
+        [None, up, up + 4.0, None],
+        [None, up + 3.0, up + 10.0, None],
+        [up, up + 4.0, up + 10.0],
+    )
+
+
+def test_what_is_not_measured_widens_with_age_and_is_forgotten_in_the_end() -> None:
+    corrected = Corrected(cell(estimator="corrected", half_life_windows=0.2))
+    sent = [off_row(40.0 * i, 7.0) for i in range(10)]
+    corrected.learn(window(local_rows(), close_ms=400.0, shadows=sent))
+    assert estimate(corrected)["OFF"].l95_ms == pytest.approx(2 + 8 + 3 + 1 + 6 + 1)
+    assert corrected.deviation()["OFF"] == 0.0
+    widths, latencies = [], []
+    for age in range(1, 20):
+        corrected.learn(window(local_rows(), close_ms=400.0))
+        assert corrected.support()["OFF"].age_windows == age
+        widths.append(corrected.deviation()["OFF"])
+        latencies.append(estimate(corrected)["OFF"].l95_ms)
+    assert widths[:12] == pytest.approx([0.03 * math.sqrt(age) for age in range(1, 13)])
+    assert latencies[:11] == sorted(latencies[:11])
+    assert latencies[0] > 21.0
+    # After sixty half-lives what is left is the profile, as wide as that.
+    assert widths[12:] == pytest.approx([0.03 * math.sqrt(12)] * 7)
+    assert latencies[11:] == pytest.approx([latencies[11]] * 8)
+    assert 14.0 < latencies[11] < 14.0 * 1.2 < 21.0
+    assert corrected.deviation()["LOC"] == 0.0
+    assert estimate(corrected)["LOC"].l95_ms == pytest.approx(17.0)
+
+
+def test_what_is_forgotten_is_corrected_again_where_that_can_be() -> None:
+    """The load of a node outlives what was measured there."""
+    corrected = Corrected(cell(half_life_windows=0.2, threads={"act": 12}))
+    sent = [off_row(40.0 * i, 0.0) for i in range(10)]
+    corrected.learn(window(local_rows(), close_ms=400.0, shadows=sent))
+    estimate(corrected)
+    shown = 0.0
+    for _ in range(30):
+        corrected.learn(window(local_rows(), close_ms=400.0))
+        shown = estimate(corrected, {"R": 0.0, "E": 0.5})["OFF"].l95_ms
+    # 12 threads beside 8.
+    assert shown > 2 + 1 + 3 * 1.25 + 1 + 6 + 1
+
+
+def test_it_learns_from_the_active_placement_alone() -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    for policy, others in (("HYB", ("SO", "LOC")), ("LOC", ("SO", "HYB"))):
+        run = dwell.simulate(
+            problem,
+            scenario="network-impairment",
+            policy=policy,
+            estimator=alone(problem),
+            seed=1,
+            windows=20,
+        )
+        shown = run.decisions
+        assert "shadow_cpu_R1" not in run.windows.columns
+        usual = Profile(problem)
+        for name in others:
+            learnt = shown[f"est_l95_ms_{name}"][-1] > usual.l95_ms[name] + 20
+            # From LOC the links to E are out of sight.
+            assert learnt == (policy == "HYB" and name == "SO")
+
+
+# ----------------------------------------------------------------------------- awkward cells
+
+
+def test_a_cell_in_which_nothing_takes_time() -> None:
+    nothing = Execution(Constant(0.0))
+    problem = make_problem(
+        [Node("R", "robot"), Node("E", "edge")],
+        [Task("A", {"R": nothing}), Task("B", {"R": nothing, "E": nothing})],
+        [Flow("A", "B")],
+        links=[Link("R", "E", Constant(0.0))],
+        candidates={"LOC": {}, "OFF": {"B": "E"}},
+        window_cycles=10,
+        scenario=[
+            LinkDisturbance("R", "E", at_s=2.0, add_delay_ms=Constant(3.0)),
+            NodeDisturbance("R", stress_threads=9),
+        ],
+        controller=ControllerSettings(estimator="corrected", shadow_fraction=0.5),
+    )
+    shown = decide(problem, "LOC", 5)
+    assert shown["est_l95_ms_LOC"].to_list() == [0.0] * 5
+    assert shown["est_l95_ms_OFF"].to_list() == pytest.approx([0.0] * 2 + [3.0] * 3)
+
+
+def test_a_latency_equal_to_the_deadline_is_met() -> None:
+    # In binary floating point 0.1 + 0.2 is more than 0.3.
+    def made(ms: float) -> Execution:
+        return Execution(Constant(ms))
+
+    problem = make_problem(
+        [Node("R", "robot")],
+        [Task("A", {"R": made(0.1)}), Task("B", {"R": made(0.2)})],
+        [Flow("A", "B")],
+        period_ms=1.0,
+        deadline_ms=0.3,
+    )
+    corrected = Corrected(problem)
+    shown = corrected.estimate(observed=QoS(1.0, 0.0, {"R": 0.0}), incumbent="LOC", own={"R": 0.0})
+    assert shown["LOC"].violation_rate == 0.0
+
+
+def test_constants_are_one_regime() -> None:
+    problem = cell(estimator="corrected", scenario=())
+    spied = Spied(problem)
+    shown = decide(problem, "LOC", 20, spied)
+    assert spied.regimes == 0
+    assert set(shown["est_l95_ms_OFF"]) == {14.0}
+
+
+class Spied(Corrected):
+    """A Corrected of which copies are itself."""
+
+    def __deepcopy__(self, memo: object) -> Spied:
+        return self
+
+
+def test_a_link_that_loses_nearly_everything() -> None:
+    problem = make_problem(
+        [Node("R", "robot"), Node("E", "edge")],
+        [
+            Task("A", {"R": Execution(Constant(1.0))}),
+            Task("B", {"R": Execution(Constant(1.0)), "E": Execution(Constant(1.0))}),
+        ],
+        [Flow("A", "B")],
+        links=[Link("R", "E", Constant(1.0), loss=0.9999)],
+        candidates={"LOC": {}, "OFF": {"B": "E"}},
+        window_cycles=10,
+        controller=ControllerSettings(estimator="corrected", shadow_fraction=0.5),
+    )
+    for estimator in (None, alone(problem)):
+        shown = decide(problem, "LOC", 3, estimator)
+        assert shown["est_violation_rate_OFF"].to_list() == [1.0] * 3
+        assert shown["est_l95_ms_OFF"].to_list() == pytest.approx([10 * 100.0] * 3)
+    shown = decide(problem, "OFF", 15, alone(problem))
+    assert set(shown["est_violation_rate_LOC"]) == {0.0}
+
+
+@pytest.mark.parametrize("window_cycles", [1, 2, 7, 20_000])
+def test_windows_of_any_length(window_cycles: int) -> None:
+    problem = cell(estimator="corrected", window_cycles=window_cycles, shadow_fraction=0.2)
+    windows = max(2, 60 // window_cycles)
+    shown = decide(problem, "LOC", windows)
+    l95_ms, missed = truth(problem, "OFF")
+    # In short windows shadows are far between, and what they measured widens meanwhile.
+    assert shown["est_l95_ms_OFF"][-1] == pytest.approx(l95_ms, rel=0.05)
+    assert shown["est_violation_rate_OFF"][-1] == pytest.approx(missed, abs=0.15)
+
+
+def test_pools_are_bounded() -> None:
+    problem = cell(estimator="corrected", half_life_windows=1e6, window_cycles=300)
+    spied = Spied(problem)
+    decide(problem, "LOC", 20, spied)
+    assert max(len(pool.ordered) for pool in spied._pools.values()) == LARGEST
+
+
+def test_a_node_that_is_down_is_lost_and_comes_back() -> None:
+    problem = cell(
+        estimator="corrected",
+        scenario=[NodeDisturbance("E", at_s=4.0, for_s=4.0, down=True)],
+        deadline_ms=25.0,
+    )
+    assert problem.controller_node == "E"
+    problem = Problem(
+        problem.name,
+        problem.pipeline,
+        problem.fabric,
+        problem.candidates,
+        problem.objective,
+        problem.scenarios,
+        ControllerSettings(on="R", estimator="corrected", shadow_fraction=0.1),
+        problem.window_cycles,
+    )
+    shown = decide(problem, "LOC", 8)["est_violation_rate_OFF"].to_list()
+    assert shown == [0.0] * 2 + [1.0] * 2 + [0.0] * 4
+
+
+class Replay:
+    """A policy that decides as it was told."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = names
+
+    def start(self, problem: Problem) -> None:
+        self.next = iter(self.names)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        return next(self.next)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("estimator", ["shadow", "scaling", "corrected"])
+@pytest.mark.parametrize("seed", range(12))
+def test_any_cell_gets_estimates_that_a_policy_can_use(seed: int, estimator: str) -> None:
+    """Overloaded nodes, links and nodes that are down, orders that take time, cold migrations."""
+    rng = Random(seed)
+    problem = random_problem(rng, orders=True, whole_ms=seed % 3 == 0)
+    windows, W = 12, rng.choice([1, 2, 5, 20])
+    share = rng.choice([0.1, 0.3, 1.0]) / len(problem.candidates)
+    settings = {
+        **{f: getattr(problem.controller, f) for f in ("on", "migration", "order_delay_ms")},
+        "shadow_fraction": share,
+        "half_life_windows": rng.choice([0.01, 2.0, 50.0]),
+    }
+    problem = Problem(
+        problem.name,
+        problem.pipeline,
+        problem.fabric,
+        problem.candidates,
+        problem.objective,
+        problem.scenarios,
+        ControllerSettings(**settings),
+        W,
+    )
+    names = [*random_stamps(rng, problem, windows), problem.initial]
+    decisions = dwell.simulate(
+        problem,
+        scenario="disturbed",
+        policy=Replay(names),
+        estimator=estimator,
+        seed=seed,
+        windows=windows,
+    ).decisions
+    for name in problem.candidates:
+        l95_ms = decisions[f"est_l95_ms_{name}"].drop_nulls().to_numpy()
+        missed = decisions[f"est_violation_rate_{name}"].drop_nulls().to_numpy()
+        assert np.isfinite(l95_ms).all()
+        assert (l95_ms >= 0).all()
+        assert (l95_ms <= problem.censor_ms + 1e-6).all()
+        assert ((missed >= 0) & (missed <= 1)).all()
+
+
+# ---------------------------------------------------------------------------------- the rest
+
+
+def test_it_is_deterministic() -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    runs = [
+        dwell.simulate(
+            problem,
+            scenario="robot-cpu-stress",
+            policy="cusum",
+            estimator=estimator,
+            seed=3,
+            windows=15,
+        ).decisions
+        for estimator in ("corrected", "corrected", Corrected(problem))
+    ]
+    assert runs[0].equals(runs[1])
+    assert runs[0].equals(runs[2])
+
+
+def test_before_any_window_it_is_about_the_profile() -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    corrected, profile = Corrected(problem), Profile(problem)
+    shown = corrected.estimate(
+        observed=QoS(1.0, 0.0, dict.fromkeys(problem.fabric.nodes, 0.0)),
+        incumbent="LOC",
+        own=dict.fromkeys(problem.fabric.nodes, 0.0),
+    )
+    for name in problem.candidates:
+        assert shown[name].l95_ms == pytest.approx(profile.l95_ms[name], rel=0.06)
+        assert shown[name].violation_rate == pytest.approx(profile.violation_rate[name], abs=0.02)
+        assert shown[name].utilisation == profile.own[name]
+
+
+def test_a_flow_of_two_candidates_on_one_link_is_one_part() -> None:
+    corrected = Corrected(cell(estimator="corrected"))
+    parts = set(corrected._pools)
+    assert Message("sense", "act", "R->E") in parts
+    assert {p for p in parts if isinstance(p, Message) and p.link == "E->R"} == {
+        Message("act", "plan", "E->R"),
+        Message("plan", "control", "E->R"),
+    }
+    assert {p for p in parts if isinstance(p, Site)} == {
+        *(Site(name, "R") for name in ("sense", "act", "plan", "control")),
+        *(Site(name, "E") for name in ("act", "plan", "control")),
+    }
+
+
+def test_a_start_forgets() -> None:
+    problem = cell(estimator="corrected")
+    corrected = Corrected(problem)
+    before = estimate(corrected)
+    twin = copy.deepcopy(corrected)
+    sent = [off_row(40.0 * i, 7.0) for i in range(10)]
+    evidence = window(local_rows(), close_ms=400.0, shadows=sent)
+    corrected.learn(evidence)
+    assert corrected.regimes > 0
+    learnt = estimate(corrected)
+    assert learnt["OFF"] != before["OFF"]
+    corrected.start(problem)
+    assert corrected.regimes == 0
+    assert corrected.support() == dict.fromkeys(MOVES, (0, 0))
+    assert estimate(corrected) == before
+    twin.learn(evidence)
+    assert estimate(twin) == learnt
+
+
+def test_estimating_twice_changes_nothing() -> None:
+    corrected = Corrected(cell(estimator="corrected"))
+    corrected.learn(window(local_rows(), close_ms=400.0))
+    busy = {"R": 0.0, "E": 0.9}
+    assert estimate(corrected, busy) == estimate(corrected, busy)
+
+
+@pytest.mark.parametrize("half_life", [0.0, -1.0, math.nan, math.inf])
+def test_a_half_life_is_a_number_above_0(half_life: float) -> None:
+    with pytest.raises(ProblemError, match=r"half_life_windows: .* is not allowed; it must be"):
+        Corrected(cell(), half_life_windows=half_life)
+
+
+def test_variation_is_kept() -> None:
+    """L95 is that of the pool's spread, not of its median."""
+    problem = make_problem(
+        [Node("R", "robot"), Node("E", "edge")],
+        [
+            Task("A", {"R": Execution(Constant(1.0))}),
+            Task("B", {"R": Execution(LogNormal(10.0, 0.5)), "E": Execution(LogNormal(5.0, 0.5))}),
+        ],
+        [Flow("A", "B")],
+        links=[Link("R", "E", Constant(0.0))],
+        candidates={"OFF": {"B": "E"}, "LOC": {}},
+        window_cycles=100,
+        scenario=[NodeDisturbance("E", stress_threads=1)],
+    )
+    shown = decide(problem, "OFF", 30, Corrected(problem))
+    real = dwell.simulate(problem, scenario="disturbed", policy="OFF", seed=1, windows=30).windows
+    # E has one core: everything takes twice as long. The 95th percentile is 1.94 times the mean.
+    assert mean(real["seen_l95_ms"]) == pytest.approx(1 + 2 * 5 * 1.94, rel=0.1)
+    assert mean(shown["est_l95_ms_LOC"]) == pytest.approx(1 + 10 * 1.94, rel=0.2)

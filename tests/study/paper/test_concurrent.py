@@ -1,0 +1,136 @@
+"""RQ1: fair baselines, and what of a gain is the second stage's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dwell.model import NodeDisturbance
+from dwell.policies import ATP
+from dwell.policies.atp import find_pairs
+from dwell.sim import draw, simulate_realisation
+from dwell.study.paper import Runner
+from dwell.study.paper import concurrent as module
+from dwell.study.paper.concurrent import (
+    DTP,
+    TUNED,
+    atp,
+    chapter,
+    only,
+    single_stages,
+    stress_scenarios,
+    verdict,
+)
+from dwell.study.paper.variants import with_candidates
+from tests.study.paper.families import make_family
+from tests.study.paper.small_cell import SCALE, make_cell
+from tests.study.paper.written import check_written
+
+WINDOWS = 12
+
+
+@pytest.mark.parametrize(
+    ("against", "too", "expected"),
+    [
+        (["lower", "lower"], ["lower", "lower"], "yes"),
+        (["lower", "lower"], ["lower", "open"], "in part"),
+        (["lower", "open"], ["lower", "lower"], "in part"),
+        # What beats ATP is then the rule, not the second stage.
+        (["lower", "lower"], ["open", "same"], "no"),
+        (["lower", "open"], ["same", "lower"], "no"),
+        (["higher", "open"], ["open", "open"], "no"),
+        (["open", "open"], ["higher", "open"], "no"),
+        (["open", "same"], ["open", "same"], "not shown"),
+    ],
+)
+def test_the_answer_asks_for_both(
+    against: Sequence[str], too: Sequence[str], expected: str
+) -> None:
+    atps = make_family({f"R{i}: {DTP}, {TUNED}": one for i, one in enumerate(against)})
+    single = make_family({f"R{i}: {DTP}, {only(DTP, 'T2')}": one for i, one in enumerate(too)})
+    answer, sentence = verdict(atps, single, "T2")
+    assert answer == expected
+    assert f"lower V_D in {against.count('lower')} of 2 stress scenarios" in sentence
+    rest = [i for i in range(2) if against[i] == "lower" and too[i] != "lower"]
+    assert ("it is the rule and its estimates" in sentence) == bool(rest)
+
+
+def test_sizes_are_named_or_their_range_is() -> None:
+    few = {f"R{i}: {DTP}, {TUNED}": "lower" for i in range(2)}
+    many = {f"R{i}: {DTP}, {TUNED}": "lower" for i in range(5)}
+    single = {name.replace(TUNED, only(DTP, "T2")): "open" for name in many}
+    assert (
+        "(R0 −10.0 points, R1 −10.0 points)"
+        in verdict(
+            make_family(few), make_family({name: single[name] for name in list(single)[:2]}), "T2"
+        )[1]
+    )
+    assert "(from −10.0 points in R0 to" in verdict(make_family(many), make_family(single), "T2")[1]
+
+
+def test_the_stages_are_those_that_the_papers_candidates_move() -> None:
+    problem = make_cell()
+    assert single_stages(problem) == {"T2": ("LOC", "HYB"), "T3": ("HYB", "SO")}
+
+
+def test_atp_begins_on_its_own_pair() -> None:
+    problem = make_cell()
+    for pair in find_pairs(problem.candidates, problem.objective.tiers):
+        policy = atp(problem, pair, (1.2, np.inf, 0.7, 0))
+        assert isinstance(policy, ATP)
+        assert policy.initial == pair.local
+        assert policy.latency_ms == pytest.approx(1.2 * 33.0)
+        assert policy.min_dwell == 0
+
+
+def test_every_stress_is_there_steady_and_not() -> None:
+    found = stress_scenarios(make_cell())
+    assert len(found) == 12
+    both = found["R1+R2 2 a core on-off"]
+    assert all(isinstance(item, NodeDisturbance) for item in both)
+    assert [(item.node, item.stress_threads) for item in both] == [("R1", 8), ("R2", 8)]  # type: ignore[union-attr]
+    assert len({item.episodes.name for item in both if item.episodes}) == 1
+    assert all(item.episodes is None for item in found["R1 1 a core"])
+
+
+def test_fewer_candidates_play_the_same_realisation() -> None:
+    whole = make_cell("robot-cpu-stress")
+    part = with_candidates(whole, ("HYB", "SO"))
+    assert part.initial == "HYB"
+    costs = [
+        simulate_realisation(
+            problem,
+            draw(problem, scenario="robot-cpu-stress", seed=1, windows=WINDOWS),
+            policy="SO",
+            estimator="profile",
+        ).windows["cost"]
+        for problem in (whole, part)
+    ]
+    assert costs[0].to_list() == costs[1].to_list()
+
+
+def test_the_chapter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name, values in (
+        ("THREADS_A_CORE", (1,)),
+        ("STRESSED", {"R1": ("R1",), "R2": ("R2",)}),
+        ("LATENCIES", (1.0,)),
+        ("ROBOTS", (0.7,)),
+        ("EDGES", (0.7, np.inf)),
+        ("DWELLS", (0,)),
+    ):
+        monkeypatch.setattr(module, name, values)
+    written = chapter(make_cell(), SCALE, Runner(tmp_path, processes=1))
+    check_written(written)
+    tables = {table.slug: table.frame for table in written.tables}
+    main = tables["concurrent"]
+    # Four scenarios, and each policy once in each: whoever was tuned for another is not there.
+    assert main["scenario"].n_unique() == 4
+    assert not main.select("scenario", "policy").is_duplicated().any()
+    assert {"atp best here", TUNED, only(DTP, "T2"), only(DTP, "T3")} <= set(main["policy"])
+    tuning = tables["concurrent-tuning"]
+    assert tuning.height == 4 + 3
+    assert tuning["violation_rate"].is_sorted()
+    assert "for all" in tuning["chosen"].to_list()
