@@ -198,6 +198,29 @@ def test_jobs_of_a_node_are_slowed_by_what_slows_the_one_that_was_measured(
 
 
 @pytest.mark.usefixtures("exact")
+def test_a_single_time_is_no_measurement_of_a_slow_node() -> None:
+    """One shadow through OFF runs `plan` on R, where the cycles' own jobs take twice as long."""
+    corrected = Corrected(cell(candidates=("LOC", "OFF", "FAR")))
+    rows: list[Row] = []
+    for i in range(10):
+        sensed, acted, planned = (40.0 * i + ms for ms in (4.0, 8.0, 10.0))
+        rows.append(
+            (
+                [40.0 * i, sensed + 1, acted, planned + 1],
+                [sensed, acted, planned, planned + 3],
+                [sensed + 1, acted, planned + 1],
+            )
+        )
+    off: Row = ([None, None, 9.0, None], [None, None, 15.0, None], [None, 9.0, 15.0])
+    sent: list[Row | None] = [off, *[None] * 9]
+    corrected.learn(
+        window(rows, close_ms=400.0, placement=[2] * 10, shadows=sent, through=[1] * 10)
+    )
+    # Both `sense` and `control` show two times and more; `plan` would take 12 ms, not 6.
+    assert estimate(corrected)["LOC"].l95_ms == pytest.approx(4.0 + 16.0 + 12.0 + 2.0)
+
+
+@pytest.mark.usefixtures("exact")
 def test_messages_of_a_link_get_the_delay_and_the_losses_of_the_one_that_was_measured() -> None:
     # FAR sends plan -> control over E -> R, OFF would send act -> plan.
     scenario = [LinkDisturbance("E", "R", at_s=2.0, add_delay_ms=Constant(5.0), loss=0.4)]

@@ -115,6 +115,16 @@ def test_shadows_through_several_candidates() -> None:
     assert (found[DOWN], found[ON]) == ([6.0], [9.0])
 
 
+def test_a_message_between_tasks_that_both_share_is_the_cycles_own() -> None:
+    # Under OFF and under FAR, B runs on E: the way up is shared.
+    off: Row = ([0.0, 6.0, 15.0, 18.0], [1.0, 10.0, 18.0, 22.0], [6.0, 15.0, 18.0])
+    far: Row = ([None, None, 10.0, None], [None, None, 19.0, None], [None, 10.0, 28.0])
+    found = times(window([off], close_ms=CLOSE_MS, placement=[1], shadows=[far], through=[2]))
+    assert found[UP] == [5.0]
+    assert (found[Site("C", "R")], found[Site("C", "E")]) == ([3.0], [9.0])
+    assert (found[DOWN], found[ON]) == ([5.0], [9.0])
+
+
 def test_a_window_of_two_placements() -> None:
     off: Row = ([0.0, 6.0, 15.0, 18.0], [1.0, 10.0, 18.0, 22.0], [6.0, 15.0, 18.0])
     found = times(window([local(0.0), off], close_ms=CLOSE_MS, placement=[0, 1]))

@@ -140,6 +140,12 @@ def test_windows_as_a_controller_sees_them(case: tuple[int, list[tuple[float, in
     assert {"latency": latency.tolist(), "ages": ages.tolist()} == before
 
 
+def test_windows_without_losses_leave_the_latencies_as_they_are() -> None:
+    latency = np.array([3.0, 1.0, 2.0, 9.0, 8.0, 7.0])
+    assert seen_windows(latency, 3, np.zeros(6), 60.0) == 6.0
+    assert latency.tolist() == [3.0, 1.0, 2.0, 9.0, 8.0, 7.0]
+
+
 def test_a_mean_of_percentiles_is_no_percentile() -> None:
     # One window of ten has six losses: no 5 % of all cycles, but the 95th of that window.
     latency = np.full(1000, 10.0)

@@ -253,6 +253,14 @@ def test_what_is_under_way_counts_with_its_age() -> None:
     assert (shown.violation_rate, shown.l95_ms) == (0.1, 40.0)
 
 
+def test_what_would_end_after_the_close_has_missed_whatever_the_deadline() -> None:
+    # Released late: the last cycle is 10 ms old at the close. Its shadow would take 10.5.
+    shadow = Shadow(cell())
+    rows = {i: off(40.0 * i, 10.5) for i in range(20, 40)}
+    shadow.learn(one_window(rows, cycles=40, close_ms=39 * 40.0 + 10.0))
+    assert estimate(shadow)["OFF"].violation_rate == 0.05
+
+
 def test_a_shadow_outlives_the_sink_of_its_cycle() -> None:
     """Where the cycle was lost behind what they share, the sink's time is the profile's."""
     rows = [local(40.0 * i) for i in range(20)]

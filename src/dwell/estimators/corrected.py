@@ -66,7 +66,6 @@ COMPOSED = 1000
 LONGEST_WINDOW = 10_000
 #: Change of a node's foreign load that means another regime where nothing else was measured.
 LOAD_STEP = 0.25
-SATURATED = 0.95
 #: Half a nanosecond: sums of milliseconds that differ by less are equal.
 ROUNDING_MS = 5e-7
 
@@ -194,7 +193,9 @@ class Corrected:
         for part in self._pools:
             here = _place(part)
             if part not in tested and (here in places or part in self._forgotten):
-                self._correct(part, [w for w in measured if _place(w) == here and w != part])
+                others = [other for other in measured if _place(other) == here and other != part]
+                # What has too few times to be tested may still show the regime before.
+                self._correct(part, [other for other in others if other in tested] or others)
 
     def support(self) -> dict[str, Support]:
         """How much stands behind each candidate's estimate: that of its weakest part."""
@@ -299,8 +300,8 @@ class Corrected:
                 self._foreign[name] = foreign
             if name in self._seen or not (changed or self._forgotten):
                 continue
-            # What a saturated node's load hides: at least one thread a core.
-            threads = node.cores if foreign > SATURATED else foreign * node.capacity
+            # A saturated node hides how many there are: at least one for each core.
+            threads = foreign * node.capacity
             for part in self._pools:
                 judged = changed or (part in self._forgotten and foreign > LOAD_STEP)
                 if judged and isinstance(part, Site) and part.node == name:

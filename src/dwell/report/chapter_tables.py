@@ -200,7 +200,7 @@ def _is_grouped(frame: pl.DataFrame, columns: Sequence[Column]) -> bool:
 def _cells(row: dict[str, object], column: Column, look: Look) -> list[Cell]:
     written = _written(row, column, look, ends=False)
     if column.unit == "text":
-        kind = "nowrap" if len(written.value) <= SHORT else ""
+        kind = "nowrap" if len(written.value) <= SHORT else "text"
         return [Cell(_text(row.get(column.name), column, look), kind)]
     number = Cell(escape(written.value), "num")
     return [number, Cell(escape(written.error), "err")] if column.interval else [number]

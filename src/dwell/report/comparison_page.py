@@ -22,6 +22,7 @@ from dwell.report.findings import (
     standing,
     verdict,
 )
+from dwell.report.look import Look
 from dwell.report.method import method, placements
 from dwell.report.page import (
     Cell,
@@ -36,11 +37,12 @@ from dwell.report.page import (
     table,
 )
 from dwell.report.palette import Palette
-from dwell.report.timeline import timeline
 from dwell.report.wording import (
+    OURS,
     Measure,
     listed,
     percent,
+    shown_contender,
     shown_policy,
     shown_scenario,
     write_interval,
@@ -64,10 +66,18 @@ MEASURES = (
 MORE = (
     Measure("p95_ms", "P95 of all cycles", "ms", ends=True),
     Measure("lost", "lost cycles"),
-    Measure("longest_misses", "misses in a row", decimals=0),
     Measure("compute_ms", "computing", "ms"),
     Measure("queue_ms", "waiting", "ms"),
     Measure("network_ms", "network", "ms"),
+)
+ACTUATOR = (
+    Measure("longest_misses", "misses in a row"),
+    Measure("misses_in_20", "most misses in 20"),
+    Measure("over_5_in_100", "stretches of 100 with more than 5", "%", 100.0),
+    Measure("aoi_mean_ms", "mean age", "ms"),
+    Measure("aoi_p95_ms", "age for 95 % of the time", "ms"),
+    Measure("aoi_peak_ms", "largest age", "ms"),
+    Measure("tracking_rms_mm", "tracking error", "mm"),
 )
 TAGS: dict[Answer, tuple[str, str]] = {
     "agrees": ("agrees", "good"),
@@ -106,19 +116,20 @@ def comparison_html(*comparisons: Comparison) -> str:
 
 def _chapter(comparison: Comparison) -> Iterator[str]:
     palette = Palette.of(comparison.problem.candidates, comparison.policies)
+    look = Look(palette, frozenset(comparison.scenarios))
     yield paragraph(_subtitle(comparison), "subtitle")
     yield paragraph(question(comparison), "question")
     yield items(verdict(comparison))
     yield section("Results", *_results(comparison, palette))
     if judge_all(comparison):
         yield section("Prediction and result", *_predictions(comparison, palette))
-    yield section("Figures", *_figures(comparison, palette))
+    yield section("Figures", *_figures(comparison, look))
     shown = _shown_in_time(comparison)
     if shown is not None:
         heading = f"{shown_policy(shown)} through time"
-        yield section(heading, *_timelines(comparison, palette, shown))
+        yield section(heading, *_timelines(comparison, look, shown))
         yield section("What was estimated, and what was measured", _beliefs(comparison, shown))
-    yield section("More numbers", _more(comparison))
+    yield section("More numbers", *_more(comparison))
     yield section("How it was measured", *method(comparison))
     yield section("What it does not say", items(limits(comparison)))
 
@@ -153,28 +164,27 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
         f"{comparison.windows - problem.warmup_windows} windows. Each number is the mean over "
         f"{len(comparison.seeds)} seeds with its 95 % interval."
     )
-    shares = [Measure(f"share_{name}", name, "%", 100.0, decimals=0) for name in problem.candidates]
-    measures = (*MEASURES, *shares)
     head = [Cell("policy")]
-    for measure in measures:
+    for measure in MEASURES:
         head.append(Cell(marked(measure.heading), "pair", 2))
         if measure is RATE:
             head.append(Cell(marked("V_D is")))
+    head += [Cell(f"{escape(name)} (%)", "num") for name in problem.candidates]
     rows: list[tuple[str, Sequence[Cell]]] = []
-    width = 2 * len(measures) + 2
+    width = 2 * len(MEASURES) + 2 + len(problem.candidates)
     for scenario in comparison.scenarios:
         rows.append(("group", [Cell(escape(shown_scenario(scenario)), columns=width)]))
         rows += [
-            ("", _result_row(comparison, palette, measures, scenario, policy))
+            ("", _result_row(comparison, palette, scenario, policy))
             for policy in comparison.policies
         ]
     yield table(
         head,
         rows,
-        f"{_columns(problem.candidates)} the shares of the windows that began under each. Bold: "
-        "the lowest V_D and J of a scenario. V_D is “under” 5 % where its one-sided 95 % limit is, "
-        "“above” where its lower limit is, else “open”.",
-        kind="wide",
+        f"{_columns(problem.candidates)} the mean shares of the windows that began under each. "
+        "Bold: the lowest V_D and J of a scenario. V_D is “under” 5 % where its one-sided 95 % limit is, "
+        f"“above” where its lower limit is, else “open”.{_ours(comparison)}",
+        kind="wide small",
     )
 
 
@@ -183,15 +193,9 @@ def _columns(names: Iterable[str]) -> str:
     return f"Columns {listed(names)} are" if len(names) > 1 else f"Column {names[0]} is"
 
 
-def _result_row(
-    comparison: Comparison,
-    palette: Palette,
-    measures: Sequence[Measure],
-    scenario: str,
-    policy: str,
-) -> list[Cell]:
+def _result_row(comparison: Comparison, palette: Palette, scenario: str, policy: str) -> list[Cell]:
     row = [Cell(_named(palette, policy))]
-    for measure in measures:
+    for measure in MEASURES:
         means = {
             name: comparison.values(scenario, name, measure.column).mean()
             for name in comparison.policies
@@ -201,6 +205,9 @@ def _result_row(
         if measure is RATE:
             word, kind = STANDING[standing(comparison, scenario, policy)]
             row.append(Cell(f'<span class="{kind} nowrap">{word}</span>'))
+    for name in comparison.problem.candidates:
+        share = 100 * comparison.interval(scenario, policy, f"share_{name}").value
+        row.append(Cell(write_number(share, 0), "num"))
     return row
 
 
@@ -212,7 +219,12 @@ def _pair(interval: Interval, measure: Measure, *, best: bool = False) -> list[C
 
 def _named(palette: Palette, policy: str) -> str:
     colour = palette.policies[policy].colour
-    return named(shown_policy(policy), colour, ring=policy not in palette.placements)
+    return named(shown_contender(policy), colour, ring=policy not in palette.placements)
+
+
+def _ours(comparison: Comparison) -> str:
+    """Say what ATP is beside everything that shows it."""
+    return f" {OURS}" if "atp" in comparison.policies else ""
 
 
 # ------------------------------------------------------------------------------- predictions
@@ -292,34 +304,21 @@ def _claims(comparison: Comparison, prediction: Prediction) -> str:
 # ----------------------------------------------------------------------------------- figures
 
 
-def _figures(comparison: Comparison, palette: Palette) -> Iterator[str]:
+def _figures(comparison: Comparison, look: Look) -> Iterator[str]:
     deadline_ms = comparison.problem.pipeline.deadline_ms
     yield figure(
-        figures.intervals(
-            comparison,
-            palette,
-            RATE,
-            title="missed deadlines (%)",
-            limit=AIM,
-            limit_name="the aim, 5 %",
-        ),
-        "V_D: mean over seeds, with its 95 % interval as a bar where that is wider than the mark. "
-        "An open mark at the left edge: no miss was seen.",
+        figures.intervals(comparison, look, RATE, "percent", limit=AIM, name="the aim, 5 %"),
+        "V_D, the share of missed deadlines: mean over seeds, with its 95 % interval as a bar "
+        f"where that is wider than the mark. An open mark at the left edge: less, or none."
+        f"{_ours(comparison)}",
     )
     yield figure(
-        figures.intervals(
-            comparison,
-            palette,
-            L95,
-            title="L95 (ms)",
-            limit=deadline_ms,
-            limit_name="the deadline",
-        ),
+        figures.intervals(comparison, look, L95, "ms", limit=deadline_ms, name="the deadline"),
         "Tail latency: L95 as the controller sees it, a cycle that has not finished counting with "
         "its age.",
     )
     yield figure(
-        figures.distributions(comparison, palette),
+        figures.distributions(comparison, look),
         "Latency of all cycles after the warm-up, all seeds together: one less the empirical "
         "distribution function, on a logarithmic scale. Where a curve crosses the dashed line one "
         "reads V_D; below the dotted line that is less than 5 %. A curve that ends on a plateau "
@@ -328,7 +327,7 @@ def _figures(comparison: Comparison, palette: Palette) -> Iterator[str]:
     moving = [name for name in comparison.policies if name not in comparison.statics]
     if moving:
         yield figure(
-            figures.placement_shares(comparison, palette, moving),
+            figures.placement_shares(comparison, look.palette, moving),
             "Where the policies that move spent their windows.",
         )
     yield figure(
@@ -348,25 +347,17 @@ def _shown_in_time(comparison: Comparison) -> str | None:
     return DTP if DTP in moving else next(iter(moving), None)
 
 
-def _timelines(comparison: Comparison, palette: Palette, policy: str) -> Iterator[str]:
-    problem = comparison.problem
+def _timelines(comparison: Comparison, look: Look, policy: str) -> Iterator[str]:
     yield paragraph(
         f"One run in each scenario, of seed {comparison.seeds[0]}. Each mark is a window and has "
-        "the colour of the placement that was active. In the lowest panel the lines are what the "
-        "policy believed the other placements would cost: where a line lies below the marks of "
-        "its colour, the estimate was too good."
+        "the colour of the placement that was active. In the lowest panel the lines without marks "
+        "are what the policy believed that the other placements would cost: where a line lies "
+        "below the marks of its colour, the estimate was too good."
     )
     for scenario in comparison.scenarios:
         example = comparison.examples[scenario, policy]
         yield f"<h3>{escape(shown_scenario(scenario))}</h3>"
-        svg = timeline(
-            example.windows,
-            example.decisions,
-            placements=palette.placements,
-            period_ms=problem.pipeline.period_ms,
-            deadline_ms=problem.pipeline.deadline_ms,
-            name=f"time-{problem.name}-{scenario}",
-        )
+        svg = figures.through_time(comparison, look, scenario, policy)
         moves = int(example.decisions["migrated"].sum())
         yield figure(svg, f"{shown_policy(policy)}: {moves} migrations, the warm-up included.")
 
@@ -400,24 +391,41 @@ def _beliefs(comparison: Comparison, policy: str) -> str:
     )
 
 
-def _more(comparison: Comparison) -> str:
-    palette = Palette.of(comparison.problem.candidates, comparison.policies)
-    head = [Cell("policy"), *(Cell(marked(measure.heading), "pair", 2) for measure in MORE)]
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for scenario in comparison.scenarios:
-        rows.append(("group", [Cell(escape(shown_scenario(scenario)), columns=2 * len(MORE) + 1)]))
-        for policy in comparison.policies:
-            row = [Cell(_named(palette, policy))]
-            for measure in MORE:
-                row += _pair(comparison.interval(scenario, policy, measure.column), measure)
-            rows.append(("", row))
-    cycles = np.mean(comparison.runs["cycles"].to_numpy())
-    return table(
-        head,
-        rows,
+def _more(comparison: Comparison) -> Iterator[str]:
+    cycles = float(np.mean(comparison.runs["cycles"].to_numpy()))
+    yield _numbers(
+        comparison,
+        MORE,
         "P95 is the 95th percentile of the final latencies of all cycles of a run, ∞ where more "
         "than 5 % never finished; its value is the median over seeds, its interval lies between "
         "order statistics. Lost are cycles of which a message, a job or an input was dropped or "
-        f"replaced, of {write_number(float(cycles), 0)} in a run. "
-        " The last three are means over the cycles that finished.",
+        f"replaced, of {write_number(cycles, 0)} in a run. The last three are means over the "
+        "cycles that finished.",
     )
+    measures = [measure for measure in ACTUATOR if measure.column in comparison.runs.columns]
+    if len(measures) > 1:
+        yield "<h3>What the actuator got</h3>"
+        yield _numbers(
+            comparison,
+            measures,
+            "Misses in a row, and the most in any 20 cycles that follow one another; the share of "
+            "stretches of 100 cycles with more than 5 misses. Age is that of the newest command "
+            "in effect, from the release of its cycle on. The tracking error is the root of the "
+            "mean square of the servo's, a median over seeds.",
+        )
+
+
+def _numbers(comparison: Comparison, measures: Sequence[Measure], caption: str) -> str:
+    """Return a table of columns by scenario and policy."""
+    palette = Palette.of(comparison.problem.candidates, comparison.policies)
+    head = [Cell("policy"), *(Cell(marked(measure.heading), "pair", 2) for measure in measures)]
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for scenario in comparison.scenarios:
+        heading = Cell(escape(shown_scenario(scenario)), columns=2 * len(measures) + 1)
+        rows.append(("group", [heading]))
+        for policy in comparison.policies:
+            row = [Cell(_named(palette, policy))]
+            for measure in measures:
+                row += _pair(comparison.interval(scenario, policy, measure.column), measure)
+            rows.append(("", row))
+    return table(head, rows, f"{caption}{_ours(comparison)}", kind="of-chapter small")

@@ -6,87 +6,77 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
-import numpy as np
-
+from dwell.report.drawing import draw
+from dwell.report.look import Look
 from dwell.report.palette import INK, MUTED, PAPER, PARTS, Palette
-from dwell.report.scales import is_wide, set_log_ticks
+from dwell.report.panels import folded
+from dwell.report.scales import is_wide
 from dwell.report.svg import inline, new_figure
-from dwell.report.wording import Measure, shown_policy, shown_scenario
-from dwell.study import AIM, Comparison
+from dwell.report.timeline import run_timeline
+from dwell.report.wording import Measure, shown_contender, shown_scenario
+from dwell.study import Comparison
+from dwell.study.paper.chapter import Figure, Unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["distributions", "intervals", "latency_split", "node_use", "placement_shares"]
+__all__ = [
+    "distributions",
+    "intervals",
+    "latency_split",
+    "node_use",
+    "placement_shares",
+    "through_time",
+]
 
 Draw: TypeAlias = "Callable[[Axes, str], None]"
 
 PANELS_A_ROW = 5
 ROW_INCHES = 0.235
 NODE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-LATER_RANGE = (0.1, 120.0)
 
 
 def intervals(
-    comparison: Comparison,
-    palette: Palette,
-    measure: Measure,
-    *,
-    title: str,
-    limit: float,
-    limit_name: str,
+    comparison: Comparison, look: Look, measure: Measure, unit: Unit, *, limit: float, name: str
 ) -> str:
     """One column of every policy and scenario: mean over seeds, and its interval as a bar.
 
     Parameters
     ----------
     comparison : Comparison
-    palette : Palette
+    look : Look
     measure : Measure
-    title : str
-        What the axis shows, with its unit.
+    unit : Unit
+        Of the column.
     limit : float
         A line to be under, in the column's unit.
-    limit_name : str
+    name : str
+        What the limit is called.
     """
-    policies = comparison.policies
-    found = {
-        (scenario, policy): comparison.interval(scenario, policy, measure.column)
+    import polars as pl
+
+    rows = [
+        (scenario, policy, *comparison.interval(scenario, policy, measure.column))
         for scenario in comparison.scenarios
-        for policy in policies
-    }
-    shown = [over.value * measure.factor for over in found.values()]
-    positive = [value for value in [*shown, limit * measure.factor] if 0 < value < math.inf]
-    low, high = min(positive), max(positive)
-    wide = is_wide(positive)
-    # Room below the smallest value, where zeros stand as open marks.
-    edge = low / 2.5 if wide else 0.0
-
-    def draw(ax: Axes, scenario: str) -> None:
-        for row, policy in enumerate(policies):
-            style = palette.policies[policy]
-            value, left, right = (end * measure.factor for end in found[scenario, policy])
-            if not math.isfinite(value):
-                continue
-            if value <= edge:
-                ax.plot([edge], [row], style.marker, mfc=PAPER, mec=style.colour, clip_on=False)
-                continue
-            if not math.isnan(left) and found[scenario, policy].value != 1.0:
-                ends = [max(left, edge), min(right, high * 2)]
-                ax.plot(ends, [row, row], "-", color=style.colour, lw=2.2, alpha=0.45)
-            ax.plot([value], [row], style.marker, color=style.colour)
-        _line(ax, limit * measure.factor)
-        if wide:
-            ax.set_xscale("log")
-            ax.set_xlim(edge / 1.3, high * 1.5)
-            set_log_ticks(ax.xaxis, edge * 1.2, high * 1.5)
-        else:
-            ax.set_xlim(-0.05 * high, high * 1.08)
-        ax.grid(axis="y", visible=False)
-
-    scale = ", logarithmic" if wide else ""
-    label = f"{title}{scale}; dashed: {limit_name}"
-    return _panels(comparison, policies, f"{measure.column}-{comparison.problem.name}", draw, label)
+        for policy in comparison.policies
+    ]
+    columns = ["scenario", "policy", "y", "y_low", "y_high"]
+    figure = Figure(
+        slug=measure.column,
+        title=f"{measure.name} by scenario and policy",
+        kind="intervals",
+        frame=pl.DataFrame(rows, schema=columns, orient="row"),
+        x="policy",
+        y="y",
+        series="policy",
+        facet="scenario",
+        y_label=measure.name,
+        y_unit=unit,
+        line_at=limit,
+        line_label=name,
+        log_y=is_wide([value for value in (*(row[2] for row in rows), limit) if value > 0]),
+    )
+    return _drawn(comparison, look, figure)
 
 
 def placement_shares(comparison: Comparison, palette: Palette, policies: Sequence[str]) -> str:
@@ -179,59 +169,40 @@ def node_use(comparison: Comparison) -> str:
     return _panels(comparison, policies, name, draw, label, handles=handles)
 
 
-def distributions(comparison: Comparison, palette: Palette) -> str:
+def distributions(comparison: Comparison, look: Look) -> str:
     """Share of the cycles that took longer than a latency: one less the empirical distribution."""
-    import polars as pl
-    from matplotlib.lines import Line2D
+    figure = Figure(
+        slug="latencies",
+        title="Distribution of latency by scenario and policy",
+        kind="ecdf",
+        frame=comparison.latencies,
+        x="latency_ms",
+        y="share",
+        series="policy",
+        facet="scenario",
+        x_label="latency (ms)",
+        line_at=comparison.problem.pipeline.deadline_ms,
+        line_label="deadline",
+    )
+    return _drawn(comparison, look, figure)
 
-    deadline_ms = comparison.problem.pipeline.deadline_ms
-    scenarios = comparison.scenarios
-    columns = len(scenarios) if len(scenarios) <= 4 else 3
-    rows = math.ceil(len(scenarios) / columns)
-    with new_figure(2.15 * rows + 0.5) as figure:
-        axes = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
-        for i, ax in enumerate(axes):
-            if i >= len(scenarios):
-                ax.set_axis_off()
-                continue
-            for policy in comparison.policies:
-                style = palette.policies[policy]
-                line = comparison.latencies.filter(
-                    (pl.col("scenario") == scenarios[i]) & (pl.col("policy") == policy)
-                )
-                later = 100 * (1 - line["share"].to_numpy())
-                # Zero has no place on a logarithmic axis.
-                later[later <= 0] = np.nan
-                ax.plot(
-                    line["latency_ms"].to_numpy(),
-                    later,
-                    color=style.colour,
-                    ls=style.dashes,
-                    lw=style.width,
-                )
-            _line(ax, deadline_ms)
-            ax.axhline(100 * AIM, color=MUTED, lw=0.8, ls=(0, (1, 2)))
-            ax.set_title(shown_scenario(scenarios[i]))
-            ax.set_yscale("log")
-            ax.set_ylim(*LATER_RANGE)
-            set_log_ticks(ax.yaxis, *LATER_RANGE)
-            ax.set_xlim(0, 3 * deadline_ms)
-        figure.supxlabel("latency (ms); dashed: deadline", size=9, color=MUTED)
-        figure.supylabel("cycles that took longer (%)", size=9, color=MUTED)
-        handles = [
-            Line2D(
-                [],
-                [],
-                color=palette.policies[policy].colour,
-                ls=palette.policies[policy].dashes,
-                lw=palette.policies[policy].width,
-                label=shown_policy(policy),
-            )
-            for policy in comparison.policies
-        ]
-        figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
-        name = f"latencies-{comparison.problem.name}"
-        return inline(figure, name, "Distribution of latency by scenario and policy")
+
+def through_time(comparison: Comparison, look: Look, scenario: str, policy: str) -> str:
+    """One run, window by window."""
+    example, problem = comparison.examples[scenario, policy], comparison.problem
+    figure = run_timeline(
+        example.windows,
+        example.decisions,
+        candidates=tuple(problem.candidates),
+        period_ms=problem.pipeline.period_ms,
+        deadline_ms=problem.pipeline.deadline_ms,
+        slug=f"time-{scenario}",
+    )
+    return _drawn(comparison, look, figure)
+
+
+def _drawn(comparison: Comparison, look: Look, figure: Figure) -> str:
+    return inline(draw(figure, look), f"{figure.slug}-{comparison.problem.name}", figure.title)
 
 
 def _panels(
@@ -259,12 +230,12 @@ def _panels(
                 ax.set_axis_off()
                 continue
             draw(ax, scenarios[i])
-            ax.set_title(_folded(shown_scenario(scenarios[i])))
+            ax.set_title(folded(shown_scenario(scenarios[i]), 22))
             ax.tick_params(axis="y", length=0)
             ax.spines["left"].set_visible(False)
         grid[0, 0].set_ylim(len(policies) - 0.4, -0.6)
         for ax in grid[:, 0]:
-            ax.set_yticks(range(len(policies)), [shown_policy(name) for name in policies])
+            ax.set_yticks(range(len(policies)), [shown_contender(name) for name in policies])
             ax.tick_params(axis="y", labelcolor=INK)
         figure.supxlabel(label, size=9, color=MUTED)
         if patches:
@@ -275,12 +246,3 @@ def _panels(
 def _line(ax: Axes, x: float) -> None:
     """Draw a limit, behind the data."""
     ax.axvline(x, color=INK, lw=0.9, ls=(0, (4, 2)), zorder=1)
-
-
-def _folded(text: str, width: int = 22) -> str:
-    """Break a long name into two lines at the blank nearest to its middle."""
-    if len(text) <= width or " " not in text:
-        return text
-    blanks = [i for i, letter in enumerate(text) if letter == " "]
-    middle = min(blanks, key=lambda i: abs(i - len(text) / 2))
-    return f"{text[:middle]}\n{text[middle + 1 :]}"

@@ -105,10 +105,11 @@ thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .begin { padding-left: 36px; }
 .wide { width: 100%; }
 .of-chapter thead .pair { white-space: normal; } .of-chapter thead th { max-width: 11em; }
-.small { font-size: 13px; } .small th { font-size: 12.5px; } .small .err { font-size: 12px; }
+.small { font-size: 13px; } .small th { font-size: 12.5px; } .small .err { font-size: 11.5px; }
 .small :not(:first-child):is(td, th) { padding-left: 9px; } .small .err.err { padding-left: 4px; }
 .summary { width: 100%; } .summary :is(th, td) { padding-top: 8px; padding-bottom: 8px; }
 .summary tbody th { white-space: normal; width: 30%; padding-right: 8px; }
+.text { min-width: 11em; }
 .prose { width: 100%; max-width: 52em; }
 .prose :not(:first-child):is(td, th) { padding-left: 20px; }
 .nowrap { white-space: nowrap; }
@@ -127,11 +128,19 @@ summary { cursor: pointer; color: var(--muted); font-size: 14px; margin: 12px 0;
 a { color: inherit; text-decoration-color: var(--muted); text-underline-offset: 2px; }
 @media (max-width: 640px) { main { padding: 40px 18px 80px; } dl { display: block; }
   dd { margin-bottom: 8px; } h1 { font-size: 27px; } h2 { margin-top: 56px; }
-  .drawing svg, .drawing img { width: 760px; max-width: none; } }
+  .drawing svg, .drawing img { width: 760px; max-width: none; }
+  .of-chapter { min-width: 820px; }
+  .of-chapter tr:not(.group) > :first-child { position: sticky; left: 0; padding-right: 6px;
+    background: var(--paper); }
+  .of-chapter tr + tr:not(.group) > :first-child { box-shadow: inset 0 1px var(--rule); }
+  .summary, .summary :is(tbody, tr, th, td) { display: block; width: auto !important; }
+  .summary thead { display: none; } .summary tr { padding: 12px 0; }
+  .summary tr + tr { border-top: 1px solid var(--rule); }
+  .summary tr > :is(th, td) { padding: 2px 0 !important; border: 0 !important; } }
 @media print { body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
   h2 { margin-top: 32pt; } h2, h3 { break-after: avoid; }
   figure, tr, li { break-inside: avoid; } .drawing { overflow: visible; }
-  .files { display: none; } tr.group { break-after: avoid; }
+  .files a { text-decoration: none; } tr.group { break-after: avoid; }
   .scroll { overflow: visible; }
   table { font-size: 8.5pt; } th, .err, small { font-size: 8pt; }
   td, th { padding-left: 6px; } .err { padding-left: 3px; } }

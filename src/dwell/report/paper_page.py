@@ -218,8 +218,10 @@ def _chapter(
 
 def _files(folder: str, name: str, endings: Sequence[str]) -> str:
     """Return where the same thing is as a file, beside the page."""
+    path = escape(f"{folder}/{name}")
     links = ", ".join(
-        f'<a href="{folder}/{escape(name)}.{ending}">{ending.upper()}</a>' for ending in endings
+        f'<a href="{path}.{ending}">{"" if i else path}.{ending}</a>'
+        for i, ending in enumerate(endings)
     )
     return f'<p class="note files">{links}</p>'
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.report.drawing import draw
+from dwell.report.look import Look
 from dwell.report.palette import INK, MUTED, PAPER, PARTS
-from dwell.report.scales import set_log_ticks
 from dwell.report.svg import inline, new_figure
-from dwell.study import AIM
+from dwell.study.paper.chapter import Figure
 from dwell.study.summary import latency_ms
 
 if TYPE_CHECKING:
@@ -24,36 +25,31 @@ LINES = ("solid", (0, (5, 2)), (0, (1.2, 1.6)), (0, (5, 1.5, 1.2, 1.5)))
 DASHED = (0, (4, 2))
 
 
-def latencies_by_placement(
-    cycles: pl.DataFrame, placements: Mapping[str, str], deadline_ms: float
-) -> str:
+def latencies_by_placement(cycles: pl.DataFrame, look: Look, deadline_ms: float) -> str:
     """Share of the cycles that took longer than a latency, a line for each placement."""
-    from matplotlib.lines import Line2D
+    import polars as pl
 
-    with new_figure(2.7) as figure:
-        ax = figure.subplots()
-        least = 0.5
-        for name, colour in placements.items():
-            final_ms = np.sort(latency_ms(cycles.filter(cycles["placement"].cast(str) == name)))
-            finite = final_ms[np.isfinite(final_ms)]
-            if not len(finite):
-                continue
-            later = 100 * (1 - np.arange(1, len(finite) + 1) / len(final_ms))
-            least = min(least, 100 / len(final_ms))
-            keep = _thinned(len(finite))
-            later[later <= 0] = math.nan
-            ax.plot(finite[keep], later[keep], color=colour)
-        ax.axvline(deadline_ms, color=INK, lw=0.9, ls=DASHED, zorder=1)
-        ax.axhline(100 * AIM, color=MUTED, lw=0.8, ls=(0, (1, 2)))
-        ax.set_yscale("log")
-        ax.set_ylim(least, 120)
-        set_log_ticks(ax.yaxis, least, 120)
-        ax.set_xlim(0, 3 * deadline_ms)
-        ax.set_xlabel("latency (ms); dashed: deadline")
-        ax.set_ylabel("cycles that took longer (%)")
-        handles = [Line2D([], [], color=hue, label=name) for name, hue in placements.items()]
-        figure.legend(handles=handles, loc="outside upper left", ncols=len(handles))
-        return inline(figure, "latencies", "Distribution of latency by placement")
+    frames = []
+    for name in look.placements:
+        final_ms = np.sort(latency_ms(cycles.filter(cycles["placement"].cast(str) == name)))
+        finite = final_ms[np.isfinite(final_ms)]
+        keep = _thinned(len(finite))
+        share = (keep + 1) / max(len(final_ms), 1)
+        lines = pl.DataFrame({"x": finite[keep], "y": share})
+        frames.append(lines.select(pl.lit(name).alias("placement"), pl.all()))
+    figure = Figure(
+        slug="latencies",
+        title="Distribution of latency by placement",
+        kind="ecdf",
+        frame=pl.concat(frames),
+        x="x",
+        y="y",
+        series="placement",
+        x_label="latency (ms)",
+        line_at=deadline_ms,
+        line_label="deadline",
+    )
+    return inline(draw(figure, look), figure.slug, figure.title)
 
 
 def split_by_placement(
@@ -110,5 +106,7 @@ def node_use_in_time(windows: pl.DataFrame, nodes: Sequence[str], period_ms: flo
 
 def _thinned(count: int, points: int = 500) -> NDArray[np.int64]:
     """Return which of `count` sorted values to draw: the nearer to the tail, the more of them."""
+    if not count:
+        return np.zeros(0, np.int64)
     from_end = np.unique(np.rint(np.geomspace(1, count, min(count, points))).astype(np.int64))
     return (count - from_end)[::-1]

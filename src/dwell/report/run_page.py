@@ -9,7 +9,9 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from dwell.report import run_figures
+from dwell.report.drawing import draw
 from dwell.report.facts import Facts
+from dwell.report.look import Look
 from dwell.report.page import (
     Cell,
     definitions,
@@ -23,7 +25,8 @@ from dwell.report.page import (
     table,
 )
 from dwell.report.palette import Palette
-from dwell.report.timeline import timeline
+from dwell.report.svg import inline
+from dwell.report.timeline import run_timeline
 from dwell.report.wording import listed, percent, shown_scenario, write_number
 from dwell.study import AIM
 from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
@@ -37,6 +40,8 @@ __all__ = ["run_html"]
 
 MOST_ROWS = 40
 WORST = 10
+# Shares of a node's cores below this are not told.
+LEAST_SHOWN = 5e-4
 REASONS = {
     "dwell": "too soon after the last migration",
     "hold": "no other placement promised enough",
@@ -130,9 +135,30 @@ def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
     undone = _undone(moves)
     text += f", {undone} of which undid the one before" if undone else ""
     yield f"{text}."
+    yield from _shadows(facts, counted.windows)
     yield (
         "One run is one sample: it says what happened, not what to expect. For intervals, compare "
         "runs over seeds."
+    )
+
+
+def _shadows(facts: Facts, windows: pl.DataFrame) -> Iterator[str]:
+    """Say what shadow jobs cost, where there were any."""
+    if "shadow_cycles" not in windows.columns or not windows["shadow_cycles"].sum():
+        return
+    cycles = windows.height * facts.window_cycles
+    share = float(windows["shadow_cycles"].sum()) / cycles
+    rate_mbps = float(windows["shadow_bytes"].sum()) * 8e-3 / (cycles * facts.period_ms)
+    used = {node: windows[f"shadow_{node}"].mean() for node in facts.nodes}
+    taken = listed(
+        f"{percent(mean, 1)} of {node}"
+        for node, mean in used.items()
+        if isinstance(mean, float) and mean >= LEAST_SHOWN
+    )
+    yield (
+        f"{percent(share, 1)} of the cycles went through another placement as well, for the "
+        f"estimator: these shadow jobs took {taken or 'next to no compute time'}, and sent "
+        f"{write_number(rate_mbps, 2)} Mbit/s more over the links."
     )
 
 
@@ -163,17 +189,18 @@ def _count(number: int, what: str) -> str:
 
 
 def _in_time(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
+    shown = run_timeline(
+        run.windows,
+        run.decisions,
+        candidates=tuple(facts.candidates),
+        period_ms=facts.period_ms,
+        deadline_ms=facts.deadline_ms,
+        slug="time",
+    )
     yield figure(
-        timeline(
-            run.windows,
-            run.decisions,
-            placements=palette.placements,
-            period_ms=facts.period_ms,
-            deadline_ms=facts.deadline_ms,
-            name="time",
-        ),
+        inline(draw(shown, Look(palette, frozenset())), shown.slug, shown.title),
         "Each mark is a window and has the colour of the placement that was active. In the lowest "
-        "panel the lines are what the other placements were estimated to cost.",
+        "panel the lines without marks are what the other placements were estimated to cost.",
     )
     yield figure(
         run_figures.node_use_in_time(run.windows, facts.nodes, facts.period_ms),
@@ -183,7 +210,9 @@ def _in_time(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
 
 def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
     yield figure(
-        run_figures.latencies_by_placement(counted.cycles, palette.placements, facts.deadline_ms),
+        run_figures.latencies_by_placement(
+            counted.cycles, Look(palette, frozenset()), facts.deadline_ms
+        ),
         "Latency of the cycles that were released under each placement: one less the empirical "
         "distribution function, on a logarithmic scale. Dotted: 5 %.",
     )

@@ -62,7 +62,8 @@ def draw_timeline(figure: Figure, look: Look) -> Canvas:
     places = [_known(place) for place in parted(figure, look, 1).places]
     x = floats(figure.frame, figure.x)
     first, last = float(np.nanmin(x)), float(np.nanmax(x))
-    step = float(np.min(np.diff(np.unique(x[np.isfinite(x)])), initial=1.0))
+    gaps = np.diff(np.unique(x[np.isfinite(x)]))
+    step = float(np.median(gaps)) if len(gaps) else 1.0
     spans = tuple(_spans(figure, step))
     labels, handles = _legend(figure, look, places)
     strips = (["placement"] if "placement" in figure.frame.columns else []) + (
@@ -118,11 +119,12 @@ def _placements(ax: Axes, figure: Figure, look: Look, step: float) -> None:
 def _stretches(
     at: Floats, names: Sequence[object], step: float
 ) -> Iterable[tuple[float, float, str]]:
-    """Yield begin, end and name of each stretch of equal names."""
+    """Yield begin, end and name of each stretch of equal names; they meet halfway."""
+    edges = np.concatenate([[at[0] - step / 2], (at[1:] + at[:-1]) / 2, [at[-1] + step / 2]])
     change = [0, *(i for i in range(1, len(names)) if names[i] != names[i - 1]), len(names)]
     for i, j in itertools.pairwise(change):
         if names[i] is not None:
-            yield float(at[i]) - step / 2, float(at[j - 1]) + step / 2, key(names[i])
+            yield float(edges[i]), float(edges[j]), key(names[i])
 
 
 def _happened(ax: Axes, spans: Sequence[Span], names: Sequence[str]) -> None:

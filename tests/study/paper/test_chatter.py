@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import polars as pl
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dwell.cost import hamming
+from dwell.model import Caps, QoS, Targets, Weights
+from dwell.policies import DTP
 from dwell.sim import draw, simulate_realisation
 from dwell.study.family import Comparative
 from dwell.study.paper import Chapter, Runner
@@ -17,6 +22,7 @@ from dwell.study.paper.chatter import (
     ESTIMATORS,
     FEW_STRENGTHS,
     JUDGED_BY,
+    METRICS,
     OF_TWO,
     PENALTY,
     STRENGTHS,
@@ -35,15 +41,23 @@ from dwell.study.study import Point, Study
 from tests.study.paper.small_cell import SCALE, make_cell
 
 NO: Comparative = "no difference shown"
-ALIKE = Seen((NO, NO, NO), (NO, NO))
-CALMER = Seen(("lower", NO, NO), (NO, "lower"))
-ROUGHER = Seen((NO, "higher", NO), (NO, NO))
-TRADED = Seen(("lower", NO, NO), ("higher", NO))
-TRADED_BACK = Seen((NO, "higher", NO), (NO, "lower"))
+
+
+def seen(dwell: int = 3, **said: Comparative) -> Seen:
+    """Return what was shown, nothing where it is not said."""
+    return Seen(dwell, dict.fromkeys(METRICS, NO) | said)
+
+
+ALIKE = seen()
+CALMER = seen(migrations="lower", j_still="lower")
+ROUGHER = seen(dwell=0, returns="higher")
+TRADED = seen(migrations="lower", violation_rate="higher")
+TRADED_BACK = seen(dwell=0, returns="higher", j_still="lower")
+SPLIT = seen(migrations="higher", moved="lower")
 
 
 @pytest.mark.parametrize(
-    ("seen", "equivalent", "expected"),
+    ("places", "equivalent", "expected"),
     [
         ([CALMER, CALMER, ALIKE], False, "yes"),
         ([CALMER, ALIKE, ALIKE], False, "in part"),
@@ -55,16 +69,23 @@ TRADED_BACK = Seen((NO, "higher", NO), (NO, "lower"))
     ],
 )
 def test_the_answer_follows_from_what_is_shown(
-    seen: Sequence[Seen], equivalent: bool, expected: str
+    places: Sequence[Seen], equivalent: bool, expected: str
 ) -> None:
-    answer, sentence = verdict(seen, equivalent=equivalent)
+    answer, sentence = verdict(places, equivalent=equivalent)
     assert answer == expected
-    assert f"of {len(seen)} comparisons" in sentence
+    assert f"of {len(places)} comparisons" in sentence
     assert ("agree within 10 %" in sentence) == equivalent
 
 
+def test_the_sentence_counts_each_dwell_apart() -> None:
+    _, sentence = verdict([CALMER, SPLIT, ROUGHER], equivalent=False)
+    assert "N_min = 0 (1 comparisons) migrations 0 and 0, returns 0 and 1" in sentence
+    assert "N_min = 3 (2 comparisons) migrations 1 and 1, returns 0 and 0" in sentence
+    assert "tasks moved 1 and 0" in sentence
+
+
 def test_what_is_traded_is_neither_calmer_nor_rougher() -> None:
-    for one in (TRADED, TRADED_BACK):
+    for one in (TRADED, TRADED_BACK, SPLIT):
         assert [one.calmer, one.rougher, one.alike] == [False] * 3
 
 
@@ -122,6 +143,75 @@ def test_tasks_moved_are_those_of_the_decisions(tmp_path_factory: pytest.TempPat
         price = mine.objective.weights.switching
         still = counted["cost"].mean() - price * sum(moves) / 4 / counted.height  # type: ignore[operator]
         assert row["j_still"].item() == pytest.approx(still)
+
+
+def ruled(switching: float, least: float, dwell: int, names: Sequence[str]) -> DTP:
+    """Return a DTP whose J is L95 in milliseconds, and the price of a move."""
+    problem = make_cell()
+    objective = replace(
+        problem.objective,
+        weights=Weights(latency=1, violations=0, robot=0, edge=0, switching=switching),
+        targets=Targets(latency_ms=1.0),
+        caps=Caps(),
+    )
+    candidates = {name: problem.candidates[name] for name in names}
+    return DTP(candidates=candidates, objective=objective, min_dwell=dwell, min_improvement=least)
+
+
+def moves(policy: DTP, rows: Sequence[Sequence[float]]) -> list[str]:
+    """Return where a policy is after each window, given J of every candidate in each."""
+    path = []
+    for row in rows:
+        seen = {
+            name: QoS(ms, 0.0, {"R1": 0.0, "E": 0.0, "R2": 0.0})
+            for name, ms in zip(policy.candidates, row, strict=True)
+        }
+        path.append(policy.decide(observed=seen[policy.incumbent], estimates=seen).name)
+    return path
+
+
+# Sums of these are exact, so that only the rules decide.
+EIGHTHS = st.integers(0, 40).map(lambda number: number / 8)
+TWO = st.lists(st.tuples(EIGHTHS, EIGHTHS), max_size=40)
+THREE = st.lists(st.tuples(EIGHTHS, EIGHTHS, EIGHTHS), max_size=40)
+
+
+@given(rows=TWO, dwell=st.integers(1, 4), switching=st.sampled_from([0.5, 1.0, 2.0]))
+def test_between_two_candidates_the_penalty_is_a_threshold(
+    rows: list[tuple[float, float]], dwell: int, switching: float
+) -> None:
+    pair = ("LOC", "SO")
+    penalty = ruled(switching, 0.25, dwell, pair)
+    threshold = ruled(0.0, 0.25 + switching / 2, dwell, pair)
+    assert moves(penalty, rows) == moves(threshold, rows)
+
+
+@given(rows=THREE, dwell=st.integers(1, 4), switching=st.sampled_from([0.5, 1.0, 2.0]))
+def test_with_a_dwell_the_penalty_is_a_threshold_of_each_pair(
+    rows: list[tuple[float, float, float]], dwell: int, switching: float
+) -> None:
+    names = ("LOC", "SO", "HYB")
+    policy = ruled(switching, 0.25, dwell, names)
+    placements, at, waited, expected = policy.candidates, "LOC", 0, []
+    for row in rows:
+        costs = dict(zip(names, row, strict=True))
+        asked = {name: switching * hamming(placements[name], placements[at]) for name in names}
+        best = min(names, key=lambda name: (costs[name] + asked[name], name != at))
+        if waited >= dwell and best != at and costs[at] - costs[best] > 0.25 + asked[best]:
+            at, waited = best, 0
+        else:
+            waited += 1
+        expected.append(at)
+    assert moves(policy, rows) == expected
+
+
+@pytest.mark.parametrize(("gain", "returns"), [(0.5, False), (0.625, True), (0.75, True)])
+def test_right_after_a_move_the_penalty_asks_for_less(gain: float, returns: bool) -> None:
+    # α_S · S = 0.5 and Δ_min = 0.25: to go back it takes 0.5, not 0.75.
+    rows = [(5.0, 1.0), (1.0, 1.0 + gain)]
+    path = moves(ruled(1.0, 0.25, 0, ("LOC", "SO")), rows)
+    assert path == ["SO", "LOC" if returns else "SO"]
+    assert moves(ruled(0.0, 0.75, 0, ("LOC", "SO")), rows) == ["SO", "SO"]
 
 
 @pytest.fixture(scope="module")

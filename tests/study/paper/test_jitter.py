@@ -76,6 +76,7 @@ def test_the_answer_follows_from_where_it_turns(
         (NEVER, "at no envelope"),
         (ALWAYS, "up to 32 ms and beyond"),
         (FEW, "up to 4.0 ms"),
+        (Interval(INF, 20.0, INF), "up to 20.0 ms at least"),
         (Interval(INF, math.nan, math.nan), "up to 32 ms and beyond"),
         (Interval(0.0, math.nan, math.nan), "at no envelope"),
     ],

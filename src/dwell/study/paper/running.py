@@ -95,7 +95,7 @@ class Scale:
             dynamic_windows=DYNAMIC_WINDOWS,
             grid=9,
             grid_seeds=12,
-            sobol_n=64,
+            sobol_n=32,
             sobol_seeds=3,
             sobol_windows=60,
             tuning_seeds=10,

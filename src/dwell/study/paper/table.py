@@ -504,6 +504,7 @@ def violations_figure(main: Table) -> Figure:
         y_unit="percent",
         line_at=AIM,
         line_label="5 %",
+        log_y=True,
         note=f"{main.note} Against the aim counts the one-sided limit, which the table has.",
     )
 

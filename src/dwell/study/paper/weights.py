@@ -89,7 +89,7 @@ def chapter(problem: Problem, scale: Scale, runner: Runner) -> Chapter:
     alone = [
         runner.run(study)
         for study in studies(
-            "weights-one", problem, scale, stepping(problem), scale.seeds, ONE_AT_A_TIME
+            "weights-one", problem, scale, stepping(problem), scale.grid_seeds, ONE_AT_A_TIME
         )
     ]
     return written(problem, scale, together, alone)
@@ -356,7 +356,7 @@ def design(
         f"{scale.dynamic_windows} where a scenario has a timetable); first-order (S1) and total "
         "(ST) indices of the mean over seeds, with 95 % intervals over base points. Outputs "
         "contain no weight that is varied. One at a time: each weight × 0, × ½ and × 2 in "
-        f"{tried}, {scale.seeds} seeds, paired by seed with the cell's weights (sign-flip test, "
+        f"{tried}, {scale.grid_seeds} seeds, paired with the cell's weights (sign-flip test, "
         "tracking: sign test; Holm over all comparisons of a metric)."
     )
 
