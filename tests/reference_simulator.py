@@ -39,7 +39,7 @@ __all__ = [
     "transmission_ns",
 ]
 
-COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, CLOSE, RELEASE = range(1, 9)
+COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, RELEASE = range(1, 10)
 # Cells: the jobs of a cycle itself, and those of its shadow.
 ITSELF, SHADOW = 0, 1
 MASK = 2**64 - 1
@@ -690,7 +690,7 @@ class Simulation:
                 ),
             )
 
-        self.at(arrival, RESTART, 0, -1, arrive, fixed=True)
+        self.at(arrival, STEP, -1, -1, arrive, fixed=True)
 
     def step(
         self,
@@ -701,8 +701,8 @@ class Simulation:
         *,
         cause: int | None = None,
     ) -> None:
-        """Let a cold migration go on with a task: after restarts, by attempt and task."""
-        self.at(time, RESTART, attempt + 1, self.index[task], action, cause=cause)
+        """Let a cold migration go on with a task."""
+        self.at(time, STEP, attempt, self.index[task], action, cause=cause)
 
     # ---------------------------------------------------------------------------------- cycles
 

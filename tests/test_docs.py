@@ -16,7 +16,13 @@ from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-EXECUTED = ("README.md", "docs/profiling.md", "docs/studies.md", "docs/tutorial.md")
+EXECUTED = (
+    "README.md",
+    "docs/estimators.md",
+    "docs/profiling.md",
+    "docs/studies.md",
+    "docs/tutorial.md",
+)
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")

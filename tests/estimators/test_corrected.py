@@ -370,7 +370,7 @@ def test_it_learns_from_the_active_placement_alone() -> None:
             windows=20,
         )
         shown = run.decisions
-        assert "shadow_cpu_R1" not in run.windows.columns
+        assert "shadow_R1" not in run.windows.columns
         usual = Profile(problem)
         for name in others:
             learnt = shown[f"est_l95_ms_{name}"][-1] > usual.l95_ms[name] + 20

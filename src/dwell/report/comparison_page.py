@@ -182,8 +182,8 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
         head,
         rows,
         f"{_columns(problem.candidates)} the mean shares of the windows that began under each. "
-        "Bold: the lowest V_D and J of a scenario. V_D is “under” 5 % where its one-sided 95 % limit is, "
-        f"“above” where its lower limit is, else “open”.{_ours(comparison)}",
+        "Bold: the lowest V_D and J of a scenario. V_D is “under” 5 % where its one-sided 95 % "
+        f"limit is, “above” where its lower limit is, else “open”.{_ours(comparison)}",
         kind="wide small",
     )
 

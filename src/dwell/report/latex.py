@@ -130,9 +130,8 @@ def tabular(
     for group, cells in rows:
         if group:
             lines += [] if first else [r"\addlinespace"]
-            lines.append(
-                rf"\multicolumn{{{len(columns)}}}{{@{{}}l}}{{\textit{{{escaped(group)}}}}} \\"
-            )
+            name = rf"\textit{{{escaped(group)}}}"
+            lines.append(rf"\multicolumn{{{len(columns)}}}{{@{{}}l@{{}}}}{{{name}}} \\")
         else:
             lines.append(" & ".join(map(_cell, cells)) + r" \\")
         first = False

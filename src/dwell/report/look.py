@@ -122,7 +122,7 @@ def _scenarios(chapters: Iterable[Chapter]) -> Iterator[str]:
         frames = [item.frame for item in chapter.figures] + [item.frame for item in chapter.tables]
         for frame in frames:
             for name in _values(frame, "scenario"):
-                if re.fullmatch(r"\w+(-\w+)+", name) and contended(name) is None:
+                if re.fullmatch(r"\w+(-\w+)*", name) and contended(name) is None:
                     yield name
 
 

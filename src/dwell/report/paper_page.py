@@ -97,7 +97,7 @@ def paper_html(
     look: Look,
     made: Made,
     drawings: Mapping[str, str],
-    files: Mapping[str, str],
+    files: Mapping[int, str],
 ) -> str:
     """Return the page.
 
@@ -110,8 +110,8 @@ def paper_html(
     made : Made
     drawings : mapping of str to str
         Every figure as HTML, by its file's name without an ending.
-    files : mapping of str to str
-        The name that figures and tables have as files, by ``chapter/slug``.
+    files : mapping of int to str
+        What the files of figures and tables are called, by their identities.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def _anchor(chapter: Chapter) -> str:
 
 
 def _chapter(
-    chapter: Chapter, look: Look, drawings: Mapping[str, str], files: Mapping[str, str]
+    chapter: Chapter, look: Look, drawings: Mapping[str, str], files: Mapping[int, str]
 ) -> str:
     word, kind = TAGS[chapter.answer]
     tag = f'<span class="tag {kind}">{word}</span>' if word else ""
@@ -199,7 +199,7 @@ def _chapter(
         paragraph(look.prose(chapter.design), "note"),
     ]
     for figure in chapter.figures:
-        name = files[f"{chapter.slug}/{figure.slug}"]
+        name = files[id(figure)]
         note = chapter_tables.noted(figure, look)
         caption = f"<figcaption>{marked(note)}</figcaption>" if note else ""
         parts.append(
@@ -208,7 +208,7 @@ def _chapter(
             f"{_files('figures', name, ('svg', 'pdf'))}\n</figure>"
         )
     for item in chapter.tables:
-        name = files[f"{chapter.slug}/{item.slug}"]
+        name = files[id(item)]
         parts.append(chapter_tables.html(item, look, main=item.slug == chapter.slug))
         parts.append(_files("tables", name, ("csv", "tex")))
     if chapter.findings:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,16 +73,16 @@ def paper_report(
         If the folder cannot be written; what is there stays.
     """
     look = Look.of(problem, chapters)
-    files = dict(_named(chapters))
+    files = _named(chapters)
     why = {name: str(error) for name, error in failures.items()}
     made = Made(scale, elapsed_s, versions(), why, replayed)
     drawings = {}
     for chapter in chapters:
         for figure in chapter.figures:
-            name = files[f"{chapter.slug}/{figure.slug}"]
+            name = files[id(figure)]
             drawings[name] = _write_figure(figure, look, folder / "figures", name)
         for table in chapter.tables:
-            name = files[f"{chapter.slug}/{table.slug}"]
+            name = files[id(table)]
             _write(folder / "tables" / f"{name}.csv", chapter_tables.csv(table).encode())
             text = chapter_tables.latex(table, look, name)
             _write(folder / "tables" / f"{name}.tex", text.encode())
@@ -92,16 +92,25 @@ def paper_report(
     return page
 
 
-def _named(chapters: Sequence[Chapter]) -> Iterator[tuple[str, str]]:
-    """Yield ``chapter/slug`` and the name of its files; a slug may begin with its chapter's."""
-    for chapter in chapters:
-        slugs = (
-            *(figure.slug for figure in chapter.figures),
-            *(table.slug for table in chapter.tables),
-        )
-        for slug in slugs:
-            inside = slug == chapter.slug or slug.startswith(f"{chapter.slug}-")
-            yield f"{chapter.slug}/{slug}", slug if inside else f"{chapter.slug}-{slug}"
+def _named(chapters: Sequence[Chapter]) -> dict[int, str]:
+    """Return what the files of every figure and table are called, by its identity."""
+    found: dict[int, str] = {}
+    for kind in ("figures", "tables"):
+        taken: set[str] = set()
+        for chapter in chapters:
+            for item in getattr(chapter, kind):
+                name = _name(chapter.slug, item.slug)
+                while name in taken:
+                    name += "-again"
+                taken.add(name)
+                found[id(item)] = name
+    return found
+
+
+def _name(chapter: str, slug: str) -> str:
+    """Join the two; a slug may begin with its chapter's."""
+    inside = slug == chapter or slug.startswith(f"{chapter}-")
+    return slug if inside else f"{chapter}-{slug}"
 
 
 def _write_figure(figure: Figure, look: Look, folder: Path, name: str) -> str:
