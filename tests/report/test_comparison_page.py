@@ -73,6 +73,13 @@ def test_every_policy_stands_in_every_scenario(html: str) -> None:
     assert "seeds 1 to 3" in text
 
 
+def test_what_the_actuator_got_is_told(html: str) -> None:
+    page = Page(html)
+    assert "What the actuator got" in page.headings
+    for words in ("misses in a row", "most misses in 20", "mean age (ms)"):
+        assert words in page.text
+
+
 def test_the_same_comparison_makes_the_same_page() -> None:
     one = replace(small_comparison(), scenarios=("baseline",))
     assert comparison_html(one) == comparison_html(one)
@@ -172,6 +179,16 @@ def test_leaving_and_returning_is_put_down_to_the_estimator() -> None:
     text = verdict(make_comparison(shown, estimated={"LOC": 1.1, "SO": 0.91, "HYB": 0.99}))[-1]
     assert "migrated 36 times in a run of 98 windows, and 97 % of these" in text
     assert "SO at J = 0.91, and run alone SO measures 9.84" in text
+
+
+def test_other_estimators_are_held_against_dtp() -> None:
+    shown: Shown = {
+        ("baseline", "dtp"): {"cost": [1.5 + x for x in NOISE]},
+        ("baseline", "dtp+corrected"): {"cost": 1.25},
+    }
+    policies = ("LOC", "SO", "HYB", "dtp", "dtp+corrected")
+    text = verdict(make_comparison(shown, policies=policies))[-1]
+    assert text == "Against DTP, the cost J of DTP (corrected) is lower by 0.25 in Baseline."
 
 
 def test_without_a_migration_nothing_is_put_down_to_anything() -> None:

@@ -53,7 +53,16 @@ def test_a_bracket_at_the_begin_of_a_row_is_no_argument() -> None:
 
 def test_groups_stand_across_the_table() -> None:
     rows = [("A_1 & co", ()), ("", ["x", "1"]), ("B", ()), ("", ["y", "2"])]
-    text = tabular(["a", "b"], "lr", rows, caption="c", label="tab:x", comments=["needs é"])
+    text = tabular(["a", "b"], "lr", rows, caption="c", label="tab:x")
     assert r"\multicolumn{2}{@{}l@{}}{\textit{A\_1 \& co}} \\" in text
     assert text.count(r"\addlinespace") == 1
-    assert text.startswith("% needs ?\n")
+    assert text.startswith("% needs")
+
+
+def test_a_table_of_more_than_a_page_goes_on_on_the_next() -> None:
+    rows = [("", [str(i), "1"]) for i in range(80)]
+    text = tabular(["a", "b"], "lr", rows, caption="c", label="tab:x")
+    assert text.count(r"a & b \\") == 2
+    for word in ("longtable", r"\endfirsthead", r"\endhead", r"\endfoot"):
+        assert word in text
+    assert r"\begin{table}" not in text

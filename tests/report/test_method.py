@@ -8,6 +8,8 @@ import pytest
 from dwell.model import (
     Constant,
     Disturbance,
+    Episodes,
+    Exponential,
     LinkDisturbance,
     LogNormal,
     NodeDisturbance,
@@ -19,6 +21,7 @@ from dwell.model import (
 )
 from dwell.report.method import describe_scenario
 
+EPISODES = Episodes("edge", every_s=Exponential(30.0), for_s=Uniform(2.0, 10.0))
 TABLE = TraceTable(file="delays.csv", columns={"delay_ms": np.array([1.0, 3.0])})
 
 
@@ -38,6 +41,19 @@ TABLE = TraceTable(file="delays.csv", columns={"delay_ms": np.array([1.0, 3.0])}
         (
             (LinkDisturbance("R1", "E", rate_mbps=10.0, at_s=5),),
             "a rate of 10 Mbit/s from 5 s on R1→E",
+        ),
+        (
+            (NodeDisturbance("E", stress_threads=16, episodes=EPISODES),),
+            "16 threads of foreign work, in episodes (off 30 s, on 6 s in the mean) on E",
+        ),
+        (
+            (NodeDisturbance("E", at_s=20, for_s=380, ramp_s=190, stress_threads=16),),
+            "16 threads of foreign work from 20 s for 380 s, growing for 190 s and falling "
+            "likewise on E",
+        ),
+        (
+            (LinkDisturbance("R1", "E", loss=0.02, ramp_s=60),),
+            "2.0 % of the messages lost, growing for 60 s on R1→E",
         ),
     ],
 )

@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import polars as pl
 import pytest
 
 from dwell import Run, open_run, simulate
@@ -42,6 +43,23 @@ def test_a_placement_that_never_moves_is_called_so() -> None:
     page = Page(run_html(small_run("LOC")))
     assert "LOC, which never moves" in page.headings[0]
     assert "and never migrated" in page.text
+
+
+def test_what_shadow_jobs_cost_is_told() -> None:
+    run = small_run()
+    assert "shadow jobs" not in Page(run_html(run)).text
+    windows = run.windows.with_columns(
+        shadow_cycles=pl.lit(1),
+        shadow_bytes=pl.lit(41250),
+        shadow_R1=pl.lit(0.0),
+        shadow_E=pl.lit(0.012),
+        shadow_R2=pl.lit(0.004),
+    )
+    shown = Run(run.meta, {"cycles": run.cycles, "windows": windows, "decisions": run.decisions})
+    text = Page(run_html(shown)).text
+    # 10 cycles of 33 ms a window: 330 kbit in 0.33 s.
+    assert "10.0 % of the cycles went through another placement as well" in text
+    assert "took 1.2 % of E and 0.4 % of R2, and sent 1.00 Mbit/s more" in text
 
 
 def test_a_run_from_its_folder_makes_the_same_page(html: str, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ SHARE = Measure("share_LOC", "LOC", "%", 100.0)
         (3.36, 1, "3.4"),
         (0.0, 1, "0.0"),
         (-0.25, 2, "−0.25"),
+        (-0.001, 2, "0.00"),
         (9.837, 2, "9.84"),
         (23.59, 2, "23.6"),
         (225.58, 1, "226"),
@@ -66,6 +67,7 @@ def test_names() -> None:
     assert shown_scenario("robot-cpu-stress") == "Robot CPU stress"
     assert shown_policy("dtp") == "DTP"
     assert "our reconstruction" in shown_policy("atp")
+    assert shown_policy("dtp+corrected") == "DTP (corrected)"
     assert shown_policy("my own") == "my own"
 
 

@@ -158,7 +158,6 @@ def latex(item: Table, look: Look, label: str) -> str:
         rows,
         caption=f"{look.prose(item.title)}. {noted(item, look)}".strip(),
         label=f"tab:{label}",
-        comments=("needs \\usepackage{booktabs,graphicx}",),
     )
 
 

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from dwell.report import figures
-from dwell.report.contenders import POLICIES
+from dwell.report.contenders import describe_contenders
 from dwell.report.findings import (
     COST,
     DTP,
@@ -23,9 +23,10 @@ from dwell.report.findings import (
     verdict,
 )
 from dwell.report.look import Look
-from dwell.report.method import method, placements
+from dwell.report.method import method
 from dwell.report.page import (
     Cell,
+    definitions,
     document,
     figure,
     items,
@@ -150,12 +151,7 @@ def _subtitle(comparison: Comparison) -> str:
 
 def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
     problem = comparison.problem
-    statics = [name for name in problem.candidates if name in comparison.policies]
-    if statics:
-        yield paragraph(f"{placements(problem, statics)} As policies these never move.")
-    notes = [POLICIES[name] for name in comparison.policies if name in POLICIES]
-    if notes:
-        yield paragraph(" ".join(notes))
+    yield definitions(describe_contenders(problem, comparison.policies))
     yield paragraph(
         "V_D is the share of cycles that finished after the deadline or not at all; L95 the 95th "
         "percentile of a window's latencies, averaged over the windows; U_r and U_e the "

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from dwell.model.document import to_document
+from dwell.report.palette import contended
 from dwell.report.wording import (
     Measure,
     listed,
@@ -77,6 +78,7 @@ def verdict(comparison: Comparison) -> list[str]:
     if DTP in comparison.policies:
         items += [_on_statics(comparison), _on_atp(comparison), _on_predictions(comparison)]
         items.append(_on_estimates(comparison))
+        items += _on_beliefs(comparison)
     return [item for item in items if item]
 
 
@@ -172,6 +174,22 @@ def _on_atp(comparison: Comparison) -> str:
     points = {name: Interval(*(100 * end for end in gap)) for name, gap in gaps.items()}
     said = _higher_or_lower(points, decimals=1, unit=" points")
     return f"Against {shown_policy(ATP)}, V_D of DTP is {said}."
+
+
+def _on_beliefs(comparison: Comparison) -> list[str]:
+    """Hold contenders with an estimator of their own against DTP with that of the cell."""
+    found = []
+    for name in comparison.policies:
+        known = contended(name)
+        if known is None or not known.belief:
+            continue
+        gaps = {
+            scenario: comparison.difference(scenario, (name, DTP), COST.column)
+            for scenario in comparison.scenarios
+        }
+        said = _higher_or_lower(gaps, decimals=2)
+        found.append(f"Against DTP, the cost J of {shown_policy(name)} is {said}.")
+    return found
 
 
 def _on_predictions(comparison: Comparison) -> str:
@@ -397,9 +415,9 @@ def limits(comparison: Comparison) -> list[str]:
         )
     if problem.controller.estimator == "profile" and DTP in comparison.policies:
         items.append(
-            "DTP is shown with the estimator `profile` (static profiling), the simplest of the "
-            "paper's three. It knows no disturbance, so what is said of DTP here is said of DTP "
-            "with that estimator."
+            "DTP without brackets has the estimator `profile` (static profiling), the simplest of "
+            "the paper's three. It knows no disturbance, so what is said of DTP here is said of "
+            "DTP with that estimator."
         )
     files = replayed_files(comparison)
     if files:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from collections.abc import Iterable, Sequence
 
@@ -19,6 +18,8 @@ SPECIAL = {
     "|": r"\textbar{}",
     **{letter: f"\\{letter}" for letter in "&%$#_{}"},
 }
+#: Rows that a page has room for.
+ONE_PAGE = 60
 #: What is no letter of the engines that read the file as it is, and is written in its place.
 SIGNS = {
     "−": "$-$",
@@ -73,7 +74,6 @@ def escaped(text: str) -> str:
 
 def _plain(text: str) -> str:
     """Escape every letter; those that nobody has heard of lose what makes them so."""
-    # An interval at the begin of a line would be taken for the argument of \\.
     return "".join(map(_letter, text.replace("`", "")))
 
 
@@ -95,9 +95,8 @@ def tabular(
     *,
     caption: str,
     label: str,
-    comments: Sequence[str] = (),
 ) -> str:
-    """Return a floating table.
+    """Return a table: a float as wide as the text at most, or one of several pages.
 
     Parameters
     ----------
@@ -111,32 +110,47 @@ def tabular(
         Plain text.
     label : str
         For references.
-    comments : sequence of str
-        Lines for who opens the file.
     """
-    lines = [f"% {re.sub(r'[^ -~]', '?', line)}" for line in comments]
-    lines += [
-        r"\begin{table}",
-        r"\centering",
-        rf"\caption{{{escaped(caption)}}}",
-        rf"\label{{{label}}}",
-        r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-        rf"\begin{{tabular}}{{@{{}}{columns}@{{}}}}",
-        r"\toprule",
-        " & ".join(map(_cell, head)) + r" \\",
-        r"\midrule",
-    ]
-    first = True
+    body: list[str] = []
     for group, cells in rows:
         if group:
-            lines += [] if first else [r"\addlinespace"]
             name = rf"\textit{{{escaped(group)}}}"
-            lines.append(rf"\multicolumn{{{len(columns)}}}{{@{{}}l@{{}}}}{{{name}}} \\")
+            body += [r"\addlinespace"] if body else []
+            body.append(rf"\multicolumn{{{len(columns)}}}{{@{{}}l@{{}}}}{{{name}}} \\")
         else:
-            lines.append(" & ".join(map(_cell, cells)) + r" \\")
-        first = False
-    lines += [r"\bottomrule", r"\end{tabular}%", "}", r"\end{table}", ""]
-    return "\n".join(lines)
+            body.append(_row(cells))
+    titled = rf"\caption{{{escaped(caption)}}}\label{{{label}}}"
+    top = [r"\toprule", _row(head), r"\midrule"]
+    shape = f"{{@{{}}{columns}@{{}}}}"
+    if len(body) > ONE_PAGE:
+        return "\n".join(
+            [
+                r"% needs \usepackage{booktabs,longtable}",
+                r"\begingroup\footnotesize\setlength{\tabcolsep}{3pt}",
+                rf"\begin{{longtable}}{shape}",
+                rf"{titled} \\",
+                *(*top, r"\endfirsthead"),
+                *(*top, r"\endhead"),
+                *(r"\bottomrule", r"\endfoot"),
+                *body,
+                *(r"\end{longtable}", r"\endgroup", ""),
+            ]
+        )
+    return "\n".join(
+        [
+            r"% needs \usepackage{booktabs,graphicx}",
+            *(r"\begin{table}", r"\centering", titled),
+            r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+            rf"\begin{{tabular}}{shape}",
+            *top,
+            *body,
+            *(r"\bottomrule", r"\end{tabular}%", "}", r"\end{table}", ""),
+        ]
+    )
+
+
+def _row(cells: Sequence[str]) -> str:
+    return " & ".join(map(_cell, cells)) + r" \\"
 
 
 def _cell(text: str) -> str:

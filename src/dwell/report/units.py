@@ -84,4 +84,5 @@ def write_over_seeds(
         write_number(end * measure.factor, measure.decimals, signed=measure.signed)
         for end in interval
     )
-    return Written(value, f"[{', '.join(limits)}]")
+    same = interval.low == interval.high
+    return Written(value, "" if same else f"[{', '.join(limits)}]")

@@ -144,8 +144,8 @@ def percent(share: float, decimals: int = 0) -> str:
 
 
 def shown_policy(name: str) -> str:
-    """Name of a policy as tables show it; a candidate's, or your own, stays what it is."""
-    return POLICY_NAMES.get(name, name)
+    """Name of a policy where nothing else says what it is; your own stays what it is."""
+    return POLICY_NAMES.get(name) or shown_contender(name)
 
 
 def shown_contender(name: str) -> str:
