@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dwell.report.latex import escaped, tabular
@@ -32,7 +32,8 @@ def test_escaping(text: str, latex: str) -> None:
     assert escaped(text) == latex
 
 
-@given(st.text(max_size=40))
+@settings(max_examples=40)
+@given(st.text(max_size=20))
 def test_whatever_is_escaped_is_balanced_and_known(text: str) -> None:
     latex = escaped(text)
     bare = re.sub(r"\\[\\&%$#_{}]|\\[a-z]+\{\}", "", latex)

@@ -244,22 +244,6 @@ def test_a_timeline_shows_placements_disturbances_and_levels(look: Look) -> None
     assert counted == [int((placed == name).sum()) for name in STATICS]
 
 
-def test_a_timeline_reads_levels_and_disturbances_from_its_windows(look: Look) -> None:
-    figure = one_of("timeline")
-    frame = figure.frame.with_columns(
-        level=pl.when(pl.col("panel") == "V_D").then(0.05),
-        disturbance=pl.when(pl.col("window") < 30)
-        .then(pl.lit("R1: 4 threads, E down"))
-        .otherwise(pl.lit("")),
-    )
-    canvas = draw(replace(figure, frame=frame, panels={}, spans=None), look)
-    _, happened, rates, *_ = canvas.axes
-    labels = [text.get_text() for text in happened.get_yticklabels()]
-    assert labels == ["R1: 4 threads", "E down"]
-    assert rates.get_ylabel() == "V_D (%)"
-    assert any(np.array_equal(line.get_ydata(), [5.0, 5.0]) for line in rates.get_lines())
-
-
 def test_panels_may_have_measures_of_their_own(look: Look) -> None:
     figure = next(figure for figure in figures() if figure.slug == "steps")
     first, second = draw(figure, look).axes

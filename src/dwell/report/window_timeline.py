@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,8 +28,8 @@ from dwell.report.panels import (
 )
 from dwell.report.scales import is_wide
 from dwell.report.svg import new_figure
-from dwell.report.units import labelled, write
-from dwell.study.paper.chapter import Figure, Unit
+from dwell.report.units import labelled
+from dwell.study.paper.chapter import Figure
 
 if TYPE_CHECKING:
     import polars as pl
@@ -45,8 +45,6 @@ SPAN_INCHES = 0.15
 # Series that are what a candidate costs when it runs alone, or are otherwise drawn thin and dashed.
 DASHES = (0, (1.5, 1.5))
 LONGEST_LABEL = 24
-#: Of panels that say no more than their title.
-UNITS: Mapping[str, Unit] = {"V_D": "percent", "L95": "ms", "L95 (ms)": "ms", "J": "cost"}
 
 
 class Span(NamedTuple):
@@ -59,12 +57,12 @@ class Span(NamedTuple):
 
 def draw_timeline(figure: Figure, look: Look) -> Canvas:
     """Draw panels that share their time, below strips of what happened and of the placement."""
-    places = [_known(place) for place in parted(figure, look, 1).places]
+    places = parted(figure, look, 1).places
     x = floats(figure.frame, figure.x)
     first, last = float(np.nanmin(x)), float(np.nanmax(x))
     gaps = np.diff(np.unique(x[np.isfinite(x)]))
     step = float(np.median(gaps)) if len(gaps) else 1.0
-    spans = tuple(_spans(figure, step))
+    spans = tuple(_spans(figure))
     labels, handles = _legend(figure, look, places)
     strips = (["placement"] if "placement" in figure.frame.columns else []) + (
         ["spans"] if spans else []
@@ -90,20 +88,6 @@ def draw_timeline(figure: Figure, look: Look) -> Canvas:
         canvas.align_ylabels(axes)
         legend(canvas, handles, labels)
     return canvas
-
-
-def _known(place: Place) -> Place:
-    """Give a panel whose title is a well-known measure its unit, and the level of its frame."""
-    panel = place.panel
-    if not place.own and place.title in UNITS:
-        panel = replace(panel, y_unit=UNITS[place.title])
-    levels = floats(place.frame, "level")
-    levels = levels[np.isfinite(levels)]
-    if panel.line_at is None and len(levels):
-        level = labelled(write(float(levels[0]), panel.y_unit), panel.y_unit)
-        level = level.replace("(", "").replace(")", "").replace(".0 ", " ")
-        panel = replace(panel, line_at=float(levels[0]), line_label=level)
-    return place._replace(panel=panel)
 
 
 def _placements(ax: Axes, figure: Figure, look: Look, step: float) -> None:
@@ -207,26 +191,12 @@ def _column(frame: pl.DataFrame, name: str) -> Sequence[object]:
     return frame[name].to_list() if name in frame.columns else [None] * frame.height
 
 
-def _spans(figure: Figure, step: float) -> Iterable[Span]:
+def _spans(figure: Figure) -> Iterable[Span]:
     """Yield what happened, in the order in which each began first."""
     if figure.spans is None:
-        yield from _noted(figure, step)
         return
     for row in figure.spans.sort("begin", maintain_order=True).iter_rows(named=True):
         yield Span(float(row["begin"]), float(row["end"]), str(row["label"]))
-
-
-def _noted(figure: Figure, step: float) -> Iterable[Span]:
-    """Yield what a column of the windows says that happened in them."""
-    if "disturbance" not in figure.frame.columns:
-        return
-    shown = figure.frame.select(figure.x, "disturbance").unique(figure.x).sort(figure.x)
-    at = floats(shown, figure.x)
-    texts = [str(text or "").split(", ") for text in shown["disturbance"]]
-    for label in dict.fromkeys(label for text in texts for label in text if label):
-        on = [label if label in text else None for text in texts]
-        for begin, end, _ in _stretches(at, on, step):
-            yield Span(begin, end, label)
 
 
 def _legend(figure: Figure, look: Look, places: Sequence[Place]) -> tuple[list[str], list[Artist]]:

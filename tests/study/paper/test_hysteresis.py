@@ -28,29 +28,37 @@ from tests.study.paper.small_cell import SCALE, make_cell
 KEPT = Bounds(runs=10, broken=0, reached=2)
 
 
+NO: Comparative = "no difference shown"
+
+
 @pytest.mark.parametrize(
-    ("held", "migrations", "cost", "expected"),
+    ("held", "migrations", "rate", "cost", "expected"),
     [
-        (KEPT, ("lower", "lower"), ("lower", "no difference shown"), "yes"),
-        (KEPT, ("lower", "lower"), ("higher", "no difference shown"), "in part"),
-        (KEPT, ("lower", "no difference shown"), ("lower", "lower"), "in part"),
-        (KEPT, ("no difference shown",) * 2, ("higher", "lower"), "no"),
-        (KEPT, ("no difference shown",) * 2, ("lower", "lower"), "not shown"),
-        (Bounds(10, 1, 2), ("lower", "lower"), ("lower", "lower"), "no"),
+        (KEPT, ("lower", "lower"), (NO, NO), ("lower", NO), "yes"),
+        (KEPT, ("lower", "lower"), (NO, NO), ("higher", NO), "in part"),
+        (KEPT, ("lower", "lower"), (NO, "higher"), (NO, NO), "in part"),
+        (KEPT, ("lower", NO), (NO, NO), ("lower", "lower"), "in part"),
+        (KEPT, (NO, NO), ("higher", NO), ("lower", "lower"), "no"),
+        (KEPT, (NO, NO), (NO, NO), ("lower", "lower"), "not shown"),
+        (Bounds(10, 1, 2), ("lower", "lower"), (NO, NO), ("lower", "lower"), "no"),
     ],
 )
 def test_the_answer_follows_from_what_is_shown(
     held: Bounds,
     migrations: tuple[Comparative, Comparative],
+    rate: tuple[Comparative, Comparative],
     cost: tuple[Comparative, Comparative],
     expected: str,
 ) -> None:
-    names = ("baseline", "step")
-    answer, sentence = verdict(
-        held, dict(zip(names, migrations, strict=True)), dict(zip(names, cost, strict=True))
-    )
+    shown = {
+        metric: dict(zip(("baseline", "step"), said, strict=True))
+        for metric, said in (("migrations", migrations), ("violation_rate", rate), ("cost", cost))
+    }
+    answer, sentence = verdict(held, shown)
     assert answer == expected
     assert ("broken in 1 of 10 runs" in sentence) == bool(held.broken)
+    if rate[1] == "higher":
+        assert "V_D higher in 1 (step) and lower in none" in sentence
 
 
 def test_bounds_count_what_breaks_and_what_reaches_them() -> None:

@@ -59,6 +59,12 @@ METRICS: Mapping[str, str] = {
     "cost": "J",
     "violation_rate": "V_D",
 }
+#: Of the figures.
+SHOWN: Mapping[str, str] = {
+    "migrations": "migrations",
+    "regret": "regret against the reference in hindsight",
+    "violation_rate": "share of missed cycles",
+}
 UNITS: Mapping[str, Unit] = {
     "migrations": "number",
     "returns": "number",
@@ -338,45 +344,54 @@ def of_cold(results: Sequence[StudyResult]) -> dict[str, Family]:
 # ------------------------------------------------------------------------------- verdict
 
 
-def verdict(
-    held: Bounds, migrations: Mapping[str, Comparative], cost: Mapping[str, Comparative]
-) -> tuple[Answer, str]:
+def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> tuple[Answer, str]:
     """Answer whether hysteresis calms DTP within its bound, and at no price.
 
     Parameters
     ----------
     held : Bounds
         Of all runs of the grid.
-    migrations, cost : mapping of str to verdict
-        By scenario: of the cell's setting, against no hysteresis at all.
+    shown : mapping of metric to mapping of scenario to verdict
+        Of the cell's setting, against no hysteresis at all, for every one of `METRICS`.
     """
-    calmer = [name for name, said in migrations.items() if said == "lower"]
-    dearer = [name for name, said in cost.items() if said == "higher"]
-    cheaper = [name for name, said in cost.items() if said == "lower"]
+    calmer = [name for name, said in shown["migrations"].items() if said == "lower"]
+    scenarios = len(shown["migrations"])
+    worse = [
+        name
+        for metric in ("violation_rate", "cost")
+        for name, said in shown[metric].items()
+        if said == "higher"
+    ]
     answer: Answer
     if held.broken:
         answer = "no"
-    elif len(calmer) == len(migrations) and not dearer:
+    elif len(calmer) == scenarios and not worse:
         answer = "yes"
     elif calmer:
         answer = "in part"
     else:
-        answer = "no" if dearer else "not shown"
+        answer = "no" if worse else "not shown"
     bound = (
         f"The bound ⌊K/(N_min + 1)⌋ is broken in {held.broken} of {held.runs} runs"
         if held.broken
         else f"No run of {held.runs} migrates more often than ⌊K/(N_min + 1)⌋"
     )
+    prices = [
+        f"{METRICS[metric]} higher in {_where(shown[metric], 'higher')} and lower in "
+        f"{_where(shown[metric], 'lower')}"
+        for metric in ("violation_rate", "cost")
+    ]
     return answer, (
         f"{bound} ({held.reached} reach it). Against no hysteresis at all, the cell's N_min = "
         f"{CELLS[0]} and Δ_min = {CELLS[1]:g} are shown to migrate less in "
-        f"{counted(len(calmer), len(migrations), 'scenarios')}, to cost more J in "
-        f"{len(dearer)}{_in(dearer)}, and to cost less in {len(cheaper)}{_in(cheaper)}."
+        f"{counted(len(calmer), scenarios, 'scenarios')}; {' and '.join(prices)}."
     )
 
 
-def _in(names: Sequence[str]) -> str:
-    return f" ({listed(names)})" if names else ""
+def _where(shown: Mapping[str, Comparative], word: Comparative) -> str:
+    """``2 (step and mixture)``."""
+    names = [name for name, said in shown.items() if said == word]
+    return f"{len(names)} ({listed(names)})" if names else "none"
 
 
 # ------------------------------------------------------------------------------- chapter
@@ -397,7 +412,7 @@ def written(
         }
         for metric, one in calm.items()
     }
-    answer, sentence = verdict(bounds(rows), of_cells["migrations"], of_cells["cost"])
+    answer, sentence = verdict(bounds(rows), of_cells)
     early, late = of_escape(escape), of_cold(cold)
     numbers = grid_table(grid)
     return Chapter(
@@ -422,7 +437,7 @@ def written(
         ),
         figures=(
             grid_figure(numbers, "migrations", rows),
-            grid_figure(numbers, "cost"),
+            grid_figure(numbers, "regret"),
             grid_figure(numbers, "violation_rate"),
         ),
     )
@@ -518,8 +533,9 @@ def price_found(cold: Sequence[StudyResult]) -> tuple[str, ...]:
                 moved += float(values(result.runs, "migrations", labels).sum())
             if moved:
                 found.append(
-                    f"{scenario}: a cold migration adds {number(added / moved, 1)} missed cycles "
-                    f"(all policies together, {number(moved, 0)} migrations)."
+                    f"{scenario}: with cold migrations {number(added / moved, 1)} more cycles are "
+                    f"missed a migration than with warm ones (all policies, {number(moved, 0)} "
+                    "migrations; what they decide otherwise included)."
                 )
     return tuple(found)
 
@@ -611,7 +627,7 @@ def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) ->
         frame = pl.concat([frame, _bound_lines(bounded)], how="diagonal_relaxed")
     return Figure(
         slug=f"hysteresis-{metric.replace('_', '-')}",
-        title=f"{'Migrations' if bounded else METRICS[metric]} over the dwell",
+        title=f"{SHOWN[metric].capitalize()} over the dwell",
         kind="lines",
         frame=frame,
         x="x",
@@ -619,10 +635,11 @@ def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) ->
         series="threshold",
         facet="scenario",
         x_label="N_min (windows)",
-        y_label=METRICS[metric],
+        y_label=SHOWN[metric],
         y_unit=UNITS[metric],
         line_at=0.05 if metric == "violation_rate" else None,
         line_label="5 %" if metric == "violation_rate" else "",
+        log_y=bool(bounded),
         note=numbers.note,
     )
 
