@@ -51,7 +51,8 @@ def test_the_canonical_demo() -> None:
     )
     paper = {"baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment"}
     assert paper < set(found.scenarios)
-    assert found.policies == ("LOC", "SO", "HYB", "atp", "dtp", "latency-first")
+    beliefs = ("dtp+corrected", "cusum+corrected")
+    assert found.policies == ("LOC", "SO", "HYB", "atp", "dtp", "latency-first", *beliefs)
     assert seen[-1] == (found.runs.height, found.runs.height)
 
 

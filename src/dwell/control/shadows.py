@@ -17,7 +17,7 @@ def shadow_stamps(
 
     Cycle c is sent through the i-th alternative where the fractional part of c times the golden
     ratio lies in [i * fraction, (i + 1) * fraction): every alternative gets its fraction of any
-    stretch within one or two cycles, evenly spread and in step with no periodic disturbance, and no
+    stretch within a few cycles, evenly spread and in step with no periodic disturbance, and no
     cycle is sent through two (H. Weyl, 1916, DOI 10.1007/BF01475864).
 
     Parameters
