@@ -252,6 +252,21 @@ def test_panels_may_have_measures_of_their_own(look: Look) -> None:
     assert first.get_xlim() != second.get_xlim()
 
 
+def test_panels_of_very_different_size_have_scales_of_their_own(look: Look) -> None:
+    rows: list[dict[str, object]] = [
+        {"facet": facet, "x": x, "series": "LOC", "y": y * (x + 1)}
+        for facet, y in (("small", 1.0), ("large", 100.0))
+        for x in range(4)
+    ]
+    figure = with_frame(one_of("lines"), rows, facet="facet", series="series", y_unit="number")
+    small, large = draw(figure, look).axes
+    assert small.get_ylim()[1] < 5 < large.get_ylim()[1]
+    assert "each on its own scale" in texts(drawing(figure, look))
+    alike = replace(figure, frame=figure.frame.with_columns(pl.col("y").clip(0, 8)))
+    first, second = draw(alike, look).axes
+    assert first.get_ylim() == second.get_ylim()
+
+
 def test_a_figure_may_be_parted_twice(look: Look) -> None:
     figure = one_of("bars")
     assert figure.facet_row is not None
@@ -355,6 +370,15 @@ def test_a_file_stands_alone_on_white(canvas: Canvas) -> None:
     assert "currentColor" not in data
     assert "var(" not in data
     assert "sans-serif" in data
+
+
+def test_symbols_have_an_index_in_a_pdf_too(look: Look) -> None:
+    rows: list[dict[str, object]] = [{"x": x, "series": "S1", "y": 0.5} for x in ("α_L", "α_V")]
+    figure = Figure("f", "t", "bars", pl.DataFrame(rows), "x", "y", "series", y_label="V_D")
+    canvas = draw(figure, look)
+    pdf_file(canvas, "t")
+    labels = [label.get_text() for label in canvas.axes[0].get_yticklabels()]
+    assert labels == [r"α$_{\mathregular{L}}$", r"α$_{\mathregular{V}}$"]
 
 
 def test_letters_of_a_pdf_stay_letters(canvas: Canvas) -> None:

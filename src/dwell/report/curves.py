@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,7 @@ from dwell.report.panels import (
     mark_level,
     only,
     parted,
+    scale_of,
     spread,
 )
 from dwell.report.scales import set_log_ticks
@@ -45,6 +47,8 @@ ALONE_INCHES = 2.9
 # Points of a line up to which each has a mark, and which are kept of a longer one.
 MARKED = 16
 KEPT = 800
+# Panels have an axis each where the largest of one is so many times that of another.
+APART = 4
 # Of cycles that took longer, in percent.
 LATER = (0.1, 120.0)
 # An axis of latencies ends after so many deadlines.
@@ -58,9 +62,15 @@ def draw_lines(figure: Figure, look: Look) -> Canvas:
     styles = look.styles(names)
     columns = (figure.y, f"{figure.y}_low", f"{figure.y}_high")
     scales = spread(grid, columns)
+    highs = [scale_of([place], columns).high for place in grid.places]
+    if not grid.own and not grid.sides and max(highs) > APART * max(min(highs), 0):
+        # On one axis the smaller would lie flat.
+        grid = replace(grid, apart=True)
+        scales = {id(place): scale_of([place], columns, linear=True) for place in grid.places}
     across = floats(figure.frame, figure.x)
     labels = entries(figure, look, names) if len(names) > 1 else []
-    marked = len(np.unique(across[np.isfinite(across)])) <= MARKED
+    lines = [one for one in (figure.facet, figure.facet_row, figure.series) if one is not None]
+    marked = max(figure.frame.group_by(lines).len()["len"]) <= MARKED
     with new_figure(_height(len(grid.rows), grid.columns, labels, own=grid.own)) as canvas:
 
         def draw(ax: Axes, place: Place) -> None:
@@ -86,6 +96,7 @@ def draw_lines(figure: Figure, look: Look) -> Canvas:
         )
         if not grid.own:
             label = label_of(grid.places[0].panel, scales[id(grid.places[0])])
+            label += "; each on its own scale" if grid.apart else ""
             # One line of a panel's height, or of two where there are more.
             label = folded(label, 24 if len(grid.rows) == 1 else 48)
             canvas.supylabel(label, size=9, color=MUTED)

@@ -148,7 +148,9 @@ def draw_bars(figure: Figure, look: Look) -> Canvas:
                 continue
             left = 0.0 if math.isnan(begin) else begin
             ax.barh(at, value - left, left=left, height=height, zorder=2, **looks[series])
-            if not math.isnan(low) and not math.isnan(high):
+            # As in tables: a share that is the same extreme in every run stands alone.
+            extreme = look.is_named(series) and row[figure.y] in (0, 1)
+            if not (math.isnan(low) or math.isnan(high) or extreme):
                 ax.plot([low, high], [at, at], "-", color=INK, lw=0.9, zorder=3)
 
     from matplotlib.patches import Patch

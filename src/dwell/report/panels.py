@@ -111,11 +111,14 @@ class Grid:
         What a row is called, at its right; empty where the figure is not parted twice.
     turned : bool
         Whether the rows are the facets.
+    apart : bool
+        Whether each panel has an axis of its own for the same measure.
     """
 
     rows: list[list[Place | None]]
     sides: list[str]
     turned: bool = False
+    apart: bool = False
 
     @property
     def places(self) -> list[Place]:
@@ -150,7 +153,7 @@ class Grid:
             The axis that belongs to a panel alone where it has a measure of its own.
         """
         share: dict[str, Share] = {"x": "all", "y": "all"}
-        if self.own and values != "none":
+        if (self.own or self.apart) and values != "none":
             share[values] = "none" if not self.sides else "row" if self.turned else "col"
         axes = canvas.subplots(
             len(self.rows), self.columns, squeeze=False, sharex=share["x"], sharey=share["y"]

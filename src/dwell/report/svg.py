@@ -154,16 +154,17 @@ def pdf_file(figure: Figure, description: str) -> bytes:
     """Return a figure as a PDF file: letters stay letters. The figure is changed by that."""
     import matplotlib as mpl
     from matplotlib.text import Text
-    from matplotlib.ticker import FixedFormatter
 
     for text in figure.findobj(Text):
         if isinstance(text, Text):
             text.set_text(_as_mathtext(text.get_text()))
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
-            formatter = axis.get_major_formatter()
-            if isinstance(formatter, FixedFormatter):
-                formatter.seq = [_as_mathtext(one) for one in formatter.seq]
+            # Tick labels are written anew whenever they are drawn.
+            places = axis.get_majorticklocs()
+            labels = axis.get_major_formatter().format_ticks(places.tolist())
+            if any(map(SYMBOL.search, labels)):
+                axis.set_ticks(places, labels=list(map(_as_mathtext, labels)))
     buffer = io.BytesIO()
     with mpl.rc_context(STYLE):
         metadata = {"CreationDate": None, "Title": description}

@@ -23,6 +23,8 @@ __all__ = ["draw_map"]
 
 MOST_PANELS = 3
 CELL_INCHES = 0.42
+# With three rows of panels or more.
+LOW_CELL_INCHES = 0.27
 # Opacity of a cell whose winner wins by nothing, and of one that wins by the most: letters in the
 # colour of the text can be read on both, in a light and in a dark page.
 FAINT, STRONG = 0.14, 0.72
@@ -53,7 +55,7 @@ def draw_map(figure: Figure, look: Look) -> Canvas:
     strong = STRONG if named else PLAIN
     width = (WIDTH - 0.9) / grid.columns - 0.35
     side = min(width / max(len(columns), 1), CELL_INCHES * 1.6)
-    tall = min(side, CELL_INCHES)
+    tall = min(side, CELL_INCHES if len(grid.rows) < 3 else LOW_CELL_INCHES)
     room = int(side * 0.9 / LETTER_INCHES)
     labels, handles = _legend(figure, look, colours, largest, strong)
     height = len(grid.rows) * (len(rows) * tall + 0.62) + 0.35 + 0.22 * legend_lines(labels)
@@ -105,6 +107,7 @@ def _cell(
     opacity: float,
     marked: bool,
 ) -> None:
+    from matplotlib.colors import to_rgba
     from matplotlib.patches import Rectangle
 
     x, y = at
@@ -113,17 +116,7 @@ def _cell(
             (x - 0.5, y - 0.5),
             1,
             1,
-            facecolor=colour,
-            alpha=opacity,
-            edgecolor="none",
-        )
-    )
-    ax.add_patch(
-        Rectangle(
-            (x - 0.5, y - 0.5),
-            1,
-            1,
-            facecolor="none",
+            facecolor=to_rgba(colour, opacity),
             edgecolor=PAPER,
             linewidth=1.2,
         )
@@ -135,9 +128,8 @@ def _cell(
                 1,
                 1,
                 facecolor="none",
-                edgecolor=MUTED,
+                edgecolor=to_rgba(INK, 0.45),
                 linewidth=0,
-                alpha=0.55,
                 hatch=HATCH,
             )
         )

@@ -157,14 +157,14 @@ def mean_latency(problem: Problem, scenario: str = "undisturbed") -> float:
 
 def test_the_chapter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(module, "MAP_WINDOWS", 6)
-    written = chapter(make_cell("robot-cpu-stress", "step"), SCALE, Runner(tmp_path, processes=1))
+    written = chapter(make_cell("step"), SCALE, Runner(tmp_path, processes=1))
     check_written(written)
     tables = {table.slug: table.frame for table in written.tables}
     assert set(tables["dominance-cell"]["scenario"]) == {
-        *("baseline", "robot-cpu-stress", "step"),
+        *("baseline", "step"),
         *module.CASES,
     }
     shares = tables["dominance-shares"]
     won = sum(shares[name].sum() for name in ("LOC", "SO", "HYB", FOURTH))
-    assert won == shares["cells"].sum() == 2 * 3 * 4
-    assert tables["dominance-map"].height == 2 * 3 * 4
+    assert won == shares["cells"].sum() == 2 * 2 * 4
+    assert tables["dominance-map"].height == 2 * 2 * 4

@@ -125,8 +125,7 @@ def test_the_sweep_has_every_size_in_every_place() -> None:
 
 
 def test_the_chapter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    kept = {name: PLACES[name] for name in (PAPERS, "R1 to E")}
-    monkeypatch.setattr(module, "PLACES", kept)
+    monkeypatch.setattr(module, "PLACES", {PAPERS: PLACES[PAPERS]})
     monkeypatch.setattr(module, "JOINED", (NONE, PAPERS))
     monkeypatch.setattr(module, "CONDITIONS", {"R1 stressed": {"R1": 1.0}})
     monkeypatch.setattr(module, "SWEPT", (PAPERS,))
@@ -134,8 +133,8 @@ def test_the_chapter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     check_written(written)
     tables = {table.slug: table.frame for table in written.tables}
     assert set(tables["reversion"]["scenario"]) == {
-        *(NONE, PAPERS, "R1 to E", module.SLOW),
+        *(NONE, PAPERS, module.SLOW),
         *(f"{NONE} + R1 stressed", f"{PAPERS} + R1 stressed"),
     }
-    assert tables["reversion-beyond"].height == 4 * 2
+    assert tables["reversion-beyond"].height == 3 * 2
     assert tables["reversion-sweep"].height == 4 * 4

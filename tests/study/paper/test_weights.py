@@ -37,6 +37,8 @@ def test_luck_is_what_seeds_and_points_make_together() -> None:
     seeds, points = np.arange(4.0)[:, None], np.arange(50.0)
     assert luck(seeds + points) == pytest.approx(0.0, abs=1e-12)
     assert luck(np.zeros((3, 7))) == 0.0
+    # Rounding is no luck.
+    assert luck(np.full((3, 7), 0.1) + 1e-17 * points[:7]) == 0.0
     assert np.isnan(luck(points[None]))
     noise = np.random.default_rng(1).normal(size=(4, 4000))
     assert luck(noise) == pytest.approx(1.0, abs=0.1)
@@ -64,6 +66,14 @@ def test_the_sentence_names_the_leading_weight_and_the_idle_ones() -> None:
     assert "1 of 2 scenarios: baseline (5.0 % to 7.0 %, most by α_V" in sentence
     assert "luck" in sentence
     assert sentence.endswith("α_L, α_r, α_e and α_S have no part in it.")
+
+
+def test_a_weight_leads_only_where_that_is_shown() -> None:
+    totals = {symbol: Interval(0.3, -0.1, 0.7) for symbol in SYMBOLS}
+    assert Reaction("step", 0.1, 0.2, 0.1, totals).leading is None
+    assert "no single weight" in str(Reaction("step", 0.1, 0.2, 0.1, totals))
+    totals["α_r"] = Interval(0.2, 0.1, 0.3)
+    assert Reaction("step", 0.1, 0.2, 0.1, totals).leading == "α_r"
 
 
 def test_the_design_spreads_factors_around_the_weights_of_the_cell() -> None:

@@ -98,8 +98,9 @@ class Figure:
         * ``ecdf``: ``y``, the share of cycles within ``x`` milliseconds, one line a ``series``;
         * ``timeline``: several lines of ``y`` over ``x`` (window), stacked in panels by ``facet``,
           with the placement of each window in a column ``placement``. A series that is a
-          candidate is drawn as a line, and in bold where it is the one that is active; any other
-          series as one mark a window in the colour of the placement.
+          candidate is drawn as a line, with a mark in every window in which it is the one that
+          is active; one that is called after a candidate (``LOC alone``) as a dashed line in its
+          colour; any other as one mark a window in the colour of the placement. Nulls are gaps.
     frame : DataFrame
     x, y : str
         Columns.

@@ -36,7 +36,7 @@ from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, percent, points, with_interval
 from dwell.study.paper.shadow_cost import FRACTIONS, shadow_finding, shadow_study, shadow_table
 from dwell.study.paper.timeline import timeline_figure
-from dwell.study.paper.tuning import best, scores, thinned
+from dwell.study.paper.tuning import TUNING_SEEDS, best, scores, thinned
 from dwell.study.study import Contender, Point, Study
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ def tuning_study(problem: Problem, scale: Scale) -> Study:
         points=(Point({}, problem),),
         scenarios=dynamic_scenarios(problem),
         contenders=tuple(rules),
-        seeds=scale.held_out,
+        seeds=scale.held_out[:TUNING_SEEDS],
         windows=scale.dynamic_windows,
         references=True,
     )

@@ -76,7 +76,8 @@ OFF_S = ON_S = 40.0
 #: Means of the delay in the sweep, milliseconds, and probabilities of loss.
 MEANS_MS = (0.0, 2.0, 5.0, 10.0, 15.0, 25.0, 40.0)
 LOSSES = (0.0, 0.02)
-SWEPT = (PAPERS, "R1 to E", "E to R2")
+#: Places of the sweep: alone, and where R1 is no refuge; the other direction is the same to all.
+SWEPT = (PAPERS, f"{PAPERS} + R1 stressed", "E to R2 + R1 stressed")
 STEADY = "fault"
 PARAMETERS = ("fault.place", "fault.mean_ms", "fault.loss")
 
@@ -134,14 +135,18 @@ def fault_scenarios(problem: Problem) -> dict[str, Scenario]:
         place: on_and_off(items, off_s=OFF_S, on_s=ON_S, name="fault")
         for place, items in steady.items()
     }
-    for condition, nodes in CONDITIONS.items():
-        stress: Scenario = tuple(
-            NodeDisturbance(node, stress_threads=round(each * problem.fabric.nodes[node].cores))
-            for node, each in nodes.items()
-        )
+    for condition in CONDITIONS:
         for place in JOINED:
-            found[f"{place} + {condition}"] = (*found[place], *stress)
+            found[f"{place} + {condition}"] = (*found[place], *stress(problem, condition))
     return found
+
+
+def stress(problem: Problem, condition: str) -> Scenario:
+    """Return the stress of a condition, all the time; none where it is empty."""
+    return tuple(
+        NodeDisturbance(node, stress_threads=round(each * problem.fabric.nodes[node].cores))
+        for node, each in CONDITIONS.get(condition, {}).items()
+    )
 
 
 def control(scenario: str) -> str:
@@ -208,16 +213,20 @@ def reverting(rule: str) -> str:
 
 def sweep_points(problem: Problem, scale: Scale) -> tuple[Point, ...]:
     """Return steady faults of every size in some of the places."""
-    means = thinned(MEANS_MS, max(2, scale.grid))
-    return tuple(
-        Point(
-            dict(zip(PARAMETERS, (place, mean_ms, loss), strict=True)),
-            with_scenarios(problem, {STEADY: fault(PLACES[place], mean_ms=mean_ms, loss=loss)}),
-        )
-        for place in SWEPT
-        for mean_ms in means
-        for loss in LOSSES
-    )
+    found = []
+    for where in SWEPT:
+        place, _, condition = where.partition(" + ")
+        for mean_ms in thinned(MEANS_MS, max(2, scale.grid)):
+            for loss in LOSSES:
+                items = fault(PLACES[place], mean_ms=mean_ms, loss=loss)
+                scenarios = {STEADY: (*items, *stress(problem, condition))}
+                found.append(
+                    Point(
+                        dict(zip(PARAMETERS, (where, mean_ms, loss), strict=True)),
+                        with_scenarios(problem, scenarios),
+                    )
+                )
+    return tuple(found)
 
 
 def sweep_study(swept: tuple[Point, ...], scale: Scale) -> Study:
@@ -432,7 +441,7 @@ def design(whole: StudyResult, swept: StudyResult) -> str:
         f"Binary reversion is the same rule with the same estimator on {listed(BINARY)} alone; "
         f"ATP (our reconstruction, default thresholds) toggles between LOC and {HYBRID}. The sweep "
         f"holds faults of {listed(f'{one:g}' for one in _means(swept))} ms with and without loss, "
-        f"all the time, σ a fifth of the mean, in {len(SWEPT)} places: {len(sweep.points)} points, "
+        f"all the time, σ a fifth of the mean, in {len(SWEPT)} cases: {len(sweep.points)} points, "
         f"{len(sweep.seeds)} seeds of {sweep.windows} windows. V_D and J are compared, each a "
         "family: sign-flip tests paired by seed, Holm over all comparisons of a question and "
         "metric; intervals are 95 % over seeds."
@@ -549,7 +558,7 @@ def sweep_findings(swept: StudyResult) -> tuple[str, ...]:
                 rates = dict(here.select("policy", "violation_rate").rows())
                 least[mean_ms] = min(candidates, key=rates.__getitem__)
             said.append(f"with {100 * loss:g} % loss {_stretches(least)}")
-        found.append(f"Steady fault, {place}: least V_D {'; '.join(said)}.")
+        found.append(f"Steady fault, {place}: least mean V_D {'; '.join(said)}.")
     return tuple(found)
 
 

@@ -12,9 +12,12 @@ from dwell.study.study import Contender
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["best", "scores", "thinned"]
+__all__ = ["TUNING_SEEDS", "best", "scores", "thinned"]
 
 Value = TypeVar("Value")
+
+#: Held-out seeds that a setting is tried on, at most; all scenarios together are many runs.
+TUNING_SEEDS = 5
 
 
 def thinned(values: Sequence[Value], count: int) -> tuple[Value, ...]:
