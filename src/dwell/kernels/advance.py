@@ -14,14 +14,13 @@ from dwell.kernels.cycles import (
     drop_waiting,
     finish,
     flush,
-    fork,
     free_worker,
     hand_over,
     hop_of,
     job_key,
     note_ready,
     release,
-    release_shadow,
+    shared_by,
 )
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
@@ -47,6 +46,7 @@ from dwell.kernels.layout import (
     END,
     FINISHED,
     FIRST,
+    FLOW_0,
     GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
@@ -55,12 +55,9 @@ from dwell.kernels.layout import (
     ITEM_MASK,
     KIND_SHIFT,
     LIVE,
+    MIGRATE,
     MIGRATING,
     MISSING,
-    MOVED,
-    MOVED_CELL,
-    MOVED_NS,
-    MOVES_LEFT,
     N_CELL,
     N_CHANGE,
     N_CYCLES,
@@ -87,16 +84,9 @@ from dwell.kernels.layout import (
     NEXT_CHANGE,
     NEXT_KEY,
     NEXT_T,
-    NO_ORDER,
     NODE,
     NODE_DOWN,
     NODE_OF,
-    ORDER,
-    ORDER_ARRIVED,
-    ORDER_CYCLE,
-    ORDER_NS,
-    ORDER_PAIR,
-    ORDERED,
     OUT_0,
     PARENT,
     PAUSE,
@@ -113,26 +103,25 @@ from dwell.kernels.layout import (
     SITE_TASK,
     START,
     START_NS,
-    STATELESS,
-    STAYS,
-    STEP_BITS,
+    STEP,
+    STEP_KEY,
+    STEP_NS,
     STRESS,
     TAKEN,
+    TARGET,
     TASK_0,
-    TASK_START_NS,
     UNKNOWN,
     VIRTUAL,
     WAITING,
     WINDOW,
     WINDOW_CYCLES,
     WINDOW_FIRST,
-    WORKER_STARTED,
     WORKERS,
     Floats,
     Ints,
     Tables,
 )
-from dwell.kernels.links import lose, send, send_state, slot_row
+from dwell.kernels.links import lose, send, slot_row
 from dwell.kernels.nodes import admit, job_row, key_row, leave, mark, refill, set_speed, tick
 
 __all__ = ["advance"]
@@ -142,26 +131,21 @@ NEVER = 1 << 30
 
 
 @phase
-def _progress(s: Tables, key: int, left: float) -> float:
-    """Core-nanoseconds that a job which has `left` nanoseconds of work has received so far."""
-    cell = (key >> CELL_SHIFT) & CELL_MASK
-    cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    site = s.jobs[job_row(s.ring, s.stride, cell, cycle, key & ITEM_MASK), SITE]
-    received: float = s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
-    return received
+def _progress(s: Tables, server: int, at: int) -> tuple[int, float]:
+    """Key of a job on a server, and the core-nanoseconds that it has received so far.
 
-
-@phase
-def _begun(s: Tables, server: int, at: int) -> tuple[int, float]:
-    """Key of a job on a server, and its progress: first those that run, then those that wait."""
-    base = s.servers[server, BASE]
+    Those that run are counted first, then those that wait for cores and may have been preempted.
+    """
     running = s.servers[server, N_RUN]
     if at < running:
-        key = s.run_key[base + at]
-        return key, _progress(s, key, s.run_v[base + at] - s.servers_f[server, VIRTUAL])
-    # One that waits for cores may have been preempted.
-    key = s.wait_key[base + at - running]
-    return key, _progress(s, key, s.wait_left[base + at - running])
+        row = index(s.servers[server, BASE] + at)
+        key, left = s.run_key[row], s.run_v[row] - s.servers_f[server, VIRTUAL]
+    else:
+        row = index(s.servers[server, BASE] + at - running)
+        key, left = s.wait_key[row], s.wait_left[row]
+    cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
+    site = s.jobs[key_row(s.ring, s.stride, key), SITE]
+    return key, s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
 
 
 @phase
@@ -177,7 +161,7 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
         own = s.own[cell, node]
         extra = s.own[shadow, node] if shadow >= 0 else 0.0
         for i in range(s.servers[server, N_RUN] + s.servers[server, N_WAIT]):
-            key, received = _begun(s, server, i)
+            key, received = _progress(s, server, i)
             whose = (key >> CELL_SHIFT) & CELL_MASK
             if whose == cell:
                 own += received
@@ -190,15 +174,10 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
 
 @phase
 def _announce(s: Tables) -> int:
-    """Announce every cell's next close or migration; return how many cells wait for one."""
+    """Announce every cell's next close; return how many cells wait for one, or migrate."""
     n = 0
     for cell in range(s.cells.shape[0]):
-        if s.cells[cell, ORDER] == ORDERED:
-            s.cells[cell, ORDER] = MIGRATING
-            key = (RESTART << KIND_SHIFT) | (cell << CELL_SHIFT) | (ORDER_ARRIVED << CYCLE_SHIFT)
-            push_event(s.clock, s.event_t, s.event_key, s.cells[cell, ORDER_NS], key)
-        if s.cells[cell, ORDER] == MIGRATING:
-            n += 1
+        n += s.cells[cell, MIGRATING]
         boundary = s.cells[cell, CLOSE_CYCLE]
         if s.cells[cell, CLOSE_PENDING] == 0 and boundary <= s.cells[cell, N_CYCLES]:
             s.cells[cell, CLOSE_PENDING] = 1
@@ -232,7 +211,7 @@ def _lose_key(s: Tables, key: int, now: int) -> None:
 def _crash(s: Tables, server: int, now: int) -> None:
     """Lose what runs or waits for cores on a server whose node goes down."""
     for i in range(s.servers[server, N_RUN] + s.servers[server, N_WAIT]):
-        key, received = _begun(s, server, i)
+        key, received = _progress(s, server, i)
         if s.servers[server, IS_CPU] != 0:
             s.own[(key >> CELL_SHIFT) & CELL_MASK, s.servers[server, NODE_OF]] += received
         _lose_key(s, key, now)
@@ -343,7 +322,6 @@ def _release(s: Tables, cell: int, cycle: int, now: int) -> None:
     if 0 <= window < s.opened.shape[1]:
         _snapshot(s, s.opened, cell, window, now)
     release(s, cell, cycle, now)
-    release_shadow(s, cell, cycle, now)
 
 
 @phase
@@ -364,15 +342,26 @@ def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int
     s.jobs[row, NETWORK] = now - s.jobs[row, NETWORK]
     if n_out > 1:
         s.slots[slot_row(s.ring, cell, cycle), LIVE] += n_out - 1
+    # What a shadow shares is sent to it as well, after the cycle's own outputs.
+    shadow = shared_by(s, cell, cycle, local)
     first = s.tasks[task, OUT_0]
-    for i in range(first, first + n_out):
-        flow = s.out_flows[index(i)]
-        hop = hop_of(s, cell, cycle, flow)
-        if hop < 0:
-            hand_over(s, cell, cycle, flow, now)
-        else:
-            send(s, cell, cycle, flow, hop, FIRST, now)
-    fork(s, cell, cycle, local, now)
+    to = cell
+    while True:
+        for i in range(first, first + n_out):
+            flow = s.out_flows[index(i)]
+            if to != cell:
+                target = s.flows[index(s.cells[cell, FLOW_0] + flow), TARGET]
+                if shared_by(s, cell, cycle, target) >= 0:
+                    continue
+                s.slots[slot_row(s.ring, shadow, cycle), LIVE] += 1
+            hop = hop_of(s, to, cycle, flow)
+            if hop < 0:
+                hand_over(s, to, cycle, flow, now)
+            else:
+                send(s, to, cycle, flow, hop, FIRST, now)
+        if shadow < 0 or to != cell:
+            break
+        to = shadow
 
 
 @phase
@@ -418,40 +407,6 @@ def _restart(s: Tables, cell: int, site: int, now: int) -> None:
 
 
 @phase
-def _announce_step(s: Tables, cell: int, step: int, attempt: int, local: int, t: int) -> None:
-    """Announce a step of a task's cold migration."""
-    name = (cell << CELL_SHIFT) | (((attempt << STEP_BITS) | step) << CYCLE_SHIFT) | local
-    push_event(s.clock, s.event_t, s.event_key, t, (RESTART << KIND_SHIFT) | name)
-
-
-@phase
-def _migrate(s: Tables, cell: int, step: int, attempt: int, local: int, now: int) -> None:
-    """Carry a cold migration one step on: start workers, send state, be ready.
-
-    The tasks that are not ready yet are counted; with the last one the caller may move the cell.
-    """
-    pair = index(s.cells[cell, ORDER_PAIR])
-    if step == ORDER_ARRIVED:
-        s.cells[cell, MOVES_LEFT] = 0
-        for task in range(s.cells[cell, N_TASKS]):
-            if s.state_hops[pair, task] != STAYS:
-                s.cells[cell, MOVES_LEFT] += 1
-                started = now + s.tasks[index(s.cells[cell, TASK_0] + task), TASK_START_NS]
-                _announce_step(s, cell, WORKER_STARTED, FIRST, task, started)
-    elif step == WORKER_STARTED and s.state_hops[pair, local] != STATELESS:
-        hop = s.state_hops[pair, local]
-        t, following, attempt = send_state(s, hop, s.cells[cell, ORDER_CYCLE], attempt, now)
-        if t >= 0:
-            _announce_step(s, cell, following, attempt, local, t)
-    else:
-        s.cells[cell, MOVES_LEFT] -= 1
-    if s.cells[cell, MOVES_LEFT] == 0:
-        s.cells[cell, ORDER] = NO_ORDER
-        s.clock[MOVED_CELL] = cell
-        s.clock[MOVED_NS] = now
-
-
-@phase
 def _room(s: Tables) -> int:
     """Whether the next event finds room for all it may add; otherwise what must grow."""
     if s.clock[N_EVENTS] + s.margin > s.event_t.size:
@@ -485,10 +440,8 @@ def _handle(s: Tables, kind: int, cell: int, cycle: int, item: int, key: int, no
         _announce_change(s)
     elif kind == CHANGE:
         _quota(s, index(item - 1), now)
-    elif kind == RESTART and cycle == 0:
-        _restart(s, cell, index(item), now)
     elif kind == RESTART:
-        _migrate(s, cell, cycle & ((1 << STEP_BITS) - 1), cycle >> STEP_BITS, item, now)
+        _restart(s, cell, index(item), now)
 
 
 @kernel
@@ -502,7 +455,6 @@ def advance(
     site_of: Ints,
     route: Ints,
     shadow_parts: Ints,
-    state_hops: Ints,
     hops: Ints,
     loss_keys: NDArray[np.uint64],
     layer_rows: Ints,
@@ -553,10 +505,9 @@ def advance(
     -------
     int
         PAUSED: clock[CLOSED_CELL] closed a window, call again after stamping the next cycles.
-        MOVED: the cold migration of clock[MOVED_CELL] was ready at clock[MOVED_NS]; set MOVED_CELL
-        to -1, stamp, and call again. FINISHED: no window is left to close. GROW_EVENTS, GROW_RING:
-        enlarge the heap of events, or the ring of cycles in flight, and call again; nothing was
-        lost.
+        STEP: the caller's event clock[STEP_KEY] is due at clock[STEP_NS]. FINISHED: no window is
+        left to close. GROW_EVENTS, GROW_RING: enlarge the heap of events, or the ring of cycles in
+        flight, and call again; nothing was lost.
     """
     s = Tables(
         ring,
@@ -568,7 +519,6 @@ def advance(
         site_of,
         route,
         shadow_parts,
-        state_hops,
         fixed_columns(hops, N_HOP),
         loss_keys,
         layer_rows,
@@ -610,8 +560,11 @@ def advance(
         log_outcome,
         log_arrived,
     )
-    waiting = _announce(s)
-    while waiting > 0 and s.clock[N_EVENTS] > 0:
+    announced = False
+    while announced or _announce(s) > 0:
+        announced = True
+        if s.clock[N_EVENTS] == 0:
+            break
         status = _room(s)
         if status != PAUSED:
             return status
@@ -624,13 +577,15 @@ def advance(
             _close(s, cell, now)
             if s.clock[PAUSE] != 0:
                 return PAUSED
-            waiting = _announce(s)
+            announced = False
             continue
         if now > s.clock[END]:
             break
+        if kind == MIGRATE:
+            s.clock[STEP_KEY] = key
+            s.clock[STEP_NS] = now
+            return STEP
         _handle(s, kind, cell, (key >> CYCLE_SHIFT) & CYCLE_MASK, key & ITEM_MASK, key, now)
         _settle(s, now)
         flush(s, now)
-        if s.clock[MOVED_CELL] >= 0:
-            return MOVED
     return FINISHED

@@ -36,7 +36,6 @@ from dwell.kernels.layout import (
     N_CYCLES,
     N_DIRTY,
     N_IN,
-    N_OUT,
     N_READY,
     N_SINKS,
     N_TASKS,
@@ -46,7 +45,6 @@ from dwell.kernels.layout import (
     NODE,
     NODE_DOWN,
     OFFSET_NS,
-    OUT_0,
     PAIR,
     PAIR_0,
     PARENT,
@@ -72,7 +70,7 @@ from dwell.kernels.layout import (
     WAITING,
     Tables,
 )
-from dwell.kernels.links import lose, send, slot_row
+from dwell.kernels.links import lose, slot_row
 from dwell.kernels.nodes import dispatch, job_row, leave, schedule
 
 __all__ = [
@@ -83,14 +81,13 @@ __all__ = [
     "drop_waiting",
     "finish",
     "flush",
-    "fork",
     "free_worker",
     "hand_over",
     "hop_of",
     "job_key",
     "note_ready",
     "release",
-    "release_shadow",
+    "shared_by",
 ]
 
 
@@ -277,34 +274,41 @@ def hop_of(s: Tables, cell: int, cycle: int, flow: int) -> int:
 
 @phase
 def release(s: Tables, cell: int, cycle: int, now: int) -> None:
-    """Release a cycle: its sources become ready, and the next release is announced."""
-    candidate = s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle]
-    first = s.cells[cell, TASK_0]
-    sources = 0
-    for local in range(s.cells[cell, N_TASKS]):
-        task = index(first + local)
-        row = job_row(s.ring, s.stride, cell, cycle, local)
-        n_in = s.tasks[task, N_IN]
-        s.jobs[row, MISSING] = n_in
-        s.jobs[row, STARTED] = -1
-        s.jobs[row, SITE] = s.site_of[index(candidate), local]
-        if n_in > 0:
-            continue
-        s.jobs[row, COMPUTE] = 0
-        s.jobs[row, NETWORK] = 0
-        sources += 1
-        offset = s.tasks[task, OFFSET_NS]
-        if offset == 0:
-            note_ready(s, cell, cycle, local)
-        else:
-            key = (START << KIND_SHIFT) | job_key(cell, cycle, local)
-            push_event(s.clock, s.event_t, s.event_key, now + offset, key)
-    slot = slot_row(s.ring, cell, cycle)
-    s.slots[slot, CYCLE] = cycle
-    s.slots[slot, CANDIDATE] = candidate
-    s.slots[slot, LIVE] = sources
-    s.slots[slot, LOST] = 0
-    s.slots[slot, SINKS_LEFT] = s.cells[cell, N_SINKS]
+    """Release a cycle, and its shadow if it has one; the next release is announced.
+
+    Of the shadow only sources that it does not share start, as those do that start later.
+    """
+    shadow = s.cells[cell, SHADOW]
+    active = s.stamps[cell, cycle]
+    for i in range(2 if shadow >= 0 and s.stamps[shadow, cycle] >= 0 else 1):
+        to = cell if i == 0 else shadow
+        candidate = s.cells[to, CANDIDATE_0] + s.stamps[to, cycle]
+        pair = s.cells[to, PAIR_0] + active * s.cells[to, N_CANDIDATES] + s.stamps[to, cycle]
+        sources = 0
+        for local in range(s.cells[to, N_TASKS]):
+            task = index(s.cells[to, TASK_0] + local)
+            row = job_row(s.ring, s.stride, to, cycle, local)
+            s.jobs[row, MISSING] = s.tasks[task, N_IN]
+            s.jobs[row, STARTED] = -1
+            s.jobs[row, SITE] = s.site_of[index(candidate), local]
+            s.jobs[row, COMPUTE] = 0
+            s.jobs[row, NETWORK] = 0
+            if s.tasks[task, N_IN] > 0 or (i > 0 and s.shadow_parts[pair, local] != SHADOWED):
+                continue
+            sources += 1
+            offset = s.tasks[task, OFFSET_NS]
+            if i == 0 and offset == 0:
+                note_ready(s, to, cycle, local)
+            else:
+                key = (START << KIND_SHIFT) | job_key(to, cycle, local)
+                push_event(s.clock, s.event_t, s.event_key, now + offset, key)
+        slot = slot_row(s.ring, to, cycle)
+        s.slots[slot, CYCLE] = cycle
+        s.slots[slot, CANDIDATE] = candidate
+        s.slots[slot, PAIR] = pair
+        s.slots[slot, LIVE] = sources
+        s.slots[slot, LOST] = 0
+        s.slots[slot, SINKS_LEFT] = s.cells[to, N_SINKS]
     following = cycle + 1
     if following < s.cells[cell, N_CYCLES]:
         key = (RELEASE << KIND_SHIFT) | job_key(cell, following, FIRST)
@@ -313,59 +317,13 @@ def release(s: Tables, cell: int, cycle: int, now: int) -> None:
 
 
 @phase
-def release_shadow(s: Tables, cell: int, cycle: int, now: int) -> None:
-    """Release the shadow of a cycle, if it has one; only sources that it does not share start."""
+def shared_by(s: Tables, cell: int, cycle: int, local: int) -> int:
+    """Shadow that shares a task with a cycle, -1 for none."""
     shadow = s.cells[cell, SHADOW]
     if shadow < 0 or s.stamps[shadow, cycle] < 0:
-        return
-    other = s.stamps[shadow, cycle]
-    candidate = s.cells[shadow, CANDIDATE_0] + other
-    active = s.stamps[cell, cycle]
-    pair = index(s.cells[shadow, PAIR_0] + active * s.cells[shadow, N_CANDIDATES] + other)
-    sources = 0
-    for local in range(s.cells[shadow, N_TASKS]):
-        row = job_row(s.ring, s.stride, shadow, cycle, local)
-        n_in = s.tasks[index(s.cells[shadow, TASK_0] + local), N_IN]
-        s.jobs[row, MISSING] = n_in
-        s.jobs[row, STARTED] = -1
-        s.jobs[row, SITE] = s.site_of[index(candidate), local]
-        s.jobs[row, COMPUTE] = 0
-        s.jobs[row, NETWORK] = 0
-        if n_in == 0 and s.shadow_parts[pair, local] == SHADOWED:
-            sources += 1
-            offset = s.tasks[index(s.cells[shadow, TASK_0] + local), OFFSET_NS]
-            key = (START << KIND_SHIFT) | job_key(shadow, cycle, local)
-            push_event(s.clock, s.event_t, s.event_key, now + offset, key)
-    slot = slot_row(s.ring, shadow, cycle)
-    s.slots[slot, CYCLE] = cycle
-    s.slots[slot, CANDIDATE] = candidate
-    s.slots[slot, PAIR] = pair
-    s.slots[slot, LIVE] = sources
-    s.slots[slot, LOST] = 0
-
-
-@phase
-def fork(s: Tables, cell: int, cycle: int, local: int, now: int) -> None:
-    """Send the output of a completed job to those tasks of the cycle's shadow that share it."""
-    shadow = s.cells[cell, SHADOW]
-    if shadow < 0 or s.stamps[shadow, cycle] < 0:
-        return
-    slot = slot_row(s.ring, shadow, cycle)
-    pair = index(s.slots[slot, PAIR])
-    if s.shadow_parts[pair, local] != SHARED:
-        return
-    task = index(s.cells[cell, TASK_0] + local)
-    first = s.tasks[task, OUT_0]
-    for i in range(first, first + s.tasks[task, N_OUT]):
-        flow = s.out_flows[index(i)]
-        if s.shadow_parts[pair, s.flows[_flow_row(s, cell, flow), TARGET]] == SHARED:
-            continue
-        s.slots[slot, LIVE] += 1
-        hop = hop_of(s, shadow, cycle, flow)
-        if hop < 0:
-            hand_over(s, shadow, cycle, flow, now)
-        else:
-            send(s, shadow, cycle, flow, hop, FIRST, now)
+        return -1
+    pair = index(s.slots[slot_row(s.ring, shadow, cycle), PAIR])
+    return int(shadow) if s.shadow_parts[pair, local] == SHARED else -1
 
 
 @phase

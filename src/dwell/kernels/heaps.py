@@ -5,13 +5,14 @@ The arrays belong to the caller; a heap is a part of them from `base` with `n` e
 
 from __future__ import annotations
 
-from dwell.kernels.compiled import index, phase
+from dwell.kernels.compiled import index, kernel, phase
 from dwell.kernels.layout import N_EVENTS, Floats, Ints
 
 __all__ = [
     "pop_event",
     "pop_running",
     "pop_waiting",
+    "post_event",
     "push_event",
     "push_running",
     "push_waiting",
@@ -33,6 +34,12 @@ def push_event(clock: Ints, event_t: Ints, event_key: Ints, t: int, key: int) ->
         i = parent
     event_t[index(i)] = t
     event_key[index(i)] = key
+
+
+@kernel
+def post_event(clock: Ints, event_t: Ints, event_key: Ints, t: int, key: int) -> None:
+    """Add an event from Python; there must be room (see `advance`)."""
+    push_event(clock, event_t, event_key, t, key)
 
 
 @phase

@@ -2,7 +2,7 @@
 
 A cell may have a *shadow*: another row of `cells` with sites and hops of its own, on the same
 servers and links, whose cycles are released by those of its parent. A *pair* of candidates (active,
-other) is row ``PAIR_0 + active * N_CANDIDATES + other`` of `shadow_parts` and `state_hops`.
+other) is row ``PAIR_0 + active * N_CANDIDATES + other`` of `shadow_parts`.
 
 Entities (cells, tasks, sites, servers, hops, links) are rows of two-dimensional int64 tables; the
 names below are their columns. A *site* is a task on one feasible node of one cell; a *server* is
@@ -26,7 +26,7 @@ def _number(value: int) -> int:
 
 
 # Kinds of events in the order in which equal times are handled.
-COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, CLOSE, RELEASE = range(8)
+COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, MIGRATE, CLOSE, RELEASE = range(9)
 
 # An event key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is
 # a task or a flow of the cell, a site, or nothing, according to the kind.
@@ -43,7 +43,7 @@ CYCLE_MASK = (1 << CYCLE_BITS) - 1
 CELL_MASK = (1 << CELL_BITS) - 1
 
 # What `advance` returns.
-PAUSED, FINISHED, GROW_EVENTS, GROW_RING, MOVED = range(5)
+PAUSED, FINISHED, GROW_EVENTS, GROW_RING, STEP = range(5)
 
 
 # Outcomes of cycles and jobs.
@@ -62,8 +62,8 @@ FAIR, FIFO, PRIORITY = range(3)
     NEXT_CHANGE,
     PAUSE,
     CLOSED_CELL,
-    MOVED_CELL,
-    MOVED_NS,
+    STEP_KEY,
+    STEP_NS,
     END,
     N_CLOCK,
 ) = range(10)
@@ -86,32 +86,19 @@ FAIR, FIFO, PRIORITY = range(3)
     PAIR_0,
     SHADOW,
     PARENT,
-    ORDER,
-    ORDER_NS,
-    ORDER_CYCLE,
-    ORDER_PAIR,
-    MOVES_LEFT,
+    MIGRATING,
     N_CELL,
-) = range(22)
+) = range(18)
 
-# What a cell does about an order for a cold migration: nothing, told by the caller, under way.
-NO_ORDER, ORDERED, MIGRATING = range(3)
-
-# Steps of a cold migration, told apart by the lowest bits of a RESTART event's cycle field; above
-# them stands the attempt. 0 is the restart of a node's workers.
-STEP_BITS = 2
-ORDER_ARRIVED, WORKER_STARTED, STATE_ARRIVED = (_number(step) for step in range(1, 4))
 # Where a link has no timeout of its own, state that was lost is sent again after Linux's least
 # TCP retransmission timeout.
 STATE_TIMEOUT_NS = 200_000_000
 
 # shadow_parts: what a task is to the shadow of a cycle.
 SHARED, SHADOWED, DISCARDED = range(3)
-# state_hops: a task that stays, or one that moves without state; otherwise its hop.
-STAYS, STATELESS = -2, -1
 
 # tasks
-N_IN, N_OUT, OUT_0, OFFSET_NS, TASK_START_NS, N_TASK = range(6)
+N_IN, N_OUT, OUT_0, OFFSET_NS, N_TASK = range(5)
 
 # flows
 SOURCE, TARGET, N_FLOW = range(3)
@@ -209,7 +196,6 @@ class Tables(NamedTuple):
     site_of: Ints  # (candidates, tasks of a cell) -> site
     route: Ints  # (candidates, flows of a cell) -> hop, or -1 on the same node
     shadow_parts: Ints  # (pairs of candidates, tasks of a cell)
-    state_hops: Ints  # (pairs of candidates, tasks of a cell)
     hops: Ints  # (hops, N_HOP)
     loss_keys: NDArray[np.uint64]  # (hops,)
     layer_rows: Ints  # (hops, layers) -> row of extra_ns, or -1

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dwell.kernels.compiled import index, phase
+from dwell.kernels.compiled import index, kernel, phase
 from dwell.kernels.heaps import push_event
 from dwell.kernels.layout import (
     ARRIVAL,
@@ -32,10 +32,8 @@ from dwell.kernels.layout import (
     SEGMENT_LAYERS,
     SEGMENT_LOSS,
     SEGMENT_RATE,
-    STATE_ARRIVED,
     STATE_TIMEOUT_NS,
     UNKNOWN,
-    WORKER_STARTED,
     Tables,
 )
 from dwell.kernels.streams import attempt_uniform
@@ -121,41 +119,39 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     push_event(s.clock, s.event_t, s.event_key, arrival, (ARRIVAL << KIND_SHIFT) | name)
 
 
-@phase
-def send_state(s: Tables, hop: int, cycle: int, attempt: int, now: int) -> tuple[int, int, int]:
+@kernel
+def send_state(s: Tables, hop: int, cycle: int, attempt: int, now: int) -> tuple[int, bool, int]:
     """Send the state of a task that moves; it is carried reliably, whatever the link does.
 
     Returns
     -------
     t : int
-        Instant of the next step; -1 where the link is down for good.
-    step : int
-        STATE_ARRIVED, or WORKER_STARTED where the state must be sent once more.
+        Instant of its arrival, or of the next attempt; -1 where the link is down for good.
+    arrived : bool
+        Which of the two.
     attempt : int
         Number of the next attempt; waiting for the end of an outage is none.
     """
     link = index(s.hops[index(hop), LINK])
     start = _begin(s, link, now)
-    segment = s.links[link, SEGMENT]
-    while s.segments[index(segment), SEGMENT_DOWN] != 0:
-        segment += 1
-        if segment == s.links[link, SEGMENT_END]:
-            return UNKNOWN, WORKER_STARTED, attempt
-        if s.segments[index(segment), SEGMENT_DOWN] == 0:
-            return s.segments[index(segment), SEGMENT_AT], WORKER_STARTED, attempt
+    segment = index(s.links[link, SEGMENT])
+    if s.segments[segment, SEGMENT_DOWN] != 0:
+        for later in range(s.links[link, SEGMENT] + 1, s.links[link, SEGMENT_END]):
+            if s.segments[index(later), SEGMENT_DOWN] == 0:
+                return s.segments[index(later), SEGMENT_AT], False, attempt
+        return UNKNOWN, False, attempt
     sent = start + _transmission(s, hop, segment)
     s.links[link, FREE] = sent
     if _is_lost(s, hop, segment, cycle, attempt):
         timeout = s.links[link, RETRANSMIT_NS]
-        again = sent + (timeout if timeout >= 0 else STATE_TIMEOUT_NS)
-        return again, WORKER_STARTED, attempt + 1
-    return _arrival(s, hop, segment, cycle, sent), STATE_ARRIVED, attempt
+        return sent + (timeout if timeout >= 0 else STATE_TIMEOUT_NS), False, attempt + 1
+    return _arrival(s, hop, segment, cycle, sent), True, attempt
 
 
 @phase
 def _transmission(s: Tables, hop: int, segment: int) -> int:
     """Time that a message takes at the rate of a link."""
-    rate = s.segments_f[index(segment), SEGMENT_RATE]
+    rate = s.segments_f[segment, SEGMENT_RATE]
     if rate < math.inf:
         return int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
     return 0
@@ -164,7 +160,7 @@ def _transmission(s: Tables, hop: int, segment: int) -> int:
 @phase
 def _is_lost(s: Tables, hop: int, segment: int, cycle: int, attempt: int) -> bool:
     """Whether an attempt to send a message is lost."""
-    loss = s.segments_f[index(segment), SEGMENT_LOSS]
+    loss = s.segments_f[segment, SEGMENT_LOSS]
     return bool(loss > 0.0 and attempt_uniform(s.loss_keys[index(hop)], cycle, attempt) < loss)
 
 
@@ -183,7 +179,7 @@ def _arrival(s: Tables, hop: int, segment: int, cycle: int, sent: int) -> int:
 def _propagation(s: Tables, hop: int, segment: int, cycle: int) -> int:
     """Delay of a message, extra delays of what is active included."""
     delay = s.delay_ns[index(hop), cycle]
-    layers = s.segments[index(segment), SEGMENT_LAYERS]
+    layers = s.segments[segment, SEGMENT_LAYERS]
     layer = 0
     while layers != 0:
         if layers & 1:

@@ -120,7 +120,6 @@ class _Layout:
         self.site_of: list[list[int]] = []
         self.route: list[list[int]] = []
         self.shadow_parts: list[list[int]] = []
-        self.state_hops: list[list[int]] = []
         self.changes = [np.empty((0, k.N_CHANGE), np.int64)]
         self.extra_rows = 0
 
@@ -186,8 +185,8 @@ class _Layout:
         link_row = self._add_links(problem, real)
         self._add_hops(problem, real, link_row)
         self._add_candidates(index, problem, real, hop_0)
-        if self.shadows is not None or problem.controller.migration == "cold":
-            self._add_pairs(problem, {hop: hop_0 + i for i, hop in enumerate(real.hops)})
+        if self.shadows is not None:
+            self._add_pairs(problem)
         self._add_changes(index, NodeChanges.of(real.node_changes))
 
     def _add_candidates(self, index: int, problem: Problem, real: Realisation, hop_0: int) -> None:
@@ -206,21 +205,11 @@ class _Layout:
             ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
 
-    def _add_pairs(self, problem: Problem, hop_row: Mapping[tuple[str, str, str], int]) -> None:
-        """Add what the tasks are to a shadow, and how their state moves, by pair of candidates."""
-        pipeline = problem.pipeline
+    def _add_pairs(self, problem: Problem) -> None:
+        """Add what the tasks are to a shadow, by pair of candidates."""
         for active in problem.candidates.values():
             for other in problem.candidates.values():
-                parts = shadow_parts(pipeline, active, other)
-                moves = [
-                    k.STAYS
-                    if active[name] == other[name]
-                    else hop_row.get((name, name, f"{active[name]}->{other[name]}"), k.STATELESS)
-                    for name in pipeline.tasks
-                ]
-                padding = self.max_tasks - len(moves)
-                self.shadow_parts.append([*parts, *[k.SHARED] * padding])
-                self.state_hops.append([*moves, *[k.STAYS] * padding])
+                self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
 
     def _add_shadow(self, problem: Problem, real: Realisation) -> None:
         """Add the shadow of the only cell: workers and draws of its own, all else shared."""
@@ -250,7 +239,6 @@ class _Layout:
         row[k.N_IN], row[k.N_OUT] = len(pipeline.inputs(task.name)), len(outputs)
         row[k.OUT_0] = len(self.out_flows)
         row[k.OFFSET_NS] = round(task.offset_ms * 1e6)
-        row[k.TASK_START_NS] = round(task.start_ms * 1e6)
         self.tasks.append(row)
         self.out_flows += outputs
 
@@ -345,7 +333,6 @@ class _Layout:
             for layer, row in rows.items():
                 layer_rows[hop, layer] = row
         clock = np.zeros(k.N_CLOCK, np.int64)
-        clock[k.MOVED_CELL] = -1
         clock[k.END] = max(
             int(real.release_ns[-1]) + row[k.GRACE_NS]
             for real, row in zip(reals, self.cell_rows, strict=True)
@@ -367,7 +354,6 @@ class _Layout:
             site_of=_table(self.site_of, self.max_tasks),
             route=_table(self.route, self.max_flows),
             shadow_parts=_table(self.shadow_parts, self.max_tasks),
-            state_hops=_table(self.state_hops, self.max_tasks),
             hops=_table(self.hops, k.N_HOP),
             loss_keys=np.concatenate([real.loss_keys for real in reals]),
             layer_rows=layer_rows,

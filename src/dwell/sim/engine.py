@@ -31,6 +31,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out, ordered_flows
+from dwell.sim.cold import Cold
 from dwell.sim.drawing import draw, draw_shadows
 from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.tables import Played, make_tables
@@ -115,7 +116,7 @@ def play(arrays: Arrays) -> int:
     Returns
     -------
     int
-        ``PAUSED``, ``MOVED`` or ``FINISHED`` (see `dwell.kernels.advance`).
+        ``PAUSED``, ``STEP`` or ``FINISHED`` (see `dwell.kernels.advance`).
     """
     while True:
         status = advance(*arrays.tables)
@@ -174,8 +175,8 @@ def _play_windows(
     stamper = _Stamper(problem, realisation, controller, arrays)
     with _quiet():
         while (status := play(arrays)) != k.FINISHED:
-            if status == k.MOVED:
-                stamper.moved()
+            if status == k.STEP:
+                stamper.step()
             else:
                 stamper.close_window()
     return Played(problem, realisation, controller, arrays, np.array(stamper.first, np.int64))
@@ -199,7 +200,7 @@ class _Stamper:
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
-        self.cold = settings.migration == "cold"
+        self.cold = Cold(problem, realisation) if settings.migration == "cold" else None
         self.fraction = controller.shadow_fraction
         self.placement = controller.incumbent
         self.next_first = 0
@@ -212,8 +213,8 @@ class _Stamper:
         """Stamp cycles with the placement, and with what they are also sent through."""
         tables, code = self.arrays.tables, self.code[self.placement]
         tables.stamps[0, start:stop] = code
-        stop = min(stop, self.cycles)
-        if self.fraction > 0 and start < stop:
+        if self.fraction > 0 and start < self.cycles:
+            stop = min(stop, self.cycles)
             plan = shadow_stamps(start, stop, code, len(self.code), self.fraction)
             tables.stamps[1, start:stop] = plan
 
@@ -252,9 +253,9 @@ class _Stamper:
             return
         earliest = self._takes_effect(boundary, close_ns)
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
-        if self.cold and earliest + self.window_cycles <= self.cycles:
-            self._order(order, boundary, close_ns)
-        else:
+        if earliest + self.window_cycles > self.cycles or not self._begin(
+            order, boundary, close_ns
+        ):
             self._move(order, earliest)
 
     def _go_on(self, boundary: int) -> None:
@@ -273,25 +274,29 @@ class _Stamper:
         self.stamped = self._reach(following + self.window_cycles)
         self._stamp(following, self.stamped)
 
-    def _order(self, order: str, boundary: int, close_ns: int) -> None:
-        """Give an order that takes effect when what it moves is ready (see `moved`)."""
-        cell, count = self.arrays.tables.cells[0], len(self.code)
-        self.ordered = (order, boundary)
-        pair = self.code[self.placement] * count + self.code[order]
-        cell[k.ORDER], cell[k.ORDER_PAIR] = k.ORDERED, cell[k.PAIR_0] + pair
-        # State has the draws of the first cycle after the window.
-        cell[k.ORDER_CYCLE], cell[k.ORDER_NS] = boundary, close_ns + self.delay_ns
+    def _begin(self, order: str, boundary: int, close_ns: int) -> bool:
+        """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
+        tables, arrival_ns = self.arrays.tables, close_ns + self.delay_ns
+        if self.cold is None or not self.cold.begin(
+            tables, self.placement, order, boundary, arrival_ns
+        ):
+            return False
+        cell = tables.cells[0]
         # No window closes before the migration is over.
         cell[k.WINDOW_FIRST] = cell[k.CLOSE_CYCLE] = self.cycles + 1
+        cell[k.MIGRATING] = 1
         self._stamp(self.stamped, self.cycles)
+        return True
 
-    def moved(self) -> None:
-        """Carry out an order whose tasks are ready now."""
-        clock = self.arrays.tables.clock
-        clock[k.MOVED_CELL] = -1
-        order, boundary = self.ordered
-        self.stamped = self._takes_effect(boundary, int(clock[k.MOVED_NS]) - self.delay_ns)
-        self._move(order, self.stamped)
+    def step(self) -> None:
+        """Carry a cold migration on; when its last task is ready, the order takes effect."""
+        tables, cold = self.arrays.tables, self.cold
+        if cold is None or not cold.step(tables):
+            return
+        tables.cells[0, k.MIGRATING] = 0
+        ready_ns = int(tables.clock[k.STEP_NS])
+        self.stamped = self._takes_effect(cold.boundary, ready_ns - self.delay_ns)
+        self._move(cold.order, self.stamped)
 
     def _takes_effect(self, boundary: int, close_ns: int) -> int:
         """First cycle that an order given at a close stamps; those before are out already."""

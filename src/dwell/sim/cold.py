@@ -1,0 +1,67 @@
+"""Cold migrations: workers are started and state is carried before an order takes effect."""
+
+from __future__ import annotations
+
+from dwell.kernels import layout as k
+from dwell.kernels.heaps import post_event
+from dwell.kernels.links import send_state
+from dwell.model import Problem
+from dwell.sim.realisation import Realisation
+
+__all__ = ["Cold"]
+
+
+class Cold:
+    """The one cold migration of a cell that may be under way.
+
+    Its steps are events like any others, which `dwell.kernels.advance` hands back: a worker is
+    ready, or state must be sent again, or has arrived. An event's cycle field says which, and
+    counts the attempts; its item is the task.
+
+    Attributes
+    ----------
+    order : str
+        The candidate that was ordered.
+    boundary : int
+        First cycle after the window at whose close it was.
+    """
+
+    def __init__(self, problem: Problem, realisation: Realisation) -> None:
+        self.candidates = problem.candidates
+        self.tasks = tuple(problem.pipeline.tasks.values())
+        self.hop_row = {hop: row for row, hop in enumerate(realisation.hops)}
+        self.order, self.boundary = "", 0
+        # Of the tasks that are not ready yet: the hop that their state takes, -1 for none.
+        self.hops: dict[int, int] = {}
+
+    def begin(
+        self, tables: k.Tables, incumbent: str, order: str, boundary: int, arrival_ns: int
+    ) -> bool:
+        """Start a worker of every task that an order moves; False if there is none."""
+        self.order, self.boundary = order, boundary
+        old, new = self.candidates[incumbent], self.candidates[order]
+        for row, task in enumerate(self.tasks):
+            if old[task.name] != new[task.name]:
+                link = f"{old[task.name]}->{new[task.name]}"
+                self.hops[row] = self.hop_row.get((task.name, task.name, link), -1)
+                started_ns = arrival_ns + round(task.start_ms * 1e6)
+                self._announce(tables, row, 0, self.hops[row] < 0, started_ns)
+        return bool(self.hops)
+
+    def step(self, tables: k.Tables) -> bool:
+        """Take the step that is due; True if the last task is ready now."""
+        key, now = int(tables.clock[k.STEP_KEY]), int(tables.clock[k.STEP_NS])
+        field, row = (key >> k.CYCLE_SHIFT) & k.CYCLE_MASK, key & k.ITEM_MASK
+        attempt, ready = field >> 1, bool(field & 1)
+        if ready:
+            del self.hops[row]
+            return not self.hops
+        t, arrived, attempt = send_state(tables, self.hops[row], self.boundary, attempt, now)
+        if t >= 0:
+            self._announce(tables, row, attempt, arrived, t)
+        return False
+
+    def _announce(self, tables: k.Tables, row: int, attempt: int, ready: bool, t: int) -> None:
+        field = (attempt << 1) | ready
+        key = (k.MIGRATE << k.KIND_SHIFT) | (field << k.CYCLE_SHIFT) | row
+        post_event(tables.clock, tables.event_t, tables.event_key, t, key)
