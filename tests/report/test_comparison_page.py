@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
+import polars as pl
 import pytest
 
 from dwell.report import comparison_html
@@ -124,6 +125,24 @@ def test_a_rate_is_under_the_aim_only_where_its_limit_is() -> None:
     comparison = make_comparison(shown)
     found = [standing(comparison, "baseline", name) for name in comparison.policies]
     assert found == ["under", "open", "above", "no miss"]
+
+
+def test_no_miss_is_shown_as_open() -> None:
+    found = small_comparison()
+    runs = found.runs.with_columns(pl.lit(0.0).alias("violation_rate"))
+    html = comparison_html(replace(found, scenarios=("baseline",), runs=runs))
+    assert html.count('<span class="open nowrap">no miss</span>') == len(found.policies)
+    assert "“No miss” is open too" in html
+
+
+def test_a_difference_that_rounds_to_nothing_is_not_said_to_be_none() -> None:
+    shown: Shown = {
+        ("baseline", "dtp"): {"cost": 1.0},
+        ("baseline", "dtp+corrected"): {"cost": [1.001 + x / 1000 for x in NOISE]},
+    }
+    policies = ("LOC", "SO", "HYB", "dtp", "dtp+corrected")
+    text = verdict(make_comparison(shown, policies=policies))[-1]
+    assert text.endswith("is higher by less than 0.01 in Baseline.")
 
 
 def test_the_verdict_names_who_keeps_the_aim() -> None:

@@ -10,6 +10,7 @@ from dwell.report.wording import (
     Measure,
     listed,
     percent,
+    shown_contender,
     shown_policy,
     shown_scenario,
     write_interval,
@@ -51,6 +52,16 @@ def test_numbers_have_three_digits_that_count(value: float, decimals: int, text:
         (Interval(36.0, 36.0, 36.0), MS, "36.0"),
         (Interval(3.0, math.nan, math.nan), MS, "3.0"),
         (Interval(0.546, 0.538, 0.554), SHARE, "54.6 ± 0.8"),
+        # Halves that differ by a unit of the last digit, and by more.
+        (Interval(31.8, 31.5, 32.0), MS, "31.8 ± 0.3"),
+        (Interval(31.8, 31.5, 31.9), MS, "31.8 [31.5, 31.9]"),
+        (Interval(226.0, 212.0, 241.0), MS, "226 ± 15"),
+        (Interval(226.0, 212.0, 242.0), MS, "226 [212, 242]"),
+        # An end that has the sign of the number keeps it, and 0 is not crossed.
+        (Interval(0.2, 0.05, 0.41), MS, "0.2 [0.1, 0.4]"),
+        (Interval(-0.2, -0.41, -0.05), MS, "−0.2 [−0.4, −0.1]"),
+        (Interval(0.2, -0.05, 0.46), MS, "0.2 ± 0.3"),
+        (Interval(0.01, 0.002, 0.03), MS, "0.0 ± <0.1"),
         (Interval(0.01, 0.0, 0.03), SHARE, "1.0 [0.0, 3.0]"),
         (Interval(0.0, 0.0, 0.139), SHARE, "0"),
         (Interval(1.0, 0.861, 1.0), SHARE, "100"),
@@ -63,10 +74,18 @@ def test_intervals(interval: Interval, measure: Measure, text: str) -> None:
     assert str(write_interval(interval, measure)) == text
 
 
+def test_a_table_that_is_short_of_room_has_the_larger_half() -> None:
+    assert str(write_interval(Interval(62.2, 58.1, 68.0), MS, larger_half=True)) == "62.2 ± 5.8"
+    endless = Interval(98.9, 85.0, math.inf)
+    assert str(write_interval(endless, MS, larger_half=True)) == "98.9 [85.0, ∞]"
+
+
 def test_names() -> None:
     assert shown_scenario("robot-cpu-stress") == "Robot CPU stress"
     assert shown_policy("dtp") == "DTP"
-    assert "our reconstruction" in shown_policy("atp")
+    assert shown_policy("atp") == "ATP (our reconstruction)"
+    assert shown_policy("atp+corrected") == "ATP (our reconstruction; corrected)"
+    assert shown_contender("atp+corrected") == "ATP (corrected)"
     assert shown_policy("dtp+corrected") == "DTP (corrected)"
     assert shown_policy("my own") == "my own"
 

@@ -14,6 +14,7 @@ from dwell.io.entries import (
     Entry,
     EpisodesEntry,
     LinkEntry,
+    LiveEntry,
     NodeEntry,
     ObjectiveEntry,
     ProcessEntry,
@@ -29,14 +30,17 @@ from dwell.model import (
     Constant,
     ControllerSettings,
     Disturbance,
+    Endpoint,
     Episodes,
     Execution,
     Exponential,
     Fabric,
     Flow,
     Gamma,
+    Host,
     Link,
     LinkDisturbance,
+    LiveSettings,
     LogNormal,
     MovingTarget,
     Node,
@@ -117,6 +121,7 @@ class Assembly:
         objective = self._objective(entry.objective or ObjectiveEntry(), nodes)
         controller = self._controller(entry.controller or ControllerEntry())
         servo = self._servo(entry.servo)
+        live = self._live(entry.live or LiveEntry())
         scenarios = {
             name: list(self._disturbances(name, items or ()))
             for name, items in (entry.scenarios or {}).items()
@@ -135,9 +140,12 @@ class Assembly:
             controller=controller,
             tiers=objective.tiers if objective is not None else (),
             reserved=POLICIES,
+            live=live,
         )
         self._judge(parts)
-        if timing is None or objective is None or controller is None or self.faults:
+        if timing is None or objective is None or controller is None or live is None:
+            return None
+        if self.faults:
             return None
         whole = {name: task for name, task in tasks.items() if task is not None}
         fabric = self.faults.attempt(
@@ -162,6 +170,7 @@ class Assembly:
             scenarios={name: tuple(item for _, item in items) for name, items in scenarios.items()},
             controller=controller,
             servo=servo,
+            live=live,
             **_given(window_cycles=entry.window_cycles, warmup_windows=entry.warmup_windows),
         )
 
@@ -261,6 +270,7 @@ class Assembly:
                 offset_ms=entry.offset_ms,
                 start_ms=entry.start_ms,
                 state_bytes=entry.state_bytes,
+                run=entry.run,
             ),
         )
 
@@ -274,6 +284,7 @@ class Assembly:
                 threads=entry.threads,
                 workers=entry.workers if entry.workers is not None else task.workers,
                 accelerator=entry.accelerator,
+                standby=entry.standby,
             ),
         )
 
@@ -407,6 +418,22 @@ class Assembly:
         if servo is not None and not self.faults.at("period_ms"):
             self.faults.attempt("", servo.require_seen, self.entry.period_ms)
         return servo
+
+    def _live(self, entry: LiveEntry) -> LiveSettings | None:
+        values = _values(entry)
+        values["hosts"] = {
+            name: Host(
+                **{
+                    **_values(host),
+                    "seen_from": {
+                        node: Endpoint(seen.address, seen.port)
+                        for node, seen in (host.seen_from or {}).items()
+                    },
+                }
+            )
+            for name, host in (entry.hosts or {}).items()
+        }
+        return self.faults.attempt("", LiveSettings, **values)
 
     # --------------------------------------------------------------------------- meaning
 

@@ -36,6 +36,7 @@ __all__ = [
     "ExecutionEntry",
     "FlowEntry",
     "LinkEntry",
+    "LiveEntry",
     "NodeEntry",
     "Number",
     "ObjectiveEntry",
@@ -412,6 +413,11 @@ class ExecutionEntry(Entry):
     accelerator: str | None = Field(
         None, description="Kind of accelerator that it runs on instead of the CPU."
     )
+    standby: Annotated[int, Number(bounds.STANDBY)] | None = Field(
+        None,
+        description="Further workers that a live node keeps, to take over when the first is "
+        "silent; default 0.",
+    )
 
 
 class InputEntry(Entry):
@@ -469,6 +475,9 @@ class TaskEntry(Entry):
     )
     state_bytes: Annotated[int, Number(bounds.STATE_BYTES)] | None = Field(
         None, description="State that a cold migration carries, bytes; default 0."
+    )
+    run: str | None = Field(
+        None, description="Class or function of a live worker, as `package.module:Name`."
     )
 
 
@@ -670,6 +679,65 @@ class ServoEntry(Entry):
     target: MovingTargetEntry = Field(description="What the robot follows.")
 
 
+class EndpointEntry(Entry):
+    """An address and the first port behind it."""
+
+    address: str = Field(description="Name or address of the host.", min_length=1)
+    port: Annotated[int, Number(bounds.PORT)] = Field(description="First port.")
+
+
+class HostEntry(Entry):
+    """Where a node's processes listen."""
+
+    address: str | None = Field(
+        None, description="Name or address of the host; default 127.0.0.1.", min_length=1
+    )
+    port: Annotated[int, Number(bounds.PORT)] | None = Field(
+        None, description="First port, default 7450; each process of the node takes three."
+    )
+    seen_from: dict[str, EndpointEntry] | None = Field(
+        None, description="Where it is reached from nodes that do not reach it there."
+    )
+
+
+class LiveEntry(Entry):
+    """What the live runtime needs to know beside the problem."""
+
+    hosts: dict[str, HostEntry] | None = Field(
+        None, description="Where each node is reached; by default all are this machine."
+    )
+    release: str | None = Field(
+        None,
+        description="A cycle begins by the clock (`timer`, default), or when the first source has "
+        "a picture (`frames`).",
+    )
+    clock: str | None = Field(
+        None,
+        description="Clocks are compared by messages (`estimated`, default), or taken for "
+        "synchronous (`system`: PTP, chrony).",
+    )
+    mode: str | None = Field(
+        None, description="Decisions are carried out (`control`, default) or recorded (`advise`)."
+    )
+    relay: str | None = Field(
+        None,
+        description="Node that carries small messages where a direct link fails; default: the "
+        "controller's.",
+    )
+    max_age_ms: Annotated[float, Number(bounds.AGE_MS)] | None = Field(
+        None, description="Age from which a command is not applied, ms; default: two periods."
+    )
+    silence: str | None = Field(
+        None, description="What the actuator is told without commands: `hold` (default) or `zero`."
+    )
+    checkpoint_cycles: Annotated[int, Number(bounds.CHECKPOINT_CYCLES)] | None = Field(
+        None, description="Cycles between copies of a state to its fallback; default 25, 0: none."
+    )
+    actuators: dict[str, str] | None = Field(
+        None, description="What applies the commands of a sink task, as `package.module:Name`."
+    )
+
+
 # ------------------------------------------------------------------------------------ cell
 
 
@@ -724,3 +792,4 @@ class CellEntry(Entry):
         None,
         description="A loop on which the tracking error of every run is computed; none by default.",
     )
+    live: LiveEntry | None = Field(None, description="Hosts and habits of the live runtime.")

@@ -2,6 +2,7 @@
 
 from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
 from dwell.model.frozen import FrozenDict
+from dwell.model.live import Endpoint, Host, LiveSettings
 from dwell.model.objective import Caps, Objective, Targets, Tier, Weights
 from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
@@ -36,6 +37,7 @@ __all__ = [
     "ControllerSettings",
     "Decision",
     "Disturbance",
+    "Endpoint",
     "Episodes",
     "Execution",
     "Exponential",
@@ -43,8 +45,10 @@ __all__ = [
     "Flow",
     "FrozenDict",
     "Gamma",
+    "Host",
     "Link",
     "LinkDisturbance",
+    "LiveSettings",
     "LogNormal",
     "MovingTarget",
     "Node",

@@ -133,6 +133,12 @@ DAMPING = Bound(0, MAX_COUNT)
 AMPLITUDE_MM = Bound(1e-6, MAX_COUNT)
 TARGET_PERIOD_S = Bound(1e-5, LARGEST)
 
+# Live runtime. Each process of a node takes three ports.
+PORT = Bound(1024, 65_000, whole=True)
+AGE_MS = Bound(0, LARGEST, above=True)
+CHECKPOINT_CYCLES = Bound(0, MAX_COUNT, whole=True)
+STANDBY = Bound(0, 1, whole=True)
+
 # Controller and windows.
 WINDOW_CYCLES = Bound(1, MAX_COUNT, whole=True)
 WARMUP_WINDOWS = Bound(0, MAX_COUNT, whole=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.fabric import Bursts, Link, Node
+from dwell.model.live import LiveSettings
 from dwell.model.pipeline import Execution, Task
 from dwell.model.problem import ControllerSettings, Problem
 from dwell.model.process import (
@@ -92,6 +93,7 @@ def to_document(problem: Problem) -> Document:
             "objective": _objective(problem),
             "controller": _controller(problem.controller),
             "servo": _servo(problem.servo),
+            "live": _live(problem.live),
         }
     )
 
@@ -203,6 +205,7 @@ def _task(task: Task) -> Document:
             "offset_ms": task.offset_ms,
             "start_ms": task.start_ms,
             "state_bytes": task.state_bytes,
+            "run": task.run,
         }
     )
 
@@ -214,6 +217,7 @@ def _execution(task: Task, node: str, execution: Execution) -> Document:
             "threads": execution.threads,
             "workers": execution.workers,
             "accelerator": execution.accelerator,
+            "standby": execution.standby or None,
         }
     )
 
@@ -269,6 +273,20 @@ def _servo(servo: Servo | None) -> Document | None:
     if servo is None:
         return None
     return {**_dataclass(servo), "target": _dataclass(servo.target)}
+
+
+def _live(settings: LiveSettings) -> Document | None:
+    if settings == LiveSettings():
+        return None
+    hosts = {
+        name: {
+            "address": host.address,
+            "port": host.port,
+            "seen_from": {node: _dataclass(seen) for node, seen in host.seen_from.items()},
+        }
+        for name, host in settings.hosts.items()
+    }
+    return {**_dataclass(settings), "hosts": hosts, "actuators": dict(settings.actuators)}
 
 
 def _dataclass(part: Any) -> Document:

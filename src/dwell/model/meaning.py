@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
 from dwell.model.fabric import Link, Node
+from dwell.model.live import LiveSettings
 from dwell.model.pipeline import Flow, Task
 from dwell.model.scenario import (
     MAX_LAYERS,
@@ -56,6 +57,7 @@ class Parts:
     controller: ControllerSettings | None = None
     tiers: Iterable[str] = ()
     reserved: Iterable[str] = ()
+    live: LiveSettings | None = None
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -78,6 +80,7 @@ def find_faults(parts: Parts) -> list[Fault]:
         *_scenarios(parts),
         *_objective(parts),
         *_controller(parts),
+        *_live(parts),
     ]
 
 
@@ -332,6 +335,24 @@ def _controller(parts: Parts) -> Iterator[Fault]:
     yield from _shadow_budget(settings, len(names))
     if settings.migration == "cold" and parts.links_complete:
         yield from _state_transfers(parts)
+
+
+def _live(parts: Parts) -> Iterator[Fault]:
+    live = parts.live
+    if live is None:
+        return
+    for name, host in live.hosts.items():
+        yield from _unknown(f"live.hosts.{name}", "node", name, parts.nodes)
+        for other in host.seen_from:
+            yield from _unknown(f"live.hosts.{name}.seen_from.{other}", "node", other, parts.nodes)
+    if live.relay is not None:
+        yield from _unknown("live.relay", "node", live.relay, parts.nodes)
+    for task in live.actuators:
+        path = f"live.actuators.{task}"
+        known = list(_unknown(path, "task", task, parts.tasks))
+        yield from known
+        if not known and any(flow.source == task for _, flow in parts.flows):
+            yield Fault(path, f"{task} is no sink: other tasks take what it sends; leave it out")
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:

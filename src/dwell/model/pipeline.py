@@ -11,6 +11,7 @@ from dwell.model.bounds import (
     DEPTH,
     PERIOD_MS,
     PRIORITY,
+    STANDBY,
     STATE_BYTES,
     THREADS,
     TIME_MS,
@@ -18,6 +19,7 @@ from dwell.model.bounds import (
     require,
 )
 from dwell.model.frozen import FrozenDict, require_names
+from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 
 __all__ = ["Execution", "Flow", "Pipeline", "Task"]
@@ -37,14 +39,18 @@ class Execution:
         Jobs of this task that may run there at the same time.
     accelerator : str, optional
         Kind of accelerator the job runs on instead of the CPU.
+    standby : int
+        Further workers that a live node keeps, to take over when the first is silent.
     """
 
     exec_ms: Process
     threads: int = 1
     workers: int = 1
     accelerator: str | None = None
+    standby: int = 0
 
     def __post_init__(self) -> None:
+        STANDBY.check("standby", self.standby)
         THREADS.check("threads", self.threads)
         WORKERS.check("workers", self.workers)
 
@@ -71,6 +77,8 @@ class Task:
         Time a new worker needs before its first job.
     state_bytes : int
         State that a cold migration carries over the link.
+    run : str, optional
+        ``module:Name`` of the class or function that a live worker runs.
     """
 
     name: str
@@ -81,8 +89,11 @@ class Task:
     offset_ms: float = 0.0
     start_ms: float = 0.0
     state_bytes: int = 0
+    run: str | None = None
 
     def __post_init__(self) -> None:
+        if self.run is not None:
+            require_callable_name("run", self.run)
         require(len(self.on) > 0, "on", dict(self.on), "at least one node")
         DEPTH.check("input", self.depth)
         PRIORITY.check("priority", self.priority)

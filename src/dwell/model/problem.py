@@ -20,6 +20,7 @@ from dwell.model.bounds import (
 )
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
+from dwell.model.live import LiveSettings
 from dwell.model.meaning import Parts, find_faults, nearest
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
@@ -126,6 +127,8 @@ class Problem:
         First windows of a run, recorded but left out of statistics.
     servo : Servo, optional
         Loop that every run's commands are tried on; none, and no tracking error, where None.
+    live : LiveSettings
+        For the live runtime.
 
     Raises
     ------
@@ -143,6 +146,7 @@ class Problem:
     window_cycles: int = 50
     warmup_windows: int = 0
     servo: Servo | None = None
+    live: LiveSettings = field(default_factory=LiveSettings)
 
     def __post_init__(self) -> None:
         WINDOW_CYCLES.check("window_cycles", self.window_cycles)
@@ -182,6 +186,7 @@ class Problem:
             controller=self.controller,
             tiers=self.objective.tiers,
             reserved=POLICIES,
+            live=self.live,
         )
 
     @property

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from dwell.report import figures
-from dwell.report.contenders import describe_contenders
+from dwell.report.contenders import describe_contenders, palette_of
 from dwell.report.findings import (
     COST,
     DTP,
@@ -90,7 +90,7 @@ STANDING: dict[Status, tuple[str, str]] = {
     "under": ("under", "good"),
     "above": ("above", "bad"),
     "open": ("open", "open"),
-    "no miss": ("no miss", "good"),
+    "no miss": ("no miss", "open"),
 }
 
 
@@ -116,7 +116,7 @@ def comparison_html(*comparisons: Comparison) -> str:
 
 
 def _chapter(comparison: Comparison) -> Iterator[str]:
-    palette = Palette.of(comparison.problem.candidates, comparison.policies)
+    palette = palette_of(comparison.problem, comparison.policies)
     look = Look(palette, frozenset(comparison.scenarios))
     yield paragraph(_subtitle(comparison), "subtitle")
     yield paragraph(question(comparison), "question")
@@ -179,9 +179,22 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
         rows,
         f"{_columns(problem.candidates)} the mean shares of the windows that began under each. "
         "Bold: the lowest V_D and J of a scenario. V_D is “under” 5 % where its one-sided 95 % "
-        f"limit is, “above” where its lower limit is, else “open”.{_ours(comparison)}",
-        kind="wide small",
+        "limit is, “above” where its lower limit is, else “open”."
+        f"{_on_no_miss(comparison)}{_ours(comparison)}",
+        kind="wide of-chapter small",
     )
+
+
+def _on_no_miss(comparison: Comparison) -> str:
+    """Say what “no miss” is, where the table says it."""
+    found = (
+        standing(comparison, scenario, policy)
+        for scenario in comparison.scenarios
+        for policy in comparison.policies
+    )
+    if "no miss" not in found:
+        return ""
+    return " “No miss” is open too: none was seen, in too few runs to show more."
 
 
 def _columns(names: Iterable[str]) -> str:
@@ -413,7 +426,7 @@ def _more(comparison: Comparison) -> Iterator[str]:
 
 def _numbers(comparison: Comparison, measures: Sequence[Measure], caption: str) -> str:
     """Return a table of columns by scenario and policy."""
-    palette = Palette.of(comparison.problem.candidates, comparison.policies)
+    palette = palette_of(comparison.problem, comparison.policies)
     head = [Cell("policy"), *(Cell(marked(measure.heading), "pair", 2) for measure in measures)]
     rows: list[tuple[str, Sequence[Cell]]] = []
     for scenario in comparison.scenarios:

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import io
+import itertools
 import textwrap
 
 from dwell.report.findings import COST, RATE, question, standing, verdict
-from dwell.report.wording import Measure, shown_policy, shown_scenario, write_interval
+from dwell.report.palette import contended
+from dwell.report.wording import (
+    OURS,
+    Measure,
+    listed,
+    shown_contender,
+    shown_scenario,
+    write_interval,
+)
 from dwell.study import Comparison
 
 __all__ = ["comparison_text"]
 
+POLICY, STANDING = "policy", ""
 # Of tables where the terminal's width is not given, and of sentences at most.
 WIDEST = 1000
 PROSE = 100
@@ -18,13 +28,13 @@ MEASURES = (
     RATE,
     Measure("l95_ms", "L95", "ms"),
     COST,
-    Measure("u_robot", "U_r", "%", 100.0),
-    Measure("u_edge", "U_e", "%", 100.0),
     Measure("migrations", "migr."),
 )
-# Narrower than in a page, with the remark below the table.
-NAMES = {"atp": "ATP *"}
-REMARK = "* our reconstruction of ATP, whose rule has no public numbers"
+# Written without their intervals, as are the shares of the windows: a page has the room for them.
+MEANS = (
+    Measure("u_robot", "U_r", "%", 100.0),
+    Measure("u_edge", "U_e", "%", 100.0),
+)
 
 
 def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
@@ -39,47 +49,66 @@ def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
     from rich.console import Console
     from rich.table import Table
 
-    shares = [
-        Measure(f"share_{name}", name, "%", 100.0, decimals=0)
-        for name in comparison.problem.candidates
-    ]
-    measures = (*MEASURES, *shares)
+    columns = _columns(comparison)
+    rows = {
+        scenario: [_row(comparison, scenario, policy) for policy in comparison.policies]
+        for scenario in comparison.scenarios
+    }
+    # The columns of all tables stand below one another.
+    cells = zip(*itertools.chain([columns], *rows.values()), strict=True)
+    widths = [max(map(len, column)) for column in cells]
     buffer = io.StringIO()
     console = Console(file=buffer, width=width or WIDEST, color_system=None, highlight=False)
-    for scenario in comparison.scenarios:
+    for scenario, found in rows.items():
         table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-        table.add_column(shown_scenario(scenario), no_wrap=True)
-        for measure in measures:
+        for column, least in zip(columns, widths, strict=True):
             table.add_column(
-                f"{measure.name} {measure.unit}".rstrip(), justify="right", overflow="fold"
+                column,
+                no_wrap=column == POLICY,
+                justify="left" if column in (POLICY, STANDING) else "right",
+                overflow="fold",
+                min_width=least,
             )
-            if measure is RATE:
-                table.add_column("", overflow="fold")
-        for policy in comparison.policies:
-            table.add_row(*_row(comparison, measures, scenario, policy))
+        for row in found:
+            table.add_row(*row)
+        console.print(shown_scenario(scenario))
         console.print(table)
         console.print()
     prose = textwrap.TextWrapper(min(width or PROSE, PROSE), break_on_hyphens=False)
-    note = (
-        f"Mean over {len(comparison.seeds)} seeds and half of its 95 % interval, or the interval. "
-        f"Columns {', '.join(comparison.problem.candidates)}: share of the windows."
-    )
-    lines = [buffer.getvalue().rstrip(), "", prose.fill(note)]
-    if any(policy in NAMES for policy in comparison.policies):
-        lines.append(prose.fill(REMARK))
+    lines = [buffer.getvalue().rstrip(), "", prose.fill(_note(comparison))]
     lines += ["", prose.fill(question(comparison)), ""]
     prose.initial_indent, prose.subsequent_indent = "- ", "  "
     lines += [prose.fill(item.replace("`", "")) for item in verdict(comparison)]
     return "\n".join(line.rstrip() for line in "\n".join(lines).splitlines()) + "\n"
 
 
-def _row(
-    comparison: Comparison, measures: tuple[Measure, ...], scenario: str, policy: str
-) -> list[str]:
-    row = [NAMES.get(policy, shown_policy(policy))]
-    for measure in measures:
-        written = write_interval(comparison.interval(scenario, policy, measure.column), measure)
+def _columns(comparison: Comparison) -> list[str]:
+    first, *others = (f"{one.name} {one.unit}".rstrip() for one in (*MEASURES, *MEANS))
+    return [POLICY, first, STANDING, *others, *comparison.problem.candidates]
+
+
+def _row(comparison: Comparison, scenario: str, policy: str) -> list[str]:
+    row = [shown_contender(policy)]
+    for measure in MEASURES:
+        interval = comparison.interval(scenario, policy, measure.column)
+        written = write_interval(interval, measure, larger_half=True)
         row.append(str(written).replace("± ", "±"))
         if measure is RATE:
             row.append(standing(comparison, scenario, policy))
+    shares = [
+        Measure(f"share_{name}", name, factor=100.0, decimals=0)
+        for name in comparison.problem.candidates
+    ]
+    for measure in (*MEANS, *shares):
+        interval = comparison.interval(scenario, policy, measure.column)
+        row.append(write_interval(interval, measure).value)
     return row
+
+
+def _note(comparison: Comparison) -> str:
+    text = (
+        f"Means over {len(comparison.seeds)} seeds; ± the larger half of the 95 % interval. "
+        f"{listed(comparison.problem.candidates)}: % of the windows."
+    )
+    known = map(contended, comparison.policies)
+    return f"{text} {OURS}" if any(one and one.family == "atp" for one in known) else text

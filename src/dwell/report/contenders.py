@@ -6,17 +6,16 @@ from collections.abc import Iterable
 
 from dwell.model import Problem
 from dwell.report.method import placements
-from dwell.report.palette import contended
+from dwell.report.palette import Palette, contended
 from dwell.report.wording import OURS, shown_contender
 
-__all__ = ["POLICIES", "describe_contenders"]
+__all__ = ["POLICIES", "describe_contenders", "palette_of"]
 
 #: By the family of the policy.
 POLICIES = {
     "dtp": "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
     "once the dwell time is over and the improvement large enough.",
-    "atp": "ATP, our reconstruction, moves one task to the edge and back by thresholds on L95 and "
-    "utilisation.",
+    "atp": "ATP moves one task to the edge and back by thresholds on L95 and utilisation.",
     "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
     "work-function": "Work-function follows the optimum in hindsight over all windows so far, one "
     "window late.",
@@ -48,6 +47,24 @@ VARIANTS = {
     "is on is over a cap.",
     "dwell": "under the dwell time of Algorithm 1.",
 }
+
+
+def palette_of(problem: Problem, names: Iterable[str]) -> Palette:
+    """Return how several contenders are drawn, by their names.
+
+    Where any of them says what it believes, the others are drawn as who believes what the cell
+    says: ``dtp`` is then another line than ``dtp+corrected``.
+    """
+    names = list(dict.fromkeys(names))
+    known = {name: contended(name) for name in names if name not in problem.candidates}
+    told = dict(zip(names, names, strict=True))
+    if any(one.belief for one in known.values() if one is not None):
+        for name, one in known.items():
+            if one is not None and not (one.variant or one.belief or one.rest):
+                told[name] = f"{name}+{problem.controller.estimator}"
+    palette = Palette.of(problem.candidates, told.values())
+    styles = {name: palette.policies[shown] for name, shown in told.items()}
+    return Palette(palette.placements, styles)
 
 
 def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str]:

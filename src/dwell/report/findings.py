@@ -448,6 +448,12 @@ def _span(values: list[float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+def _gap(gap: float, decimals: int) -> str:
+    """Write a difference above 0, which is not to be read as none."""
+    least = 10.0**-decimals
+    return write_number(gap, decimals) if gap >= least / 2 else f"less than {least:.{decimals}f}"
+
+
 def _higher_or_lower(gaps: Mapping[str, Interval], decimals: int, unit: str = "") -> str:
     """Say in which scenarios a difference is above 0, below, or not told by the seeds."""
     higher = {name: gap.value for name, gap in gaps.items() if gap.known and gap.low > 0}
@@ -456,7 +462,7 @@ def _higher_or_lower(gaps: Mapping[str, Interval], decimals: int, unit: str = ""
     for found, word in ((higher, "higher"), (lower, "lower")):
         if found:
             where = listed(
-                f"{write_number(gap, decimals)}{unit if i == 0 else ''} in {shown_scenario(name)}"
+                f"{_gap(gap, decimals)}{unit if i == 0 else ''} in {shown_scenario(name)}"
                 for i, (name, gap) in enumerate(found.items())
             )
             words.append(f"{word} by {where}")

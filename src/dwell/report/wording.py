@@ -25,17 +25,16 @@ __all__ = [
     "write_number",
 ]
 
-POLICY_NAMES = {
+#: By the family of the policy.
+NAMES = {
     "dtp": "DTP",
-    "atp": "ATP (our reconstruction)",
+    "atp": "ATP",
     "latency-first": "Latency-first",
     "work-function": "Work-function",
     "cusum": "CUSUM",
     "clairvoyant": "Clairvoyant",
     "best static": "Best static",
 }
-#: Names where what ATP is stands beside the table or figure.
-SHORT_NAMES = {**POLICY_NAMES, "atp": "ATP"}
 #: What has to stand beside everything that shows ATP.
 OURS = "ATP is our reconstruction: its rule has no public numbers."
 #: A symbol with its index: V_D, N_min, α_L.
@@ -101,25 +100,45 @@ def write_number(value: float, decimals: int = 1, *, signed: bool = False) -> st
     return plus + _fixed(value, _places(value, decimals))
 
 
-def write_interval(interval: Interval, measure: Measure) -> Written:
+def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = False) -> Written:
     """Write a number over seeds with its 95 % interval.
 
-    Symmetric intervals become ``± half``, others ``[low, high]``. Where every seed showed the same
-    number, or the same extreme of a share, nothing stands beside it.
+    Intervals become ``± half``, the larger one, where the halves differ by no more than a unit of
+    the last digit, and the sign is as certain as the ends say; others ``[low, high]``. Where every
+    seed showed the same number, or the same extreme of a share, nothing stands beside it.
+
+    Parameters
+    ----------
+    interval : Interval
+    measure : Measure
+    larger_half : bool
+        Whether ``±`` stands before the larger half however much they differ, as long as it is
+        finite: for tables that are short of room and say so.
     """
     value, low, high = (end * measure.factor for end in interval)
     text = write_number(value, measure.decimals, signed=measure.signed)
     if not interval.known or low == high or (value in (low, high) and interval.value in (0, 1)):
         return Written(text if value else "0", "")
-    half = high - value
-    even = math.isfinite(half) and abs(half - (value - low)) <= 0.02 * (high - low)
-    if measure.ends or not even:
+    half = max(high - value, value - low)
+    if measure.ends or not math.isfinite(half):
         return Written(text, _between(low, high, measure))
     places = _places(value, measure.decimals)
     least = 10.0**-places
-    if half < least / 2:
+    small = half < least / 2
+    if not (larger_half or small or _is_even(value, low, high, least)):
+        return Written(text, _between(low, high, measure))
+    if small:
         return Written(text, f"± <{_fixed(least, places)}")
     return Written(text, f"± {_fixed(half, places)}")
+
+
+def _is_even(value: float, low: float, high: float, least: float) -> bool:
+    """Whether the larger half says, to the last digit and in its sign, what the ends say."""
+    below, above = value - low, high - value
+    half = max(below, above)
+    # A hair more, for what rounding does to halves that differ by exactly a unit.
+    alike = abs(above - below) <= least * (1 + 1e-6)
+    return alike and (value - half < 0) == (low < 0) and (value + half > 0) == (high > 0)
 
 
 def _places(value: float, decimals: int) -> int:
@@ -144,21 +163,27 @@ def percent(share: float, decimals: int = 0) -> str:
 
 
 def shown_policy(name: str) -> str:
-    """Name of a policy where nothing else says what it is; your own stays what it is."""
-    return POLICY_NAMES.get(name) or shown_contender(name)
+    """``dtp+corrected`` as ``DTP (corrected)``, where nothing beside it says what ATP is."""
+    known = contended(name)
+    return _shown(name, "our reconstruction" if known and known.family == "atp" else "")
 
 
 def shown_contender(name: str) -> str:
-    """``dtp (corrected)`` as ``DTP (corrected)``; what is no policy of ours stays what it is.
+    """``dtp+corrected`` as ``DTP (corrected)``; what is no policy of ours stays what it is.
 
     What ATP is has to be said beside what shows this name (see `OURS`).
     """
+    return _shown(name)
+
+
+def _shown(name: str, remark: str = "") -> str:
     known = contended(name)
     if known is None:
         return name
-    shown = SHORT_NAMES[known.family]
+    shown = NAMES[known.family]
     shown += f"-{known.variant}" if known.variant else ""
-    shown += f" ({known.belief})" if known.belief else ""
+    brackets = "; ".join(filter(None, (remark, known.belief)))
+    shown += f" ({brackets})" if brackets else ""
     return f"{shown}, {known.rest}" if known.rest else shown
 
 

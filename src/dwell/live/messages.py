@@ -1,0 +1,300 @@
+"""What the processes of a live cell say to one another, and how it is written.
+
+Everything but a stage's payload is a MessagePack array of one of the types below. Decoding checks
+length, types and bounds, allocates no more than the message is long, and names what is wrong; it
+never imports or executes anything.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeAlias, TypeVar
+
+import msgspec
+
+from dwell.errors import LiveError
+
+__all__ = [
+    "MAX_CONTROL_BYTES",
+    "MAX_HEADER_BYTES",
+    "Accepted",
+    "Beat",
+    "Completion",
+    "Header",
+    "Heard",
+    "Hop",
+    "Order",
+    "Stamp",
+    "decode",
+    "encode",
+]
+
+#: Longer headers and control messages are refused before anything of them is read.
+MAX_HEADER_BYTES = 16_384
+MAX_CONTROL_BYTES = 262_144
+
+Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
+Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-(1 << 62), lt=1 << 62)]
+Words: TypeAlias = Annotated[str, msgspec.Meta(max_length=2_000)]
+
+
+class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """What the stamper writes on a cycle, and everyone downstream routes by.
+
+    Parameters
+    ----------
+    run : int
+        Run id; later runs have larger ones.
+    cycle : int
+    term : int
+        Grows at every change of placement.
+    placement : str
+        Candidate.
+    released_ns : int
+        Release on the stamper's clock.
+    shadow : str
+        Candidate that the cycle is also sent through; empty for none.
+    fork : str
+        Task whose inputs go to `fork_to` as well, because its state is on the way there; empty for
+        none.
+    fork_to : str
+        Node.
+    """
+
+    run: Count
+    cycle: Count
+    term: Count
+    placement: Name
+    released_ns: Instant
+    shadow: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    fork: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    fork_to: Annotated[str, msgspec.Meta(max_length=120)] = ""
+
+
+class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """One job of a cycle, on the clock of the node it ran on.
+
+    Parameters
+    ----------
+    task, node : str
+    arrived_ns : int
+        When the last of its inputs was there.
+    started_ns, ended_ns : int
+    inputs : tuple of (str, int)
+        For every flow into the task: its source, and when its message was handed over here.
+    """
+
+    task: Name
+    node: Name
+    arrived_ns: Instant
+    started_ns: Instant
+    ended_ns: Instant
+    inputs: Annotated[tuple[tuple[Name, Instant], ...], msgspec.Meta(max_length=64)] = ()
+
+
+class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """Travels beside the payload of every message between stages.
+
+    Parameters
+    ----------
+    stamp : Stamp
+    source : str
+        Task that sent it.
+    node : str
+        Where that task ran.
+    kind : str
+        How the payload is written; see `dwell.live.payloads`.
+    hops : tuple of Hop
+        All jobs behind it, each once.
+    shadow : bool
+        Whether this is the shadow of the cycle and not the cycle itself.
+    """
+
+    stamp: Stamp
+    source: Name
+    node: Name
+    kind: Annotated[str, msgspec.Meta(max_length=200)]
+    hops: Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)] = ()
+    shadow: bool = False
+
+
+class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """What a sink says once of every cycle that reached it.
+
+    Parameters
+    ----------
+    stamp : Stamp
+    sink : str
+        Task.
+    done_ns : int
+        When the command was handed to the actuator, on the sink's clock.
+    outcome : str
+        ``actuated``, ``behind`` (a later cycle had been actuated), ``stale`` (older than
+        `max_age_ms`), ``shadow`` (stopped before the sink).
+    hops : tuple of Hop
+    node : str
+        Of the sink; where a shadow stopped.
+    """
+
+    stamp: Stamp
+    sink: Name
+    done_ns: Instant
+    outcome: Annotated[str, msgspec.Meta(max_length=20)]
+    hops: Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)]
+    node: Name
+
+
+class Heard(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """The last beat that the sender of a beat has heard of somebody.
+
+    Parameters
+    ----------
+    who, node : str
+    beat_ns : int
+        When that beat was sent, on the clock of who sent it.
+    at_ns : int
+        When it was heard, on the clock of who heard it.
+    """
+
+    who: Name
+    node: Name
+    beat_ns: Instant
+    at_ns: Instant
+
+
+class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """Heartbeat: I am there; and what I last heard of others, so that clocks can be compared.
+
+    Parameters
+    ----------
+    who, node : str
+        Process and its node.
+    life : int
+        Grows with every start of the process.
+    sent_ns : int
+    ready : bool
+        Whether it can do its work: its stage has started and does not hang.
+    heard : tuple of Heard
+    term : int
+        The stamper's current term; 0 from anybody else.
+    placement : str
+        The stamper's current placement; empty from anybody else.
+    cell : str
+        Digest of the cell file, so that different files are noticed.
+    note : str
+        What keeps it from being ready, or the last thing that went wrong.
+    """
+
+    who: Name
+    node: Name
+    life: Count
+    sent_ns: Instant
+    ready: bool
+    heard: Annotated[tuple[Heard, ...], msgspec.Meta(max_length=256)] = ()
+    term: Count = 0
+    placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    cell: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    note: Words = ""
+
+
+class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """What the controller asks of the stamper; answered by one `Accepted`.
+
+    Parameters
+    ----------
+    number : int
+        Grows with every order of this controller; a repeated one is the same order.
+    controller : str
+        Name of the controller that asks.
+    run, term : int
+        Run and term it was computed on; 0 and 0 only to ask how things are (`placement` empty).
+    placement : str
+        Candidate; empty to change nothing.
+    shadow : str
+        Candidate that cycles shall be sent through as well while the order holds; empty for what
+        `shadow_fraction` says, ``-`` for none.
+    shadow_fraction : float
+        Share of the cycles sent through each alternative.
+    fork, fork_to : str
+        Task and node for `Stamp.fork`; both empty to end it.
+    """
+
+    number: Count
+    controller: Name
+    run: Count
+    term: Count
+    placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    shadow: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    shadow_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
+    fork: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    fork_to: Annotated[str, msgspec.Meta(max_length=120)] = ""
+
+
+class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """The stamper's answer to an order.
+
+    Parameters
+    ----------
+    number : int
+    controller : str
+        Whose order it answers.
+    refused : str
+        Empty where it was accepted; else ``stale term``, ``stale run``, ``infeasible``,
+        ``not ready``, ``not proven`` (probes are missing), ``another controller``, with details.
+    run, term : int
+    placement : str
+        What holds now.
+    cycle : int
+        The next one that will be stamped.
+    fallback : bool
+        Whether the guard's placement holds.
+    """
+
+    number: Count
+    controller: Name
+    refused: Words
+    run: Count
+    term: Count
+    placement: Name
+    cycle: Count
+    fallback: bool = False
+
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+_ENCODER = msgspec.msgpack.Encoder()
+_DECODERS: dict[type, msgspec.msgpack.Decoder[msgspec.Struct]] = {}
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """Write a message."""
+    return _ENCODER.encode(message)
+
+
+def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
+    """Read a message.
+
+    Parameters
+    ----------
+    data : bytes
+    kind : type
+        What it has to be.
+    limit : int
+        Longest length accepted.
+
+    Raises
+    ------
+    LiveError
+        If it is longer, or anything else.
+    """
+    if len(data) > limit:
+        raise LiveError(f"a {kind.__name__} of {len(data)} bytes; at most {limit} are read")
+    decoder = _DECODERS.get(kind)
+    if decoder is None:
+        decoder = _DECODERS[kind] = msgspec.msgpack.Decoder(kind)
+    try:
+        message = decoder.decode(data)
+    except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        raise LiveError(f"no {kind.__name__}: {error}") from None
+    assert isinstance(message, kind)
+    return message

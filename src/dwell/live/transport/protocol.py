@@ -1,0 +1,56 @@
+"""What every transport does, whatever carries the messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias
+
+__all__ = ["Lane", "Receive", "Sample", "Transport"]
+
+#: `control` is for what is small and must not wait; `images` for payloads, newest first.
+Lane: TypeAlias = Literal["control", "images"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One message as it arrives.
+
+    Parameters
+    ----------
+    key : str
+    payload : bytes
+    header : bytes
+        Empty where none was sent.
+    """
+
+    key: str
+    payload: bytes
+    header: bytes = b""
+
+
+Receive: TypeAlias = Callable[[Sample], None]
+
+
+class Transport(Protocol):
+    """Carries messages by key between the processes of a cell.
+
+    A message is delivered at most once, to every subscriber whose key expression matches and that
+    can be reached, or is lost without a word; messages of one sender on one lane arrive in order.
+    """
+
+    def put(self, key: str, payload: bytes, header: bytes = b"", *, lane: Lane = "control") -> None:
+        """Send a message; returns at once, whatever the receivers do."""
+        ...
+
+    def subscribe(self, key: str, receive: Receive) -> None:
+        """Have `receive` called with every message under a key expression (``*``, ``**``).
+
+        It is called from a thread of the transport's, one message after another for one lane, and
+        must not block.
+        """
+        ...
+
+    def close(self) -> None:
+        """Send and deliver nothing more; safe to call twice."""
+        ...
