@@ -69,7 +69,8 @@ class Log:
         ``(window, incumbent, placement, migrated, reason, dwell, delta_j)``, then J of every
         candidate (None where not priced), then the estimated L95 (ms) and violation rate of every
         candidate, and where the estimator says it, how many samples stand behind the estimate and
-        how old (windows) the newest is.
+        how old (windows) the newest is. A move of the guard is a row of its own, without any of
+        these, before the row of the window that it began.
     """
 
     seen: list[tuple[float | None, ...]] = field(default_factory=list)
@@ -135,6 +136,10 @@ class Controller:
         self.incumbent = str(initial) if known else problem.initial
         self.previous = self.incumbent
         self.dwell = 0
+        #: Whether the guard's own move holds (see `adopt`).
+        self.on_fallback = False
+        #: What the policy would leave the fallback for, had it been proven by probes; else None.
+        self.wanted: str | None = None
         self.nodes = tuple(problem.fabric.nodes)
         self._names = tuple(problem.candidates)
         self.log = Log()
@@ -160,8 +165,15 @@ class Controller:
         never_moves = type(self.policy) is Static and type(estimator) is Profile
         return estimator if never_moves and isinstance(estimator, Profile) else None
 
-    def close(self, window: ClosedWindow) -> str:
+    def close(self, window: ClosedWindow, *, proven: str | None = None) -> str:
         """Look at a closed window and decide the placement of the cycles after it.
+
+        Parameters
+        ----------
+        window : ClosedWindow
+        proven : str, optional
+            Candidate that enough probes have completed through, for a cell that is on a fallback;
+            it is left for no other (see `adopt`).
 
         Returns
         -------
@@ -187,6 +199,7 @@ class Controller:
             ),
             # Neither the cell's jobs nor its shadow jobs are foreign.
             dict(zip(self.nodes, (own + shadow).tolist(), strict=True)),
+            proven=proven,
         )
 
     def utilisation(self, window: ClosedWindow) -> Floats:
@@ -196,18 +209,89 @@ class Controller:
             span_ns = span_ns[..., None]
         return utilisation(window.core_ns, self._cores, span_ns)
 
-    def decide(self, observed: QoS, own: Mapping[str, float]) -> str:
+    def decide(self, observed: QoS, own: Mapping[str, float], *, proven: str | None = None) -> str:
         """Decide on metrics that are already aggregated (see `close`)."""
         incumbent = self.incumbent
         measured = self._price(observed, incumbent)
         estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
         estimates[incumbent] = observed
+        before = copy.deepcopy(self.policy) if self.on_fallback else self.policy
         decision = self._checked(self.policy.decide(observed=observed, estimates=estimates))
+        self.wanted = None
+        if self.on_fallback and decision.migrated:
+            if decision.name == proven:
+                self.on_fallback = False
+            else:
+                decision = self._held_back(decision, before)
         self._record(observed, measured, decision, estimates)
         self.previous = incumbent
         self.incumbent = decision.name
         self.dwell = decision.dwell
         return decision.name
+
+    def _held_back(self, decision: Decision, before: MinimalPolicy) -> Decision:
+        """Stay on the fallback: what is wanted has not been proven.
+
+        A decision that cannot be carried out has not been made: the policy is put back to where it
+        was, and says at the next close what it wants then.
+        """
+        self.policy, self.wanted = before, decision.name
+        if self.previous != self.incumbent:
+            # Nothing has been decided since the guard moved; this window has paid for the move.
+            self._tell(self.incumbent)
+        return Decision(
+            placement=self.problem.candidates[self.incumbent],
+            name=self.incumbent,
+            migrated=False,
+            reason="guard",
+            costs=decision.costs,
+            dwell=self.dwell,
+            delta_j=decision.delta_j,
+        )
+
+    def adopt(self, name: str, *, left: str | None = None) -> None:
+        """Take note that the guard has moved the cell to a fallback (rules 5 and 6 of the guard).
+
+        The fallback is the incumbent with n_d = 0, and the next window, which begins with the first
+        cycle stamped with it, carries the switching term of the move. The log has a row for it,
+        with reason ``guard``, and so has every close at which the policy would have left the
+        fallback for a candidate that is not proven: `wanted` names it then, and probes are to be
+        sent through it.
+
+        Parameters
+        ----------
+        name : str
+            The fallback.
+        left : str, optional
+            Placement that held until then; the incumbent where None. They differ where an order
+            was still under way: it is void.
+
+        Raises
+        ------
+        PolicyError
+            If one of them is no candidate.
+        """
+        left = self.incumbent if left is None else left
+        for who in (name, left):
+            if who not in self.problem.candidates:
+                raise PolicyError(
+                    f"the guard cannot have moved the cell from {left!r} to {name!r}: {who!r} is "
+                    f"no candidate (candidates here: {', '.join(self.problem.candidates)})"
+                )
+        if left != self.incumbent:
+            self._tell(left)
+        self._tell(name)
+        self.previous, self.incumbent, self.dwell = left, name, 0
+        self.on_fallback, self.wanted = True, None
+        priced = [None] * (3 * len(self._names) + (2 * len(self._names) if self.supports else 0))
+        fixed = (len(self.log.seen), left, name, name != left, "guard", 0, None)
+        self.log.decisions.append((*fixed, *priced))
+
+    def _tell(self, name: str) -> None:
+        """Tell the policy where the cell is, if it wants to know."""
+        adopt = getattr(self.policy, "adopt", None)
+        if adopt is not None:
+            adopt(name)
 
     def _price(self, observed: QoS, incumbent: str) -> float:
         """J of what was observed, with the switching term of the decision that led to it."""
@@ -288,7 +372,8 @@ class Controller:
                 raise PolicyError(
                     f"{who}.decide returned a decision for {name!r} at window "
                     f"{len(self.log.seen)} whose placement or `migrated` contradicts its "
-                    f"name (incumbent: {self.incumbent!r})"
+                    f"name (incumbent: {self.incumbent!r}; a policy that remembers it needs "
+                    "adopt(name), by which it is told of moves of the guard)"
                 )
             return decision
         migrated = name != self.incumbent

@@ -7,7 +7,7 @@ never imports or executes anything.
 
 from __future__ import annotations
 
-from typing import Annotated, TypeAlias, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 import msgspec
 
@@ -22,8 +22,12 @@ __all__ = [
     "Header",
     "Heard",
     "Hop",
+    "Load",
     "Order",
+    "Restored",
+    "Snapshot",
     "Stamp",
+    "State",
     "decode",
     "encode",
 ]
@@ -35,6 +39,7 @@ MAX_CONTROL_BYTES = 262_144
 Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-(1 << 62), lt=1 << 62)]
+Forks: TypeAlias = Annotated[tuple[tuple[Name, Name], ...], msgspec.Meta(max_length=16)]
 Words: TypeAlias = Annotated[str, msgspec.Meta(max_length=2_000)]
 
 
@@ -54,11 +59,8 @@ class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Release on the stamper's clock.
     shadow : str
         Candidate that the cycle is also sent through; empty for none.
-    fork : str
-        Task whose inputs go to `fork_to` as well, because its state is on the way there; empty for
-        none.
-    fork_to : str
-        Node.
+    forks : tuple of (str, str)
+        Tasks and nodes that get their inputs as well, because their state is on the way there.
     """
 
     run: Count
@@ -67,8 +69,7 @@ class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
     placement: Name
     released_ns: Instant
     shadow: Annotated[str, msgspec.Meta(max_length=120)] = ""
-    fork: Annotated[str, msgspec.Meta(max_length=120)] = ""
-    fork_to: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    forks: Forks = ()
 
 
 class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -82,6 +83,9 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     started_ns, ended_ns : int
     inputs : tuple of (str, int)
         For every flow into the task: its source, and when its message was handed over here.
+    state_age : int
+        Cycles that the restored state behind it lacked, where it was the first after a failover;
+        -1 otherwise.
     """
 
     task: Name
@@ -90,6 +94,7 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     started_ns: Instant
     ended_ns: Instant
     inputs: Annotated[tuple[tuple[Name, Instant], ...], msgspec.Meta(max_length=64)] = ()
+    state_age: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
 
 
 class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -210,13 +215,10 @@ class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Run and term it was computed on; 0 and 0 only to ask how things are (`placement` empty).
     placement : str
         Candidate; empty to change nothing.
-    shadow : str
-        Candidate that cycles shall be sent through as well while the order holds; empty for what
-        `shadow_fraction` says, ``-`` for none.
     shadow_fraction : float
         Share of the cycles sent through each alternative.
-    fork, fork_to : str
-        Task and node for `Stamp.fork`; both empty to end it.
+    forks : tuple of (str, str)
+        For `Stamp.forks` from now on.
     """
 
     number: Count
@@ -224,10 +226,91 @@ class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
     run: Count
     term: Count
     placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
-    shadow: Annotated[str, msgspec.Meta(max_length=120)] = ""
     shadow_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
-    fork: Annotated[str, msgspec.Meta(max_length=120)] = ""
-    fork_to: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    forks: Forks = ()
+
+
+class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """What a node's CPU has done since it started counting.
+
+    Parameters
+    ----------
+    node : str
+    life : int
+        Of the agent that counts; another one counts from another beginning.
+    at_ns : int
+        On the node's clock.
+    busy_ns, own_ns, shadow_ns : int
+        Core-nanoseconds of everything, of the cell's own jobs, and of its shadow workers.
+    accelerator : float
+        Utilisation of the node's accelerator, where a hook tells; -1 otherwise.
+    """
+
+    node: Name
+    life: Count
+    at_ns: Instant
+    busy_ns: Count
+    own_ns: Count
+    shadow_ns: Count
+    accelerator: Annotated[float, msgspec.Meta(ge=-1.0, le=1e9)] = -1.0
+
+
+class Snapshot(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """Asks the worker of a task for its state, to be sent to another node's.
+
+    Parameters
+    ----------
+    number : int
+        Comes back in `Restored`.
+    task, node, to : str
+        Task, where its state is, and where it shall go.
+    """
+
+    number: Count
+    task: Name
+    node: Name
+    to: Name
+
+
+class State(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """Header of a task's state on its way; the payload is what the stage wrote.
+
+    Parameters
+    ----------
+    run, cycle : int
+        The last cycle that is in it.
+    task, node : str
+        Task, and where the state comes from.
+    number : int
+        That of the `Snapshot` it answers; 0 for a checkpoint, which waits until it is needed.
+    """
+
+    run: Count
+    cycle: Count
+    task: Name
+    node: Name
+    number: Count = 0
+
+
+class Restored(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """Says that a state has arrived and the inputs since then are replayed.
+
+    Parameters
+    ----------
+    number : int
+    task, node : str
+    run, cycle : int
+        The last cycle that is in the state now.
+    failed : str
+        What went wrong; empty if nothing.
+    """
+
+    number: Count
+    task: Name
+    node: Name
+    run: Count
+    cycle: Count
+    failed: Words = ""
 
 
 class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -263,7 +346,7 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
 T = TypeVar("T", bound=msgspec.Struct)
 
 _ENCODER = msgspec.msgpack.Encoder()
-_DECODERS: dict[type, msgspec.msgpack.Decoder[msgspec.Struct]] = {}
+_DECODERS: dict[type, msgspec.msgpack.Decoder[Any]] = {}
 
 
 def encode(message: msgspec.Struct) -> bytes:
@@ -293,8 +376,6 @@ def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
     if decoder is None:
         decoder = _DECODERS[kind] = msgspec.msgpack.Decoder(kind)
     try:
-        message = decoder.decode(data)
+        return cast("T", decoder.decode(data))
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
         raise LiveError(f"no {kind.__name__}: {error}") from None
-    assert isinstance(message, kind)
-    return message

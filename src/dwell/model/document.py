@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from dataclasses import fields
 from typing import Any, TypeAlias
@@ -28,7 +29,7 @@ from dwell.model.process import (
 from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
 from dwell.model.servo import Servo
 
-__all__ = ["VERSION", "digest", "to_document"]
+__all__ = ["VERSION", "digest", "fingerprint", "to_document"]
 
 # Version of the cell file.
 VERSION = 1
@@ -291,3 +292,19 @@ def _live(settings: LiveSettings) -> Document | None:
 
 def _dataclass(part: Any) -> Document:
     return _filled({item.name: getattr(part, item.name) for item in fields(part)})
+
+
+def fingerprint(problem: Problem) -> str:
+    """Return a short digest of what all nodes of a live cell have to agree on.
+
+    Left out is what each node may say for itself: the code it runs, and how it reaches others.
+    """
+    document = to_document(problem)
+    live = {**document.get("live", {})}
+    for key in ("hosts", "actuators", "mode"):
+        live.pop(key, None)
+    document["live"] = live
+    for task in document["tasks"].values():
+        task.pop("run", None)
+    text = json.dumps(document, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -207,6 +207,16 @@ class Problem:
             return self.controller.on
         return next(iter((*self.fabric.tier("edge"), *self.fabric.nodes)))
 
+    @property
+    def stamper_node(self) -> str:
+        """Node where cycles are released: that of the first source task in the initial placement.
+
+        In a live cell that task is anchored there.
+        """
+        pipeline = self.pipeline
+        source = next(name for name in pipeline.tasks if not pipeline.inputs(name))
+        return self.candidates[self.initial][source]
+
     def scenario(self, name: str) -> Scenario:
         """Disturbances of a scenario.
 

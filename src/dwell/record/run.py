@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import RunError
+from dwell.record.journal import JOURNAL, Journal, read_journal
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run", "require_free"]
+__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run", "require_free", "seal_run"]
 
 SCHEMA_VERSION = 1
 OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down")
@@ -127,6 +128,8 @@ def require_free(path: str | os.PathLike[str]) -> None:
         If it holds something else, or is no folder.
     """
     target = Path(path)
+    if (target / JOURNAL).is_file() and not (target / "run.json").is_file():
+        raise RunError(f"{target} holds a live run that has not been sealed; choose another folder")
     if target.exists() and not (target / "run.json").is_file() and _occupied(target):
         raise RunError(f"{target} exists and is not a run; choose another folder")
 
@@ -156,6 +159,9 @@ def _replace(draft: Path, target: Path) -> None:
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run's folder; tables are read when first asked for.
 
+    Of a live run that is still going on, or was killed, the folder has a journal only: everything
+    is read from it, and the meta say under ``recovered`` what was lost.
+
     Raises
     ------
     RunError
@@ -165,6 +171,12 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     if not folder.is_dir():
         raise RunError(f"{folder}: no such folder")
     file = folder / "run.json"
+    if (folder / JOURNAL).is_file() and not file.is_file():
+        found = read_journal(folder)
+        missing = [name for name in TABLES if name not in found.tables]
+        if missing:
+            raise RunError(f"{folder / JOURNAL}: no run, without {', '.join(missing)}")
+        return Run(found.meta, found.tables)
     try:
         meta = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -181,6 +193,50 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
     names = [*TABLES, *(["jobs"] if (folder / "jobs.parquet").is_file() else [])]
     return Run(meta, {name: _reader(folder / f"{name}.parquet") for name in names})
+
+
+def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
+    """Turn a live run's journal into tables; a kill at any moment leaves one or the other.
+
+    Parameters
+    ----------
+    path : path-like
+        The run's folder. Nothing is done to one that is sealed already.
+    **meta : JSON-able
+        Said of the run beside what its journal says.
+
+    Raises
+    ------
+    RunError
+        If the journal is being written, cannot be read, or the tables cannot be written.
+    """
+    folder = Path(path)
+    journal, file = folder / JOURNAL, folder / "run.json"
+    if not file.is_file():
+        if Journal.written(folder):
+            raise RunError(f"{journal}: the run is still going on; stop it first")
+        found = open_run(folder)
+        recovered = {**found.meta.get("recovered", {}), "sealed": True}
+        text = json.dumps({**found.meta, **meta, "recovered": recovered}, indent=2) + "\n"
+        try:
+            for name, table in found._tables.items():
+                frame = table() if callable(table) else table
+                _write(folder / f"{name}.parquet", frame.write_parquet)
+            # From here on the folder is a finished run.
+            _write(file, lambda draft: draft.write_text(text, encoding="utf-8"))
+        except OSError as error:
+            raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    journal.unlink(missing_ok=True)
+    return open_run(folder)
+
+
+def _write(file: Path, write: Callable[[Path], object]) -> None:
+    """Write a file so that it is there as a whole, also after a loss of power, or not at all."""
+    draft = file.with_name(f".{file.name}.draft")
+    write(draft)
+    with draft.open("rb") as stream:
+        os.fsync(stream.fileno())
+    draft.replace(file)
 
 
 def _reader(file: Path) -> Callable[[], pl.DataFrame]:

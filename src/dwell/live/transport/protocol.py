@@ -37,10 +37,17 @@ class Transport(Protocol):
 
     A message is delivered at most once, to every subscriber whose key expression matches and that
     can be reached, or is lost without a word; messages of one sender on one lane arrive in order.
+    Nobody is handed what it has put itself, nor what was put before it subscribed. Keys and key
+    expressions that are none raise a LiveError.
     """
 
-    def put(self, key: str, payload: bytes, header: bytes = b"", *, lane: Lane = "control") -> None:
-        """Send a message; returns at once, whatever the receivers do."""
+    def put(
+        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
+    ) -> None:
+        """Send a message; returns at once, whatever the receivers do.
+
+        Does nothing once it is closed.
+        """
         ...
 
     def subscribe(self, key: str, receive: Receive) -> None:

@@ -1,0 +1,411 @@
+"""The guard beside the stamper: it leaves a placement that has fallen silent, and never returns.
+
+Everything here is arithmetic on instants that the caller brings: there is no clock, no thread and
+no message, so that the simulator and the live runtime run the same lines. Instants are whole
+nanoseconds of one clock, that of the node the guard is on, and never go back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import TypeAlias
+
+from dwell.model import FrozenDict, Problem
+from dwell.model.bounds import GUARD_CYCLES, require
+
+__all__ = ["PROBE_CYCLES", "Guard", "Presence", "Probation", "parts_of"]
+
+#: Probes that must complete before a fallback is left for the first time (h).
+PROBE_CYCLES = 30
+#: However often a cell relapses, no more than this many times as many.
+MOST_DOUBLINGS = 5
+#: Windows' worth of completed cycles that make a cell healthy (see `Probation`).
+HEALTH_WINDOWS = 10
+
+#: Whether all parts of a candidate have been heard lately.
+Whole: TypeAlias = Callable[[str], bool] | Mapping[str, bool]
+
+
+class _Silence:
+    """How long the cycle after the newest completed one has been waited for.
+
+    Cycles older than the patience are all alike, so no more of them are kept than were released
+    within it, and one.
+    """
+
+    __slots__ = ("newest", "patience_ns", "released", "waiting")
+
+    def __init__(self, patience_ns: int) -> None:
+        self.patience_ns = patience_ns
+        self.waiting: deque[tuple[int, int]] = deque()
+        self.released = self.newest = -1
+
+    def release(self, cycle: int, at_ns: int) -> None:
+        """Wait for a cycle, from its release on; numbers that do not grow are ignored."""
+        if cycle <= self.released:
+            return
+        self.released = cycle
+        waiting = self.waiting
+        waiting.append((cycle, at_ns))
+        while len(waiting) > 1 and waiting[1][1] <= at_ns - self.patience_ns:
+            waiting.popleft()
+
+    def complete(self, cycle: int) -> None:
+        """Wait no longer for a cycle, nor for those before it; unknown ones are ignored."""
+        if not self.newest < cycle <= self.released:
+            return
+        self.newest = cycle
+        while self.waiting and self.waiting[0][0] <= cycle:
+            self.waiting.popleft()
+
+    def forget(self) -> None:
+        """Wait only for cycles that are released from now on."""
+        self.waiting.clear()
+
+    @property
+    def due_ns(self) -> int | None:
+        """When the patience ends; None where nothing is waited for."""
+        return self.waiting[0][1] + self.patience_ns if self.waiting else None
+
+    def over(self, now_ns: int) -> bool:
+        """Whether the patience has ended."""
+        due_ns = self.due_ns
+        return due_ns is not None and now_ns >= due_ns
+
+
+class Guard:
+    """Says when the cell must leave its placement by itself, and for which fallback.
+
+    It *fires* when the cycle after the newest completed one is older than g periods. Precisely:
+
+    * The *newest completed* cycle is the one with the highest number of which a completion has
+      been heard, not the one heard last. A completion that comes after that of a later cycle
+      changes nothing, and a cycle that is lost between two completed ones is nothing.
+    * The *cycle after* it is the first one released with a higher number, so that gaps in the
+      numbers (the stamper has started again) are no silence. Before anything has completed it is
+      the first cycle released.
+    * It *is older than* g periods from g periods after its release on, that instant included. A
+      completion heard at that very instant comes first.
+    * A move, whoever makes it, begins anew: only cycles released under the placement that holds
+      now are waited for, so that a new placement has g periods to complete its first cycle. A
+      late completion of a cycle of the placement before changes nothing.
+    * Completions of cycles that were never released here are ignored.
+
+    The guard is *on a fallback* from its own move until the next order. There it never fires. A
+    fallback that the controller ordered is a placement like any other: the guard watches it, and
+    leaves it for another one.
+
+    **Bound.** After a single fault from which on one fallback is whole, at most g + 1 consecutive
+    cycles bring no actuation: the first that is lost, those released within the g periods after
+    its release, and the one that may be released at the instant of the move. (At most 2g + 1 if an
+    order to another placement that the fault broke takes effect within these g periods.) Without a
+    fault it does not fire while every cycle completes, and is heard, within g periods of its
+    release, nor, where single cycles are lost, while the others are heard within g - 1.
+
+    Parameters
+    ----------
+    fallbacks : iterable of str
+        Candidates, best first; none: it never fires.
+    guard_cycles : int
+        g, at least 2.
+    period_ns : int
+        P.
+    placement : str
+        Candidate that the first cycles are stamped with.
+
+    Attributes
+    ----------
+    placement : str
+        Candidate that holds.
+    on_fallback : bool
+        Whether it is the guard's own move that holds.
+    newest : int
+        Highest cycle completed, -1 for none.
+    """
+
+    __slots__ = ("_silence", "fallbacks", "on_fallback", "placement")
+
+    def __init__(
+        self, fallbacks: Iterable[str], *, guard_cycles: int, period_ns: int, placement: str
+    ) -> None:
+        GUARD_CYCLES.check("guard_cycles", guard_cycles)
+        require(period_ns > 0, "period_ns", period_ns, "at least 1")
+        self.fallbacks = tuple(dict.fromkeys(fallbacks))
+        self.placement, self.on_fallback = placement, False
+        self._silence = _Silence(guard_cycles * period_ns)
+
+    @classmethod
+    def of(cls, problem: Problem, placement: str | None = None) -> Guard:
+        """Make the guard of a cell, on its initial placement or another one."""
+        settings = problem.controller
+        return cls(
+            settings.fallbacks,
+            guard_cycles=settings.guard_cycles,
+            period_ns=round(problem.pipeline.period_ms * 1e6),
+            placement=placement or problem.initial,
+        )
+
+    def __repr__(self) -> str:
+        where = f"{self.placement!r}{', on a fallback' if self.on_fallback else ''}"
+        return f"Guard({', '.join(self.fallbacks)}; at {where}, newest={self.newest})"
+
+    @property
+    def newest(self) -> int:
+        """Highest cycle completed, -1 for none."""
+        return self._silence.newest
+
+    @property
+    def patience_ns(self) -> int:
+        """G periods."""
+        return self._silence.patience_ns
+
+    def released(self, cycle: int, at_ns: int) -> None:
+        """Note a cycle that has been stamped and released."""
+        if not self.on_fallback:
+            self._silence.release(cycle, at_ns)
+        else:
+            self._silence.released = max(self._silence.released, cycle)
+
+    def completed(self, cycle: int, at_ns: int) -> None:
+        """Note that the completion of a cycle (by every sink) has been heard."""
+        self._silence.complete(cycle)
+
+    @property
+    def due_ns(self) -> int | None:
+        """Next instant at which it would fire if nothing completed; None where it would not.
+
+        It lies in the past where the guard has fired and no fallback was whole.
+        """
+        if self.on_fallback or not any(name != self.placement for name in self.fallbacks):
+            return None
+        return self._silence.due_ns
+
+    def check(self, now_ns: int, whole: Whole) -> str | None:
+        """Look whether to move, and where to.
+
+        Parameters
+        ----------
+        now_ns : int
+        whole : callable of str to bool, or mapping
+            Whether all nodes, links and workers of a candidate were heard within g periods; see
+            `Presence`. Fallbacks are asked for in order, up to the first that is.
+
+        Returns
+        -------
+        str or None
+            The first other fallback that is whole; `adopt` it. None where there is no reason to
+            move, or no such fallback: the guard stays armed, so ask again when one may be.
+        """
+        due_ns = self.due_ns
+        if due_ns is None or now_ns < due_ns:
+            return None
+        ask = whole.__getitem__ if isinstance(whole, Mapping) else whole
+        others = (name for name in self.fallbacks if name != self.placement)
+        return next((name for name in others if ask(name)), None)
+
+    def adopt(self, candidate: str, fallback: bool = False) -> None:
+        """Take note of a move: cycles released from now on have another placement.
+
+        Parameters
+        ----------
+        candidate : str
+        fallback : bool
+            Whether the guard itself makes it (`check` said so), and no order. An order for the
+            placement that holds already is a move, too: it makes a fallback the controller's.
+        """
+        self.placement, self.on_fallback = candidate, fallback
+        self._silence.forget()
+
+    def restart(self) -> None:
+        """Begin anew: nothing released so far is waited for (the guard's own node was away)."""
+        self._silence.forget()
+
+
+def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
+    """Return the names of all that must be there for a candidate to be whole.
+
+    Nodes by their name, links as ``R1->E``, workers as ``perception@E``.
+    """
+    pipeline, placement = problem.pipeline, problem.candidates[candidate]
+    crossed = {(placement[flow.source], placement[flow.target]) for flow in pipeline.flows}
+    return frozenset(
+        {
+            *placement.values(),
+            *(f"{source}->{target}" for source, target in crossed if source != target),
+            *(f"{task}@{node}" for task, node in placement.items()),
+        }
+    )
+
+
+class Presence:
+    """When every node, link and worker was last heard, and which candidates are whole.
+
+    Parameters
+    ----------
+    parts : mapping of str to collection of str
+        Of each candidate; see `parts_of`.
+    within_ns : int
+        g periods.
+    """
+
+    __slots__ = ("_heard_ns", "parts", "within_ns")
+
+    def __init__(self, parts: Mapping[str, Collection[str]], within_ns: int) -> None:
+        self.parts = FrozenDict({name: frozenset(mine) for name, mine in parts.items()})
+        self.within_ns = within_ns
+        self._heard_ns: dict[str, int] = {}
+
+    @classmethod
+    def of(cls, problem: Problem) -> Presence:
+        """Make that of all candidates of a cell."""
+        period_ns = round(problem.pipeline.period_ms * 1e6)
+        parts = {name: parts_of(problem, name) for name in problem.candidates}
+        return cls(parts, problem.controller.guard_cycles * period_ns)
+
+    def heard(self, part: str, at_ns: int) -> None:
+        """Note a sign of life."""
+        self._heard_ns[part] = max(at_ns, self._heard_ns.get(part, at_ns))
+
+    def gone(self, part: str) -> None:
+        """Forget a part that has said itself that it cannot do its work."""
+        self._heard_ns.pop(part, None)
+
+    def missing(self, candidate: str, now_ns: int) -> frozenset[str]:
+        """Return the parts of a candidate that were not heard within g periods."""
+        since_ns = now_ns - self.within_ns
+        heard_ns = self._heard_ns
+        return frozenset(
+            part for part in self.parts[candidate] if heard_ns.get(part, since_ns) <= since_ns
+        )
+
+    def whole(self, candidate: str, now_ns: int) -> bool:
+        """Whether all parts of a candidate were heard less than g periods ago."""
+        return not self.missing(candidate, now_ns)
+
+
+class Probation:
+    """When an order may leave the fallback: after h probes through the placement it wants.
+
+    A *probe* is the shadow of a cycle through the placement that is wanted. While somebody wants to
+    leave, every cycle brings one. Once h of them have completed since the wish began, the placement
+    is *proven*, for as long as the wish lasts. By the measure of the guard itself: where the
+    probe after the newest completed one becomes older than g periods, the count begins anew, for
+    there the guard would have fired.
+
+    h is `probe_cycles` at first. It doubles at every *relapse*: the guard fires before a whole
+    *stretch of health* has completed since the fallback was left. It halves, not below
+    `probe_cycles`, with every stretch of health that completes under orders. It never exceeds 32
+    times `probe_cycles`.
+
+    Parameters
+    ----------
+    probe_cycles : int
+        The least h, at least 1.
+    health_cycles : int
+        Completed cycles that make a stretch of health.
+    patience_ns : int
+        g periods.
+
+    Attributes
+    ----------
+    needed : int
+        h.
+    wanted : str or None
+        Placement that probes are sent through.
+    """
+
+    __slots__ = (
+        "_count",
+        "_fallen",
+        "_first",
+        "_health",
+        "_returned",
+        "_silence",
+        "health_cycles",
+        "most",
+        "needed",
+        "probe_cycles",
+        "wanted",
+    )
+
+    def __init__(
+        self, probe_cycles: int = PROBE_CYCLES, *, health_cycles: int, patience_ns: int
+    ) -> None:
+        require(probe_cycles >= 1, "probe_cycles", probe_cycles, "at least 1")
+        require(health_cycles >= 1, "health_cycles", health_cycles, "at least 1")
+        self.probe_cycles = self.needed = probe_cycles
+        self.most = probe_cycles << MOST_DOUBLINGS
+        self.health_cycles = health_cycles
+        self.wanted: str | None = None
+        self._silence = _Silence(patience_ns)
+        self._count = self._first = self._health = 0
+        self._fallen = self._returned = False
+
+    @classmethod
+    def of(cls, problem: Problem, probe_cycles: int = PROBE_CYCLES) -> Probation:
+        """Make that of a cell: ten windows completed are a stretch of health."""
+        settings = problem.controller
+        return cls(
+            probe_cycles,
+            health_cycles=HEALTH_WINDOWS * problem.window_cycles,
+            patience_ns=settings.guard_cycles * round(problem.pipeline.period_ms * 1e6),
+        )
+
+    def __repr__(self) -> str:
+        return f"Probation({self._count} of {self.needed} through {self.wanted!r})"
+
+    def want(self, candidate: str | None) -> None:
+        """Say which placement the fallback shall be left for; another wish begins anew."""
+        if candidate != self.wanted:
+            self.wanted, self._count = candidate, 0
+            self._first = self._silence.released + 1
+            self._silence.forget()
+
+    def released(self, cycle: int, at_ns: int) -> None:
+        """Note that a cycle has been sent as a probe through the wanted placement."""
+        self._look(at_ns)
+        self._silence.release(cycle, at_ns)
+
+    def completed(self, cycle: int, at_ns: int) -> None:
+        """Note that the completion of a probe through the wanted placement has been heard.
+
+        One that comes after that of a later cycle counts, too. One that was sent under a wish
+        before does not. Doubles are the caller's to drop.
+        """
+        self._look(at_ns, also_now=False)
+        if self.wanted is not None and self._first <= cycle <= self._silence.released:
+            self._count += 1
+            self._silence.complete(cycle)
+
+    def proven(self, candidate: str, now_ns: int) -> bool:
+        """Whether an order for a candidate may leave the fallback."""
+        self._look(now_ns)
+        return candidate == self.wanted and self._count >= self.needed
+
+    def _look(self, now_ns: int, *, also_now: bool = True) -> None:
+        """Begin to count anew where the patience has ended."""
+        if self._silence.over(now_ns if also_now else now_ns - 1):
+            self._count = 0
+
+    def fell(self) -> None:
+        """Note that the guard has moved the cell to a fallback."""
+        if self._returned:
+            self.needed = min(2 * self.needed, self.most)
+        self._fallen, self._returned, self._health = True, False, 0
+        self.want(None)
+
+    def left(self) -> None:
+        """Note that an order has left the fallback."""
+        self._fallen, self._returned, self._health = False, True, 0
+        self.want(None)
+
+    def healthy(self, cycles: int = 1) -> None:
+        """Note cycles that have completed; under a fallback they say nothing."""
+        if self._fallen:
+            return
+        self._health += cycles
+        stretches, self._health = divmod(self._health, self.health_cycles)
+        if stretches:
+            self._returned = False
+            self.needed = max(self.needed >> stretches, self.probe_cycles)

@@ -1,0 +1,178 @@
+"""A process that does what its parent asks it to, one JSON line a request, and dies with it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from typing import TypeAlias, cast
+
+from dwell.errors import LiveError
+
+__all__ = ["PARENT_CHECK_S", "Child", "Json", "Parent"]
+
+Json: TypeAlias = dict[str, object]
+
+ANSWER_S = 10.0
+STOP_S = 2.0
+RECEIVE_BYTES = 2**16
+#: How often a child looks for its parent, beside the end of their connection.
+PARENT_CHECK_S = 0.5
+
+
+class Child:
+    """The parent's side.
+
+    The child stays in the parent's session: in one of its own, a kernel that shares the CPU by
+    session (autogroup) would give all of its threads together what one of the others gets.
+
+    Parameters
+    ----------
+    module : str
+        Run as ``python -m``; its main function makes a `Parent`.
+    name : str
+        For messages.
+    """
+
+    def __init__(self, module: str, name: str) -> None:
+        self._module = module
+        self._name = name
+        self._process: subprocess.Popen[bytes] | None = None
+        self._socket: socket.socket | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def pid(self) -> int:
+        """Process id.
+
+        Raises
+        ------
+        LiveError
+            If it has not been started.
+        """
+        if self._process is None:
+            raise LiveError(f"{self._name} has not been started")
+        return self._process.pid
+
+    def start(self, settings: Mapping[str, object]) -> Json:
+        """Start it and return its answer to its settings.
+
+        Raises
+        ------
+        LiveError
+            If it has been started before, or does not answer, or answers with an error.
+        """
+        if self._process is not None:
+            raise LiveError(f"{self._name} has been started before")
+        ours, theirs = socket.socketpair()
+        with theirs:
+            # Standard output and error are the parent's: a child that fails says why there.
+            self._process = subprocess.Popen(  # noqa: S603 (our own module)
+                [sys.executable, "-P", "-m", self._module], stdin=theirs
+            )
+        ours.settimeout(ANSWER_S)
+        self._socket = ours
+        try:
+            return self.ask(settings)
+        except LiveError:
+            self.stop()
+            raise
+
+    def ask(self, request: Mapping[str, object]) -> Json:
+        """Send a request and return the answer; safe from any thread.
+
+        Raises
+        ------
+        LiveError
+            If it does not run, does not answer in time, or answers with an error.
+        """
+        with self._lock:
+            if self._socket is None:
+                raise LiveError(f"{self._name} does not run")
+            try:
+                self._socket.sendall(json.dumps(request).encode() + b"\n")
+                answer = self._receive(self._socket)
+            except TimeoutError:
+                raise LiveError(
+                    f"{self._name} (process {self.pid}) has not answered within {ANSWER_S:g} s"
+                ) from None
+            except (EOFError, OSError):
+                raise LiveError(f"{self._name} (process {self.pid}) has ended") from None
+        if "error" in answer:
+            raise LiveError(f"{self._name}: {answer['error']}")
+        return answer
+
+    @staticmethod
+    def _receive(connection: socket.socket) -> Json:
+        line = bytearray()
+        while not line.endswith(b"\n"):
+            received = connection.recv(RECEIVE_BYTES)
+            if not received:
+                raise EOFError
+            line += received
+        return cast("Json", json.loads(line))
+
+    def stop(self) -> None:
+        """End it and wait until it is gone; safe to call twice, and if it has ended by itself."""
+        with self._lock:
+            if self._socket is not None:
+                self._socket.close()
+                self._socket = None
+            if self._process is None:
+                return
+            try:
+                self._process.wait(STOP_S)
+            except subprocess.TimeoutExpired:  # stopped by a signal, or hung
+                self._process.kill()
+                self._process.wait()
+
+
+class Parent:
+    """The child's side: requests come on standard input, a socket.
+
+    Ctrl-C in a terminal reaches the children too; it is left to the parent to end them.
+    """
+
+    def __init__(self) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        self._pid = os.getppid()
+        self._socket = socket.socket(fileno=0)
+        self._line = bytearray()
+
+    def fileno(self) -> int:
+        """Descriptor that is readable when there is a request, or the parent has gone."""
+        return self._socket.fileno()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the parent still runs."""
+        return os.getppid() == self._pid
+
+    def receive(self) -> Json:
+        """Return the next request; waits for it. The parent has at most one under way.
+
+        Raises
+        ------
+        EOFError
+            If the parent has gone, or wants this process to end.
+        """
+        while not self._line.endswith(b"\n"):
+            received = b""
+            with contextlib.suppress(ConnectionError):
+                received = self._socket.recv(RECEIVE_BYTES)
+            if not received:
+                raise EOFError
+            self._line += received
+        request, self._line = self._line, bytearray()
+        return cast("Json", json.loads(request))
+
+    def answer(self, answer: Mapping[str, object]) -> None:
+        """Answer the request received last."""
+        with contextlib.suppress(ConnectionError):
+            self._socket.sendall(json.dumps(answer).encode() + b"\n")

@@ -1,0 +1,177 @@
+"""Conditions of one direction of an emulated link, and the delays drawn from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal, TypeAlias, cast
+
+import numpy as np
+
+from dwell.errors import LiveError
+from dwell.model import bounds
+from dwell.model.process import (
+    AR1,
+    Constant,
+    Exponential,
+    Gamma,
+    LogNormal,
+    Normal,
+    Process,
+    Trace,
+    TraceTable,
+    Uniform,
+)
+
+__all__ = ["CUTS", "Conditions", "Cut", "changed", "delays_ns", "to_json"]
+
+#: `drop`: data is lost; `hold`: it waits, as in the sender's buffers; either way nothing passes.
+Cut: TypeAlias = Literal["drop", "hold"]
+CUTS: tuple[Cut, ...] = ("drop", "hold")
+
+NAMED: dict[str, type[Process]] = {
+    "constant": Constant,
+    "uniform": Uniform,
+    "normal": Normal,
+    "lognormal": LogNormal,
+    "gamma": Gamma,
+    "exponential": Exponential,
+    "ar1": AR1,
+}
+NAMES = {kind: name for name, kind in NAMED.items()}
+# Drawn at a time: a draw of one costs a hundred times as much a value.
+BLOCK = 256
+NS_PER_MS = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What a message meets on its way.
+
+    Parameters
+    ----------
+    delay_ms : Process
+        Propagation delay, one value a message.
+    add_delay_ms : Process
+        What a disturbance adds to it.
+    rate_mbps : float
+        Serialisation rate that all connections share, Mbit/s; infinite where nothing queues.
+    loss : float
+        Probability that a message of data is lost, in [0, 1).
+    cut : {"drop", "hold"}, optional
+        Nothing begins its way while it is cut. Data is lost (`drop`, as on a link of the simulator
+        that drops), or waits until it is whole again (`hold`, as on one that retransmits). What
+        keeps the sessions going always waits.
+    """
+
+    delay_ms: Process = field(default_factory=lambda: Constant(0.0))
+    add_delay_ms: Process = field(default_factory=lambda: Constant(0.0))
+    rate_mbps: float = math.inf
+    loss: float = 0.0
+    cut: Cut | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("delay_ms", "add_delay_ms"):
+            value = getattr(self, name)
+            bounds.require(isinstance(value, Process), name, value, "a random process")
+        bounds.RATE_MBPS.check("rate_mbps", self.rate_mbps)
+        bounds.LOSS.check("loss", self.loss)
+        known = self.cut is None or self.cut in CUTS
+        bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
+
+
+# ------------------------------------------------------------------ on the way to the link's process
+
+
+def to_json(changes: Mapping[str, object]) -> dict[str, object]:
+    """Return fields of conditions as JSON has them.
+
+    Raises
+    ------
+    LiveError
+        If there is no such field, or no such process.
+    """
+    known = [item.name for item in fields(Conditions)]
+    unknown = [name for name in changes if name not in known]
+    if unknown:
+        raise LiveError(f"a link has no {', '.join(unknown)}; it has {', '.join(known)}")
+    return {
+        name: _process(value) if isinstance(value, Process) else value
+        for name, value in changes.items()
+    }
+
+
+def changed(conditions: Conditions, changes: Mapping[str, object]) -> Conditions:
+    """Return conditions with what `to_json` returned.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of its bounds.
+    """
+    values = {
+        name: _read(cast("dict[str, dict[str, float]]", value))
+        if isinstance(value, dict)
+        else value
+        for name, value in changes.items()
+    }
+    return replace(conditions, **cast("dict[str, float]", values))
+
+
+def _process(process: Process) -> dict[str, object]:
+    if isinstance(process, Trace):
+        return {"trace": process.values.tolist()}
+    name = NAMES.get(type(process))
+    if name is None:
+        known = ", ".join((*NAMES.values(), "trace"))
+        raise LiveError(f"a link knows no {type(process).__name__}; it knows {known}")
+    return {name: {slot: getattr(process, slot) for slot in type(process).__slots__}}
+
+
+def _read(written: Mapping[str, Mapping[str, float]]) -> Process:
+    ((name, values),) = written.items()
+    if name == "trace":
+        return Trace(TraceTable("trace", {"delay": np.asarray(values, np.float64)}), "delay")
+    return NAMED[name](**values)
+
+
+# ---------------------------------------------------------------------------------- delays
+
+
+def delays_ns(process: Process, rng: np.random.Generator) -> Iterator[int]:
+    """Draw one delay after another, for ever.
+
+    An `ar1` process has its memory, a trace is replayed from a random row and begins again at its
+    end; the values of all others are independent.
+    """
+    if isinstance(process, Constant):
+        value = round(process.value * NS_PER_MS)
+        while True:
+            yield value
+    if isinstance(process, Trace):
+        yield from _replayed(process, rng)
+    if isinstance(process, AR1) and process.cv > 0:
+        yield from _remembering(process, rng)
+    while True:
+        block = np.rint(process.marginal(rng, BLOCK) * NS_PER_MS).astype(np.int64)
+        yield from block.tolist()
+
+
+def _replayed(trace: Trace, rng: np.random.Generator) -> Iterator[int]:
+    values = np.rint(trace.values * NS_PER_MS).astype(np.int64).tolist()
+    row = int(rng.integers(len(values)))
+    while True:
+        yield values[row]
+        row = (row + 1) % len(values)
+
+
+def _remembering(process: AR1, rng: np.random.Generator) -> Iterator[int]:
+    mu, sigma = LogNormal(process.mean, process.cv).log_parameters
+    r = process.log_correlation
+    fresh = math.sqrt(1 - r * r)
+    state = rng.standard_normal()
+    while True:
+        for noise in rng.standard_normal(BLOCK).tolist():
+            yield round(math.exp(mu + sigma * state) * NS_PER_MS)
+            state = r * state + fresh * noise

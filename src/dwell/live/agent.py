@@ -1,0 +1,118 @@
+"""Agent: what a node has one of. It keeps the cell's processes there, and carries none of its data.
+
+It also tells what the node's CPU does, and on one node it is the detour for small messages.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+import psutil
+
+from dwell.live.messages import Load, encode
+from dwell.live.role import Place, Pulse
+from dwell.live.supervision import Supervisor
+from dwell.live.transport.protocol import Sample
+
+__all__ = ["Agent", "CpuCount"]
+
+#: Time between two looks at the processes, and between two reports of what the CPU does.
+LOOK_NS = 20_000_000
+LOAD_NS = 100_000_000
+
+
+class CpuCount:
+    """Core-nanoseconds that some CPUs have been busy.
+
+    Parameters
+    ----------
+    cpus : iterable of int, optional
+        Those that the node has; all that this process may use where None.
+    """
+
+    def __init__(self, cpus: Iterable[int] | None = None) -> None:
+        own = psutil.Process().cpu_affinity() or list(range(psutil.cpu_count() or 1))
+        self.cpus = tuple(own if cpus is None else cpus)
+
+    def busy_ns(self) -> int:
+        """Since the machine was started, with the kernel's resolution of 10 ms."""
+        times = psutil.cpu_times(percpu=True)
+        busy_s = 0.0
+        for cpu in self.cpus:
+            spent = times[cpu]
+            busy_s += sum(spent) - spent.idle - spent.iowait - spent.guest - spent.guest_nice
+        return round(busy_s * 1e9)
+
+
+class Agent:
+    """See the module.
+
+    Parameters
+    ----------
+    place : Place
+    supervisor : Supervisor
+    cpu : CpuCount
+    accelerator : callable, optional
+        Returns the utilisation of the node's accelerator.
+    """
+
+    def __init__(
+        self,
+        place: Place,
+        supervisor: Supervisor,
+        cpu: CpuCount,
+        accelerator: Callable[[], float] | None = None,
+    ) -> None:
+        self.place, self.supervisor = place, supervisor
+        self._cpu, self._accelerator = cpu, accelerator
+        self.pulse = Pulse(place, self._state)
+        self._relays = place.node == place.relay
+        self._look_ns = self._load_ns = 0
+        self._spent: dict[str, int] = {"own": 0, "shadow": 0}
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        yield from self.pulse.subscriptions()
+        if self._relays:
+            yield self.place.keys.relay(f"{self.place.keys.root}/**")
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        """Take a message in; carry it on where this is the detour."""
+        if self.pulse.hears(sample):
+            self.pulse.receive(sample, now_ns)
+            return
+        keys = self.place.keys
+        prefix = f"{keys.root}/relay/"
+        if self._relays and sample.key.startswith(prefix):
+            onward = keys.detour(f"{keys.root}/{sample.key.removeprefix(prefix)}")
+            self.place.transport.put(onward, sample.payload, sample.header)
+
+    def _state(self) -> tuple[bool, str]:
+        return True, self.supervisor.notes()
+
+    def wake(self, now_ns: int) -> int:
+        """Look after the processes, report the load, beat; returns what is due next."""
+        if now_ns >= self._look_ns:
+            self.supervisor.step()
+            self._look_ns = now_ns + LOOK_NS
+        if now_ns >= self._load_ns:
+            self._report(now_ns)
+            self._load_ns = now_ns + LOAD_NS
+        return min(self.pulse.wake(now_ns), self._look_ns, self._load_ns)
+
+    def _report(self, now_ns: int) -> None:
+        place = self.place
+        shadow = self._grown("shadow", lambda who: who.endswith(".shadow"))
+        own = self._grown("own", lambda who: not who.endswith(".shadow"))
+        busy_ns = self._cpu.busy_ns()
+        at_ns = now_ns if self._accelerator is None else time.monotonic_ns()
+        used = -1.0 if self._accelerator is None else self._accelerator()
+        load = Load(place.node, place.life, at_ns, busy_ns, own, shadow, used)
+        place.put_twice(place.keys.load(place.node), encode(load))
+
+    def _grown(self, what: str, select: Callable[[str], bool]) -> int:
+        """CPU time of processes; it never falls, though processes die."""
+        spent = round(self.supervisor.cpu_seconds(select) * 1e9)
+        self._spent[what] = max(self._spent[what], spent)
+        return self._spent[what]

@@ -1,0 +1,171 @@
+"""Hosting: a role gets a thread, a clock and a transport, and becomes a process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from dwell.live.role import Role
+from dwell.live.stage import Message
+from dwell.live.transport.protocol import Sample, Transport
+from dwell.live.worker import Job, Worker
+
+__all__ = ["Clock", "Hosted", "work"]
+
+Clock = Callable[[], int]
+
+#: No thread sleeps longer, so that it notices that it shall stop.
+LONGEST_SLEEP_S = 0.2
+
+
+class Hosted:
+    """A role on a transport: called by one thread at a time, and woken when something is due.
+
+    Parameters
+    ----------
+    role : Role
+    transport : Transport
+    clock : callable
+        Nanoseconds; a clock that never steps.
+    heard : callable, optional
+        Called, outside the role, after every message.
+    stopped : Event, optional
+        Ends `run` within a fifth of a second.
+    """
+
+    def __init__(
+        self,
+        role: Role,
+        transport: Transport,
+        clock: Clock = time.monotonic_ns,
+        heard: Callable[[], None] | None = None,
+        stopped: threading.Event | None = None,
+    ) -> None:
+        self.role, self.transport, self.clock = role, transport, clock
+        self.lock = threading.Lock()
+        self.stopped = stopped or threading.Event()
+        self._hurry = threading.Event()
+        self._heard = heard
+        self._due_ns = 0
+        self.fault: BaseException | None = None
+        for key in role.subscriptions():
+            transport.subscribe(key, self._receive)
+
+    def _receive(self, sample: Sample) -> None:
+        if self.stopped.is_set():
+            return
+        with self.lock:
+            self.role.receive(sample, self.clock())
+        if self._heard is not None:
+            self._heard()
+
+    def hurry(self) -> None:
+        """Wake the role now: something has changed."""
+        self._hurry.set()
+
+    def run(self) -> None:
+        """Wake the role whenever it is due, until `stop`."""
+        try:
+            while not self.stopped.is_set():
+                with self.lock:
+                    due_ns = self.role.wake(self.clock())
+                wait_s = min((due_ns - self.clock()) / 1e9, LONGEST_SLEEP_S)
+                if wait_s > 0:
+                    self._hurry.wait(wait_s)
+                self._hurry.clear()
+        except BaseException as error:
+            self.fault = error
+            raise
+        finally:
+            self.stopped.set()
+
+    def stop(self) -> None:
+        """Have `run` return."""
+        self.stopped.set()
+        self._hurry.set()
+
+
+def work(
+    worker: Worker,
+    transport: Transport,
+    *,
+    stopped: threading.Event,
+    note: Callable[[Job | None], None] | None = None,
+    clock: Clock = time.monotonic_ns,
+    ready: Callable[[], None] | None = None,
+) -> None:
+    """Run a worker's jobs in this thread until it is told to stop.
+
+    Parameters
+    ----------
+    worker : Worker
+    transport : Transport
+    stopped : Event
+    note : callable, optional
+        Told what job begins, and None when it is over.
+    clock : callable
+    ready : callable, optional
+        Called when the stage has started.
+    """
+    news = threading.Semaphore(0)
+    hosted = Hosted(worker, transport, clock, heard=news.release)
+    beats = threading.Thread(target=hosted.run, name="beats", daemon=True)
+    beats.start()
+    stage = worker.stage
+    start = getattr(stage, "start", None)
+    if start is not None:
+        start()
+    with hosted.lock:
+        worker.started = True
+        worker.pulse.send(clock())
+    if ready is not None:
+        ready()
+    waits = getattr(stage, "wait", None)
+    if worker.triggers and callable(waits):
+        threading.Thread(target=_frames, args=(worker, waits, stopped), daemon=True).start()
+    try:
+        while not stopped.is_set():
+            _drain(worker, hosted, note, clock)
+            news.acquire(timeout=LONGEST_SLEEP_S if not worker.stands_by else 0.01)
+    finally:
+        hosted.stop()
+        stop = getattr(stage, "stop", None)
+        if stop is not None:
+            stop()
+
+
+def _drain(
+    worker: Worker, hosted: Hosted, note: Callable[[Job | None], None] | None, clock: Clock
+) -> None:
+    """Do all that there is to do."""
+    while True:
+        with hosted.lock:
+            chore = worker.next_chore()
+            job = None if chore is not None else worker.next_job(clock())
+        if chore is not None:
+            worker.do_chore(chore)
+            continue
+        if job is None:
+            return
+        if note is not None:
+            note(job)
+        started_ns = clock()
+        output: Message | None
+        output, state_age = worker.run(job, started_ns)
+        ended_ns = clock()
+        with hosted.lock:
+            worker.finish(job, output, started_ns, ended_ns, state_age)
+        if note is not None:
+            note(None)
+
+
+def _frames(worker: Worker, wait: Callable[[], object], stopped: threading.Event) -> None:
+    """Ask the stamper for a cycle whenever the source has a frame."""
+    while not stopped.is_set():
+        with suppress(Exception):  # the user's code; a camera that fails shows in its beats
+            wait()
+            worker.place.transport.put(worker.place.keys.frame(), b"")
+            continue
+        time.sleep(LONGEST_SLEEP_S)

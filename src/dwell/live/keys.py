@@ -1,0 +1,88 @@
+"""The keys under which the processes of a cell send and hear."""
+
+from __future__ import annotations
+
+__all__ = ["MAIN", "SHADOW", "Keys"]
+
+MAIN, SHADOW = "main", "shadow"
+
+
+class Keys:
+    """Keys of one cell.
+
+    Parameters
+    ----------
+    cell : str
+        Its name.
+    """
+
+    def __init__(self, cell: str) -> None:
+        self.root = f"dwell/{cell}"
+
+    def inputs(self, task: str, node: str, kind: str = MAIN) -> str:
+        """What a task's worker takes in; of its shadow worker where `kind` is `SHADOW`."""
+        return f"{self.root}/in/{task}/{node}/{kind}"
+
+    def command(self, task: str) -> str:
+        """What a sink task sends to its actuator."""
+        return f"{self.root}/sink/{task}"
+
+    def done(self, sink: str) -> str:
+        """Completions of a sink; ``*`` for all."""
+        return f"{self.root}/done/{sink}"
+
+    def probed(self) -> str:
+        """Completions of shadows."""
+        return f"{self.root}/probed"
+
+    def beat(self, node: str, who: str) -> str:
+        """Heartbeats; ``*`` for all nodes or processes."""
+        return f"{self.root}/beat/{node}/{who}"
+
+    def stamped(self) -> str:
+        """The stamp of every cycle."""
+        return f"{self.root}/stamped"
+
+    def frame(self) -> str:
+        """Asks the stamper for a cycle, because the source has a frame."""
+        return f"{self.root}/frame"
+
+    def order(self) -> str:
+        """Orders of the controller."""
+        return f"{self.root}/order"
+
+    def accepted(self) -> str:
+        """Answers to them."""
+        return f"{self.root}/accepted"
+
+    def load(self, node: str) -> str:
+        """What each node's CPU does."""
+        return f"{self.root}/load/{node}"
+
+    def snapshot(self, task: str, node: str) -> str:
+        """Asks a worker for its state."""
+        return f"{self.root}/snapshot/{task}/{node}"
+
+    def state(self, task: str, node: str) -> str:
+        """States on their way to a worker."""
+        return f"{self.root}/state/{task}/{node}"
+
+    def restored(self) -> str:
+        """Says that a state has arrived."""
+        return f"{self.root}/restored"
+
+    def ask(self) -> str:
+        """Questions of a person to the controller."""
+        return f"{self.root}/ask"
+
+    def answer(self, number: str) -> str:
+        """Answers to them; ``*`` for all."""
+        return f"{self.root}/answer/{number}"
+
+    def relay(self, key: str) -> str:
+        """The copy of a message for whoever carries it on; ``**`` below the root for all."""
+        return f"{self.root}/relay/{key.removeprefix(self.root + '/')}"
+
+    def detour(self, key: str) -> str:
+        """The copy as it arrives."""
+        return f"{self.root}/detour/{key.removeprefix(self.root + '/')}"

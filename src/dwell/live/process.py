@@ -1,0 +1,154 @@
+"""The process of a stamper, worker or sink: what an agent starts."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+
+import msgspec
+
+from dwell.errors import LiveError
+from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
+from dwell.live.hosting import Hosted, work
+from dwell.live.messages import Header
+from dwell.live.role import Place, Pulse, Role
+from dwell.live.sink import Sink
+from dwell.live.stage import Actuator, load_actuator, load_stage
+from dwell.live.stamper import Stamper
+from dwell.live.transport.protocol import Sample, Transport
+from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wiring import Role as Named
+from dwell.live.wiring import wire
+from dwell.live.worker import Job, Worker
+from dwell.model import Problem
+
+__all__ = ["run_process"]
+
+
+def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Event) -> None:
+    """Run one process of a cell until it is told to end.
+
+    Parameters
+    ----------
+    problem : Problem
+    who : str
+        As in `wiring.roles`: a stamper, worker, shadow, standby or sink.
+    folder : Path
+        Where the node's processes keep their files.
+    stopped : Event
+
+    Raises
+    ------
+    LiveError
+        If there is no such process, or it cannot listen.
+    """
+    entry = wire(problem).entry(who)
+    transport = ZenohTransport(entry)
+    place = Place(problem, who, entry.role.node, transport, time.time_ns())
+    try:
+        _run(problem, entry.role, place, make_folder(folder), stopped)
+    finally:
+        transport.close()
+
+
+def _run(
+    problem: Problem, role: Named, place: Place, folder: Path, stopped: threading.Event
+) -> None:
+    # A stage that computes must not keep a beat waiting for long.
+    sys.setswitchinterval(0.0005)
+    if role.kind == "stamper":
+        book = BookFile(folder / f"{role.who}.book")
+        stamper = Stamper(place, book, time.time_ns(), time.monotonic_ns())
+        _host(stamper, place.transport, stopped)
+    elif role.kind == "sink":
+        actuator = _actuator(problem, role.task)
+        highest = HighestFile(folder / f"{role.who}.highest")
+        expected = getattr(actuator, "inputs", {}).get(role.task)
+        _host(Sink(place, role.task, actuator, highest, expected), place.transport, stopped)
+    else:
+        _work(problem, role, place, folder, stopped)
+
+
+def _host(role: Role, transport: Transport, stopped: threading.Event) -> None:
+    """Run a role in this thread until the process is told to end."""
+    hosted = Hosted(role, transport, stopped=stopped)
+    hosted.run()
+
+
+def _actuator(problem: Problem, task: str) -> Actuator:
+    name = problem.live.actuators.get(task)
+    if name is None:
+        raise LiveError(
+            f"live.actuators.{task}: missing; name what applies its commands, as module:Name"
+        )
+    return load_actuator(name, f"live.actuators.{task}")
+
+
+def _work(
+    problem: Problem, role: Named, place: Place, folder: Path, stopped: threading.Event
+) -> None:
+    name = problem.pipeline.tasks[role.task].run
+    try:
+        if name is None:
+            raise LiveError(f"tasks.{role.task}.run: missing; name its stage, as module:Name")
+        stage = load_stage(name, f"tasks.{role.task}.run")
+    except LiveError as error:
+        # It stays, and says in its beats what is wrong: a crash loop would say it less well.
+        print(error, file=sys.stderr, flush=True)
+        _host(_Broken(place, f"{role.who}: {error}"), place.transport, stopped)
+        return
+    worker = Worker(
+        place,
+        role.task,
+        stage,
+        shadow=role.kind == "shadow",
+        stands_by=f"{role.task}@{role.node}" if role.kind == "standby" else "",
+    )
+    inflight = InFlight(folder / f"{role.who}.inflight")
+    _again(worker, folder / f"{role.who}.again")
+
+    def note(job: Job | None) -> None:
+        if job is None:
+            inflight.end()
+        else:
+            inflight.begin(_written(job))
+
+    work(worker, place.transport, stopped=stopped, note=note)
+
+
+class _Broken:
+    """Stands for a worker whose stage cannot be had, and says so."""
+
+    def __init__(self, place: Place, why: str) -> None:
+        self._why = why
+        self.pulse = Pulse(place, lambda: (False, self._why))
+
+    def subscriptions(self) -> tuple[str, ...]:
+        return self.pulse.subscriptions()
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        self.pulse.receive(sample, now_ns)
+
+    def wake(self, now_ns: int) -> int:
+        return self.pulse.wake(now_ns)
+
+
+def _written(job: Job) -> bytes:
+    """Write a job's inputs so that another process can try them again."""
+    return msgspec.msgpack.encode(
+        [job.shadow, [(header, bytes(payload)) for header, payload, _ in job.inputs.values()]]
+    )
+
+
+def _again(worker: Worker, path: Path) -> None:
+    """Try first what the process before died of, to see whether it was the message."""
+    try:
+        shadow, inputs = msgspec.msgpack.decode(
+            path.read_bytes(), type=tuple[bool, list[tuple[Header, bytes]]]
+        )
+        path.unlink()
+    except (OSError, msgspec.MsgspecError):
+        return
+    worker.retry(shadow, inputs, time.monotonic_ns())

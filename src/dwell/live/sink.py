@@ -1,0 +1,131 @@
+"""Sink: the gate before the actuator, and its watchdog."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Protocol
+
+from dwell.errors import LiveError
+from dwell.live.messages import Completion, Header, encode
+from dwell.live.payloads import read_payload
+from dwell.live.role import Place, Pulse
+from dwell.live.stage import Actuator, Message
+from dwell.live.transport.protocol import Sample
+
+__all__ = ["Highest", "Sink"]
+
+
+class Highest(Protocol):
+    """Remembers, across restarts, the highest cycle that was actuated."""
+
+    def load(self) -> tuple[int, int]:
+        """Return run and cycle; (-1, -1) if there is none."""
+        ...
+
+    def store(self, run: int, cycle: int) -> None:
+        """Remember them before the actuator is called."""
+        ...
+
+
+class Sink:
+    """Lets each command through once, in order and fresh; tells the actuator when none comes.
+
+    Nothing of the user's runs before the gate has decided and remembered.
+
+    Parameters
+    ----------
+    place : Place
+    task : str
+        Sink task whose commands it takes.
+    actuator : Actuator
+    highest : Highest
+    expected : type, optional
+        Struct that the actuator takes.
+    """
+
+    def __init__(
+        self,
+        place: Place,
+        task: str,
+        actuator: Actuator,
+        highest: Highest,
+        expected: type | None = None,
+    ) -> None:
+        self.place, self.task, self.actuator = place, task, actuator
+        self._highest, self._expected = highest, expected
+        live, pipeline = place.problem.live, place.problem.pipeline
+        max_age_ms = 2 * pipeline.period_ms if live.max_age_ms is None else live.max_age_ms
+        self.max_age_ns = round(max_age_ms * 1e6)
+        self.newest = highest.load()
+        self.offsets = place.offsets()
+        self.pulse = Pulse(place, self._state)
+        self.counts = {"actuated": 0, "behind": 0, "stale": 0, "silences": 0}
+        self.trouble = ""
+        self._alarm_ns: int | None = None
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        yield from self.pulse.subscriptions()
+        yield self.place.keys.command(self.task)
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        """Take a command or a beat in."""
+        if self.pulse.hears(sample):
+            beat = self.pulse.receive(sample, now_ns)
+            if beat is not None:
+                self.offsets.hear(beat, now_ns)
+            return
+        header = self.place.header(sample)
+        if header is None or header.source != self.task:
+            return
+        outcome = self._gate(header, now_ns)
+        self.counts[outcome] += 1
+        if outcome == "actuated":
+            self._alarm_ns = now_ns + self.max_age_ns
+            self._apply(header, sample.payload, now_ns)
+        done = Completion(header.stamp, self.task, now_ns, outcome, header.hops, self.place.node)
+        self.place.put_twice(self.place.keys.done(self.task), encode(done))
+
+    def age_ns(self, header: Header, now_ns: int) -> int:
+        """Longest time that can have passed since a cycle's release, for all the clocks say."""
+        here_ns, bound_ns = self.offsets.to_reference(self.place.node, now_ns)
+        return here_ns + bound_ns - header.stamp.released_ns
+
+    def _gate(self, header: Header, now_ns: int) -> str:
+        cycle = header.stamp.run, header.stamp.cycle
+        if cycle <= self.newest:
+            return "behind"
+        if self.age_ns(header, now_ns) > self.max_age_ns:
+            return "stale"
+        self.newest = cycle
+        self._highest.store(*cycle)
+        return "actuated"
+
+    def _apply(self, header: Header, payload: bytes, now_ns: int) -> None:
+        stamp = header.stamp
+        age_ms = self.age_ns(header, now_ns) / 1e6
+        try:
+            command = read_payload(header.kind, payload, self._expected)
+            self.actuator.apply(Message(command, stamp.cycle, stamp.released_ns, age_ms))
+            self.trouble = ""
+        except Exception as error:  # the user's code
+            what = f"cycle {stamp.cycle}: apply() raised {type(error).__name__}: {error}"
+            self.trouble = f"sink of {self.task} on {self.place.node}: {what}"
+            self.place.complain(LiveError(self.trouble))
+
+    def _state(self) -> tuple[bool, str]:
+        return True, self.trouble
+
+    def wake(self, now_ns: int) -> int:
+        """Beat, and call the watchdog where no command came; returns when something is due."""
+        if self._alarm_ns is not None and now_ns >= self._alarm_ns:
+            self._alarm_ns = None
+            self.counts["silences"] += 1
+            silence = self.place.problem.live.silence
+            try:
+                self.actuator.zero() if silence == "zero" else self.actuator.hold()
+            except Exception as error:  # the user's code
+                self.trouble = f"{silence}() raised {type(error).__name__}: {error}"
+                self.place.complain(LiveError(self.trouble))
+        due_ns = self.pulse.wake(now_ns)
+        return due_ns if self._alarm_ns is None else min(due_ns, self._alarm_ns)

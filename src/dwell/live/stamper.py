@@ -1,0 +1,335 @@
+"""Stamper: releases the cycles of a cell, each with its placement, and hosts the guard."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from dwell.control import shadow_stamps
+from dwell.control.guard import Guard, Presence, Probation
+from dwell.errors import LiveError
+from dwell.live.messages import (
+    Accepted,
+    Beat,
+    Completion,
+    Header,
+    Order,
+    Stamp,
+    decode,
+    encode,
+)
+from dwell.live.role import Place, Pulse
+from dwell.live.routing import STAMPER, Routes
+from dwell.live.transport.protocol import Sample
+
+__all__ = ["Book", "Entry", "Stamper"]
+
+#: Cycle numbers that are reserved at a time; after a restart the rest of them stays unused.
+RESERVED = 1_024
+#: Time after which a controller that is silent is in charge no more.
+LEASE_NS = 1_000_000_000
+#: Completions of a cycle by some sinks that are kept until the others come.
+MAX_PARTIAL = 1_024
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What outlives the stamper's process.
+
+    Parameters
+    ----------
+    run : int
+        Run id.
+    reserved : int
+        No cycle from this number on has been stamped.
+    term : int
+    placement : str
+    on_fallback : bool
+        Whether the placement is the guard's.
+    """
+
+    run: int
+    reserved: int
+    term: int
+    placement: str
+    on_fallback: bool
+
+
+class Book(Protocol):
+    """Keeps the `Entry` of a cell."""
+
+    def read(self) -> Entry | None:
+        """Return it; None if there is none."""
+        ...
+
+    def write(self, entry: Entry) -> None:
+        """Keep it, before anything that it says happens."""
+        ...
+
+
+class Stamper:
+    """Owns run, term and placement of a cell.
+
+    Parameters
+    ----------
+    place : Place
+    book : Book
+    run : int
+        Run id where the book has none; larger than any before.
+    now_ns : int
+    """
+
+    def __init__(self, place: Place, book: Book, run: int, now_ns: int) -> None:
+        self.place, self._book = place, book
+        problem = place.problem
+        entry = book.read()
+        if entry is None or entry.placement not in problem.candidates:
+            entry = Entry(run, 0, 1, problem.initial, False)
+        self.run, self.term = entry.run, entry.term
+        self.placement = entry.placement
+        self.cycle = entry.reserved
+        self._reserved = entry.reserved
+        self.routes = Routes(problem)
+        self.guard = Guard.of(problem, entry.placement)
+        if entry.on_fallback:
+            self.guard.adopt(entry.placement, fallback=True)
+        self.presence = Presence.of(problem)
+        self.probation = Probation.of(problem)
+        if entry.on_fallback:
+            self.probation.fell()
+        self.pulse = Pulse(place, self._ready, self._holds)
+        self.timer = problem.live.release == "timer"
+        self._next_ns = now_ns + place.period_ns
+        self._names = tuple(problem.candidates)
+        self._sinks = frozenset(
+            name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
+        )
+        self._partial: dict[int, set[str]] = {}
+        self._probes: set[int] = set()
+        self._fraction = 0.0
+        self._forks: tuple[tuple[str, str], ...] = ()
+        self._charge = ""
+        self._charged_ns = 0
+        self._answered: tuple[str, int, Accepted] | None = None
+        self.skipped = 0
+        self.moves: list[tuple[int, str, str]] = []
+
+    # ------------------------------------------------------------------------ hearing
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        keys = self.place.keys
+        yield from self.pulse.subscriptions()
+        for key in (keys.done("*"), keys.probed()):
+            yield key
+            yield keys.detour(key)
+        yield keys.order()
+        yield keys.frame()
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        """Take a message in."""
+        if self.pulse.hears(sample):
+            beat = self.pulse.receive(sample, now_ns)
+            if beat is not None:
+                direct = "/detour/" not in sample.key
+                self._heard(beat, now_ns, direct)
+            return
+        try:
+            if sample.key == self.place.keys.order():
+                self._order(decode(sample.payload, Order), now_ns)
+            elif sample.key == self.place.keys.frame():
+                if not self.timer:
+                    self._release(now_ns, now_ns)
+            else:
+                self._completed(decode(sample.payload, Completion), now_ns)
+        except LiveError as error:
+            self.place.complain(error)
+
+    def _heard(self, beat: Beat, now_ns: int, direct: bool) -> None:
+        presence = self.presence
+        presence.heard(beat.node, now_ns)
+        if direct:
+            presence.heard(f"{beat.node}->{self.place.node}", now_ns)
+        for heard in beat.heard:
+            age_ns = max(beat.sent_ns - heard.at_ns, 0)
+            presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
+        worker, _, extra = beat.who.partition(".")
+        if extra in ("", "1") and "@" in worker:
+            if beat.ready:
+                presence.heard(worker, now_ns)
+            elif not extra:
+                presence.gone(worker)
+
+    def _completed(self, done: Completion, now_ns: int) -> None:
+        stamp = done.stamp
+        if stamp.run != self.run:
+            return
+        if done.outcome == "shadow":
+            if stamp.shadow == self.probation.wanted and stamp.cycle in self._probes:
+                self._probes.discard(stamp.cycle)
+                self.probation.completed(stamp.cycle, now_ns)
+            return
+        if done.outcome != "actuated" or stamp.cycle < self.guard.newest:
+            return
+        said = self._partial.setdefault(stamp.cycle, set())
+        if done.sink in said:
+            return
+        said.add(done.sink)
+        if said == self._sinks:
+            self.guard.completed(stamp.cycle, now_ns)
+            self.probation.healthy()
+        if len(self._partial) > MAX_PARTIAL:
+            for cycle in sorted(self._partial)[: MAX_PARTIAL // 2]:
+                del self._partial[cycle]
+
+    # ------------------------------------------------------------------------- orders
+
+    def _order(self, order: Order, now_ns: int) -> None:
+        """Answer an order; the same one twice gets the same answer."""
+        answered = self._answered
+        if answered is not None and answered[:2] == (order.controller, order.number):
+            answer = answered[2]
+        else:
+            refused = self._refusal(order, now_ns)
+            if not refused:
+                self._accept(order)
+            answer = Accepted(
+                order.number,
+                order.controller,
+                refused,
+                self.run,
+                self.term,
+                self.placement,
+                self.cycle,
+                self.guard.on_fallback,
+            )
+            self._answered = order.controller, order.number, answer
+        self.place.put_twice(self.place.keys.accepted(), encode(answer))
+
+    def _refusal(self, order: Order, now_ns: int) -> str:
+        """Return why an order is not accepted, or nothing."""
+        other = self._charge not in ("", order.controller)
+        if other and now_ns - self._charged_ns < LEASE_NS:
+            return f"another controller: {self._charge} is in charge"
+        self._charge, self._charged_ns = order.controller, now_ns
+        if order.run == 0 and order.term == 0 and not order.placement:
+            return ""
+        if order.run != self.run:
+            return f"stale run: {order.run}, now {self.run}"
+        if order.term != self.term:
+            return f"stale term: {order.term}, now {self.term}"
+        if not order.placement:
+            return self._misfork(order)
+        if order.placement not in self.place.problem.candidates:
+            return f"infeasible: {order.placement!r} is no candidate ({', '.join(self._names)})"
+        if order.placement == self.placement:
+            return ""
+        missing = self.presence.missing(order.placement, now_ns)
+        if missing:
+            return f"not ready: {', '.join(sorted(missing))} not heard"
+        if self.guard.on_fallback and not self.probation.proven(order.placement, now_ns):
+            self.probation.want(order.placement)
+            return f"not proven: {self.probation!r}"
+        return ""
+
+    def _misfork(self, order: Order) -> str:
+        tasks = self.place.problem.pipeline.tasks
+        for task, node in order.forks:
+            if task not in tasks or node not in tasks[task].on:
+                return f"infeasible: {task} cannot run on {node}"
+        return ""
+
+    def _accept(self, order: Order) -> None:
+        if order.run == 0 and order.term == 0:
+            return
+        self._fraction = order.shadow_fraction
+        self._forks = order.forks
+        if order.placement and (order.placement != self.placement or self.guard.on_fallback):
+            self._move(order.placement, by_guard=False)
+
+    def _move(self, placement: str, *, by_guard: bool) -> None:
+        """Change the placement: a new term, known to the book before any cycle has it."""
+        was_fallback = self.guard.on_fallback
+        self.moves.append((self.cycle, placement, "guard" if by_guard else "order"))
+        del self.moves[:-1_000]
+        self.term += 1
+        self.placement = placement
+        self._partial.clear()
+        self._write(on_fallback=by_guard)
+        self.guard.adopt(placement, fallback=by_guard)
+        if by_guard:
+            self._forks = ()
+            self.probation.fell()
+        elif was_fallback:
+            self.probation.left()
+        self._probes.clear()
+
+    def _write(self, *, on_fallback: bool) -> None:
+        self._book.write(Entry(self.run, self._reserved, self.term, self.placement, on_fallback))
+
+    # -------------------------------------------------------------------------- cycles
+
+    def wake(self, now_ns: int) -> int:
+        """Release the cycle that is due, let the guard look, beat; returns what is due next."""
+        fallback = self.guard.check(now_ns, lambda name: self.presence.whole(name, now_ns))
+        if fallback is not None:
+            self._move(fallback, by_guard=True)
+            self.pulse.send(now_ns)
+        if self.timer and now_ns >= self._next_ns:
+            behind = (now_ns - self._next_ns) // self.place.period_ns
+            self.skipped += behind
+            self._next_ns += behind * self.place.period_ns
+            self._release(self._next_ns, now_ns)
+            self._next_ns += self.place.period_ns
+        due_ns = self.pulse.wake(now_ns)
+        if self.timer:
+            due_ns = min(due_ns, self._next_ns)
+        guard_ns = self.guard.due_ns
+        # Where no fallback is whole, the guard looks again every quarter of a period.
+        again_ns = now_ns + self.place.period_ns // 4
+        return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
+
+    def _release(self, released_ns: int, now_ns: int) -> None:
+        """Stamp a cycle and send it to the source tasks."""
+        if self.cycle >= self._reserved:
+            self._reserved = self.cycle + RESERVED
+            self._write(on_fallback=self.guard.on_fallback)
+        stamp = self._stamp(released_ns)
+        self.cycle += 1
+        self.guard.released(stamp.cycle, released_ns)
+        if stamp.shadow and stamp.shadow == self.probation.wanted:
+            self.probation.released(stamp.cycle, released_ns)
+            self._probes.add(stamp.cycle)
+            if len(self._probes) > MAX_PARTIAL:
+                self._probes.discard(min(self._probes))
+        place = self.place
+        header = encode(Header(stamp, STAMPER, place.node, "none"))
+        for task, node, kind in self.routes.destinations(STAMPER, stamp):
+            place.transport.put(place.keys.inputs(task, node, kind), b"", header)
+        place.transport.put(place.keys.stamped(), encode(stamp))
+
+    def _stamp(self, released_ns: int) -> Stamp:
+        wanted = self.probation.wanted if self.guard.on_fallback else None
+        shadow = wanted or self._shadowed()
+        if shadow == self.placement:
+            shadow = ""
+        return Stamp(
+            self.run, self.cycle, self.term, self.placement, released_ns, shadow, self._forks
+        )
+
+    def _shadowed(self) -> str:
+        """Return the candidate that the estimator's plan sends this cycle through, too."""
+        if not self._fraction:
+            return ""
+        code = self._names.index(self.placement)
+        plan = shadow_stamps(self.cycle, self.cycle + 1, code, len(self._names), self._fraction)
+        return self._names[int(plan[0])] if plan[0] >= 0 else ""
+
+    # --------------------------------------------------------------------------- beats
+
+    def _ready(self) -> tuple[bool, str]:
+        return True, ""
+
+    def _holds(self) -> tuple[int, str]:
+        return self.term, self.placement

@@ -1,0 +1,240 @@
+"""Supervision: keeps the processes of a node running, and finds out what they die of."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+
+from dwell.live.files import InFlight
+
+__all__ = ["Child", "Supervisor"]
+
+#: Waits between two starts of a process that keeps dying.
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
+#: A process that lived so long has recovered.
+HEALTHY_S = 10.0
+#: Deaths of one message before it is put aside.
+POISONOUS = 2
+
+
+@dataclass(slots=True)
+class Child:
+    """A process that is kept running.
+
+    Parameters
+    ----------
+    who : str
+    command : sequence of str
+    folder : Path
+        Where it keeps its files.
+    """
+
+    who: str
+    command: Sequence[str]
+    folder: Path
+    process: subprocess.Popen[bytes] | None = None
+    adopted: psutil.Process | None = None
+    starts: int = 0
+    failures: int = 0
+    started_s: float = 0.0
+    next_s: float = 0.0
+    note: str = ""
+    deaths: Counter[str] = field(default_factory=Counter)
+    spent_s: float = 0.0
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process that runs."""
+        if self.process is not None:
+            return self.process.pid
+        return self.adopted.pid if self.adopted is not None else None
+
+    @property
+    def inflight(self) -> Path:
+        """Where a worker notes what it is working on."""
+        return self.folder / f"{self.who}.inflight"
+
+    @property
+    def log(self) -> Path:
+        """What the process prints."""
+        return self.folder / f"{self.who}.log"
+
+    @property
+    def mark(self) -> Path:
+        """Tells the next agent of a process that outlives this one."""
+        return self.folder / f"{self.who}.pid"
+
+
+class Supervisor:
+    """Starts processes, starts them again when they die, and adopts those of an agent before.
+
+    Parameters
+    ----------
+    folder : Path
+        The node's.
+    say : callable
+        Takes a line for the log of the agent.
+    """
+
+    def __init__(self, folder: Path, say: Callable[[str], None]) -> None:
+        self.folder = folder
+        self.children: list[Child] = []
+        self._say = say
+        self._environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+
+    def keep(self, who: str, command: Sequence[str]) -> Child:
+        """Have a process run from now on."""
+        child = Child(who, command, self.folder)
+        child.adopted = _survivor(child.mark)
+        if child.adopted is not None:
+            self._say(f"{who}: goes on (process {child.adopted.pid})")
+            child.started_s = time.monotonic()
+        self.children.append(child)
+        return child
+
+    def step(self) -> None:
+        """Look after every process once."""
+        for child in self.children:
+            if not self._alive(child) and time.monotonic() >= child.next_s:
+                self._start(child)
+
+    def _alive(self, child: Child) -> bool:
+        if child.process is not None:
+            code = child.process.poll()
+            if code is None:
+                return True
+            child.process = None
+            self._died(child, _reason(code))
+        elif child.adopted is not None:
+            if child.adopted.is_running() and child.adopted.status() != psutil.STATUS_ZOMBIE:
+                return True
+            child.adopted = None
+            self._died(child, "has ended")
+        return False
+
+    def _died(self, child: Child, reason: str) -> None:
+        lived_s = time.monotonic() - child.started_s
+        child.failures = 1 if lived_s > HEALTHY_S else child.failures + 1
+        wait_s = min(FIRST_WAIT_S * 2 ** (child.failures - 1), LONGEST_WAIT_S)
+        child.next_s = time.monotonic() + (wait_s if child.failures > 1 else 0.0)
+        last = _last_line(child.log)
+        child.note = f"{child.who} {reason}{f': {last}' if last else ''}"
+        again = f"; start {child.starts + 1} in {wait_s:.1f} s" if child.failures > 1 else ""
+        self._say(f"{child.note}{again}")
+        self._blame(child)
+
+    def _blame(self, child: Child) -> None:
+        """Give the message that a worker died of to the next one, but not twice."""
+        content = InFlight.read(child.inflight)
+        again = child.folder / f"{child.who}.again"
+        again.unlink(missing_ok=True)
+        if content is None:
+            return
+        child.inflight.unlink(missing_ok=True)
+        name = hashlib.sha256(content).hexdigest()[:16]
+        child.deaths[name] += 1
+        if child.deaths[name] < POISONOUS:
+            again.write_bytes(content)
+            return
+        quarantine = child.folder / "quarantine"
+        quarantine.mkdir(exist_ok=True)
+        kept = quarantine / f"{child.who}-{name}.bin"
+        kept.write_bytes(content)
+        child.note = f"{child.who}: a message has killed it twice; it is kept in {kept}"
+        self._say(child.note)
+
+    def _start(self, child: Child) -> None:
+        child.starts += 1
+        with child.log.open("ab") as log:
+            child.process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                child.command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=self._environment,
+                start_new_session=True,
+            )
+        child.started_s = time.monotonic()
+        started = psutil.Process(child.process.pid).create_time()
+        draft = child.mark.with_suffix(".new")
+        draft.write_text(json.dumps({"pid": child.process.pid, "started": started}))
+        draft.replace(child.mark)
+
+    def cpu_seconds(self, select: Callable[[str], bool]) -> float:
+        """CPU time of the processes whose names are selected, past ones included."""
+        total = 0.0
+        for child in self.children:
+            if select(child.who) and child.pid is not None:
+                try:
+                    times = psutil.Process(child.pid).cpu_times()
+                except psutil.Error:
+                    continue
+                total += times.user + times.system
+        return total
+
+    def notes(self) -> str:
+        """What went wrong last, of processes that keep dying."""
+        return "; ".join(child.note for child in self.children if child.failures > 1)[:2000]
+
+    def stop(self, patience_s: float = 2.0) -> None:
+        """End all processes; those that do not listen are killed."""
+        running = [
+            psutil.Process(c.pid) for c in self.children if c.pid and psutil.pid_exists(c.pid)
+        ]
+        for process in running:
+            _signal(process, signal.SIGTERM)
+            _signal(process, signal.SIGCONT)
+        _, alive = psutil.wait_procs(running, timeout=patience_s)
+        for process in alive:
+            _signal(process, signal.SIGKILL)
+        psutil.wait_procs(alive, timeout=patience_s)
+        for child in self.children:
+            child.mark.unlink(missing_ok=True)
+            child.process = child.adopted = None
+
+
+def _signal(process: psutil.Process, number: int) -> None:
+    try:
+        process.send_signal(number)
+    except psutil.Error:
+        return
+
+
+def _survivor(mark: Path) -> psutil.Process | None:
+    """Return the process that a mark tells of, if it is still that one."""
+    try:
+        told = json.loads(mark.read_text())
+        process = psutil.Process(int(told["pid"]))
+        same = abs(process.create_time() - float(told["started"])) < 0.05
+        return process if same and process.status() != psutil.STATUS_ZOMBIE else None
+    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
+        return None
+
+
+def _reason(code: int) -> str:
+    if code < 0:
+        try:
+            return f"was killed by {signal.Signals(-code).name}"
+        except ValueError:
+            return f"was killed by signal {-code}"
+    return f"ended with exit code {code}"
+
+
+def _last_line(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - 2_000, 0))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+    except OSError:
+        return ""
+    return lines[-1][:300] if lines else ""

@@ -1,0 +1,1 @@
+"""Messages by key between the processes of a cell: over Zenoh, or in memory for tests."""

@@ -1,0 +1,485 @@
+"""A network in memory: deterministic, on a clock that only the test moves.
+
+Every link between two processes can delay, lose, double and reorder messages, be cut, or stall;
+processes can freeze, die and come back. Whole cells run in it: whoever attaches a participant is
+called with what arrives and at the instants it asked for, in order of time and, at one instant, in
+the order in which things were put.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from itertools import count
+from math import inf
+from random import Random
+from typing import Protocol, TypeAlias
+
+from dwell.errors import LiveError
+from dwell.live.transport.expressions import matcher, require_key
+from dwell.live.transport.protocol import Lane, Receive, Sample
+
+__all__ = [
+    "STALLED_MESSAGES",
+    "Clock",
+    "Conditions",
+    "Delivery",
+    "MemoryTransport",
+    "Network",
+    "Participant",
+    "Reach",
+]
+
+#: Says who may hear whom: names of sender and receiver, lane, key.
+Reach: TypeAlias = Callable[[str, str, Lane, str], bool]
+
+#: How many messages wait for a link that stalls, or a process that is frozen.
+STALLED_MESSAGES = 64
+
+
+class Participant(Protocol):
+    """A process without its input and output: what `Network.attach` drives."""
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        ...
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        """Take a message."""
+        ...
+
+    def wake(self, now_ns: int) -> int | None:
+        """Do what is due, and say when to be called next; None for not before a message."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """A node's clock, as a function of the network's.
+
+    Parameters
+    ----------
+    offset_ns : int
+        What it shows beyond the network's at 0.
+    drift_ppm : float
+        What it gains, microseconds a second.
+    """
+
+    offset_ns: int = 0
+    drift_ppm: float = 0.0
+
+    def shown(self, at_ns: int) -> int:
+        """What it shows at an instant of the network."""
+        return at_ns + self.offset_ns + round(at_ns * self.drift_ppm * 1e-6)
+
+    def instant(self, shown_ns: int) -> int:
+        """First instant of the network at which it shows at least that."""
+        guess = round((shown_ns - self.offset_ns) / (1.0 + self.drift_ppm * 1e-6))
+        while self.shown(guess) < shown_ns:
+            guess += 1
+        while self.shown(guess - 1) >= shown_ns:
+            guess -= 1
+        return guess
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What happens to messages on their way.
+
+    Parameters
+    ----------
+    delay_ns : int, or function of Random to int
+        Added to what other conditions add.
+    loss, duplication, reordering : float
+        Probabilities: that a message is lost, that it arrives twice, that it is held back by
+        `reorder_ns` and others may overtake it.
+    reorder_ns : int
+    stalled : bool
+        Whether messages wait until this is lifted; the oldest beyond `waiting` are dropped.
+    waiting : int
+    """
+
+    delay_ns: int | Callable[[Random], int] = 0
+    loss: float = 0.0
+    duplication: float = 0.0
+    reordering: float = 0.0
+    reorder_ns: int = 1_000_000
+    stalled: bool = False
+    waiting: int = STALLED_MESSAGES
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """One message that arrived, as `Network.log` keeps it."""
+
+    at_ns: int
+    source: str
+    target: str
+    lane: Lane
+    key: str
+
+
+@dataclass(eq=False, slots=True)
+class _Rule:
+    source: str
+    target: str
+    applies: Callable[[str], bool]
+    conditions: Conditions
+
+    def holds(self, source: MemoryTransport, target: MemoryTransport, key: str) -> bool:
+        return (
+            self.source in ("*", source.who, source.node)
+            and self.target in ("*", target.who, target.node)
+            and self.applies(key)
+        )
+
+
+@dataclass(eq=False, slots=True)
+class _Message:
+    source: MemoryTransport
+    target: MemoryTransport
+    lane: Lane
+    sample: Sample
+
+
+@dataclass(eq=False, slots=True)
+class _Path:
+    """What is remembered of one sender, receiver and lane."""
+
+    random: Random
+    last_ns: int = 0
+    held: deque[_Message] = field(default_factory=deque)
+
+
+class MemoryTransport:
+    """One process's end of a `Network`; see `Transport`."""
+
+    def __init__(self, network: Network, who: str, node: str, clock: Clock) -> None:
+        self.who = who
+        self.node = node
+        self.clock = clock
+        self.closed = False
+        self.frozen = False
+        self._network = network
+        self.subscriptions: list[tuple[Callable[[str], bool], Receive]] = []
+        #: Messages, and then wakes, that are put off until it thaws.
+        self.inbox: deque[_Message] = deque(maxlen=STALLED_MESSAGES)
+        self.wakes: list[Callable[[], None]] = []
+
+    @property
+    def now_ns(self) -> int:
+        """What the clock of its node shows."""
+        return self.clock.shown(self._network.now_ns)
+
+    def put(self, key: str, payload: bytes, header: bytes = b"", *, lane: Lane = "control") -> None:
+        """Send a message; returns at once, whatever the receivers do."""
+        require_key(key)
+        if not self.closed:
+            self._network.send(self, Sample(key, bytes(payload), bytes(header)), lane)
+
+    def subscribe(self, key: str, receive: Receive) -> None:
+        """Have `receive` called with every message under a key expression (``*``, ``**``)."""
+        matches = matcher(key)
+        if not self.closed:
+            self.subscriptions.append((matches, receive))
+
+    def close(self) -> None:
+        """Send and deliver nothing more; safe to call twice."""
+        if not self.closed:
+            self.closed = True
+            self.subscriptions.clear()
+            self.inbox.clear()
+            self.wakes.clear()
+            self._network.forget(self)
+
+
+class Network:
+    """Carries messages between `MemoryTransport`s.
+
+    Parameters
+    ----------
+    seed : int
+        Every pair of processes draws from a stream of its own, so that one more participant
+        changes nothing for the others.
+    start_ns : int
+        Where the clock begins.
+    delay_ns : int
+        What every message takes at least.
+    reach : function, optional
+        Who may hear whom; everybody hears everybody where None.
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int = 0,
+        start_ns: int = 0,
+        delay_ns: int = 0,
+        reach: Reach | None = None,
+    ) -> None:
+        self.now_ns = start_ns
+        self.seed = seed
+        self.delay_ns = delay_ns
+        self.reach = reach
+        #: What was delivered, in order; empty it when it grows too long.
+        self.log: list[Delivery] = []
+        self.lost = 0
+        self._transports: dict[str, MemoryTransport] = {}
+        self._rules: list[_Rule] = []
+        self._paths: dict[tuple[str, str, Lane], _Path] = {}
+        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
+        self._turn = count()
+
+    # ------------------------------------------------------------------ who is there
+
+    def transport(
+        self, who: str, node: str | None = None, *, clock: Clock | None = None
+    ) -> MemoryTransport:
+        """Return the end of a process; one of the name that was closed may come back.
+
+        Parameters
+        ----------
+        who : str
+        node : str, optional
+            What follows the ``@`` in its name where None, without what follows a dot there.
+        clock : Clock, optional
+            Of the node; the network's where None.
+
+        Raises
+        ------
+        LiveError
+            If somebody of that name is there.
+        """
+        if who in self._transports:
+            raise LiveError(f"{who} is in the network already; close it first")
+        if node is None:
+            node = who.partition("@")[2].partition(".")[0] or who
+        end = MemoryTransport(self, who, node, clock or Clock())
+        self._transports[who] = end
+        return end
+
+    def attach(self, end: MemoryTransport, participant: Participant) -> None:
+        """Drive a participant: hand it what it subscribes to, and wake it when it wants.
+
+        It is woken once at the present instant, and after every message, as a real host does.
+        """
+        drive = _Drive(self, end, participant)
+        for key in participant.subscriptions():
+            end.subscribe(key, drive.receive)
+        self.call_at(self.now_ns, lambda: drive.wake(None))
+
+    def call_at(self, at_ns: int, call: Callable[[], None]) -> None:
+        """Have something done at an instant, or at once if that has passed."""
+        heapq.heappush(self._agenda, (max(at_ns, self.now_ns), next(self._turn), call))
+
+    # ------------------------------------------------------------- what goes wrong
+
+    def impair(
+        self,
+        conditions: Conditions,
+        source: str = "*",
+        target: str = "*",
+        *,
+        key: str = "**",
+    ) -> object:
+        """Put conditions on messages from one process or node to another; several add up.
+
+        Parameters
+        ----------
+        conditions : Conditions
+        source, target : str
+            Name of a process or of a node, or ``*``; the other direction is not touched.
+        key : str
+            Expression that only some messages are under.
+
+        Returns
+        -------
+        object
+            What `heal` takes.
+        """
+        rule = _Rule(source, target, matcher(key), conditions)
+        self._rules.append(rule)
+        return rule
+
+    def cut(self, source: str = "*", target: str = "*", *, key: str = "**") -> object:
+        """Lose everything from one process or node to another until that is healed."""
+        return self.impair(Conditions(loss=1.0), source, target, key=key)
+
+    def stall(
+        self,
+        source: str = "*",
+        target: str = "*",
+        *,
+        key: str = "**",
+        waiting: int = STALLED_MESSAGES,
+    ) -> object:
+        """Hold everything back until that is healed, as a link that hangs does."""
+        return self.impair(Conditions(stalled=True, waiting=waiting), source, target, key=key)
+
+    def heal(self, rule: object) -> None:
+        """Lift what `impair`, `cut` or `stall` put on; what waited for it goes on its way."""
+        self._rules = [other for other in self._rules if other is not rule]
+        for path in self._paths.values():
+            held, path.held = path.held, deque()
+            for message in held:
+                self._forward(path, message)
+
+    def freeze(self, who: str, *, waiting: int = STALLED_MESSAGES) -> None:
+        """Stop a process as SIGSTOP does: it is not called, and its newest messages wait."""
+        end = self._transports[who]
+        end.frozen = True
+        end.inbox = deque(end.inbox, maxlen=waiting)
+
+    def thaw(self, who: str) -> None:
+        """Let a frozen process go on: all that waited happens now, in order."""
+        end = self._transports[who]
+        end.frozen = False
+        while end.inbox and not end.frozen:
+            self._arrive(end.inbox.popleft())
+        wakes, end.wakes = end.wakes, []
+        for wake in wakes:
+            wake()
+
+    def kill(self, who: str) -> None:
+        """End a process; what is on the way to it is lost, what it sent is not."""
+        self._transports[who].close()
+
+    # ----------------------------------------------------------------------- time
+
+    def advance(self, until_ns: int) -> None:
+        """Let everything happen that is due by an instant, which then is the present one."""
+        while self._agenda and self._agenda[0][0] <= until_ns:
+            self.step()
+        self.now_ns = max(self.now_ns, until_ns)
+
+    def step(self) -> bool:
+        """Let the next thing happen; return whether there was one."""
+        if not self._agenda:
+            return False
+        at_ns, _, call = heapq.heappop(self._agenda)
+        self.now_ns = max(self.now_ns, at_ns)
+        call()
+        return True
+
+    @property
+    def next_ns(self) -> float:
+        """Instant of the next thing to happen; infinite if nothing will."""
+        return self._agenda[0][0] if self._agenda else inf
+
+    # ----------------------------------------------------------- for the transports
+
+    def send(self, source: MemoryTransport, sample: Sample, lane: Lane) -> None:
+        """Send a message to everybody who subscribed to it, the sender left out."""
+        for target in list(self._transports.values()):
+            if target is source or not any(hit(sample.key) for hit, _ in target.subscriptions):
+                continue
+            if self.reach and not self.reach(source.who, target.who, lane, sample.key):
+                continue
+            path = self._path(source.who, target.who, lane)
+            self._forward(path, _Message(source, target, lane, sample))
+
+    def forget(self, end: MemoryTransport) -> None:
+        """Take a closed transport out."""
+        del self._transports[end.who]
+        for path in self._paths.values():
+            path.held = deque(message for message in path.held if message.target is not end)
+
+    def _path(self, source: str, target: str, lane: Lane) -> _Path:
+        key = (source, target, lane)
+        if key not in self._paths:
+            seed = f"{self.seed}/{source}/{target}/{lane}"
+            self._paths[key] = _Path(Random(seed))  # noqa: S311 - repeatable, not secret
+        return self._paths[key]
+
+    def _forward(self, path: _Path, message: _Message) -> None:
+        """Apply every condition to a message and put what is left of it on the agenda."""
+        random, copies, delay_ns, overtaken_ns = path.random, 1, self.delay_ns, 0
+        for rule in self._rules:
+            if not rule.holds(message.source, message.target, message.sample.key):
+                continue
+            conditions = rule.conditions
+            if conditions.stalled:
+                self._hold(path, message, conditions.waiting)
+                return
+            # Every draw is made whatever came before, so that one more loss shifts no later draw.
+            lost, twice, later = random.random(), random.random(), random.random()
+            extra = conditions.delay_ns
+            delay_ns += extra if isinstance(extra, int) else extra(random)
+            if lost < conditions.loss:
+                copies = 0
+            elif twice < conditions.duplication:
+                copies *= 2
+            if later < conditions.reordering:
+                overtaken_ns += conditions.reorder_ns
+        if copies == 0:
+            self.lost += 1
+            return
+        at_ns = max(self.now_ns + delay_ns, path.last_ns)
+        if overtaken_ns:
+            at_ns += overtaken_ns
+        else:
+            path.last_ns = at_ns
+        for _ in range(copies):
+            self.call_at(at_ns, lambda: self._arrive(message))
+
+    def _hold(self, path: _Path, message: _Message, waiting: int) -> None:
+        path.held.append(message)
+        while len(path.held) > waiting:
+            path.held.popleft()
+            self.lost += 1
+
+    def _arrive(self, message: _Message) -> None:
+        target = message.target
+        if target.closed:
+            self.lost += 1
+        elif target.frozen:
+            self.lost += len(target.inbox) == target.inbox.maxlen
+            target.inbox.append(message)
+        else:
+            sample = message.sample
+            self.log.append(
+                Delivery(self.now_ns, message.source.who, target.who, message.lane, sample.key)
+            )
+            for hit, receive in list(target.subscriptions):
+                if hit(sample.key) and not target.closed:
+                    receive(sample)
+
+
+class _Drive:
+    """Calls a participant at the instants it asks for, on the clock of its node."""
+
+    def __init__(self, network: Network, end: MemoryTransport, participant: Participant) -> None:
+        self.network = network
+        self.end = end
+        self.participant = participant
+        #: Instant of the network for which the last wake was arranged; older ones are void.
+        self.due_ns: int | None = None
+
+    def receive(self, sample: Sample) -> None:
+        """Hand over a message, and see what that makes due."""
+        self.participant.receive(sample, self.end.now_ns)
+        self._arrange()
+
+    def wake(self, due_ns: int | None) -> None:
+        """Wake the participant unless it has asked for another instant since."""
+        if self.end.closed or (due_ns is not None and due_ns != self.due_ns):
+            return
+        if self.end.frozen:
+            self.end.wakes.append(lambda: self.wake(due_ns))
+            return
+        self._arrange()
+
+    def _arrange(self) -> None:
+        if self.end.closed:
+            return
+        wanted = self.participant.wake(self.end.now_ns)
+        if wanted is None:
+            self.due_ns = None
+            return
+        # A wake at the present instant would be followed by itself for ever.
+        due_ns = max(self.end.clock.instant(wanted), self.network.now_ns + 1)
+        if due_ns != self.due_ns:
+            self.due_ns = due_ns
+            self.network.call_at(due_ns, lambda: self.wake(due_ns))

@@ -1,0 +1,319 @@
+"""Messages over Eclipse Zenoh: up to three sessions a process, explicit endpoints, nothing blocks.
+
+Small messages and payloads have sessions of their own, because one TCP connection that is full of
+images delays everything behind them whatever its priority. Payloads that stay on their node have
+a third one, in which large ones go through shared memory.
+
+Zenoh has no "latest only": where a receiver does not keep up, a put is dropped once the queue to
+that receiver is full, and no other receiver notices.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from dwell.errors import LiveError
+from dwell.live.transport.expressions import require_expression, require_key
+from dwell.live.transport.protocol import Lane, Receive, Sample
+from dwell.live.wiring import Entry, Session, session_of
+from dwell.model import FrozenDict
+
+if TYPE_CHECKING:
+    import zenoh
+
+__all__ = ["ZenohSettings", "ZenohTransport"]
+
+_LOG = logging.getLogger(__name__)
+_SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
+#: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
+_PUBLISHERS = 256
+_PRIORITIES = (
+    "control",
+    "real_time",
+    "interactive_high",
+    "interactive_low",
+    "data_high",
+    "data",
+    "data_low",
+    "background",
+)
+
+
+#: What sends, and whether large payloads of it go through shared memory.
+_Way: TypeAlias = tuple[Callable[..., None], bool]
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohSettings:
+    """How sessions behave; the defaults are what was measured to work.
+
+    Parameters
+    ----------
+    lease_ms : int
+        Silence after which a peer counts as gone and its connection is given up.
+    keep_alives : int
+        Signs of life sent in that time.
+    retry_ms : (int, int)
+        Shortest and longest pause between attempts to connect.
+    queue_batches : int
+        Messages, or fragments of 48 kB, that wait for one peer at most, 1 to 16.
+    drop_after_us, drop_fragments_after_us : int
+        How long a put waits, once, for room in a full queue before it drops the message: one that
+        fits into a batch, and one that needs several.
+    shared_bytes : int
+        Payloads from here on go through shared memory where they stay on the node.
+    pool_bytes : int
+        Shared memory for payloads under way from one process.
+    more : mapping of str to object
+        Further settings of Zenoh by path, as ``transport/link/tls/root_ca_certificate``.
+    """
+
+    lease_ms: int = 400
+    keep_alives: int = 4
+    retry_ms: tuple[int, int] = (50, 200)
+    queue_batches: int = 16
+    drop_after_us: int = 100
+    drop_fragments_after_us: int = 1_000
+    shared_bytes: int = 100_000
+    pool_bytes: int = 16 << 20
+    more: Mapping[str, object] = field(default_factory=FrozenDict)
+
+
+class ZenohTransport:
+    """One process's sessions; see `Transport`.
+
+    It returns at once, whoever else is there yet, and connects in the background for as long as it
+    is open. Callbacks run in Zenoh's own threads.
+
+    Parameters
+    ----------
+    entry : Entry
+        Where it listens and to whom it connects, from `Wiring.entry`.
+    settings : ZenohSettings
+
+    Raises
+    ------
+    LiveError
+        If Zenoh is not installed, or a port is taken.
+    """
+
+    def __init__(self, entry: Entry, settings: ZenohSettings | None = None) -> None:
+        try:
+            import zenoh
+        except ImportError:
+            raise LiveError("Zenoh is not installed; pip install 'dwell[live]'") from None
+        self.entry = entry
+        self.settings = settings or ZenohSettings()
+        self._zenoh = zenoh
+        self._closed = False
+        # Read and filled without a lock: a publisher too many does no harm.
+        self._publishers: dict[tuple[str, Lane], _Way] = {}
+        self._locks: dict[Lane, threading.RLock] = {
+            "control": threading.RLock(),
+            "images": threading.RLock(),
+        }
+        self._pool: _Pool | None = None
+        self._sessions: dict[Session, zenoh.Session] = {}
+        try:
+            for name in entry.sessions:
+                self._sessions[name] = self._open(name)
+        except BaseException:
+            self.close()
+            raise
+        if "local" in self._sessions:
+            self._pool = _Pool.of(self.settings)
+
+    def put(self, key: str, payload: bytes, header: bytes = b"", *, lane: Lane = "control") -> None:
+        """Send a message; returns at once, whatever the receivers do."""
+        way = self._publishers.get((key, lane)) or self._way(key, lane)
+        if way is None or self._closed:
+            return
+        send, shared = way
+        content: Any = payload
+        if shared and len(payload) >= self.settings.shared_bytes and self._pool:
+            content = self._pool.filled(payload)
+        try:
+            send(content, attachment=header or None)
+        except self._zenoh.ZError:
+            if not self._closed:
+                raise
+
+    def subscribe(self, key: str, receive: Receive) -> None:
+        """Have `receive` called with every message under a key expression (``*``, ``**``)."""
+        require_expression(key)
+        for name, session in list(self._sessions.items()):
+            deliver = self._deliver(receive, "control" if name == "control" else "images")
+            # Called in the thread that read the message: one hand-over less, and a receiver that
+            # is behind makes its senders drop instead of growing a queue here.
+            session.declare_subscriber(
+                key,
+                self._zenoh.handlers.Callback(deliver, indirect=False),
+                allowed_origin=self._zenoh.Locality.REMOTE,
+            )
+
+    def close(self) -> None:
+        """Send and deliver nothing more; safe to call twice."""
+        # With both locks no callback is running, unless it is this thread's own.
+        with self._locks["control"], self._locks["images"]:
+            self._closed = True
+            sessions, self._sessions = self._sessions, {}
+            self._publishers = {}
+            self._pool = None
+        for session in sessions.values():
+            session.close()
+
+    @property
+    def peers(self) -> Mapping[Session, int]:
+        """How many processes each session is connected to at the moment."""
+        return {name: len(session.info.peers_zid()) for name, session in self._sessions.items()}
+
+    def _open(self, name: Session) -> zenoh.Session:
+        """Open one session.
+
+        Raises
+        ------
+        LiveError
+            With what Zenoh says, and where it should have listened.
+        """
+        config = self._zenoh.Config()
+        for path, value in _configuration(self.entry, name, self.settings).items():
+            config.insert_json5(path, json.dumps(value))
+        try:
+            return self._zenoh.open(config)
+        except self._zenoh.ZError as error:
+            where = self.entry.listen.get(name)
+            raise LiveError(
+                f"{self.entry.role.who} cannot open its session {name!r}"
+                f"{f' on {where}' if where else ''}: {error}; is the port taken, by an older "
+                "process or another cell?"
+            ) from None
+
+    def _way(self, key: str, lane: Lane) -> _Way | None:
+        """Declare a publisher in the session that a key and a lane belong to."""
+        require_key(key)
+        name = session_of(self.entry, lane, key)
+        session = self._sessions.get(name)
+        priority = self._zenoh.Priority.REAL_TIME
+        if lane == "images":
+            alone = name != "control"
+            priority = self._zenoh.Priority.DATA if alone else self._zenoh.Priority.DATA_LOW
+        if session is None:
+            return None
+        try:
+            publisher = session.declare_publisher(
+                key,
+                congestion_control=self._zenoh.CongestionControl.DROP,
+                priority=priority,
+                express=True,
+                allowed_destination=self._zenoh.Locality.REMOTE,
+            )
+        except self._zenoh.ZError:
+            if self._closed:
+                return None
+            raise
+        way = publisher.put, name == "local"
+        while len(self._publishers) >= _PUBLISHERS:
+            self._publishers.pop(next(iter(self._publishers)), None)
+        self._publishers[key, lane] = way
+        return way
+
+    def _deliver(self, receive: Receive, lane: Lane) -> Callable[[zenoh.Sample], None]:
+        lock = self._locks[lane]
+
+        def deliver(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment
+            message = Sample(
+                str(sample.key_expr),
+                sample.payload.to_bytes(),
+                b"" if attachment is None else attachment.to_bytes(),
+            )
+            with lock:
+                if self._closed:
+                    return
+                try:
+                    receive(message)
+                except Exception:
+                    _LOG.exception("%s: a receiver of %s failed", self.entry.role.who, message.key)
+
+        return deliver
+
+
+class _Pool:
+    """Shared memory that payloads are copied into for as long as a receiver needs them."""
+
+    def __init__(self, pool_bytes: int) -> None:
+        from zenoh import ZError, shm
+
+        self._error = ZError
+        self._provider = shm.ShmProvider.default_backend(pool_bytes)
+        # What receivers have let go of is collected only where there is no room.
+        self._policy = shm.Defragment(shm.GarbageCollect())
+
+    @classmethod
+    def of(cls, settings: ZenohSettings) -> _Pool | None:
+        """Return a pool, or None where there is no shared memory for it."""
+        try:
+            room = os.statvfs(_SHARED_MEMORY)
+        except OSError:
+            return None
+        # The file is sparse: writing to one that does not fit would kill the process.
+        if room.f_bavail * room.f_frsize < 2 * settings.pool_bytes:
+            _LOG.warning(
+                "%s has less than %d bytes free: images are copied through sockets",
+                _SHARED_MEMORY,
+                2 * settings.pool_bytes,
+            )
+            return None
+        return cls(settings.pool_bytes)
+
+    def filled(self, payload: bytes) -> Any:
+        """Return the payload in shared memory, or as it is where there is no room."""
+        try:
+            buffer = self._provider.alloc(len(payload), self._policy)
+        except self._error:
+            return payload
+        buffer[:] = payload
+        return buffer
+
+
+def _configuration(entry: Entry, name: Session, settings: ZenohSettings) -> dict[str, object]:
+    """Zenoh's settings for one session, by path."""
+    listen = entry.listen.get(name)
+    first_ms, last_ms = settings.retry_ms
+    retry = {"period_init_ms": first_ms, "period_max_ms": last_ms, "period_increase_factor": 2}
+    queue = "transport/link/tx/queue"
+    return {
+        "mode": "peer",
+        # Nobody is looked for: who is there stands in the cell file.
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "open/return_conditions/connect_scouted": False,
+        "open/return_conditions/declares": False,
+        "listen/endpoints": [] if listen is None else [str(listen)],
+        # A predecessor that has just been killed may hold the port for a moment.
+        "listen/timeout_ms": 1_000,
+        "listen/retry": {"period_init_ms": 20, "period_max_ms": 100, "period_increase_factor": 2},
+        "connect/endpoints": [str(end) for end in entry.connect.get(name, ())],
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": retry,
+        "transport/link/tx/lease": settings.lease_ms,
+        "transport/link/tx/keep_alive": settings.keep_alives,
+        # One message is one batch: nothing waits for company, and 100 kB cost 25 us, not 130.
+        f"{queue}/batching/enabled": False,
+        f"{queue}/size": dict.fromkeys(_PRIORITIES, settings.queue_batches),
+        f"{queue}/congestion_control/drop/wait_before_drop": settings.drop_after_us,
+        f"{queue}/congestion_control/drop/max_wait_before_drop_fragments": (
+            settings.drop_fragments_after_us
+        ),
+        "transport/shared_memory/enabled": name == "local",
+        # Payloads are put there by `_Pool`, with a plain copy where it is full.
+        "transport/shared_memory/transport_optimization/enabled": False,
+        **settings.more,
+    }

@@ -1,0 +1,423 @@
+"""Worker: joins a task's inputs, runs its stage, and sends the output where the stamp says."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from dwell.errors import LiveError
+from dwell.live.keys import MAIN, SHADOW
+from dwell.live.messages import (
+    Completion,
+    Header,
+    Hop,
+    Restored,
+    Snapshot,
+    State,
+    decode,
+    encode,
+)
+from dwell.live.payloads import read_payload, write_payload
+from dwell.live.role import Place, Pulse
+from dwell.live.routing import STAMPER, Routes
+from dwell.live.stage import Message, Stage, Stateful
+from dwell.live.transport.protocol import Lane, Sample
+
+__all__ = ["IMAGE_BYTES", "Job", "Worker"]
+
+#: Flows that declare at least so many bytes travel in the lane of images.
+IMAGE_BYTES = 16_384
+#: Cycles that may wait for the rest of their inputs.
+MAX_JOINS = 64
+UNKNOWN = -1
+
+
+@dataclass(slots=True)
+class Job:
+    """A complete set of inputs of one cycle.
+
+    Parameters
+    ----------
+    header : Header
+        Of any of the inputs; its stamp is the cycle's.
+    inputs : dict of str to (Header, bytes, int)
+        By source task: header, payload, and when it was handed over.
+    shadow : bool
+    """
+
+    header: Header
+    inputs: dict[str, tuple[Header, bytes, int]]
+    shadow: bool
+
+    @property
+    def arrived_ns(self) -> int:
+        """When the last input was there."""
+        return max(at_ns for _, _, at_ns in self.inputs.values())
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """Run and cycle: what later jobs have more of."""
+        return self.header.stamp.run, self.header.stamp.cycle
+
+    def hops(self) -> tuple[Hop, ...]:
+        """All jobs behind it, each once."""
+        found: dict[tuple[str, str], Hop] = {}
+        for header, _, _ in self.inputs.values():
+            for hop in header.hops:
+                found[hop.task, hop.node] = hop
+        return tuple(found.values())
+
+
+@dataclass(slots=True)
+class _Joins:
+    """Inputs of cycles that wait for the rest; a later complete cycle evicts the earlier ones."""
+
+    sources: frozenset[str]
+    waiting: dict[tuple[int, int], dict[str, tuple[Header, bytes, int]]] = field(
+        default_factory=dict
+    )
+    newest: tuple[int, int] = (-1, -1)
+
+    def add(
+        self, header: Header, payload: bytes, at_ns: int
+    ) -> dict[str, tuple[Header, bytes, int]] | None:
+        """Take an input; returns the complete set that it completes."""
+        cycle = header.stamp.run, header.stamp.cycle
+        if cycle <= self.newest or header.source not in self.sources:
+            return None
+        inputs = self.waiting.setdefault(cycle, {})
+        inputs.setdefault(header.source, (header, payload, at_ns))
+        if len(inputs) < len(self.sources):
+            if len(self.waiting) > MAX_JOINS:
+                del self.waiting[min(self.waiting)]
+            return None
+        self.newest = cycle
+        self.waiting = {other: kept for other, kept in self.waiting.items() if other > cycle}
+        return inputs
+
+
+class Worker:
+    """A task on a node, for cycles or for their shadows.
+
+    A standby hears what the worker that it stands by hears, and takes over when that one's beats
+    stay out; everybody behind it drops what comes twice.
+
+    Parameters
+    ----------
+    place : Place
+    task : str
+    stage : Stage
+    shadow : bool
+        Whether it runs shadows.
+    stands_by : str
+        Process that it stands by for; empty for none.
+    """
+
+    def __init__(
+        self, place: Place, task: str, stage: Stage, *, shadow: bool = False, stands_by: str = ""
+    ) -> None:
+        self.place, self.task, self.stage = place, task, stage
+        self.shadow, self.stands_by = shadow, stands_by
+        problem = place.problem
+        self.routes = Routes(problem)
+        flows = problem.pipeline.inputs(task)
+        sources = frozenset(flow.source for flow in flows) or frozenset([STAMPER])
+        #: Whether its stage's frames begin the cycles.
+        self.triggers = STAMPER in sources and problem.live.release == "frames" and not shadow
+        self.is_sink = not problem.pipeline.outputs(task)
+        self._depth = problem.pipeline.tasks[task].depth
+        self._joins = {MAIN: _Joins(sources), SHADOW: _Joins(sources)}
+        self._lanes: dict[str, Lane] = {
+            flow.target: "images" if flow.payload_bytes >= IMAGE_BYTES else "control"
+            for flow in problem.pipeline.outputs(task)
+        }
+        self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
+        self._jobs: deque[Job] = deque()
+        self._stateful = isinstance(stage, Stateful) and not shadow
+        self._asked: Snapshot | None = None
+        self._checkpoint: tuple[State, bytes] | None = None
+        self._restoring: tuple[State, bytes] | None = None
+        self._forked: list[Job] = []
+        self._replayed: State | None = None
+        self.state_at: tuple[int, int] = (-1, -1)
+        self.started = False
+        self.trouble = ""
+        self.busy_since_ns: int | None = None
+        self.replaced = 0
+        self.failures = 0
+        self._now_ns = 0
+        self.pulse = Pulse(place, self._state, loud=True)
+
+    # ------------------------------------------------------------------------ hearing
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        keys, node = self.place.keys, self.place.node
+        yield from self.pulse.subscriptions()
+        if self.shadow:
+            yield keys.inputs(self.task, node, SHADOW)
+            return
+        yield keys.inputs(self.task, node, MAIN)
+        if self.is_sink:
+            yield keys.inputs(self.task, node, SHADOW)
+        if self._stateful:
+            yield keys.snapshot(self.task, node)
+            yield keys.state(self.task, node)
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        """Take a message in."""
+        if self.pulse.hears(sample):
+            self.pulse.receive(sample, now_ns)
+            return
+        kind = sample.key.rpartition("/")[2]
+        if kind in (MAIN, SHADOW) and "/in/" in sample.key:
+            self._input(sample, kind, now_ns)
+        elif "/snapshot/" in sample.key or "/state/" in sample.key:
+            try:
+                self._about_state(sample)
+            except LiveError as error:
+                self.place.complain(error)
+
+    def _input(self, sample: Sample, kind: str, now_ns: int) -> None:
+        header = self.place.header(sample)
+        if header is None:
+            return
+        complete = self._joins[kind].add(header, sample.payload, now_ns)
+        if complete is None:
+            return
+        job = Job(header, complete, kind == SHADOW)
+        if self.is_sink and job.shadow:
+            self._stop_shadow(job)
+        elif self._replaying(job):
+            self._forked.append(job)
+            del self._forked[:-MAX_JOINS]
+        else:
+            self._jobs.append(job)
+            if (self._depth and len(self._jobs) > self._depth) or len(self._jobs) > 10 * MAX_JOINS:
+                self._jobs.popleft()
+                self.replaced += 1
+
+    def _stop_shadow(self, job: Job) -> None:
+        """A shadow ends where the sink begins; what it showed is reported."""
+        place = self.place
+        inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
+        arrived = Hop(self.task, place.node, job.arrived_ns, UNKNOWN, UNKNOWN, inputs)
+        stopped = Completion(
+            job.header.stamp,
+            self.task,
+            job.arrived_ns,
+            "shadow",
+            (*job.hops(), arrived),
+            place.node,
+        )
+        place.put_twice(place.keys.probed(), encode(stopped))
+
+    # -------------------------------------------------------------------------- state
+
+    def _replaying(self, job: Job) -> bool:
+        """Whether a job is here only because the state is on its way."""
+        stamp = job.header.stamp
+        mine = self.routes.runs(self.task, self.place.node, stamp)
+        return self._stateful and not mine and not job.shadow and self._replayed is None
+
+    def _about_state(self, sample: Sample) -> None:
+        if "/snapshot/" in sample.key:
+            self._asked = decode(sample.payload, Snapshot)
+            return
+        state = decode(sample.header, State)
+        if state.task != self.task:
+            raise LiveError(f"a state of {state.task} came to {self.task}")
+        if state.number:
+            self._restoring = state, sample.payload
+        elif self._checkpoint is None or (state.run, state.cycle) > (
+            self._checkpoint[0].run,
+            self._checkpoint[0].cycle,
+        ):
+            self._checkpoint = state, sample.payload
+
+    def next_chore(self) -> Snapshot | tuple[State, bytes] | None:
+        """Return what to do with the state before the next job; `do_chore` has to follow."""
+        if self.busy_since_ns is not None or not self.started:
+            return None
+        chore: Snapshot | tuple[State, bytes] | None = self._asked or self._restoring
+        if chore is self._asked:
+            self._asked = None
+        else:
+            self._restoring = None
+        return chore
+
+    def do_chore(self, chore: Snapshot | tuple[State, bytes]) -> None:
+        """Hand the state out, or take one over; calls the stage."""
+        if isinstance(chore, Snapshot):
+            self._send_state(chore.to, chore.number)
+            return
+        state, data = chore
+        failed = self._take_over(state, data)
+        if not failed:
+            self._replayed = state
+        restored = Restored(
+            state.number, self.task, self.place.node, state.run, state.cycle, failed
+        )
+        self.place.transport.put(self.place.keys.restored(), encode(restored))
+
+    def _send_state(self, to: str, number: int) -> None:
+        place, stage = self.place, self.stage
+        if not isinstance(stage, Stateful):
+            return
+        run, cycle = (max(part, 0) for part in self.state_at)
+        try:
+            data = bytes(stage.snapshot())
+        except Exception as error:  # the user's code
+            self._failed(f"snapshot() failed ({type(error).__name__}: {error})")
+            return
+        header = encode(State(run, cycle, self.task, place.node, number))
+        place.transport.put(place.keys.state(self.task, to), data, header, lane="images")
+
+    def _take_over(self, state: State, data: bytes) -> str:
+        """Restore a state; returns what went wrong, or nothing."""
+        if not isinstance(self.stage, Stateful):
+            return f"{self.task} has no restore()"
+        try:
+            self.stage.restore(data)
+        except Exception as error:  # the user's code
+            self._failed(f"restore() failed ({type(error).__name__}: {error})")
+            return self.trouble
+        self.state_at = state.run, state.cycle
+        return ""
+
+    def _recover(self, job: Job) -> int:
+        """After a failover: the last checkpoint, if it is newer than this state; its age."""
+        if self._checkpoint is None:
+            return UNKNOWN
+        (state, data), self._checkpoint = self._checkpoint, None
+        if (state.run, state.cycle) <= self.state_at or (state.run, state.cycle) >= job.order:
+            return UNKNOWN
+        if self._take_over(state, data):
+            return UNKNOWN
+        return job.header.stamp.cycle - state.cycle if state.run == job.header.stamp.run else 0
+
+    def _checkpoint_due(self, job: Job) -> None:
+        """Copy the state to the fallbacks' nodes every so many cycles."""
+        every = self.place.problem.live.checkpoint_cycles
+        if not (self._stateful and every) or job.header.stamp.cycle % every:
+            return
+        problem = self.place.problem
+        nodes = {problem.candidates[name][self.task] for name in problem.controller.fallbacks}
+        for node in sorted(nodes - {self.place.node}):
+            self._send_state(node, 0)
+
+    # --------------------------------------------------------------------------- jobs
+
+    @property
+    def active(self) -> bool:
+        """Whether it works: it stands by for nobody, or for somebody who is silent."""
+        if not self.stands_by:
+            return True
+        hearing = self.pulse.hearing
+        beat = hearing.last(self.stands_by)
+        patience_ns = 2 * self.place.period_ns
+        return not (
+            beat and beat.ready and hearing.fresh(self.stands_by, self._now_ns, patience_ns)
+        )
+
+    def next_job(self, now_ns: int) -> Job | None:
+        """Return the job to run now, if there is one; `run` has to follow."""
+        self._now_ns = now_ns
+        if self.busy_since_ns is not None or not self.started:
+            return None
+        if self._replayed is not None:
+            # Inputs that came while the state was on its way, but for those that are in it.
+            self._jobs.extend(job for job in self._forked if job.order > self.state_at)
+            self._forked.clear()
+        if not self.active:
+            horizon_ns = now_ns - 2 * self.place.period_ns
+            while self._jobs and self._jobs[0].arrived_ns < horizon_ns:
+                self._jobs.popleft()
+            return None
+        if not self._jobs:
+            return None
+        self.busy_since_ns = now_ns
+        return self._jobs.popleft()
+
+    def retry(self, shadow: bool, inputs: list[tuple[Header, bytes]], now_ns: int) -> None:
+        """Put a job that another process has not finished before all others."""
+        if inputs:
+            by_source = {header.source: (header, data, now_ns) for header, data in inputs}
+            self._jobs.appendleft(Job(inputs[0][0], by_source, shadow))
+
+    def run(self, job: Job, started_ns: int) -> tuple[Message | None, int]:
+        """Call the stage; returns its output, None if it failed, and the state's age."""
+        stamp = job.header.stamp
+        state_age = self._recover(job) if self._stateful else UNKNOWN
+        try:
+            inputs = {
+                source: Message(
+                    read_payload(header.kind, payload, self._expected.get(source)),
+                    stamp.cycle,
+                    stamp.released_ns,
+                    (started_ns - stamp.released_ns) / 1e6,
+                )
+                for source, (header, payload, _) in job.inputs.items()
+            }
+        except LiveError as error:
+            self._failed(f"cycle {stamp.cycle}: {error}")
+            return None, state_age
+        try:
+            output = self.stage.process(inputs)
+        except Exception as error:  # the user's code
+            self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
+            return None, state_age
+        if not isinstance(output, Message):
+            what = type(output).__name__
+            self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")
+            return None, state_age
+        return output, state_age
+
+    def finish(
+        self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1
+    ) -> None:
+        """Send a job's output where its stamp says."""
+        self.busy_since_ns = None
+        self.state_at = max(self.state_at, job.order)
+        if output is None:
+            return
+        place, stamp = self.place, job.header.stamp
+        try:
+            kind, data = write_payload(output.payload)
+        except LiveError as error:
+            self._failed(f"cycle {stamp.cycle}: {error}")
+            return
+        self.trouble = ""
+        inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
+        hop = Hop(*(self.task, place.node, job.arrived_ns, started_ns, ended_ns, inputs, state_age))
+        header = Header(stamp, self.task, place.node, kind, (*job.hops(), hop), job.shadow)
+        head = encode(header)
+        if self.is_sink:
+            place.transport.put(place.keys.command(self.task), data, head)
+        elif job.shadow or self.routes.runs(self.task, place.node, stamp):
+            for target, node, to in self.routes.destinations(self.task, stamp, shadow=job.shadow):
+                key = place.keys.inputs(target, node, to)
+                place.transport.put(key, data, head, lane=self._lanes[target])
+            self._checkpoint_due(job)
+        if self._replayed is not None and self.routes.runs(self.task, place.node, stamp):
+            self._replayed = None
+
+    def _failed(self, what: str) -> None:
+        self.trouble = f"{self.task} on {self.place.node}: {what}"
+        self.failures += 1
+        self.place.complain(LiveError(self.trouble))
+
+    # -------------------------------------------------------------------------- beats
+
+    def _state(self) -> tuple[bool, str]:
+        limit_ns = max(10 * self.place.period_ns, 1_000_000_000)
+        hangs = self.busy_since_ns is not None and self._now_ns - self.busy_since_ns > limit_ns
+        if hangs:
+            return False, f"{self.task} on {self.place.node}: process() does not return"
+        return self.started, self.trouble
+
+    def wake(self, now_ns: int) -> int:
+        """Beat; returns when the next beat is due."""
+        self._now_ns = max(self._now_ns, now_ns)
+        return self.pulse.wake(now_ns)

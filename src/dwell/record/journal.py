@@ -1,0 +1,437 @@
+"""Journal: the rows of a run that is still going on, written so that a kill costs little.
+
+A run's tables are written when it ends. A live run may end at any moment, so that its rows go to
+one file first, ``journal.bin`` in the run's folder, as frames of what belongs together (a window
+with its cycles and its decision): a frame is there as a whole, or not at all. Rows of cycles and
+windows may come again with what has become known since; the last one counts. `open_run` reads a
+folder that has only a journal; sealing it writes the tables, then ``run.json``, and removes it.
+
+A frame is a mark that occurs nowhere else, the length of its text, a checksum of both, and the text
+(JSON, ASCII). What was torn by a kill is cut off; what was damaged is skipped, up to the next mark.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import mmap
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from dwell.errors import RunError
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["JOURNAL", "Columns", "Journal", "Recovered", "read_journal"]
+
+JOURNAL = "journal.bin"
+
+#: Type of every column of every table: a name of Polars', or the categories of an Enum.
+Columns: TypeAlias = Mapping[str, Mapping[str, str | Sequence[str]]]
+Rows: TypeAlias = Mapping[str, Sequence[Sequence[Any]]]
+
+#: Tables whose first column numbers the rows; a row that comes again replaces the one before.
+NUMBERED = ("cycles", "windows")
+TYPES = ("Int64", "Float64", "Boolean", "String")
+
+MARK = b"\xd3DJ1"
+HEAD = struct.Struct("<II")
+BEGIN = len(MARK) + HEAD.size
+#: Longer frames are not written, and a length beyond it is damage.
+MAX_FRAME_BYTES = 1 << 28
+#: Rows that are kept as Python objects before they become a table.
+CHUNK_ROWS = 20_000
+
+
+def _frame(content: Mapping[str, object]) -> bytes:
+    text = json.dumps(content, separators=(",", ":"), default=_plain).encode("ascii")
+    if len(text) > MAX_FRAME_BYTES:
+        raise RunError(f"{len(text)} bytes of rows at once; the journal takes {MAX_FRAME_BYTES}")
+    return MARK + HEAD.pack(len(text), _checksum(text)) + text
+
+
+def _plain(value: object) -> object:
+    """Numbers of NumPy as plain ones."""
+    item = getattr(value, "item", None)
+    if item is None:
+        raise TypeError(f"{value!r} cannot be written to a journal")
+    return item()
+
+
+def _checksum(text: bytes) -> int:
+    return zlib.crc32(text, zlib.crc32(len(text).to_bytes(4, "little")))
+
+
+@dataclass(slots=True)
+class _Scan:
+    """Frames of a journal from its beginning, and what between them is damaged."""
+
+    data: bytes | mmap.mmap
+    end: int = 0
+    damaged: list[tuple[int, int]] = field(default_factory=list)
+
+    def frames(self) -> Iterator[dict[str, Any]]:
+        data, position = self.data, 0
+        while position < len(data):
+            text = self._text(position)
+            if text is not None:
+                yield _content(text)
+                self.end = position = position + BEGIN + len(text)
+                continue
+            following = position
+            while (following := data.find(MARK, following + 1)) >= 0:
+                if self._text(following) is not None:
+                    self.damaged.append((position, following))
+                    break
+            if following < 0:
+                return
+            position = following
+
+    def _text(self, position: int) -> bytes | None:
+        data = self.data
+        if data[position : position + len(MARK)] != MARK or len(data) < position + BEGIN:
+            return None
+        length, checksum = HEAD.unpack(data[position + len(MARK) : position + BEGIN])
+        if length > len(data) - position - BEGIN:
+            return None
+        text = bytes(data[position + BEGIN : position + BEGIN + length])
+        return text if _checksum(text) == checksum else None
+
+    @property
+    def torn_bytes(self) -> int:
+        """Bytes after the last whole frame."""
+        return len(self.data) - self.end
+
+
+def _content(text: bytes) -> dict[str, Any]:
+    content = json.loads(text)
+    if not isinstance(content, dict):
+        raise RunError("no journal of a run: a frame is not a mapping")
+    return content
+
+
+class _Table:
+    """Rows of one table as they come, kept as columns."""
+
+    def __init__(self, name: str, columns: Mapping[str, str | Sequence[str]]) -> None:
+        self.name, self.columns = name, columns
+        self.rows: list[Sequence[object]] = []
+        self.chunks: list[pl.DataFrame] = []
+
+    def add(self, rows: Sequence[Sequence[object]]) -> None:
+        self.rows += rows
+        if len(self.rows) >= CHUNK_ROWS:
+            self._pack()
+
+    def _pack(self) -> None:
+        import polars as pl
+
+        schema = {
+            name: getattr(pl, kind) if isinstance(kind, str) else pl.Enum(kind)
+            for name, kind in self.columns.items()
+        }
+        try:
+            self.chunks.append(pl.DataFrame(self.rows, schema=schema, orient="row"))
+        except (pl.exceptions.PolarsError, TypeError, ValueError, OverflowError) as error:
+            why = str(error).partition("\n")[0]
+            raise RunError(f"its {self.name} do not fit their columns ({why})") from None
+        self.rows = []
+
+    def frame(self) -> pl.DataFrame:
+        """Return the table: one row a number, in their order."""
+        import polars as pl
+
+        if self.rows or not self.chunks:
+            self._pack()
+        frame = pl.concat(self.chunks)
+        if self.name in NUMBERED:
+            number = frame.columns[0]
+            frame = frame.unique(number, keep="last", maintain_order=True).sort(number)
+        return frame
+
+
+@dataclass(slots=True)
+class Recovered:
+    """What a journal holds.
+
+    Parameters
+    ----------
+    run : str
+        Id of the run.
+    meta : dict
+        What the writer said of the run, and under ``recovered`` what was lost.
+    columns : mapping
+        Of every table.
+    tables : dict of str to DataFrame
+    following : dict of str to int
+        By numbered table, the number after its last row's.
+    """
+
+    run: str
+    meta: dict[str, Any]
+    columns: Columns
+    tables: dict[str, pl.DataFrame]
+    following: dict[str, int]
+
+
+@dataclass(slots=True)
+class _Contents:
+    """Frames of a journal put together, with or without their rows."""
+
+    run: str | None = None
+    meta: dict[str, Any] = field(default_factory=dict)
+    columns: dict[str, dict[str, str | list[str]]] = field(default_factory=dict)
+    tables: dict[str, _Table] = field(default_factory=dict)
+    following: dict[str, int] = field(default_factory=dict)
+    opened: int = 0
+    keep: bool = True
+
+    def take(self, frame: Mapping[str, Any]) -> None:
+        if "run" in frame:
+            self._take_header(frame)
+        elif self.run is None:
+            raise RunError("its beginning is damaged: rows before any header")
+        self.meta.update(frame.get("meta", {}))
+        for name, rows in frame.get("rows", {}).items():
+            if name not in self.columns:
+                raise RunError(f"it has rows of an unknown table {name!r}")
+            if name in NUMBERED and rows:
+                last = max(int(row[0]) for row in rows)
+                self.following[name] = max(self.following.get(name, 0), last + 1)
+            if self.keep:
+                self.tables[name].add(rows)
+
+    def _take_header(self, frame: Mapping[str, Any]) -> None:
+        if self.run is None:
+            self.run = str(frame["run"])
+            self.columns = frame["columns"]
+            self.tables = {name: _Table(name, kinds) for name, kinds in self.columns.items()}
+        elif self.run != frame["run"] or self.columns != frame["columns"]:
+            raise RunError("its headers contradict one another")
+        self.opened = max(self.opened, int(frame["opened"]))
+
+
+def _read(data: bytes | mmap.mmap, *, keep: bool = True) -> tuple[_Contents, _Scan]:
+    contents, scan = _Contents(keep=keep), _Scan(data)
+    for frame in scan.frames():
+        contents.take(frame)
+    return contents, scan
+
+
+def read_journal(folder: str | os.PathLike[str]) -> Recovered:
+    """Read what a folder's journal holds, also while it is written.
+
+    Raises
+    ------
+    RunError
+        If there is none, or nothing of it can be read.
+    """
+    file = Path(folder) / JOURNAL
+    try:
+        with file.open("rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            if size == 0:
+                raise RunError(f"{file}: empty; the run was killed before it began")
+            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                contents, scan = _read(data)
+                torn_bytes = scan.torn_bytes
+        tables = {name: table.frame() for name, table in contents.tables.items()}
+    except FileNotFoundError:
+        raise RunError(f"{folder}: no journal there") from None
+    except OSError as error:
+        raise RunError(f"{file}: cannot be read ({error.strerror})") from None
+    except RunError as error:
+        raise RunError(f"{file}: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise RunError(f"{file}: no journal of a run ({error!r})") from None
+    if contents.run is None:
+        raise RunError(f"{file}: nothing in it can be read; the run was killed before it began")
+    recovered = {
+        "sealed": False,
+        "opened": contents.opened,
+        "torn_bytes": torn_bytes,
+        "damaged_bytes": sum(end - begin for begin, end in scan.damaged),
+        "damaged_places": len(scan.damaged),
+    }
+    windows = len(tables["windows"]) if "windows" in tables else 0
+    meta = {"windows": windows, **contents.meta, "recovered": recovered}
+    return Recovered(contents.run, meta, contents.columns, tables, contents.following)
+
+
+class Journal:
+    """The journal of a run, open for appending.
+
+    Parameters
+    ----------
+    folder : path-like
+        The run's; made where it is missing. A journal of the same run there is gone on with: its
+        torn end is cut off.
+    run : str
+        Id of the run.
+    meta : mapping
+        JSON-able: what the run is the record of (see `Run`).
+    columns : mapping
+        Type of every column of ``cycles``, ``windows``, ``decisions`` and other tables.
+
+    Attributes
+    ----------
+    cut_bytes : int
+        Length of the torn end that was cut off.
+
+    Raises
+    ------
+    RunError
+        If the folder holds a finished run, the journal of another run or with other columns, one
+        that somebody is writing, or something else; or cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        run: str,
+        meta: Mapping[str, Any],
+        columns: Columns,
+    ) -> None:
+        self.folder = Path(folder)
+        self.run = run
+        self.columns = {
+            table: {
+                name: kind if isinstance(kind, str) else list(kind) for name, kind in of.items()
+            }
+            for table, of in columns.items()
+        }
+        _require_types(self.columns)
+        self.cut_bytes = 0
+        self.file = self.folder / JOURNAL
+        # Anything that cannot be written must not leave half a journal.
+        header = {"run": run, "meta": dict(meta), "columns": self.columns}
+        _frame({**header, "opened": 1})
+        self._require_place()
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise RunError(f"{self.file}: cannot be written ({error.strerror})") from None
+        try:
+            self._lock()
+            contents = self._go_on()
+            self._following = contents.following
+            frame = _frame({**header, "opened": contents.opened + 1})
+            # The header stands twice, so that damage at one place loses no more than that place.
+            self._write(frame + frame if contents.opened == 0 else frame)
+        except BaseException:
+            os.close(self._descriptor)
+            self._descriptor = -1
+            raise
+
+    def _require_place(self) -> None:
+        if (self.folder / "run.json").is_file():
+            raise RunError(f"{self.folder} holds a finished run; choose another folder")
+        if self.folder.exists() and not self.file.is_file():
+            if not self.folder.is_dir():
+                raise RunError(f"{self.folder} is not a folder")
+            if any(self.folder.iterdir()):
+                raise RunError(f"{self.folder} exists and is not a run; choose another folder")
+
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise RunError(f"{self.file}: another process is writing this run") from None
+
+    def _go_on(self) -> _Contents:
+        """Read what is there, cut its torn end off, and stand at the end."""
+        size = os.fstat(self._descriptor).st_size
+        if size == 0:
+            return _Contents()
+        try:
+            with mmap.mmap(self._descriptor, 0, access=mmap.ACCESS_READ) as data:
+                contents, scan = _read(data, keep=False)
+                self.cut_bytes = scan.torn_bytes
+        except (RunError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise RunError(f"{self.file}: {error}") from None
+        if contents.run is None:
+            contents = _Contents()
+        elif contents.run != self.run:
+            raise RunError(f"{self.file} is of run {contents.run}, not {self.run}")
+        elif contents.columns != self.columns:
+            raise RunError(f"{self.file} has other columns: the cell or the estimator has changed")
+        os.ftruncate(self._descriptor, size - self.cut_bytes)
+        os.lseek(self._descriptor, 0, os.SEEK_END)
+        return contents
+
+    def _write(self, data: bytes) -> None:
+        """Hand bytes to the operating system: they survive the process, not a loss of power."""
+        if self._descriptor < 0:
+            raise RunError(f"{self.file}: the journal is closed")
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except OSError as error:
+            raise RunError(f"{self.file}: cannot be written ({error.strerror})") from None
+
+    def following(self, table: str) -> int:
+        """Return the number after the last row's of a numbered table; 0 where it has none."""
+        return self._following.get(table, 0)
+
+    def append(self, rows: Rows, **meta: object) -> None:
+        """Write rows that belong together; they will be found all, or none.
+
+        Parameters
+        ----------
+        rows : mapping of str to sequence of rows
+            By table; values in the order of its columns, None for null.
+        **meta : JSON-able
+            Said of the run from now on.
+
+        Raises
+        ------
+        RunError
+            If a row has not as many values as its table has columns, or cannot be written.
+        """
+        for name, of in rows.items():
+            width = len(self.columns.get(name, ()))
+            wrong = next((row for row in of if len(row) != width), None)
+            if wrong is not None:
+                raise RunError(f"a row of {name} has {len(wrong)} values; it has {width} columns")
+        content: dict[str, object] = {"rows": {name: of for name, of in rows.items() if of}}
+        if meta:
+            content["meta"] = meta
+        self._write(_frame(content))
+        for name in NUMBERED:
+            for row in rows.get(name, ()):
+                self._following[name] = max(self._following.get(name, 0), int(row[0]) + 1)
+
+    @staticmethod
+    def written(folder: str | os.PathLike[str]) -> bool:
+        """Whether somebody is writing a folder's journal."""
+        try:
+            with (Path(folder) / JOURNAL).open("rb") as stream:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return True
+        return False
+
+    def close(self) -> None:
+        """Stop writing; the journal stays, and can be gone on with or sealed. Safe to call twice."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def _require_types(columns: Mapping[str, Mapping[str, str | Sequence[str]]]) -> None:
+    for table, kinds in columns.items():
+        for name, kind in kinds.items():
+            if isinstance(kind, str) and kind not in TYPES:
+                known = ", ".join(TYPES)
+                raise RunError(f"column {name} of {table}: type {kind!r} is none of {known}")

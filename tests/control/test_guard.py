@@ -1,0 +1,529 @@
+"""The guard: when it fires, that it holds, and what leaves a fallback."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.control import Controller, Guard, Presence, Probation, parts_of
+from dwell.cost import hamming
+from dwell.errors import PolicyError, ProblemError
+from dwell.model import Decision, FrozenDict, QoS
+from tests.estimators.cell import cell
+
+P = 1000
+WHOLE = {"LOC": True, "HYB": True, "SO": True}
+
+
+def guard(*fallbacks: str, g: int = 3, placement: str = "SO") -> Guard:
+    return Guard(fallbacks or ("LOC", "HYB"), guard_cycles=g, period_ns=P, placement=placement)
+
+
+def released(mine: Guard | Probation, cycles: Sequence[int], start: int = 0) -> None:
+    """Release cycles one period apart."""
+    for i, cycle in enumerate(cycles):
+        mine.released(cycle, start + i * P)
+
+
+def fires(mine: Guard, now_ns: int) -> bool:
+    return mine.check(now_ns, WHOLE) is not None
+
+
+# ---------------------------------------------------------------------------- when it fires
+
+
+def test_at_the_start_the_first_cycle_released_is_waited_for() -> None:
+    mine = guard()
+    assert mine.due_ns is None
+    assert not fires(mine, 10**9)
+    released(mine, [7, 8, 9], start=50)
+    assert mine.due_ns == 50 + 3 * P
+    assert not fires(mine, 50 + 3 * P - 1)
+    assert fires(mine, 50 + 3 * P)
+
+
+def test_the_highest_cycle_completed_counts_not_the_one_heard_last() -> None:
+    mine = guard()
+    released(mine, range(5))
+    mine.completed(2, 4 * P)
+    assert (mine.newest, mine.due_ns) == (2, 3 * P + 3 * P)
+    mine.completed(0, 4 * P + 1)
+    mine.completed(2, 4 * P + 2)
+    assert (mine.newest, mine.due_ns) == (2, 6 * P)
+    mine.completed(4, 4 * P + 3)
+    assert mine.due_ns is None
+    mine.released(5, 5 * P)
+    assert mine.due_ns == 8 * P
+
+
+def test_gaps_in_the_numbers_are_no_silence() -> None:
+    mine = guard()
+    released(mine, [0, 1, 2])
+    mine.completed(2, 2 * P + 5)
+    mine.released(1_000_000, 3 * P)
+    assert mine.due_ns == 6 * P
+    mine.completed(1_000_000, 4 * P)
+    assert mine.due_ns is None
+
+
+def test_numbers_that_do_not_grow_and_completions_of_nothing_released_are_ignored() -> None:
+    mine = guard()
+    released(mine, [10, 11])
+    mine.released(3, 2 * P)
+    mine.completed(12, 2 * P)
+    assert (mine.newest, mine.due_ns) == (-1, 3 * P)
+    mine.completed(11, 2 * P)
+    assert (mine.newest, mine.due_ns) == (11, None)
+
+
+def test_a_move_gives_the_new_placement_g_periods() -> None:
+    mine = guard()
+    released(mine, range(4))
+    mine.completed(0, 2 * P)
+    mine.adopt("HYB")
+    assert mine.due_ns is None
+    mine.released(4, 4 * P)
+    mine.completed(2, 4 * P + 1)
+    assert mine.due_ns == 7 * P
+    assert mine.check(7 * P, WHOLE) == "LOC"
+
+
+def test_it_moves_to_the_first_other_fallback_that_is_whole() -> None:
+    mine = guard("LOC", "HYB", "SO")
+    released(mine, range(3))
+    assert mine.check(3 * P, {"LOC": True, "HYB": True}) == "LOC"
+    assert mine.check(3 * P, {"LOC": False, "HYB": True, "SO": True}) == "HYB"
+    assert mine.check(3 * P, {"LOC": False, "HYB": False, "SO": True}) is None
+    # It stays armed, and looks at what is whole when it is asked again.
+    assert mine.due_ns == 3 * P
+    assert mine.check(9 * P, lambda name: name == "HYB") == "HYB"
+
+
+def test_a_fallback_that_was_ordered_is_watched_like_any_placement() -> None:
+    mine = guard("LOC", "HYB", placement="LOC")
+    released(mine, range(3))
+    assert mine.check(3 * P, WHOLE) == "HYB"
+    only = guard("LOC", placement="LOC")
+    released(only, range(3))
+    assert only.due_ns is None
+    assert not fires(only, 10**9)
+
+
+def test_after_its_own_outage_it_begins_anew() -> None:
+    mine = guard()
+    released(mine, range(3))
+    mine.restart()
+    assert mine.due_ns is None
+    mine.released(3, 20 * P)
+    assert mine.due_ns == 23 * P
+
+
+def test_no_fallbacks_no_guard() -> None:
+    mine = Guard((), guard_cycles=3, period_ns=P, placement="SO")
+    released(mine, range(9))
+    assert mine.due_ns is None
+    assert not fires(mine, 10**9)
+
+
+@pytest.mark.parametrize(("g", "period_ns"), [(1, P), (3, 0)])
+def test_settings_out_of_their_range_are_refused(g: int, period_ns: int) -> None:
+    with pytest.raises(ProblemError, match=r"guard_cycles|period_ns"):
+        Guard(("LOC",), guard_cycles=g, period_ns=period_ns, placement="SO")
+
+
+def test_it_keeps_no_more_than_it_needs_while_nothing_completes() -> None:
+    mine = guard()
+    released(mine, range(100_000))
+    assert len(mine._silence.waiting) <= 5
+    assert fires(mine, 100_000 * P)
+    mine.completed(99_998, 100_000 * P)
+    assert mine.due_ns == 99_999 * P + 3 * P
+
+
+@given(
+    g=st.integers(2, 6),
+    steps=st.lists(
+        st.tuples(st.sampled_from(["release", "complete", "wait"]), st.integers(0, 12)),
+        max_size=60,
+    ),
+)
+def test_it_is_the_rule_word_for_word(g: int, steps: list[tuple[str, int]]) -> None:
+    mine = guard(g=g)
+    releases: dict[int, int] = {}
+    newest, now = -1, 0
+    for what, number in steps:
+        if what == "wait":
+            now += number * P // 4
+        elif what == "release":
+            cycle = max(releases, default=-1) + 1 + number // 4
+            releases[cycle] = now
+            mine.released(cycle, now)
+        elif number in releases:
+            newest = max(newest, number)
+            mine.completed(number, now)
+        after = [at for cycle, at in releases.items() if cycle > newest]
+        assert fires(mine, now) == bool(after and now - after[0] >= g * P)
+
+
+# ------------------------------------------------------------------------- the bound of rule 5
+
+
+def play(
+    g: int,
+    latencies: Sequence[int],
+    *,
+    fault: int | None = None,
+    orders: Mapping[int, str] | None = None,
+    lost: Callable[[int], bool] = lambda cycle: False,
+) -> tuple[list[bool], list[tuple[int, str]]]:
+    """Play cycles one period apart; from `fault` on, nothing completes but under LOC.
+
+    Returns
+    -------
+    done : list of bool
+        Whether each cycle completed.
+    moves : list of (int, str)
+        Moves of the guard, with their instants.
+    """
+    mine = guard("LOC", g=g)
+    done = [False] * len(latencies)
+    events = [(cycle * P, 1, cycle) for cycle in range(len(latencies))]
+    moves = []
+    while events:
+        now, kind, cycle = heapq.heappop(events)
+        due_ns = mine.due_ns
+        # A completion at the very instant comes first, and the release of a cycle after the guard.
+        if due_ns is not None and (due_ns, 0) < (now, kind):
+            heapq.heappush(events, (now, kind, cycle))
+            to = mine.check(due_ns, WHOLE)
+            assert to == "LOC"
+            assert not mine.on_fallback
+            mine.adopt(to, fallback=True)
+            moves.append((due_ns, to))
+            continue
+        if kind == 0:
+            done[cycle] = True
+            mine.completed(cycle, now)
+            continue
+        # An order that was given before the guard moved dies with its term.
+        if orders and cycle in orders and not mine.on_fallback:
+            mine.adopt(orders[cycle])
+        mine.released(cycle, now)
+        end = now + latencies[cycle]
+        survives = mine.placement == "LOC" or fault is None or end < fault
+        if survives and not lost(cycle):
+            heapq.heappush(events, (end, 0, cycle))
+    return done, moves
+
+
+def longest_gap(done: Sequence[bool]) -> int:
+    """Most cycles in a row that did not complete."""
+    longest = row = 0
+    for completed in done:
+        row = 0 if completed else row + 1
+        longest = max(longest, row)
+    return longest
+
+
+@given(data=st.data(), g=st.integers(2, 6))
+def test_after_a_single_fault_at_most_g_plus_1_cycles_are_lost(data: st.DataObject, g: int) -> None:
+    latency = st.integers(0, (g - 1) * P - 1)
+    latencies = data.draw(st.lists(latency, min_size=3 * g + 9, max_size=3 * g + 20))
+    fault = data.draw(st.integers(0, (g + 5) * P))
+    done, moves = play(g, latencies, fault=fault)
+    assert longest_gap(done) <= g + 1
+    assert [to for _, to in moves] == ["LOC"]
+    # From the move on every cycle completes.
+    first = -(-moves[0][0] // P)
+    assert all(done[first:])
+
+
+@given(data=st.data(), g=st.integers(2, 6))
+def test_an_order_within_the_g_periods_at_most_doubles_that(data: st.DataObject, g: int) -> None:
+    latencies = data.draw(
+        st.lists(st.integers(0, (g - 1) * P - 1), min_size=4 * g + 9, max_size=4 * g + 20)
+    )
+    fault = data.draw(st.integers(0, (g + 5) * P))
+    order = data.draw(st.integers(0, 3 * g + 5))
+    done, moves = play(g, latencies, fault=fault, orders={order: "HYB"})
+    assert longest_gap(done) <= 2 * g + 1
+    assert len(moves) == 1
+
+
+@given(data=st.data(), g=st.integers(2, 6))
+def test_it_never_fires_while_completions_flow(data: st.DataObject, g: int) -> None:
+    latencies = data.draw(st.lists(st.integers(0, (g - 1) * P - 1), min_size=1, max_size=60))
+    # Single cycles may be lost between others.
+    first = data.draw(st.integers(1, 3))
+    _, moves = play(g, latencies, lost=lambda cycle: cycle % 4 == first)
+    assert not [at for at, _ in moves if at <= (len(latencies) - 1) * P]
+
+
+@given(data=st.data(), g=st.integers(2, 6))
+def test_it_never_fires_on_its_fallback(data: st.DataObject, g: int) -> None:
+    mine = guard(g=g)
+    released(mine, range(g + 1))
+    mine.adopt("LOC", fallback=True)
+    for cycle in range(g + 1, 4 * g):
+        mine.released(cycle, cycle * P)
+        if data.draw(st.booleans()):
+            mine.completed(cycle, cycle * P)
+        assert mine.due_ns is None
+        assert not fires(mine, cycle * P + 100 * P)
+    # The next order arms it again.
+    mine.adopt("LOC")
+    mine.released(4 * g, 4 * g * P)
+    assert mine.due_ns == 5 * g * P
+
+
+# -------------------------------------------------------------------------------- what is whole
+
+
+def test_what_a_candidate_needs() -> None:
+    problem = cell()
+    assert parts_of(problem, "LOC") == {"R", "sense@R", "act@R", "plan@R", "control@R"}
+    off = {"R", "E", "R->E", "E->R", "sense@R", "act@E", "plan@R", "control@R"}
+    assert parts_of(problem, "OFF") == off
+
+
+def test_a_candidate_is_whole_while_all_of_it_is_heard_within_g_periods() -> None:
+    presence = Presence({"LOC": ["R1"], "SO": ["R1", "E"]}, 3 * P)
+    assert presence.missing("SO", 0) == {"R1", "E"}
+    presence.heard("R1", 0)
+    presence.heard("E", P)
+    presence.heard("E", 0)
+    assert presence.whole("SO", 3 * P - 1)
+    assert presence.missing("SO", 3 * P) == {"R1"}
+    presence.heard("R1", 2 * P)
+    presence.gone("E")
+    assert presence.whole("LOC", 3 * P)
+    assert presence.missing("SO", 3 * P) == {"E"}
+    assert not Presence.of(cell()).whole("LOC", 10**12)
+
+
+# ----------------------------------------------------------------------------------- the return
+
+
+def probation(h: int = 3, health: int = 10) -> Probation:
+    return Probation(h, health_cycles=health, patience_ns=3 * P)
+
+
+def test_h_probes_prove_the_placement_that_is_wanted() -> None:
+    mine = probation()
+    mine.fell()
+    mine.want("SO")
+    released(mine, range(4))
+    for cycle in (0, 2, 1):
+        assert not mine.proven("SO", 2 * P + cycle)
+        mine.completed(cycle, 2 * P + cycle)
+    assert mine.proven("SO", 3 * P)
+    assert not mine.proven("HYB", 3 * P)
+    mine.want("SO")
+    assert mine.proven("SO", 3 * P)
+    mine.want("HYB")
+    assert not mine.proven("HYB", 3 * P)
+    # A late probe through SO says nothing of HYB.
+    mine.completed(3, 3 * P)
+    mine.released(4, 4 * P)
+    mine.completed(4, 4 * P)
+    assert "1 of 3 through 'HYB'" in repr(mine)
+
+
+def test_a_silence_that_would_make_the_guard_fire_begins_the_count_anew() -> None:
+    mine = probation()
+    mine.want("SO")
+    released(mine, range(6))
+    mine.completed(0, P)
+    mine.completed(1, 2 * P)
+    # Cycle 2 is older than three periods; a completion at that very instant would have counted.
+    mine.completed(4, 5 * P + 1)
+    mine.completed(5, 6 * P)
+    assert not mine.proven("SO", 6 * P)
+    mine.released(6, 6 * P)
+    mine.completed(6, 7 * P)
+    assert mine.proven("SO", 7 * P)
+    mine.released(7, 7 * P)
+    assert not mine.proven("SO", 10 * P)
+
+
+def test_a_wish_that_ends_forgets_its_probes() -> None:
+    mine = probation(1)
+    mine.want("SO")
+    mine.released(0, 0)
+    mine.completed(0, 1)
+    assert mine.proven("SO", 1)
+    mine.want(None)
+    mine.want("SO")
+    assert not mine.proven("SO", 1)
+
+
+def test_h_doubles_with_relapses_and_halves_with_health() -> None:
+    mine = probation()
+    mine.healthy(100)
+    mine.fell()
+    assert mine.needed == 3
+    mine.left()
+    mine.healthy(9)
+    mine.fell()
+    assert mine.needed == 6
+    # Under the fallback nothing that completes is health.
+    mine.healthy(1000)
+    assert mine.needed == 6
+    mine.left()
+    mine.fell()
+    assert mine.needed == 12
+    mine.left()
+    mine.healthy(5)
+    mine.healthy(5)
+    assert mine.needed == 6
+    mine.fell()
+    assert mine.needed == 6
+    mine.left()
+    mine.healthy(10_000)
+    assert mine.needed == 3
+
+
+def test_h_has_a_cap() -> None:
+    mine = probation()
+    for _ in range(40):
+        mine.fell()
+        mine.left()
+    assert mine.needed == 3 * 32
+
+
+# ------------------------------------------------------------------------------- the controller
+
+
+class Wishful:
+    """Wants one candidate, and remembers every decision and move in a list that all copies have."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.decided, self.told = name, 0, list[str]()
+
+    def start(self, problem: object) -> None:
+        """Begin."""
+
+    def adopt(self, name: str) -> None:
+        """Note where the cell is."""
+        self.told.append(name)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Want the same as ever."""
+        self.decided += 1
+        return self.name
+
+
+SEEN = QoS(10.0, 0.0, FrozenDict({"R": 0.1, "E": 0.1}))
+OWN = {"R": 0.1, "E": 0.1}
+
+
+def shown(controller: Controller) -> list[tuple[object, ...]]:
+    return [row[:6] for row in controller.log.decisions]
+
+
+def test_the_guards_move_is_in_the_log_and_in_the_next_windows_cost() -> None:
+    controller = Controller(cell(estimator="profile"), policy="dtp")
+    initial = controller.decide(SEEN, OWN)
+    assert initial == "LOC"
+    controller.adopt("OFF")
+    assert (controller.incumbent, controller.previous, controller.dwell) == ("OFF", "LOC", 0)
+    assert controller.on_fallback
+    controller.decide(SEEN, OWN)
+    assert shown(controller) == [
+        (0, "LOC", "LOC", False, "dwell", 1),
+        (1, "LOC", "OFF", True, "guard", 0),
+        (1, "OFF", "OFF", False, "dwell", 1),
+    ]
+    names = controller.log.columns(controller.problem.candidates, support=controller.supports)
+    assert {len(row) for row in controller.log.decisions} == {len(names)}
+    moved = [row[2] for row in controller.log.seen]
+    controller.decide(SEEN, OWN)
+    stayed = controller.log.seen[-1][2]
+    assert moved[1] is not None
+    assert stayed is not None
+    candidates = controller.problem.candidates
+    switching = controller.problem.objective.weights.switching
+    assert moved[1] - stayed == pytest.approx(
+        switching * hamming(candidates["OFF"], candidates["LOC"])
+    )
+
+
+def test_an_order_under_way_is_void() -> None:
+    controller = Controller(cell(estimator="profile"), policy=Wishful("FAR"))
+    assert controller.decide(SEEN, OWN) == "FAR"
+    controller.adopt("OFF", left="LOC")
+    assert shown(controller)[-1] == (1, "LOC", "OFF", True, "guard", 0)
+    assert (controller.previous, controller.incumbent) == ("LOC", "OFF")
+    policy = controller.policy
+    assert isinstance(policy, Wishful)
+    assert policy.told == ["LOC", "OFF"]
+
+
+def test_a_fallback_is_left_only_for_what_is_proven() -> None:
+    controller = Controller(cell(estimator="profile"), policy=Wishful("FAR"))
+    controller.adopt("OFF")
+    assert controller.decide(SEEN, OWN) == "OFF"
+    assert (controller.wanted, controller.on_fallback) == ("FAR", True)
+    assert controller.decide(SEEN, OWN, proven="LOC") == "OFF"
+    assert controller.decide(SEEN, OWN, proven="FAR") == "FAR"
+    assert (controller.wanted, controller.on_fallback) == (None, False)
+    assert shown(controller) == [
+        (0, "LOC", "OFF", True, "guard", 0),
+        (0, "OFF", "OFF", False, "guard", 0),
+        (1, "OFF", "OFF", False, "guard", 0),
+        (2, "OFF", "FAR", True, "migrate", 0),
+    ]
+
+
+def test_a_decision_that_is_held_back_has_not_been_made() -> None:
+    policy = Wishful("FAR")
+    controller = Controller(cell(estimator="profile"), policy=policy)
+    controller.adopt("OFF")
+    for _ in range(3):
+        controller.decide(SEEN, OWN)
+    held = controller.policy
+    assert isinstance(held, Wishful)
+    # The second telling settles the switching term of the move, which one window has paid for.
+    assert (held.decided, held.told) == (0, ["OFF", "OFF"])
+    assert policy.told == []
+
+
+def test_after_the_guard_dtp_dwells_then_wants_and_leaves_once_proven() -> None:
+    problem = cell(estimator="profile")
+    settings = replace(problem.controller, min_dwell=2)
+    controller = Controller(replace(problem, controller=settings), policy="dtp")
+    controller.adopt("FAR")
+    bad = replace(SEEN, l95_ms=60.0, violation_rate=1.0)
+    for _ in range(4):
+        controller.decide(bad, OWN)
+    wanted = controller.wanted
+    assert wanted is not None
+    assert [row[4] for row in controller.log.decisions[1:]] == ["dwell", "dwell", "guard", "guard"]
+    assert [row[5] for row in controller.log.decisions[1:]] == [1, 2, 2, 2]
+    assert controller.decide(bad, OWN, proven=wanted) == wanted
+    assert shown(controller)[-1] == (4, "FAR", wanted, True, "migrate", 0)
+
+
+def test_a_fallback_that_is_no_candidate_is_refused() -> None:
+    controller = Controller(cell(estimator="profile"))
+    with pytest.raises(PolicyError, match="'NONE' is no candidate"):
+        controller.adopt("NONE")
+
+
+def test_a_policy_that_cannot_be_told_hears_what_it_lacks() -> None:
+    problem = cell(estimator="profile")
+
+    class Deaf:
+        def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
+            return Decision(problem.candidates["LOC"], "LOC", False, "hold")
+
+    controller = Controller(problem, policy=Deaf())
+    controller.decide(SEEN, OWN)
+    controller.adopt("OFF")
+    with pytest.raises(PolicyError, match=r"needs adopt\(name\)"):
+        controller.decide(SEEN, OWN)
