@@ -25,6 +25,8 @@ BENCHMARKS = {
     "draw": ("drawing", "measure"),
     "first-use": ("first_use", "measure"),
     "import": ("importing", "measure"),
+    "link": ("link", "measure"),
+    "transport": ("transport", "measure"),
 }
 
 

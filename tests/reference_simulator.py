@@ -1,6 +1,7 @@
 """A second, slow simulator of the page docs/background/simulator.md, for one cell, on SimPy.
 
-It shares no code with the kernels and is written to be compared with the page, sentence by
+It shares no code with the kernels (the guard is the one that a live cell has, told of every event)
+and is written to be compared with the page, sentence by
 sentence: every node looks at all of its jobs after every event, remaining work is an exact
 fraction, a link is a SimPy process that takes messages out of a queue. What the page leaves open is
 read as the comments marked "Reading:" say.
@@ -12,13 +13,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
 import simpy
 
+from dwell.control import Guard, Presence, Probation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Task
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
@@ -39,7 +41,7 @@ __all__ = [
     "transmission_ns",
 ]
 
-COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, RELEASE = range(1, 10)
+COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, GUARD, RELEASE = range(1, 11)
 # Cells: the jobs of a cycle itself, and those of its shadow.
 ITSELF, SHADOW = 0, 1
 MASK = 2**64 - 1
@@ -124,6 +126,7 @@ class Result:
     `cycles` are those up to the last close. `jobs` and `shadow_jobs` are by cycle and task;
     `arrived` is when a message was handed to its target, by cell, cycle, source and target.
     `stamps` are the candidates that every released cycle runs under, and is also sent through.
+    `guarded` are the moves of the guard: when, from which candidate, to which.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
     with each other (see `closest_unrelated`); None where there is no such pair.
     """
@@ -134,6 +137,7 @@ class Result:
     arrived: Mapping[tuple[int, int, str, str], int]
     windows: tuple[WindowResult, ...]
     stamps: tuple[tuple[str, str | None], ...]
+    guarded: tuple[tuple[int, str, str], ...]
     closest_ns: int | None
 
     @property
@@ -239,6 +243,7 @@ class Message:
     sent_by: int
     flow: int = 0
     is_state: bool = False
+    migration: int = 0
     attempt: int = 0
     number: int = 0
 
@@ -256,6 +261,7 @@ class Pool:
     idle: int
     waiting: list[Job] = field(default_factory=list)
     restart: int = 0
+    starting: bool = False
 
 
 @dataclass(frozen=True)
@@ -418,7 +424,8 @@ class Simulation:
     """One run of one cell, and of its shadow if it has one.
 
     Cycles are stamped as `given` says, or else as a controller does that orders what the `script`
-    says, one name at each close that it sees.
+    says, one name at each close that it sees. With a guard the cell has one, and a name that it
+    holds back is said again at the next close.
     """
 
     def __init__(
@@ -430,6 +437,7 @@ class Simulation:
         given: Sequence[tuple[str, str | None]] | None = None,
         script: Sequence[str] = (),
         fraction: float = 0.0,
+        guarded: bool = False,
     ) -> None:
         self.env = simpy.Environment()
         self.problem = problem
@@ -444,7 +452,7 @@ class Simulation:
         self.sinks = [task for task in self.pipeline.tasks if not self.pipeline.outputs(task)]
 
         self.given = given
-        self.script: Iterator[str] = iter(script)
+        self.script = list(script)
         self.fraction = fraction
         # Candidates that were ordered, with the first cycle that each stamps.
         self.moves = [(0, problem.initial)]
@@ -453,6 +461,15 @@ class Simulation:
         self.over = False
         self.opened: dict[int, dict[str, Usage]] = {}
         self.windows: list[WindowResult] = []
+        self.migration = 0
+
+        self.guard = Guard.of(problem) if guarded else None
+        self.presence, self.probation = Presence.of(problem), Probation.of(problem)
+        self.guarded: list[tuple[int, str, str]] = []
+        # First cycle that is under orders; candidates that cycles are probes of, from which on.
+        self.ordered = 0
+        self.wishes: list[tuple[int, str | None]] = []
+        self.heard_of: set[tuple[int, int]] = set()
 
         self.nodes = {name: NodeState(node) for name, node in problem.fabric.nodes.items()}
         self.pools = {
@@ -579,6 +596,9 @@ class Simulation:
                 self.at(begin, DISTURBANCE, -1, 0, self.renewer(node), fixed=True)
         for k in range(self.number):
             self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
+        if self.guard is not None:
+            for time in sorted(self.looks(self.guard)):
+                self.at(time, GUARD, -1, -1, self.look, fixed=True)
         self.open_window(0)
         while not self.over and self.env.peek() <= self.end:
             self.env.step()
@@ -590,6 +610,7 @@ class Simulation:
             arrived=self.arrived,
             windows=tuple(self.windows),
             stamps=tuple(self.stamps),
+            guarded=tuple(self.guarded),
             closest_ns=closest_unrelated(self.log),
         )
 
@@ -610,7 +631,16 @@ class Simulation:
             self.over = True
             return
         close = self.release[boundary] + nanoseconds(self.settings.close_grace_ms)
-        self.at(close, CLOSE, boundary, -1, self.close_window, fixed=True)
+        self.at(
+            close,
+            CLOSE,
+            boundary,
+            -1,
+            self.close_window,
+            fixed=True,
+            # A window that the guard has cut short does not close.
+            valid=lambda: self.first == first,
+        )
 
     def close_window(self) -> None:
         boundary = self.first + self.problem.window_cycles
@@ -628,7 +658,7 @@ class Simulation:
         active = self.moves[-1][1]
         order = active
         if self.given is None and not self.nodes[self.problem.controller_node].down:
-            order = next(self.script)
+            order = self.ordered_at_close(active, boundary)
         if order == active:
             self.open_window(boundary)
         elif self.settings.migration == "cold":
@@ -637,10 +667,30 @@ class Simulation:
             delay = nanoseconds(self.settings.order_delay_ms)
             self.move(order, boundary, self.now + delay)
 
+    def ordered_at_close(self, active: str, boundary: int) -> str:
+        """Return what the script says, unless the guard holds it back."""
+        name = self.script[0]
+        if self.guard is None or not self.guard.on_fallback:
+            return self.script.pop(0)
+        if name != active and self.probation.proven(name, self.now):
+            return self.script.pop(0)
+        wish = None if name == active else name
+        if wish is None:
+            self.script.pop(0)
+        if wish != self.probation.wanted:
+            self.probation.want(wish)
+            delay = nanoseconds(self.settings.order_delay_ms)
+            self.wishes.append((self.first_stamped(boundary, self.now + delay), wish))
+        return active
+
     def move(self, order: str, boundary: int, ready: int) -> None:
         """Stamp cycles with what was ordered once it is ready, and open a window with them."""
         first = self.first_stamped(boundary, ready)
         self.moves.append((first, order))
+        if self.guard is not None and self.guard.on_fallback:
+            self.probation.left()
+            self.ordered = first
+            self.wishes.append((first, None))
         self.open_window(first)
 
     def first_stamped(self, boundary: int, ready: int) -> int:
@@ -656,6 +706,8 @@ class Simulation:
             return
         old, new = self.problem.candidates[active], self.problem.candidates[order]
         moving = {task for task in self.pipeline.tasks if old[task] != new[task]}
+        self.migration += 1
+        number = self.migration
 
         def be_ready(task: str) -> None:
             moving.remove(task)
@@ -667,7 +719,7 @@ class Simulation:
                 self.move(order, boundary, self.now)
             for task in moving:
                 started = self.now + nanoseconds(self.pipeline.tasks[task].start_ms)
-                self.step(started, 0, task, lambda task=task: send_state(task))  # type: ignore[misc]
+                self.step(started, 0, task, number, lambda task=task: send_state(task))  # type: ignore[misc]
 
         def send_state(task: str) -> None:
             payload = self.pipeline.tasks[task].state_bytes
@@ -687,22 +739,112 @@ class Simulation:
                     self.now,
                     self.current,
                     is_state=True,
+                    migration=number,
                 ),
             )
 
-        self.at(arrival, STEP, -1, -1, arrive, fixed=True)
+        valid = self.going_on(number)
+        self.at(arrival, STEP, -1, -1, arrive, fixed=True, valid=valid)
+
+    def going_on(self, migration: int) -> Callable[[], bool]:
+        """Whether a migration has not been cut short by the guard."""
+        return lambda: migration == self.migration
 
     def step(
         self,
         time: int,
         attempt: int,
         task: str,
+        migration: int,
         action: Callable[[], None],
         *,
         cause: int | None = None,
     ) -> None:
         """Let a cold migration go on with a task."""
-        self.at(time, STEP, attempt, self.index[task], action, cause=cause)
+        valid = self.going_on(migration)
+        self.at(time, STEP, attempt, self.index[task], action, cause=cause, valid=valid)
+
+    # --------------------------------------------------------------------------------- the guard
+
+    def looks(self, guard: Guard) -> set[int]:
+        """Instants at which the guard may fire: patience ends, or something is there again."""
+        back = {change.at_ns for change in self.reals[ITSELF].node_changes}
+        started = {
+            at + nanoseconds(task.start_ms) for at in back for task in self.pipeline.tasks.values()
+        }
+        links = {segment.at_ns for segments in self.segments.values() for segment in segments}
+        return {release + guard.patience_ns for release in self.release} | back | started | links
+
+    def hear(self) -> None:
+        """Hear of everything that is there."""
+        for name, node in self.nodes.items():
+            if not node.down:
+                self.presence.heard(name, self.now)
+        for link, segments in self.segments.items():
+            heard = self.now
+            for segment in reversed([s for s in segments if s.at_ns <= self.now]):
+                if not segment.down:
+                    break
+                heard = segment.at_ns
+            self.presence.heard(link, heard)
+        for (cell, task, name), pool in self.pools.items():
+            if cell == ITSELF and not pool.starting:
+                self.presence.heard(f"{task}@{name}", self.now)
+
+    def look(self) -> None:
+        """Let the guard look whether to move."""
+        self.hear()
+        if self.guard is None or self.nodes[self.problem.stamper_node].down:
+            return
+        fallback = self.guard.check(self.now, lambda name: self.presence.whole(name, self.now))
+        if fallback is None:
+            return
+        first = [*(k for k in range(self.number) if self.release[k] >= self.now), self.number][0]
+        left = self.guard.placement
+        self.guard.adopt(fallback, fallback=True)
+        self.probation.fell()
+        self.migration += 1
+        self.moves = [*(move for move in self.moves if move[0] < first), (first, fallback)]
+        self.open_window(first)
+        if not self.over:
+            self.guarded.append((self.now, left, fallback))
+
+    def hear_back(self, cell: int, cycle: int) -> None:
+        """Let the guard hear of a cycle or a probe if it has completed, after the way back."""
+        if self.guard is None or (cell, cycle) in self.heard_of or (cell, cycle) not in self.placed:
+            return
+        if not all(self.reached(cell, cycle, sink) for sink in self.sinks):
+            return
+        self.heard_of.add((cell, cycle))
+        back = way_back(self.problem, self.placed[cell, cycle])
+        self.at(self.now + back, ARRIVAL, cycle, -1, lambda: self.heard(cell, cycle), cell=cell)
+
+    def heard(self, cell: int, cycle: int) -> None:
+        """The guard hears of the completion of a cycle or a probe."""
+        if self.guard is None:
+            return
+        if cell == SHADOW:
+            if self.is_probe(cycle):
+                self.probation.completed(cycle, self.now)
+            return
+        self.guard.completed(cycle, self.now)
+        if cycle >= self.ordered:
+            self.probation.healthy()
+
+    def is_probe(self, cycle: int) -> bool:
+        """Whether a cycle that is released is sent through what is wanted now."""
+        first, wish = self.wishes[-1] if self.wishes else (0, None)
+        return wish is not None and first <= cycle
+
+    def reached(self, cell: int, cycle: int, sink: str) -> bool:
+        """Whether a sink has completed, or has all inputs that a shadow stops with."""
+        if cell == ITSELF or sink not in self.apart[cycle]:
+            job = self.jobs.get((ITSELF, cycle, sink))
+            return job is not None and job.outcome == "done"
+        return all(
+            (SHADOW, cycle, flow.source, sink) in self.arrived
+            for flow in self.pipeline.inputs(sink)
+        )
 
     # ---------------------------------------------------------------------------------- cycles
 
@@ -711,6 +853,9 @@ class Simulation:
         if self.given is not None:
             return self.given[cycle]
         active = [name for first, name in self.moves if first <= cycle][-1]
+        wishes = [name for first, name in self.wishes if first <= cycle]
+        if wishes and wishes[-1] is not None:
+            return active, wishes[-1]
         return active, shadow_stamp(cycle, active, list(self.problem.candidates), self.fraction)
 
     def releaser(self, cycle: int) -> Callable[[], None]:
@@ -719,6 +864,12 @@ class Simulation:
             active, other = self.stamp(cycle)
             self.stamps.append((active, other))
             self.placed[ITSELF, cycle] = self.problem.candidates[active]
+            if self.guard is not None:
+                if active != self.guard.placement:
+                    self.guard.adopt(active)
+                self.guard.released(cycle, self.now)
+                if self.is_probe(cycle):
+                    self.probation.released(cycle, self.now)
             for name in self.sources:
                 offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
                 if offset == 0:
@@ -738,6 +889,7 @@ class Simulation:
             if name in self.apart[cycle] and name not in self.sinks:
                 offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
                 self.start_later(SHADOW, cycle, name, offset)
+        self.hear_back(SHADOW, cycle)
 
     def start_later(self, cell: int, cycle: int, task: str, offset: int) -> None:
         self.at(
@@ -831,6 +983,8 @@ class Simulation:
             self.lose(cell, cycle, "node_down")
             return
         self.arrived[cell, cycle, flow.source, flow.target] = self.now
+        if cell == SHADOW:
+            self.hear_back(SHADOW, cycle)
         if key in self.lost_joins:
             return
         there = self.inputs.setdefault(key, [])
@@ -893,6 +1047,9 @@ class Simulation:
         pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
+        if job.cell == ITSELF and job.task.name in self.sinks:
+            self.hear_back(ITSELF, job.cycle)
+            self.hear_back(SHADOW, job.cycle)
 
     def send_output(self, cell: int, flow: Flow, job: Job) -> None:
         """Hand an output over, or send it, to where a cell has its target."""
@@ -924,11 +1081,14 @@ class Simulation:
             node = self.nodes[change.node]
             node.foreign = change.threads
             if change.down and not node.down:
+                self.hear()
                 node.down = True
                 self.go_down(change.node)
             elif node.down and not change.down:
                 node.down = False
                 self.come_up(change.node)
+                if self.guard is not None and change.node == self.problem.stamper_node:
+                    self.guard.restart()
 
         return happen
 
@@ -945,6 +1105,7 @@ class Simulation:
                 pool.waiting.clear()
                 pool.idle = 0
                 pool.restart += 1
+                pool.starting = True
         for cell, cycle, task in list(self.inputs):
             if self.placed[cell, cycle][task] == name:
                 del self.inputs[cell, cycle, task]
@@ -967,7 +1128,7 @@ class Simulation:
 
     def restarter(self, pool: Pool, node: str) -> Callable[[], None]:
         def happen() -> None:
-            pool.idle = pool.task.on[node].workers
+            pool.idle, pool.starting = pool.task.on[node].workers, False
             self.take(pool, node)
 
         return happen
@@ -1045,7 +1206,7 @@ class Simulation:
                 arrival, begun = last, last_begun
             self.last_arrival[link] = arrival, begun
         if message.is_state:
-            self.step(arrival, 0, message.target, message.arrive, cause=begun)
+            self.step(arrival, 0, message.target, message.migration, message.arrive, cause=begun)
             return
         self.at(
             arrival,
@@ -1067,7 +1228,7 @@ class Simulation:
             self.send(link, message)
 
         if message.is_state:
-            self.step(again, attempt, message.target, happen, cause=begun)
+            self.step(again, attempt, message.target, message.migration, happen, cause=begun)
             return
         task = self.index[message.target]
         self.at(
@@ -1080,6 +1241,20 @@ class Simulation:
             flow=message.flow,
             cause=begun,
         )
+
+
+def way_back(problem: Problem, placement: Placement) -> int:
+    """Return the least sum of mean delays from the farthest sink's node to the stamper's."""
+    nodes, links = list(problem.fabric.nodes), problem.fabric.links
+    ms = {(a, b): 0.0 if a == b else math.inf for a in nodes for b in nodes}
+    for link in links.values():
+        ms[link.source, link.target] = link.delay_ms.expectation
+    for via, a, b in itertools.product(nodes, nodes, nodes):
+        ms[a, b] = min(ms[a, b], ms[a, via] + ms[via, b])
+    tasks = problem.pipeline.tasks
+    sinks = [placement[task] for task in tasks if not problem.pipeline.outputs(task)]
+    ways = [ms[sink, problem.stamper_node] for sink in sinks]
+    return nanoseconds(max(0.0 if math.isinf(way) else way for way in ways))
 
 
 def closest_unrelated(log: Sequence[LogEntry]) -> int | None:
@@ -1137,9 +1312,13 @@ def control(
     *,
     shadows: Realisation | None = None,
     fraction: float = 0.0,
+    guarded: bool = False,
 ) -> Result:
     """Play a realisation under a controller that orders one name of a script at each close.
 
-    `fraction` is the share of cycles that are also sent through each alternative.
+    `fraction` is the share of cycles that are also sent through each alternative. If it is
+    `guarded`, the cell's guard acts, and `shadows` are what its probes meet.
     """
-    return Simulation(problem, realisation, shadows, script=script, fraction=fraction).run()
+    return Simulation(
+        problem, realisation, shadows, script=script, fraction=fraction, guarded=guarded
+    ).run()

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 import dwell
 from dwell.control import Controller
+from dwell.control import guard as control_guard
 from dwell.estimators import Evidence, Instants
 from dwell.kernels import streams
 from dwell.kernels.layout import FINISHED
@@ -126,13 +127,15 @@ class Probe:
 class Case:
     """A problem, a realisation of it, and a candidate for every window.
 
-    A `shadow_fraction` of the cycles is also sent through each alternative.
+    A `shadow_fraction` of the cycles is also sent through each alternative. Where it is `guarded`,
+    the cell's guard acts.
     """
 
     problem: Problem
     real: Realisation
     names: tuple[str, ...]
     shadow_fraction: float = 0.0
+    guarded: bool = False
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,7 @@ class Played:
     cycles: pl.DataFrame
     jobs: pl.DataFrame
     windows: pl.DataFrame
+    decisions: pl.DataFrame | None = None
     probe: Probe | None = None
     arrived: Mapping[tuple[int, int, str, str], int] | None = None
     core_ns: NDArray[np.float64] | None = None
@@ -159,6 +163,25 @@ def make_case(
     return Case(problem, real, names, share)
 
 
+def make_guarded(
+    seed: int, schedulers: Sequence[Scheduler], *, whole_ms: bool = False, orders: bool = False
+) -> Case:
+    """Make a case whose cell has a guard."""
+    case = make_case(seed, schedulers, whole_ms=whole_ms, orders=orders)
+    rng = Random(seed)
+    names = list(case.problem.candidates)
+    settings = replace(
+        case.problem.controller,
+        fallbacks=tuple(rng.sample(names, rng.randint(1, len(names)))),
+        guard_cycles=rng.choice([2, 2, 3, 4]),
+    )
+    problem = replace(case.problem, controller=settings)
+    windows = rng.randint(6, 14)
+    real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
+    stamps = tuple(random_stamps(rng, problem, windows))
+    return replace(case, problem=problem, real=real, names=stamps, guarded=True)
+
+
 def script(case: Case) -> list[str]:
     # One name more: the last window closes with a decision too.
     return [*case.names[1:], case.names[0]]
@@ -167,16 +190,26 @@ def script(case: Case) -> list[str]:
 def play(case: Case) -> Played:
     probe = Probe(case.shadow_fraction) if case.shadow_fraction else None
     run = dwell.simulate_realisation(
-        case.problem, case.real, policy=Replay(script(case)), estimator=probe, jobs=True
+        case.problem,
+        case.real,
+        policy=Replay(script(case)),
+        estimator=probe,
+        jobs=True,
+        guard=case.guarded,
     )
     assert run.jobs is not None
-    return Played(run.cycles, run.jobs, run.windows, probe)
+    return Played(run.cycles, run.jobs, run.windows, run.decisions, probe)
 
 
 def reference(case: Case) -> Result:
-    shadows = draw_shadows(case.problem, case.real) if case.shadow_fraction else None
+    shadowed = case.shadow_fraction or case.guarded
     return control(
-        case.problem, case.real, script(case), shadows=shadows, fraction=case.shadow_fraction
+        case.problem,
+        case.real,
+        script(case),
+        shadows=draw_shadows(case.problem, case.real) if shadowed else None,
+        fraction=case.shadow_fraction,
+        guarded=case.guarded,
     )
 
 
@@ -188,6 +221,8 @@ def differences(case: Case, found: Played, result: Result, tolerance_ns: int) ->
     yield from cycle_differences(found.cycles, result, tolerance_ns)
     yield from job_differences(found.jobs, result, tolerance_ns)
     yield from window_differences(case, found.windows, result)
+    if found.decisions is not None:
+        yield from guard_differences(found.decisions, result)
     if found.probe is not None:
         yield from probe_differences(case, found.probe, result, tolerance_ns)
     if found.arrived is not None:
@@ -278,6 +313,17 @@ def window_differences(case: Case, windows: pl.DataFrame, result: Result) -> Ite
             for column, value in ((f"u_{name}", busy), (f"shadow_{name}", shadow)):
                 if abs(row.get(column, 0.0) - value) > 1e-6:
                     yield f"{where}: {column} {row[column]}, expected {value}"
+
+
+def guard_differences(decisions: pl.DataFrame, result: Result) -> Iterator[str]:
+    """Compare the moves of the guard: after how many windows, from where, and to where."""
+    moves = decisions.filter((pl.col("reason") == "guard") & pl.col("migrated"))
+    found = moves.select("window", "incumbent", "placement").rows()
+    closes = [window.close_ns for window in result.windows]
+    # A window that closes at the very instant of a move closes first.
+    expected = [(sum(c <= at for c in closes), left, to) for at, left, to in result.guarded]
+    if found != expected:
+        yield f"the guard moved {found}, expected {expected}"
 
 
 def shares(case: Case, window: WindowResult, node: str) -> tuple[float, float, float]:
@@ -470,12 +516,14 @@ def compare(
     whole_ms: bool = False,
     orders: bool = False,
     stamped: bool = False,
+    guarded: bool = False,
 ) -> None:
     excluded = 0
     failures: list[str] = []
     examples = LONGER if orders else EXAMPLES
     for seed in range(examples):
-        case = make_case(seed, schedulers, whole_ms=whole_ms, orders=orders)
+        make = make_guarded if guarded else make_case
+        case = make(seed, schedulers, whole_ms=whole_ms, orders=orders)
         found = (
             examine_stamped(seed, case, tolerance_ns) if stamped else examine(case, tolerance_ns)
         )
@@ -483,7 +531,7 @@ def compare(
             excluded += 1
         elif found:
             how = f"whole_ms={whole_ms}, orders={orders}"
-            failures.append(f"make_case({seed}, {schedulers}, {how}): {found[:3]}")
+            failures.append(f"{make.__name__}({seed}, {schedulers}, {how}): {found[:3]}")
     assert not failures, f"{len(failures)} of {examples} differ:\n" + "\n".join(failures[:10])
     assert excluded <= MOST_EXCLUDED * examples
 
@@ -525,6 +573,24 @@ def test_orders_equal_to_the_nanosecond_without_processor_sharing(whole_ms: bool
 
 def test_orders_equal_to_the_microsecond_with_processor_sharing() -> None:
     compare(EVERY, FAIR_TOLERANCE_NS, orders=True)
+
+
+@pytest.fixture
+def _eager_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let few probes prove a placement, and few cycles make health."""
+    monkeypatch.setattr(control_guard, "PROBE_CYCLES", 2)
+    monkeypatch.setattr(control_guard, "HEALTH_WINDOWS", 2)
+
+
+@pytest.mark.usefixtures("_eager_return")
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
+def test_the_guard_equal_to_the_nanosecond_without_processor_sharing(whole_ms: bool) -> None:
+    compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, guarded=True)
+
+
+@pytest.mark.usefixtures("_eager_return")
+def test_the_guard_equal_to_the_microsecond_with_processor_sharing() -> None:
+    compare(EVERY, FAIR_TOLERANCE_NS, orders=True, guarded=True)
 
 
 def test_cycles_are_stamped_as_decided() -> None:

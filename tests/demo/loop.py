@@ -1,10 +1,10 @@
-"""The loop of the demo in simulated time: the stages themselves, and delays that a test chooses."""
+"""The loop of the demo in simulated time: the stages themselves, with delays of a test's choice."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.demo.arm import Arm
-from dwell.demo.camera import Sensing, write_mark, read_mark
+from dwell.demo.camera import Sensing, read_mark, write_mark
 from dwell.demo.control import Control
 from dwell.demo.horizon import HorizonSettings
+from dwell.demo.messages import Plan
 from dwell.demo.perception import Perception
 from dwell.demo.planning import Planning
 from dwell.demo.scene import Scene
@@ -50,7 +51,7 @@ class Loop:
         self.planning = Planning(self.scene, self.settings, clock=self.clock)
         self.control = Control(clock=self.clock)
         self.arm = Arm(path, clock=self.clock)
-        self.plans: list[object] = []
+        self.plans: list[Plan] = []
 
     def clock(self) -> int:
         return self.now_ns

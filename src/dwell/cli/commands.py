@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from dwell import __version__
+from dwell.cli.live import agent, controller, live
 from dwell.cli.profile import profile
 from dwell.errors import (
     DwellError,
@@ -270,3 +271,8 @@ def demo(
         processes=processes,
         as_json=as_json,
     )
+
+
+app.command()(agent)
+app.command()(controller)
+app.add_typer(live, name="live")

@@ -159,6 +159,16 @@ class Controller:
         return self._learner is not None
 
     @property
+    def guarded(self) -> bool:
+        """Whether a guard may move the cell: it has fallbacks, and a policy that moves.
+
+        A policy whose attribute `guarded` is false is left alone, as is the placement that never
+        moves.
+        """
+        moves = type(self.policy) is not Static and getattr(self.policy, "guarded", True)
+        return bool(moves and self.problem.controller.fallbacks)
+
+    @property
     def fixed_profile(self) -> Profile | None:
         """The profile where nothing decided in a window matters, so that all close at once."""
         estimator = self.estimator
@@ -286,6 +296,22 @@ class Controller:
         priced = [None] * (3 * len(self._names) + (2 * len(self._names) if self.supports else 0))
         fixed = (len(self.log.seen), left, name, name != left, "guard", 0, None)
         self.log.decisions.append((*fixed, *priced))
+
+    def resume(self, name: str) -> None:
+        """Take note of where the cell is, though something else was decided, or nothing yet.
+
+        An order was not carried out, or this controller takes over from another one. It counts as
+        a decision to be there: n_d is 0.
+
+        Parameters
+        ----------
+        name : str
+            Candidate.
+        """
+        if name != self.incumbent:
+            self._tell(name)
+        self.previous = self.incumbent = name
+        self.dwell = 0
 
     def _tell(self, name: str) -> None:
         """Tell the policy where the cell is, if it wants to know."""

@@ -343,11 +343,11 @@ class Probation:
         self._fallen = self._returned = False
 
     @classmethod
-    def of(cls, problem: Problem, probe_cycles: int = PROBE_CYCLES) -> Probation:
+    def of(cls, problem: Problem, probe_cycles: int | None = None) -> Probation:
         """Make that of a cell: ten windows completed are a stretch of health."""
         settings = problem.controller
         return cls(
-            probe_cycles,
+            PROBE_CYCLES if probe_cycles is None else probe_cycles,
             health_cycles=HEALTH_WINDOWS * problem.window_cycles,
             patience_ns=settings.guard_cycles * round(problem.pipeline.period_ms * 1e6),
         )

@@ -75,7 +75,8 @@ class Arm:
         position, velocity = motion.state(now_ns, limits)
         wanted = motion.command if command is None else command
         limited = tuple(
-            min(max(value, -most), most) for value, most in zip(wanted, limits.velocity, strict=True)
+            min(max(value, -most), most)
+            for value, most in zip(wanted, limits.velocity, strict=True)
         )
         if taken_ns is not None:
             worth = worth.then(taken_ns, *self.world.scene.errors(position, now_ns))

@@ -84,16 +84,17 @@ class Renderer:
         camera = rotation(0, 0, arm[3]).T
         target = self.scene.target(at_ns)
         table = np.array([0, 0, self.scene.table_m])
-        picture = np.full(self._size[::-1], 90, np.uint8)
+        picture: Picture = np.full(self._size[::-1], 90, np.uint8)
         self._paint(picture, self._table, _TABLE_PPM, camera, camera @ (table - arm[:3]))
         turned = camera @ rotation(*target[3:])
         cell_m = self.scene.tag_m / _CELLS
         self._paint(picture, self._tag, _CELL_PX / cell_m, turned, camera @ (target[:3] - arm[:3]))
-        picture = np.asarray(cv2.multiply(picture, self._light, dst=picture, scale=1 / 255))
+        cv2.multiply(picture, self._light, dst=picture, scale=1 / 255)
         # One sheet of noise, shifted: drawing a new one took longer than everything else here.
         right, down = np.random.default_rng((self.scene.seed, at_ns)).integers(_NOISE_PX, size=2)
         noise = self._noise[down : down + self._size[1], right : right + self._size[0]]
-        return np.asarray(cv2.addWeighted(picture, 1.0, noise, 1.0, -128.0, dst=picture), np.uint8)
+        cv2.addWeighted(picture, 1.0, noise, 1.0, -128.0, dst=picture)
+        return picture
 
     def _paint(
         self, picture: Picture, plane: Picture, pixels_per_m: float, turned: Array, at: Array

@@ -74,7 +74,7 @@ class Child:
         with theirs:
             # Standard output and error are the parent's: a child that fails says why there.
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
-                [sys.executable, "-P", "-m", self._module], stdin=theirs
+                [sys.executable, "-P", "-m", self._module], stdin=theirs.fileno()
             )
         ours.settimeout(ANSWER_S)
         self._socket = ours

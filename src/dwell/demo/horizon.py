@@ -1,4 +1,4 @@
-"""A model-predictive step: the camera's best motion over a horizon, as one sparse quadratic program.
+"""A model-predictive step: the camera's best motion over a horizon, a sparse quadratic program.
 
 The camera's axes are double integrators, exactly discretised: an acceleration a[k] is held over a
 step h,
@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import osqp
+import osqp  # type: ignore[import-untyped]
 from scipy import sparse
 
 from dwell.demo.scene import Array, Scene
@@ -60,7 +60,8 @@ class HorizonSettings:
     tolerance : float
         Of the solver, absolute and relative.
     iterations : int
-        At most; what it has by then is used.
+        At most; what it has by then is used. The usual ones take about all of them, so that a
+        step always takes about as long.
     """
 
     steps: int = 30
@@ -68,14 +69,14 @@ class HorizonSettings:
     decays: tuple[float, ...] = (0.0, 1.5, -1.5)
     weights: tuple[float, ...] = (0.5, 0.25, 0.25)
     common: int = 4
-    track: tuple[float, ...] = (400.0, 400.0, 400.0, 10.0)
-    pace: float = 2e-3
-    effort: float = 1e-6
-    smooth: float = 1e-6
-    slack: float = 5.0
-    rho: float = 1.0
-    tolerance: float = 1e-4
-    iterations: int = 400
+    track: tuple[float, ...] = (4e4, 4e4, 4e4, 1e3)
+    pace: float = 5e-4
+    effort: float = 2e-7
+    smooth: float = 1e-7
+    slack: float = 2000.0
+    rho: float = 0.3
+    tolerance: float = 1e-3
+    iterations: int = 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,15 +150,20 @@ class Horizon:
         target, speed : float array, shape (4,)
             Where the camera should be at the start, and how fast that moves.
         """
-        goals, paces = self.goals(target, speed)
-        low, high = self._bounds(position, velocity, goals)
+        # Seen from the target, numbers are small where it matters that they are exact.
+        goals, paces = self.goals(np.zeros(4), speed)
+        low, high = self._bounds(position - target, velocity, goals)
         self._solver.update(q=self._linear(goals, paces), l=low, u=high)
         result = self._solver.solve(raise_error=False)
         scenarios, steps, _ = goals.shape
         moves = result.x.reshape(scenarios, 13 * steps)
         states = moves[:, : 12 * steps].reshape(scenarios, 3, steps, 4)
         return Motions(
-            states[:, 0], states[:, 1], states[:, 2], moves[:, 12 * steps :], result.info.iter
+            target + states[:, 0],
+            states[:, 1],
+            states[:, 2],
+            moves[:, 12 * steps :],
+            result.info.iter,
         )
 
     def goals(self, target: Array, speed: Array) -> tuple[Array, Array]:

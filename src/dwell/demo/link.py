@@ -1,8 +1,8 @@
-"""A pair of nodes' link, emulated: a process that forwards their Zenoh connections, and spoils them.
+"""The link of two nodes, emulated: a process that forwards their connections, and spoils them.
 
 The endpoints that one node dials go to a port of this process instead, which forwards both
 directions to the real one, each under `Conditions` of its own that may change at any time. It knows
-Zenoh's framing (`dwell.demo.zenoh_batches`), so that the unit is the message: a loss takes all
+Zenoh's framing (`dwell.demo.link_batches`), so that the unit is the message: a loss takes all
 fragments of one message of data and nothing else, and the session goes on.
 
 What differs from a real link:
@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Self, cast
 
 from dwell.demo.child import Child, Json
-from dwell.demo.conditions import Conditions, Cut, to_json
+from dwell.demo.link_conditions import Conditions, Cut, Scheduling, to_json
 from dwell.errors import LiveError
 
 __all__ = ["Forward", "LinkProcess", "Traffic"]
@@ -131,7 +131,10 @@ class LinkProcess:
             "queue_bytes": queue_bytes,
             "cpus": sorted(cpus) if cpus is not None else None,
         }
+        #: Where to dial, by forward.
         self.ports: tuple[int, ...] = ()
+        #: How well it can keep its instants beside busy threads.
+        self.scheduling: Scheduling = "usual"
 
     @property
     def pid(self) -> int:
@@ -148,6 +151,7 @@ class LinkProcess:
         """
         answer = self._child.start(self._settings)
         self.ports = tuple(cast("list[int]", answer["ports"]))
+        self.scheduling = cast("Scheduling", answer["scheduling"])
 
     def stop(self) -> None:
         """End it, and with it the connections; safe to call twice."""

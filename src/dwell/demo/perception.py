@@ -72,7 +72,7 @@ class Perception:
         picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.ndim == 1 else data
         if picture is None or picture.shape != (camera.height, camera.width):
             raise LiveError(f"no picture of {camera.width} x {camera.height} pixels")
-        corners = self.corners(picture)
+        corners = self.corners(np.asarray(picture, np.uint8))
         if corners is None:
             return unseen
         found, turn, at = cv2.solvePnP(

@@ -2,7 +2,7 @@
 
 The world's z axis points along the camera's view, into the scene; x points right and y down in a
 picture taken at yaw 0. The camera hangs in the hand of an arm of four axes, as of a SCARA robot:
-x, y, z and yaw about the view. The tag's own tilt is out of the arm's reach; it is there to be seen.
+x, y, z and yaw about the view. The tag also tilts, which is beyond the arm and only to be seen.
 """
 
 from __future__ import annotations

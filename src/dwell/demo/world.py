@@ -11,13 +11,14 @@ at most, whatever order the processor makes the stores visible in. The scene sta
 
 from __future__ import annotations
 
+import contextlib
 import math
 import mmap
 import os
 import struct
 import tempfile
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -158,22 +159,22 @@ class World:
             self._map.close()
             raise LiveError(f"{path}: not a world of this version of the demo; delete it")
         front = self._map[len(_MAGIC) : _FRONT_BYTES].rstrip(b"\0")
-        self.scene = msgspec.json.decode(front, type=Scene)
+        try:
+            self.scene = msgspec.json.decode(front, type=Scene)
+        except msgspec.MsgspecError as error:
+            raise LiveError(f"{path}: no scene: {error}; delete it") from None
 
     @classmethod
     def create(cls, path: Path, scene: Scene, at_ns: int) -> World:
         """Make the file, the arm at home; one that is there already is opened and left as it is."""
         front = _MAGIC + msgspec.json.encode(scene)
         home = _written(0, Motion(at_ns, scene.home, (0.0, 0.0, 0.0, 0.0)), Worth())
-        assert len(front) < _FRONT_BYTES
         with tempfile.NamedTemporaryFile(dir=path.parent) as file:
             file.write((front.ljust(_FRONT_BYTES, b"\0") + home).ljust(_SIZE_BYTES, b"\0"))
             file.flush()
             # A link appears whole or not at all, and never in place of another file.
-            try:
+            with contextlib.suppress(FileExistsError):
                 os.link(file.name, path)
-            except FileExistsError:
-                pass
         return cls(path)
 
     @classmethod

@@ -27,6 +27,7 @@ from dwell.kernels.layout import (
     ARRIVAL,
     BASE,
     BUSY,
+    CANDIDATE_0,
     CELL_MASK,
     CELL_SHIFT,
     CHANGE,
@@ -42,6 +43,7 @@ from dwell.kernels.layout import (
     CYCLE,
     CYCLE_MASK,
     CYCLE_SHIFT,
+    DONE,
     DOWN,
     END,
     FINISHED,
@@ -50,6 +52,9 @@ from dwell.kernels.layout import (
     GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
+    GUARD,
+    GUARD_NS,
+    GUARD_T,
     IDLE,
     IS_CPU,
     ITEM_MASK,
@@ -58,6 +63,7 @@ from dwell.kernels.layout import (
     MIGRATE,
     MIGRATING,
     MISSING,
+    MOVED,
     N_CELL,
     N_CHANGE,
     N_CYCLES,
@@ -112,6 +118,7 @@ from dwell.kernels.layout import (
     TASK_0,
     UNKNOWN,
     VIRTUAL,
+    WAITED,
     WAITING,
     WINDOW,
     WINDOW_CYCLES,
@@ -182,7 +189,7 @@ def _announce(s: Tables) -> int:
         if s.cells[cell, CLOSE_PENDING] == 0 and boundary <= s.cells[cell, N_CYCLES]:
             s.cells[cell, CLOSE_PENDING] = 1
             t = s.release_ns[cell, boundary] + s.cells[cell, GRACE_NS]
-            key = (CLOSE << KIND_SHIFT) | (cell << CELL_SHIFT)
+            key = (CLOSE << KIND_SHIFT) | (cell << CELL_SHIFT) | (boundary << CYCLE_SHIFT)
             push_event(s.clock, s.event_t, s.event_key, t, key)
         n += s.cells[cell, CLOSE_PENDING]
     return int(n)
@@ -197,6 +204,40 @@ def _close(s: Tables, cell: int, now: int) -> None:
     s.cells[cell, WINDOW] += 1
     s.cells[cell, WINDOW_FIRST] = s.cells[cell, CLOSE_CYCLE]
     s.cells[cell, CLOSE_CYCLE] += s.cells[cell, WINDOW_CYCLES]
+
+
+@phase
+def _silent(s: Tables, cell: int, now: int) -> bool:
+    """Whether the guard fires; if not, it looks again when it would if nothing completed.
+
+    Nothing has to be done at completions: the guard fires no earlier than g periods after the
+    release of the cycle that it has waited for, and what has completed by then can be seen then.
+    """
+    if s.cells[cell, GUARD_T] != now:
+        # It has been told to look at another time instead.
+        return False
+    s.cells[cell, GUARD_T] = -1
+    cycles = s.cells[cell, N_CYCLES]
+    waited = s.cells[cell, WAITED]
+    cycle = waited
+    while cycle < cycles and s.release_ns[cell, cycle] < now:
+        if s.outcome[cell, cycle] == DONE:
+            back = s.back_ns[index(s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle])]
+            if s.release_ns[cell, cycle] + s.latency_ns[cell, cycle] + back <= now:
+                waited = cycle + 1
+        cycle += 1
+    moved = s.cells[cell, MOVED]
+    if waited < moved and s.release_ns[cell, moved] < now:
+        waited = moved
+    s.cells[cell, WAITED] = waited
+    if waited >= cycles:
+        return False
+    due = s.release_ns[cell, waited] + s.cells[cell, GUARD_NS]
+    if due <= now:
+        return True
+    s.cells[cell, GUARD_T] = due
+    push_event(s.clock, s.event_t, s.event_key, due, (GUARD << KIND_SHIFT) | (cell << CELL_SHIFT))
+    return False
 
 
 @phase
@@ -454,6 +495,7 @@ def advance(
     out_flows: Ints,
     site_of: Ints,
     route: Ints,
+    back_ns: Ints,
     shadow_parts: Ints,
     hops: Ints,
     loss_keys: NDArray[np.uint64],
@@ -505,9 +547,9 @@ def advance(
     -------
     int
         PAUSED: clock[CLOSED_CELL] closed a window, call again after stamping the next cycles.
-        STEP: the caller's event clock[STEP_KEY] is due at clock[STEP_NS]. FINISHED: no window is
-        left to close. GROW_EVENTS, GROW_RING: enlarge the heap of events, or the ring of cycles in
-        flight, and call again; nothing was lost.
+        STEP: the caller's event clock[STEP_KEY] (a step of a migration, or the guard that fires) is
+        due at clock[STEP_NS]. FINISHED: no window is left to close. GROW_EVENTS, GROW_RING: enlarge
+        the heap of events, or the ring of cycles in flight, and call again; nothing was lost.
     """
     s = Tables(
         ring,
@@ -518,6 +560,7 @@ def advance(
         out_flows,
         site_of,
         route,
+        back_ns,
         shadow_parts,
         fixed_columns(hops, N_HOP),
         loss_keys,
@@ -573,7 +616,11 @@ def advance(
         pop_event(s.clock, s.event_t, s.event_key)
         kind = key >> KIND_SHIFT
         cell = (key >> CELL_SHIFT) & CELL_MASK
+        cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
         if kind == CLOSE:
+            # A window that the guard has cut short does not close.
+            if cycle != s.cells[cell, CLOSE_CYCLE]:
+                continue
             _close(s, cell, now)
             if s.clock[PAUSE] != 0:
                 return PAUSED
@@ -581,11 +628,11 @@ def advance(
             continue
         if now > s.clock[END]:
             break
-        if kind == MIGRATE:
+        if kind == MIGRATE or (kind == GUARD and _silent(s, cell, now)):
             s.clock[STEP_KEY] = key
             s.clock[STEP_NS] = now
             return STEP
-        _handle(s, kind, cell, (key >> CYCLE_SHIFT) & CYCLE_MASK, key & ITEM_MASK, key, now)
+        _handle(s, kind, cell, cycle, key & ITEM_MASK, key, now)
         _settle(s, now)
         flush(s, now)
     return FINISHED

@@ -26,7 +26,7 @@ def _number(value: int) -> int:
 
 
 # Kinds of events in the order in which equal times are handled.
-COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, MIGRATE, CLOSE, RELEASE = range(9)
+COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART, MIGRATE, CLOSE, GUARD, RELEASE = range(10)
 
 # An event key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is
 # a task or a flow of the cell, a site, or nothing, according to the kind.
@@ -69,6 +69,9 @@ FAIR, FIFO, PRIORITY = range(3)
 ) = range(10)
 
 # cells
+# GUARD_T is when the guard looks next, -1 for never, and GUARD_NS is g periods; WAITED is the first
+# cycle that no completion has been heard of or after, MOVED the first one stamped with the newest
+# placement.
 (
     TASK_0,
     N_TASKS,
@@ -87,8 +90,12 @@ FAIR, FIFO, PRIORITY = range(3)
     SHADOW,
     PARENT,
     MIGRATING,
+    GUARD_T,
+    GUARD_NS,
+    WAITED,
+    MOVED,
     N_CELL,
-) = range(18)
+) = range(22)
 
 # Where a link has no timeout of its own, state that was lost is sent again after Linux's least
 # TCP retransmission timeout.
@@ -195,6 +202,7 @@ class Tables(NamedTuple):
     out_flows: Ints  # flows out of each task, in the order of the file
     site_of: Ints  # (candidates, tasks of a cell) -> site
     route: Ints  # (candidates, flows of a cell) -> hop, or -1 on the same node
+    back_ns: Ints  # (candidates,) time from a completion until the guard hears of it
     shadow_parts: Ints  # (pairs of candidates, tasks of a cell)
     hops: Ints  # (hops, N_HOP)
     loss_keys: NDArray[np.uint64]  # (hops,)

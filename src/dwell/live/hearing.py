@@ -92,3 +92,7 @@ class Hearing:
         """Forget who has been silent for longer than `after_ns`."""
         for who in [who for who, v in self._voices.items() if now_ns - v.at_ns > after_ns]:
             del self._voices[who]
+
+    def everybody(self, now_ns: int) -> list[tuple[str, Beat, int]]:
+        """Return who was heard: name, last beat, and its age."""
+        return [(who, v.beat, now_ns - v.at_ns) for who, v in self._voices.items()]

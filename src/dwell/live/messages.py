@@ -17,6 +17,8 @@ __all__ = [
     "MAX_CONTROL_BYTES",
     "MAX_HEADER_BYTES",
     "Accepted",
+    "Answer",
+    "Ask",
     "Beat",
     "Completion",
     "Header",
@@ -219,6 +221,8 @@ class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Share of the cycles sent through each alternative.
     forks : tuple of (str, str)
         For `Stamp.forks` from now on.
+    want : str
+        Candidate that the guard's fallback shall be left for, so that probes are sent through it.
     """
 
     number: Count
@@ -228,6 +232,42 @@ class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
     placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
     shadow_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
     forks: Forks = ()
+    want: Annotated[str, msgspec.Meta(max_length=120)] = ""
+
+
+class Ask(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """What a person asks of a cell's controller.
+
+    Parameters
+    ----------
+    number : str
+        Chosen by who asks; the answer goes to the key of that name.
+    what : str
+        ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``.
+    about : str
+        Candidate to pin, node to drain.
+    """
+
+    number: Name
+    what: Name
+    about: Annotated[str, msgspec.Meta(max_length=120)] = ""
+
+
+class Answer(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """The controller's answer.
+
+    Parameters
+    ----------
+    number : str
+    refused : str
+        Why not; empty if it was done.
+    status : dict
+        How the cell is; see `dwell.live.cell.Cell.status`.
+    """
+
+    number: Name
+    refused: Words
+    status: dict[str, Any]
 
 
 class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -331,6 +371,8 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
         The next one that will be stamped.
     fallback : bool
         Whether the guard's placement holds.
+    proven : str
+        Candidate that enough probes have completed through; empty for none.
     """
 
     number: Count
@@ -341,6 +383,7 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     placement: Name
     cycle: Count
     fallback: bool = False
+    proven: Annotated[str, msgspec.Meta(max_length=120)] = ""
 
 
 T = TypeVar("T", bound=msgspec.Struct)

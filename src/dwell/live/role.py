@@ -94,10 +94,13 @@ class Place:
         )
 
     def put_twice(self, key: str, payload: bytes) -> None:
-        """Send a small message directly, and over the detour."""
+        """Send a small message directly, and over the detour.
+
+        Those on the relay's own node do so, too: the detour reaches whoever has no connection of
+        its own to the sender.
+        """
         self.transport.put(key, payload)
-        if self.node != self.relay:
-            self.transport.put(self.keys.relay(key), payload)
+        self.transport.put(self.keys.relay(key), payload)
 
     def complain(self, error: LiveError) -> None:
         """Count a message that could not be used; a flood of them takes no memory."""

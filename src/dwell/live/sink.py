@@ -72,7 +72,7 @@ class Sink:
         """Take a command or a beat in."""
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
-            if beat is not None:
+            if beat is not None and "/detour/" not in sample.key:
                 self.offsets.hear(beat, now_ns)
             return
         header = self.place.header(sample)
@@ -106,7 +106,8 @@ class Sink:
         age_ms = self.age_ns(header, now_ns) / 1e6
         try:
             command = read_payload(header.kind, payload, self._expected)
-            self.actuator.apply(Message(command, stamp.cycle, stamp.released_ns, age_ms))
+            released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
+            self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms))
             self.trouble = ""
         except Exception as error:  # the user's code
             what = f"cycle {stamp.cycle}: apply() raised {type(error).__name__}: {error}"

@@ -203,9 +203,14 @@ class Stamper:
                 self.placement,
                 self.cycle,
                 self.guard.on_fallback,
+                self._proven(now_ns),
             )
             self._answered = order.controller, order.number, answer
         self.place.put_twice(self.place.keys.accepted(), encode(answer))
+
+    def _proven(self, now_ns: int) -> str:
+        wanted = self.probation.wanted if self.guard.on_fallback else None
+        return wanted if wanted and self.probation.proven(wanted, now_ns) else ""
 
     def _refusal(self, order: Order, now_ns: int) -> str:
         """Return why an order is not accepted, or nothing."""
@@ -245,6 +250,8 @@ class Stamper:
             return
         self._fraction = order.shadow_fraction
         self._forks = order.forks
+        if self.guard.on_fallback and order.want in self.place.problem.candidates:
+            self.probation.want(order.want)
         if order.placement and (order.placement != self.placement or self.guard.on_fallback):
             self._move(order.placement, by_guard=False)
 

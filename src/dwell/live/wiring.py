@@ -19,11 +19,10 @@ __all__ = [
     "IMAGE_BYTES",
     "PORTS_PER_ROLE",
     "SESSIONS",
-    "Detour",
-    "Endpoint",
     "Entry",
-    "Host",
     "Kind",
+    "Locator",
+    "Passage",
     "Role",
     "Session",
     "Wire",
@@ -46,23 +45,6 @@ IMAGE_BYTES = 16_384
 PORTS_PER_ROLE = len(SESSIONS)
 
 _LAST_PORT = 65_535
-_LOOPBACK = "127.0.0.1"
-
-
-@dataclass(frozen=True, slots=True)
-class Host:
-    """Where the processes of a node listen.
-
-    Parameters
-    ----------
-    address : str
-        Name or IP address under which the other nodes reach it.
-    port : int
-        First of three ports for each of its processes.
-    """
-
-    address: str
-    port: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +77,7 @@ class Role:
 
 
 @dataclass(frozen=True, slots=True)
-class Endpoint:
+class Locator:
     """Where a session listens, or is reached."""
 
     address: str
@@ -125,22 +107,24 @@ class Wire:
 
 
 @dataclass(frozen=True, slots=True)
-class Detour:
-    """A port that something between two nodes has to listen on and pass on to another.
+class Passage:
+    """Where a process is reached from a node that does not reach it where it listens.
+
+    A translation of addresses, a tunnel or an emulated link takes what comes there on to it.
 
     Parameters
     ----------
     source, target : str
         Nodes: of who connects, and of who listens.
     session : str
-    listen, to : Endpoint
+    seen, to : Locator
     """
 
     source: str
     target: str
     session: Session
-    listen: Endpoint
-    to: Endpoint
+    seen: Locator
+    to: Locator
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,15 +134,15 @@ class Entry:
     Parameters
     ----------
     role : Role
-    listen : mapping of str to Endpoint
+    listen : mapping of str to Locator
         By session; those that nobody connects to are missing.
-    connect : mapping of str to tuple of Endpoint
+    connect : mapping of str to tuple of Locator
         By session.
     """
 
     role: Role
-    listen: Mapping[Session, Endpoint]
-    connect: Mapping[Session, tuple[Endpoint, ...]]
+    listen: Mapping[Session, Locator]
+    connect: Mapping[Session, tuple[Locator, ...]]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "listen", FrozenDict(self.listen))
@@ -180,14 +164,14 @@ class Wiring:
     entries : mapping of str to Entry
         By who.
     wires : tuple of Wire
-    detours : tuple of Detour
-        What `via` asks something else to provide.
+    passages : tuple of Passage
+        What has to be there that is no part of the cell.
     """
 
     cell: str
     entries: Mapping[str, Entry]
     wires: tuple[Wire, ...]
-    detours: tuple[Detour, ...] = ()
+    passages: tuple[Passage, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "entries", FrozenDict(self.entries))
@@ -240,8 +224,7 @@ def roles(problem: Problem) -> tuple[Role, ...]:
     """
     pipeline = problem.pipeline
     order = pipeline.topological()
-    source = next(task for task in order if not pipeline.inputs(task))
-    stamper = next(iter(pipeline.tasks[source].on))
+    stamper = problem.stamper_node
     found = [Role(f"stamper@{stamper}", stamper, "stamper")]
     found += [
         Role(f"sink.{task}@{node}", node, "sink", task)
@@ -256,36 +239,22 @@ def roles(problem: Problem) -> tuple[Role, ...]:
             found.append(Role(f"{task}@{node}", node, "worker", task))
             if (task, node) in shadows:
                 found.append(Role(f"{task}@{node}.shadow", node, "shadow", task))
-            standby: int = getattr(execution, "standby", 0)
             found += [
                 Role(f"{task}@{node}.{index}", node, "standby", task, index)
-                for index in range(1, standby + 1)
+                for index in range(1, execution.standby + 1)
             ]
     node = problem.controller_node
     found.append(Role(f"controller@{node}", node, "controller"))
     return tuple(found)
 
 
-def wire(
-    problem: Problem,
-    hosts: Mapping[str, Host],
-    *,
-    via: Mapping[tuple[str, str], int] | None = None,
-    relay: str | None = None,
-    protocol: str = "tcp",
-) -> Wiring:
+def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     """Work out the ports and connections of a cell.
 
     Parameters
     ----------
     problem : Problem
-    hosts : mapping of str to Host
-        By node.
-    via : mapping of (str, str) to int, optional
-        Pairs of nodes, in either order, whose connections go to 127.0.0.1 and that much above the
-        port, where something passes them on.
-    relay : str, optional
-        Node whose agent takes the second path; the controller's where None.
+        With every node among `live.hosts`.
     protocol : str
         Zenoh's name of what carries the sessions.
 
@@ -294,37 +263,44 @@ def wire(
     LiveError
         With everything that is missing or clashes.
     """
-    offsets = {frozenset(pair): offset for pair, offset in (via or {}).items()}
-    relay = problem.controller_node if relay is None else relay
     everybody = roles(problem)
-    _require_hosts(problem, everybody, hosts, offsets, relay)
-    by_who = {role.who: role for role in everybody}
+    _require_hosts(problem, everybody)
+    hosts = problem.live.hosts
     rank = {role.who: i for i, role in enumerate(everybody)}
-    ports = _ports(everybody, hosts)
+    places = _places(everybody)
 
-    wires = _wires(problem, everybody, relay)
-    listen: dict[str, dict[Session, Endpoint]] = {who: {} for who in by_who}
-    connect: dict[str, dict[Session, list[Endpoint]]] = {who: {} for who in by_who}
-    detours: dict[Endpoint, Detour] = {}
-    laid = []
-    for session, pair in wires:
+    def locator(who: str, session: Session, seen_from: str | None = None) -> Locator:
+        host = hosts[everybody[rank[who]].node]
+        base = host if seen_from is None else host.endpoint(seen_from)
+        port = base.port + PORTS_PER_ROLE * places[who] + SESSIONS.index(session)
+        return Locator(base.address, port, protocol)
+
+    listen: dict[str, dict[Session, Locator]] = {who: {} for who in rank}
+    connect: dict[str, dict[Session, list[Locator]]] = {who: {} for who in rank}
+    wires = []
+    passages: dict[tuple[str, Locator], Passage] = {}
+    for session, pair in _wires(problem, everybody):
         target, source = sorted(pair, key=rank.__getitem__)
-        laid.append(Wire(session, source, target))
-        there, here = by_who[target].node, by_who[source].node
-        port = ports[target] + SESSIONS.index(session)
-        end = Endpoint(hosts[there].address, port, protocol)
+        wires.append(Wire(session, source, target))
+        here, there = everybody[rank[source]].node, everybody[rank[target]].node
+        end = locator(target, session)
+        seen = end if here == there else locator(target, session, here)
+        if seen != end:
+            passages[here, seen] = Passage(here, there, session, seen, end)
         listen[target][session] = end
-        offset = offsets.get(frozenset((here, there)))
-        if offset is not None and here != there:
-            between = Endpoint(_LOOPBACK, port + offset, protocol)
-            detours[between] = Detour(here, there, session, between, end)
-            end = between
-        connect[source].setdefault(session, []).append(end)
+        connect[source].setdefault(session, []).append(seen)
+    for role in everybody:
+        if role.kind == "controller":  # somebody may want to ask it something
+            listen[role.who]["control"] = locator(role.who, "control")
     entries = {
-        who: Entry(role, listen[who], {name: tuple(ends) for name, ends in connect[who].items()})
-        for who, role in by_who.items()
+        role.who: Entry(
+            role,
+            listen[role.who],
+            {session: tuple(ends) for session, ends in connect[role.who].items()},
+        )
+        for role in everybody
     }
-    wiring = Wiring(problem.name, entries, tuple(laid), tuple(detours.values()))
+    wiring = Wiring(problem.name, entries, tuple(wires), tuple(passages.values()))
     _require_apart(wiring)
     return wiring
 
@@ -368,10 +344,9 @@ def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
     )
 
 
-def _wires(
-    problem: Problem, everybody: Sequence[Role], relay: str
-) -> list[tuple[Session, frozenset[str]]]:
+def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, frozenset[str]]]:
     """Every pair that has to hear each other, by session; each once, in a fixed order."""
+    relay = problem.live.relay or problem.controller_node
     found: dict[tuple[Session, frozenset[str]], None] = {}
     for one, other in combinations(everybody, 2):
         if _meet(problem, one, other, relay):
@@ -410,74 +385,66 @@ def _calls(problem: Problem, one: Role, other: Role, relay: str) -> bool:
     match one.kind:
         case "stamper":  # it stamps, and hears from everybody whether they are there
             return True
-        case "agent":  # supervises its own node, and is the detour of all others
+        case "agent":  # supervises its own node, and is the passage of all others
             return other.kind == "agent" or same_node or one.node == relay
         case "sink":  # takes the commands of its task's workers
             return other.kind == "controller" or (other.works and other.task == one.task)
-        case "controller":  # is told of completions, of loads, and of shadows where they end
-            if other.kind in ("agent", "shadow"):
-                return True
-            return other.works and not problem.pipeline.outputs(other.task)
+        case "controller":  # of completions, loads, shadows that stopped, states that moved
+            if not other.works:
+                return other.kind == "agent"
+            task = problem.pipeline.tasks[other.task]
+            stops = not problem.pipeline.outputs(other.task)
+            return stops or (other.kind == "worker" and not task.anchored)
     return False
 
 
-def _ports(everybody: Iterable[Role], hosts: Mapping[str, Host]) -> dict[str, int]:
-    """First port of everybody, by order on the node."""
-    free = {node: host.port for node, host in hosts.items()}
-    ports = {}
+def _places(everybody: Iterable[Role]) -> dict[str, int]:
+    """Place of everybody on its node, from 0."""
+    counts: dict[str, int] = {}
+    places = {}
     for role in everybody:
-        ports[role.who] = free[role.node]
-        free[role.node] += PORTS_PER_ROLE
-    return ports
+        places[role.who] = counts.get(role.node, 0)
+        counts[role.node] = places[role.who] + 1
+    return places
 
 
-def _require_hosts(
-    problem: Problem,
-    everybody: Sequence[Role],
-    hosts: Mapping[str, Host],
-    offsets: Mapping[frozenset[str], int],
-    relay: str,
-) -> None:
-    nodes = problem.fabric.nodes
-    known = ", ".join(nodes)
-    faults = [f"live.hosts.{node}: missing; give its address and first port" for node in nodes]
-    faults = [fault for fault, node in zip(faults, nodes, strict=True) if node not in hosts]
-    faults += [f"live.hosts.{n}: no such node; there are {known}" for n in hosts if n not in nodes]
-    for node, host in hosts.items():
+def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
+    """Raise a LiveError unless every node has a host, and ports enough."""
+    faults = []
+    for node in problem.fabric.nodes:
+        host = problem.live.hosts.get(node)
+        if host is None:
+            faults.append(f"live.hosts.{node}: missing; give its address and first port")
+            continue
         count = PORTS_PER_ROLE * sum(role.node == node for role in everybody)
         last = _LAST_PORT + 1 - count
-        if not 1 <= host.port <= last:
-            faults.append(
-                f"live.hosts.{node}.port: {host.port} is not from 1 to {last}; "
-                f"{count} ports are needed"
-            )
-    for pair in offsets:
-        text = "-".join(sorted(pair))
-        if len(pair) != 2 or not pair <= set(nodes):
-            faults.append(f"live.via.{text}: not two of the nodes {known}")
-    if relay not in nodes:
-        faults.append(f"live.relay: no node {relay!r}; there are {known}")
+        seen = {f".seen_from.{other}": end.port for other, end in host.seen_from.items()}
+        faults += [
+            f"live.hosts.{node}{path}.port: {port} is above {last}; {count} ports are needed"
+            for path, port in {"": host.port, **seen}.items()
+            if port > last
+        ]
     if faults:
         raise LiveError("\n".join(faults))
 
 
 def _require_apart(wiring: Wiring) -> None:
-    """Raise a LiveError where two would listen on one port of one address."""
-    taken: dict[tuple[str, int], str] = {}
+    """Raise a LiveError where one port of one address would stand for two things."""
+    taken: dict[Locator, str] = {}
     faults = []
+
+    def take(end: Locator, what: str) -> None:
+        other = taken.setdefault(end, what)
+        if other != what:
+            faults.append(f"{other} and {what} are both at {end}")
+
     for who, entry in wiring.entries.items():
         for session, end in entry.listen.items():
-            text = f"{who} ({session})"
-            other = taken.setdefault((end.address, end.port), text)
-            if other != text:
-                faults.append(f"{other} and {text} would both listen on {end}")
-    for detour in wiring.detours:
-        end, text = detour.listen, f"the link between {detour.source} and {detour.target}"
-        other = taken.setdefault((end.address, end.port), f"{text} to {detour.to}")
-        if other != f"{text} to {detour.to}":
-            faults.append(f"{other} and {text} would both listen on {end}")
-        if end.port > _LAST_PORT:
-            faults.append(f"{text} would listen on port {end.port}; the last is {_LAST_PORT}")
+            take(end, f"{who} ({session})")
+    for passage in wiring.passages:
+        take(passage.seen, f"the way to {passage.to}")
     if faults:
         lines = "\n".join(faults)
-        raise LiveError(f"{lines}\nchange live.hosts or live.via: 3 ports a process, apart")
+        raise LiveError(
+            f"{lines}\ngive live.hosts ports further apart: each process takes {PORTS_PER_ROLE}"
+        )

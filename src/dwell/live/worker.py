@@ -121,6 +121,7 @@ class Worker:
         self.shadow, self.stands_by = shadow, stands_by
         problem = place.problem
         self.routes = Routes(problem)
+        self.offsets = place.offsets()
         flows = problem.pipeline.inputs(task)
         sources = frozenset(flow.source for flow in flows) or frozenset([STAMPER])
         #: Whether its stage's frames begin the cycles.
@@ -168,7 +169,9 @@ class Worker:
     def receive(self, sample: Sample, now_ns: int) -> None:
         """Take a message in."""
         if self.pulse.hears(sample):
-            self.pulse.receive(sample, now_ns)
+            beat = self.pulse.receive(sample, now_ns)
+            if beat is not None and "/detour/" not in sample.key:
+                self.offsets.hear(beat, now_ns)
             return
         kind = sample.key.rpartition("/")[2]
         if kind in (MAIN, SHADOW) and "/in/" in sample.key:
@@ -201,16 +204,8 @@ class Worker:
     def _stop_shadow(self, job: Job) -> None:
         """A shadow ends where the sink begins; what it showed is reported."""
         place = self.place
-        inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
-        arrived = Hop(self.task, place.node, job.arrived_ns, UNKNOWN, UNKNOWN, inputs)
-        stopped = Completion(
-            job.header.stamp,
-            self.task,
-            job.arrived_ns,
-            "shadow",
-            (*job.hops(), arrived),
-            place.node,
-        )
+        stamp, at_ns = job.header.stamp, job.arrived_ns
+        stopped = Completion(stamp, self.task, at_ns, "shadow", job.hops(), place.node)
         place.put_twice(place.keys.probed(), encode(stopped))
 
     # -------------------------------------------------------------------------- state
@@ -350,13 +345,14 @@ class Worker:
         """Call the stage; returns its output, None if it failed, and the state's age."""
         stamp = job.header.stamp
         state_age = self._recover(job) if self._stateful else UNKNOWN
+        released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
         try:
             inputs = {
                 source: Message(
                     read_payload(header.kind, payload, self._expected.get(source)),
                     stamp.cycle,
-                    stamp.released_ns,
-                    (started_ns - stamp.released_ns) / 1e6,
+                    released_ns,
+                    (started_ns - released_ns) / 1e6,
                 )
                 for source, (header, payload, _) in job.inputs.items()
             }

@@ -423,7 +423,7 @@ class Journal:
         return False
 
     def close(self) -> None:
-        """Stop writing; the journal stays, and can be gone on with or sealed. Safe to call twice."""
+        """Stop writing; the journal can be gone on with, or sealed. Safe to call twice."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

@@ -10,6 +10,7 @@ from dwell.control import NEVER_NS
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Flow, Pipeline, Placement, Problem, Task
+from dwell.sim.guard import back_ns
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 __all__ = ["Arrays", "lay_out"]
@@ -119,6 +120,7 @@ class _Layout:
         self.segments_f = [np.empty((0, k.N_SEGMENT_F))]
         self.site_of: list[list[int]] = []
         self.route: list[list[int]] = []
+        self.back_ns: list[int] = []
         self.shadow_parts: list[list[int]] = []
         self.changes = [np.empty((0, k.N_CHANGE), np.int64)]
         self.extra_rows = 0
@@ -204,6 +206,7 @@ class _Layout:
                 for f in ordered_flows(problem.pipeline)
             ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
+            self.back_ns.append(back_ns(problem, placement))
 
     def _add_pairs(self, problem: Problem) -> None:
         """Add what the tasks are to a shadow, by pair of candidates."""
@@ -353,6 +356,7 @@ class _Layout:
             out_flows=np.array(self.out_flows, np.int64),
             site_of=_table(self.site_of, self.max_tasks),
             route=_table(self.route, self.max_flows),
+            back_ns=np.array(self.back_ns, np.int64),
             shadow_parts=_table(self.shadow_parts, self.max_tasks),
             hops=_table(self.hops, k.N_HOP),
             loss_keys=np.concatenate([real.loss_keys for real in reals]),

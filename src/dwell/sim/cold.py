@@ -10,13 +10,18 @@ from dwell.sim.realisation import Realisation
 
 __all__ = ["Cold"]
 
+# The cycle field of an event: number of the migration, attempt, whether it is ready.
+NUMBER_SHIFT = 20
+ATTEMPTS = (1 << (NUMBER_SHIFT - 1)) - 1
+NUMBERS = (1 << (k.CYCLE_BITS - NUMBER_SHIFT)) - 1
+
 
 class Cold:
     """The one cold migration of a cell that may be under way.
 
     Its steps are events like any others, which `dwell.kernels.advance` hands back: a worker is
     ready, or state must be sent again, or has arrived. An event's cycle field says which, and
-    counts the attempts; its item is the task.
+    counts the attempts, and the migrations; its item is the task.
 
     Attributes
     ----------
@@ -30,7 +35,7 @@ class Cold:
         self.candidates = problem.candidates
         self.tasks = tuple(problem.pipeline.tasks.values())
         self.hop_row = {hop: row for row, hop in enumerate(realisation.hops)}
-        self.order, self.boundary = "", 0
+        self.order, self.boundary, self.number = "", 0, 0
         # Of the tasks that are not ready yet: the hop that their state takes, -1 for none.
         self.hops: dict[int, int] = {}
 
@@ -38,7 +43,7 @@ class Cold:
         self, tables: k.Tables, incumbent: str, order: str, boundary: int, arrival_ns: int
     ) -> bool:
         """Start a worker of every task that an order moves; False if there is none."""
-        self.order, self.boundary = order, boundary
+        self.order, self.boundary, self.number = order, boundary, self.number + 1
         old, new = self.candidates[incumbent], self.candidates[order]
         for row, task in enumerate(self.tasks):
             if old[task.name] != new[task.name]:
@@ -52,7 +57,10 @@ class Cold:
         """Take the step that is due; True if the last task is ready now."""
         key, now = int(tables.clock[k.STEP_KEY]), int(tables.clock[k.STEP_NS])
         field, row = (key >> k.CYCLE_SHIFT) & k.CYCLE_MASK, key & k.ITEM_MASK
-        attempt, ready = field >> 1, bool(field & 1)
+        attempt, ready = (field >> 1) & ATTEMPTS, bool(field & 1)
+        if not self.hops or field >> NUMBER_SHIFT != self.number & NUMBERS:
+            # A step of a migration that the guard has cut short.
+            return False
         if ready:
             del self.hops[row]
             return not self.hops
@@ -61,7 +69,11 @@ class Cold:
             self._announce(tables, row, attempt, arrived, t)
         return False
 
+    def stop(self) -> None:
+        """Forget the migration that is under way, if there is one: its order is void."""
+        self.hops.clear()
+
     def _announce(self, tables: k.Tables, row: int, attempt: int, ready: bool, t: int) -> None:
-        field = (attempt << 1) | ready
+        field = ((self.number & NUMBERS) << NUMBER_SHIFT) | ((attempt & ATTEMPTS) << 1) | ready
         key = (k.MIGRATE << k.KIND_SHIFT) | (field << k.CYCLE_SHIFT) | row
         post_event(tables.clock, tables.event_t, tables.event_key, t, key)

@@ -33,6 +33,7 @@ from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out, ordered_flows
 from dwell.sim.cold import Cold
 from dwell.sim.drawing import draw, draw_shadows
+from dwell.sim.guard import Watch
 from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.tables import Played, make_tables
 
@@ -48,6 +49,7 @@ def simulate(
     seed: int,
     windows: int = 300,
     jobs: bool = False,
+    guard: bool = False,
 ) -> Run:
     """Draw a realisation of a scenario and play it under a policy.
 
@@ -67,6 +69,8 @@ def simulate(
         Number of windows, at least 1.
     jobs : bool
         Whether the run keeps every job's instants (48 bytes a cycle and task).
+    guard : bool
+        Whether the cell's guard acts, where it has fallbacks and the policy may move.
 
     Returns
     -------
@@ -78,7 +82,9 @@ def simulate(
         If something named is unknown, or the run cannot be drawn.
     """
     realisation = draw(problem, scenario=scenario, seed=seed, windows=windows)
-    return simulate_realisation(problem, realisation, policy=policy, estimator=estimator, jobs=jobs)
+    return simulate_realisation(
+        problem, realisation, policy=policy, estimator=estimator, jobs=jobs, guard=guard
+    )
 
 
 def simulate_realisation(
@@ -88,6 +94,7 @@ def simulate_realisation(
     policy: MinimalPolicy | str | None = None,
     estimator: Estimator | str | None = None,
     jobs: bool = False,
+    guard: bool = False,
     by_window: bool = False,
 ) -> Run:
     """Play a realisation under a policy (see `simulate`).
@@ -98,16 +105,41 @@ def simulate_realisation(
         Stop at every window even where nothing that is decided could matter; the Run is the same.
     """
     _check_fit(problem, realisation)
+    try:
+        played = _play(problem, realisation, policy, estimator, jobs, guard, by_window)
+    except _ProbesWantedError:
+        # Until the first probe is sent a shadow changes nothing, so that this repeats what has been
+        # played. Drawing shadows for every run that may want probes would cost all runs more.
+        played = _play(problem, realisation, policy, estimator, jobs, guard, by_window, shadow=True)
+    return Run(_meta(problem, realisation, played.controller), make_tables(played, jobs=jobs))
+
+
+class _ProbesWantedError(Exception):
+    """Probes are to be sent in a run that was laid out without a shadow."""
+
+
+def _play(
+    problem: Problem,
+    realisation: Realisation,
+    policy: MinimalPolicy | str | None,
+    estimator: Estimator | str | None,
+    jobs: bool,
+    guard: bool,
+    by_window: bool,
+    *,
+    shadow: bool = False,
+) -> Played:
+    """Play a realisation with or without a shadow."""
     controller = Controller(problem, policy, estimator)
-    shadows = draw_shadows(problem, realisation) if controller.shadow_fraction > 0 else None
-    log_jobs = jobs or controller.learns or shadows is not None
+    shadow = shadow or controller.shadow_fraction > 0
+    shadows = draw_shadows(problem, realisation) if shadow else None
+    log_jobs = jobs or controller.learns or shadow
     arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
     sees_all = not _host_changes(problem, realisation)[:, 3].any()
     if controller.fixed_profile is not None and sees_all and not by_window:
-        played = _play_static(problem, realisation, controller, arrays)
-    else:
-        played = _play_windows(problem, realisation, controller, arrays)
-    return Run(_meta(problem, realisation, controller), make_tables(played, jobs=jobs))
+        return _play_static(problem, realisation, controller, arrays)
+    guarded = guard and controller.guarded
+    return _play_windows(problem, realisation, controller, arrays, guarded=guarded)
 
 
 def play(arrays: Arrays) -> int:
@@ -169,10 +201,15 @@ def _play_static(
 
 
 def _play_windows(
-    problem: Problem, realisation: Realisation, controller: Controller, arrays: Arrays
+    problem: Problem,
+    realisation: Realisation,
+    controller: Controller,
+    arrays: Arrays,
+    *,
+    guarded: bool,
 ) -> Played:
     """Play window by window; the controller looks at each and stamps what follows."""
-    stamper = _Stamper(problem, realisation, controller, arrays)
+    stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
     with _quiet():
         while (status := play(arrays)) != k.FINISHED:
             if status == k.STEP:
@@ -186,13 +223,20 @@ class _Stamper:
     """Carries closed windows to the controller, and its orders to the cycles they stamp."""
 
     def __init__(
-        self, problem: Problem, realisation: Realisation, controller: Controller, arrays: Arrays
+        self,
+        problem: Problem,
+        realisation: Realisation,
+        controller: Controller,
+        arrays: Arrays,
+        *,
+        guarded: bool,
     ) -> None:
         self.controller, self.arrays = controller, arrays
         self.release_ns = realisation.release_ns
         self.cycles = realisation.cycles
         self.window_cycles = problem.window_cycles
-        self.code = {name: i for i, name in enumerate(problem.candidates)}
+        self.names = tuple(problem.candidates)
+        self.code = {name: i for i, name in enumerate(self.names)}
         settings = problem.controller
         self.lead = settings.order_lead_cycles
         self.delay_ns = round(settings.order_delay_ms * 1e6)
@@ -206,6 +250,7 @@ class _Stamper:
         self.next_first = 0
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         arrays.tables.clock[k.PAUSE] = 1
+        self.watch = Watch(problem, realisation, arrays.tables) if guarded else None
         self.stamped = self._reach(self.window_cycles)
         self._stamp(0, self.stamped)
 
@@ -213,10 +258,12 @@ class _Stamper:
         """Stamp cycles with the placement, and with what they are also sent through."""
         tables, code = self.arrays.tables, self.code[self.placement]
         tables.stamps[0, start:stop] = code
-        if self.fraction > 0 and start < self.cycles:
+        if len(tables.cells) > 1 and start < self.cycles:
             stop = min(stop, self.cycles)
             plan = shadow_stamps(start, stop, code, len(self.code), self.fraction)
             tables.stamps[1, start:stop] = plan
+        if self.watch is not None:
+            self.watch.probes.stamp(tables, start, stop)
 
     def _reach(self, boundary: int) -> int:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
@@ -247,7 +294,7 @@ class _Stamper:
             )
             if self.evidence is not None:
                 window.evidence = partial(self.evidence, first, boundary, close_ns)
-            order = self.controller.close(window)
+            order = self._decide(window, boundary, close_ns)
         if order == self.placement:
             self._go_on(boundary)
             return
@@ -257,6 +304,18 @@ class _Stamper:
             order, boundary, close_ns
         ):
             self._move(order, earliest)
+
+    def _decide(self, window: ClosedWindow, boundary: int, close_ns: int) -> str:
+        """Ask the controller, and send the probes that it wants."""
+        watch, controller, tables = self.watch, self.controller, self.arrays.tables
+        if watch is None or not watch.on_fallback:
+            return controller.close(window)
+        order = controller.close(window, proven=watch.proven(tables, close_ns))
+        if controller.wanted is not None and len(tables.cells) < 2:
+            raise _ProbesWantedError
+        if order == self.placement:
+            watch.want(controller.wanted, self._takes_effect(boundary, close_ns))
+        return order
 
     def _go_on(self, boundary: int) -> None:
         """Stamp the next window with the placement that stays."""
@@ -268,6 +327,8 @@ class _Stamper:
         """Begin the next window under another placement; cycles before it keep the old one."""
         self._stamp(self.stamped, following)
         self.placement = order
+        if self.watch is not None:
+            self.watch.moved(self.arrays.tables, following)
         cell = self.arrays.tables.cells[0]
         cell[k.WINDOW_FIRST] = self.next_first = following
         cell[k.CLOSE_CYCLE] = following + self.window_cycles
@@ -289,6 +350,39 @@ class _Stamper:
         return True
 
     def step(self) -> None:
+        """Take the step that is due: of a cold migration, or of the guard."""
+        if int(self.arrays.tables.clock[k.STEP_KEY]) >> k.KIND_SHIFT == k.GUARD:
+            self._fire()
+        else:
+            self._carry_on()
+
+    def _fire(self) -> None:
+        """Move to a fallback, if there is one; the window that is open is cut short."""
+        tables, watch = self.arrays.tables, self.watch
+        if watch is None:
+            return
+        now = int(tables.clock[k.STEP_NS])
+        first = int(np.searchsorted(self.release_ns[: self.cycles], now))
+        active = self.names[tables.stamps[0, first - 1]]
+        fallback = watch.fire(tables, now, active)
+        if fallback is None:
+            return
+        cell = tables.cells[0]
+        watch.fell(tables, now)
+        if self.cold is not None:
+            self.cold.stop()
+        cell[k.MIGRATING] = cell[k.CLOSE_PENDING] = 0
+        cell[k.WINDOW_FIRST] = self.next_first = first
+        cell[k.CLOSE_CYCLE] = first + self.window_cycles
+        if first + self.window_cycles > self.cycles:
+            # No window can follow, so that the run ended with the last close.
+            return
+        self.controller.adopt(fallback, left=active)
+        self.placement = fallback
+        self.stamped = self._reach(first + self.window_cycles)
+        self._stamp(first, self.stamped)
+
+    def _carry_on(self) -> None:
         """Carry a cold migration on; when its last task is ready, the order takes effect."""
         tables, cold = self.arrays.tables, self.cold
         if cold is None or not cold.step(tables):

@@ -173,7 +173,9 @@ class MemoryTransport:
         """What the clock of its node shows."""
         return self.clock.shown(self._network.now_ns)
 
-    def put(self, key: str, payload: bytes, header: bytes = b"", *, lane: Lane = "control") -> None:
+    def put(
+        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
+    ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
         require_key(key)
         if not self.closed:

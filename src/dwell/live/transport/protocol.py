@@ -36,7 +36,8 @@ class Transport(Protocol):
     """Carries messages by key between the processes of a cell.
 
     A message is delivered at most once, to every subscriber whose key expression matches and that
-    can be reached, or is lost without a word; messages of one sender on one lane arrive in order.
+    can be reached, or is lost without a word; messages of one sender under one key and on one lane
+    arrive in order.
     Nobody is handed what it has put itself, nor what was put before it subscribed. Keys and key
     expressions that are none raise a LiveError.
     """

@@ -4,8 +4,10 @@ Small messages and payloads have sessions of their own, because one TCP connecti
 images delays everything behind them whatever its priority. Payloads that stay on their node have
 a third one, in which large ones go through shared memory.
 
-Zenoh has no "latest only": where a receiver does not keep up, a put is dropped once the queue to
-that receiver is full, and no other receiver notices.
+A put copies its message into the queue of every receiver and returns; where a queue is full, it is
+dropped there, and no other receiver notices. Payloads that fill a queue by themselves have to wait
+for the network, however fast it is: a thread for each of their keys does that, and puts what is
+newest.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import json
 import logging
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -33,6 +36,8 @@ _LOG = logging.getLogger(__name__)
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
 #: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
 _PUBLISHERS = 256
+#: Large payloads of one key that wait while another is on its way.
+_WAITING = 2
 _PRIORITIES = (
     "control",
     "real_time",
@@ -45,8 +50,7 @@ _PRIORITIES = (
 )
 
 
-#: What sends, and whether large payloads of it go through shared memory.
-_Way: TypeAlias = tuple[Callable[..., None], bool]
+_Put: TypeAlias = Callable[..., None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +67,13 @@ class ZenohSettings:
         Shortest and longest pause between attempts to connect.
     queue_batches : int
         Messages, or fragments of 48 kB, that wait for one peer at most, 1 to 16.
-    drop_after_us, drop_fragments_after_us : int
-        How long a put waits, once, for room in a full queue before it drops the message: one that
-        fits into a batch, and one that needs several.
+    drop_after_us : int
+        How long a put waits for room in a full queue before it drops the message. Each batch that
+        a larger message has found room for doubles that.
+    drop_fragments_after_us : int
+        Where the doubling ends.
+    patient_bytes : int
+        Payloads above that are put by a thread, which may wait as long as the former says.
     shared_bytes : int
         Payloads from here on go through shared memory where they stay on the node.
     pool_bytes : int
@@ -79,7 +87,8 @@ class ZenohSettings:
     retry_ms: tuple[int, int] = (50, 200)
     queue_batches: int = 16
     drop_after_us: int = 100
-    drop_fragments_after_us: int = 1_000
+    drop_fragments_after_us: int = 50_000
+    patient_bytes: int = 150_000
     shared_bytes: int = 100_000
     pool_bytes: int = 16 << 20
     more: Mapping[str, object] = field(default_factory=FrozenDict)
@@ -113,11 +122,12 @@ class ZenohTransport:
         self._zenoh = zenoh
         self._closed = False
         # Read and filled without a lock: a publisher too many does no harm.
-        self._publishers: dict[tuple[str, Lane], _Way] = {}
+        self._ways: dict[tuple[str, Lane], _Way] = {}
         self._locks: dict[Lane, threading.RLock] = {
             "control": threading.RLock(),
             "images": threading.RLock(),
         }
+        self._growing = threading.Lock()
         self._pool: _Pool | None = None
         self._sessions: dict[Session, zenoh.Session] = {}
         try:
@@ -129,20 +139,21 @@ class ZenohTransport:
         if "local" in self._sessions:
             self._pool = _Pool.of(self.settings)
 
-    def put(self, key: str, payload: bytes, header: bytes = b"", *, lane: Lane = "control") -> None:
+    def put(
+        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
+    ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
-        way = self._publishers.get((key, lane)) or self._way(key, lane)
+        way = self._ways.get((key, lane)) or self._way(key, lane)
         if way is None or self._closed:
             return
-        send, shared = way
-        content: Any = payload
-        if shared and len(payload) >= self.settings.shared_bytes and self._pool:
-            content = self._pool.filled(payload)
-        try:
-            send(content, attachment=header or None)
-        except self._zenoh.ZError:
-            if not self._closed:
-                raise
+        # Zenoh takes no views: whoever has one pays for a copy more.
+        data = payload if isinstance(payload, bytes) else bytes(payload)
+        if way.sender is None:
+            content = way.content(data)
+            if content is not data or len(data) <= self.settings.patient_bytes:
+                self._send(way, content, header)
+                return
+        self._sender(way).send(data, header)
 
     def subscribe(self, key: str, receive: Receive) -> None:
         """Have `receive` called with every message under a key expression (``*``, ``**``)."""
@@ -163,8 +174,11 @@ class ZenohTransport:
         with self._locks["control"], self._locks["images"]:
             self._closed = True
             sessions, self._sessions = self._sessions, {}
-            self._publishers = {}
-            self._pool = None
+            ways, self._ways = self._ways, {}
+        with self._growing:
+            senders = [way.sender for way in ways.values() if way.sender is not None]
+        for sender in senders:
+            sender.stop()
         for session in sessions.values():
             session.close()
 
@@ -217,11 +231,30 @@ class ZenohTransport:
             if self._closed:
                 return None
             raise
-        way = publisher.put, name == "local"
-        while len(self._publishers) >= _PUBLISHERS:
-            self._publishers.pop(next(iter(self._publishers)), None)
-        self._publishers[key, lane] = way
+        pool = self._pool if name == "local" else None
+        way = _Way(publisher.put, pool, self.settings.shared_bytes)
+        while len(self._ways) >= _PUBLISHERS:
+            dropped = self._ways.pop(next(iter(self._ways)), None)
+            if dropped is not None and dropped.sender is not None:
+                dropped.sender.stop()
+        self._ways[key, lane] = way
         return way
+
+    def _sender(self, way: _Way) -> _Sender:
+        """Return the thread that puts for a key; from then on it puts everything for it."""
+        with self._growing:
+            if way.sender is None:
+                way.sender = _Sender(way, self._send)
+                if self._closed:
+                    way.sender.stop()
+            return way.sender
+
+    def _send(self, way: _Way, content: Any, header: bytes) -> None:
+        try:
+            way.put(content, attachment=header or None)
+        except self._zenoh.ZError:
+            if not self._closed:
+                raise
 
     def _deliver(self, receive: Receive, lane: Lane) -> Callable[[zenoh.Sample], None]:
         lock = self._locks[lane]
@@ -242,6 +275,61 @@ class ZenohTransport:
                     _LOG.exception("%s: a receiver of %s failed", self.entry.role.who, message.key)
 
         return deliver
+
+
+@dataclass(slots=True)
+class _Way:
+    """How messages of a key and lane go out."""
+
+    put: _Put
+    pool: _Pool | None
+    shared_bytes: int
+    #: Once there is one, everything goes through it, so that the order stays.
+    sender: _Sender | None = None
+
+    def content(self, data: bytes) -> Any:
+        """Return a payload as Zenoh is handed it: in shared memory, or as it is."""
+        if self.pool is None or len(data) < self.shared_bytes:
+            return data
+        return self.pool.filled(data)
+
+
+class _Sender:
+    """Puts the newest messages of one key in a thread of its own, which may have to wait."""
+
+    def __init__(self, way: _Way, send: Callable[[_Way, Any, bytes], None]) -> None:
+        self._way = way
+        self._send = send
+        self._changed = threading.Condition()
+        self._waiting: deque[tuple[bytes, bytes]] = deque(maxlen=_WAITING)
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="dwell-sender", daemon=True)
+        self._thread.start()
+
+    def send(self, data: bytes, header: bytes) -> None:
+        """Have a message put next; the oldest that waits is dropped where there are too many."""
+        with self._changed:
+            self._waiting.append((data, header))
+            self._changed.notify()
+
+    def stop(self) -> None:
+        """Put nothing more."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+        self._thread.join(timeout=1.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopped or self._waiting)
+                if self._stopped:
+                    return
+                data, header = self._waiting.popleft()
+            try:
+                self._send(self._way, self._way.content(data), header)
+            except Exception:
+                _LOG.exception("a payload of %d bytes could not be sent", len(data))
 
 
 class _Pool:

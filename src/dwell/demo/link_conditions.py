@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -24,11 +24,13 @@ from dwell.model.process import (
     Uniform,
 )
 
-__all__ = ["CUTS", "Conditions", "Cut", "changed", "delays_ns", "to_json"]
+__all__ = ["CUTS", "Conditions", "Cut", "Scheduling", "changed", "delays_ns", "to_json"]
 
 #: `drop`: data is lost; `hold`: it waits, as in the sender's buffers; either way nothing passes.
 Cut: TypeAlias = Literal["drop", "hold"]
 CUTS: tuple[Cut, ...] = ("drop", "hold")
+#: How a link's process gets the CPU: by real-time priority, with short time slices, as any other.
+Scheduling: TypeAlias = Literal["fifo", "short slices", "usual"]
 
 NAMED: dict[str, type[Process]] = {
     "constant": Constant,
@@ -81,7 +83,7 @@ class Conditions:
         bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 
 
-# ------------------------------------------------------------------ on the way to the link's process
+# --------------------------------------------------------------- on the way to the process
 
 
 def to_json(changes: Mapping[str, object]) -> dict[str, object]:
@@ -110,23 +112,21 @@ def changed(conditions: Conditions, changes: Mapping[str, object]) -> Conditions
     ProblemError
         If a value is out of its bounds.
     """
-    values = {
-        name: _read(cast("dict[str, dict[str, float]]", value))
-        if isinstance(value, dict)
-        else value
-        for name, value in changes.items()
+    values: dict[str, Any] = {
+        name: _read(value) if isinstance(value, dict) else value for name, value in changes.items()
     }
-    return replace(conditions, **cast("dict[str, float]", values))
+    return replace(conditions, **values)
 
 
 def _process(process: Process) -> dict[str, object]:
     if isinstance(process, Trace):
         return {"trace": process.values.tolist()}
-    name = NAMES.get(type(process))
+    kind: Any = type(process)
+    name = NAMES.get(kind)
     if name is None:
         known = ", ".join((*NAMES.values(), "trace"))
         raise LiveError(f"a link knows no {type(process).__name__}; it knows {known}")
-    return {name: {slot: getattr(process, slot) for slot in type(process).__slots__}}
+    return {name: {item.name: getattr(process, item.name) for item in fields(kind)}}
 
 
 def _read(written: Mapping[str, Mapping[str, float]]) -> Process:

@@ -1,0 +1,212 @@
+"""`dwell agent`, `dwell controller` and `dwell live`: cells of real processes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dwell.cli.output import print_json
+
+__all__ = ["agent", "controller", "live"]
+
+Cell = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file.")]
+Cpus = Annotated[
+    str | None,
+    typer.Option(metavar="LIST", help="CPUs to use, as 0,2-3; those of this process if not given."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+live = typer.Typer(
+    no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
+)
+
+
+def agent(
+    node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
+    cell: Cell,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Where processes keep their files; by default below ~/.local."
+        ),
+    ] = None,
+    cpus: Cpus = None,
+) -> None:
+    """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
+    import dwell
+    from dwell.cli.process import command
+    from dwell.live.node import run_agent
+
+    problem = dwell.load(cell)
+    folder = state or _state_folder() / problem.name / node
+    sys.path.insert(0, str(cell.resolve().parent))
+    run_agent(
+        problem,
+        node,
+        folder,
+        lambda who: command(cell.resolve(), who, folder),
+        _until_told(),
+        cpus=_cpus(cpus),
+        say=_say,
+    )
+
+
+def controller(
+    cell: Annotated[
+        list[Path], typer.Option("--cell", metavar="FILE", help="Cell file; may be repeated.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
+        "runs"
+    ),
+    policy: Annotated[
+        str | None, typer.Option(help="Instead of the policy that the cells name.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Of this controller; its process id if not given.")
+    ] = None,
+    cpus: Cpus = None,
+) -> None:
+    """Decide where the stages of live cells run."""
+    import dwell
+    from dwell.live.node import run_controller
+
+    wanted = _cpus(cpus)
+    if wanted is not None:
+        os.sched_setaffinity(0, wanted)
+    problems = [dwell.load(file) for file in cell]
+    folders = run_controller(problems, out, _until_told(), policy=policy, name=name, say=_say)
+    for folder in folders:
+        _say(f"run: {folder}")
+
+
+@live.command()
+def status(cell: Cell, as_json: AsJson = False) -> None:
+    """Show how a cell is."""
+    _ask(cell, "status", "", as_json=as_json)
+
+
+@live.command()
+def pin(
+    candidate: Annotated[str, typer.Argument(metavar="CANDIDATE")],
+    cell: Cell,
+    as_json: AsJson = False,
+) -> None:
+    """Have a cell stay on one candidate, whatever its policy would do."""
+    _ask(cell, "pin", candidate, as_json=as_json)
+
+
+@live.command()
+def unpin(cell: Cell, as_json: AsJson = False) -> None:
+    """Let the policy decide again."""
+    _ask(cell, "unpin", "", as_json=as_json)
+
+
+@live.command()
+def drain(
+    node: Annotated[str, typer.Argument(metavar="NODE")], cell: Cell, as_json: AsJson = False
+) -> None:
+    """Have no stage run on a node, so that it can be stopped or its code changed."""
+    _ask(cell, "drain", node, as_json=as_json)
+
+
+@live.command()
+def undrain(
+    node: Annotated[str, typer.Argument(metavar="NODE")], cell: Cell, as_json: AsJson = False
+) -> None:
+    """Let stages run on a node again."""
+    _ask(cell, "undrain", node, as_json=as_json)
+
+
+@live.command()
+def demo(
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Where logs, the run and its report go.")
+    ] = Path("live-demo-out"),
+    scenario: Annotated[str, typer.Option(help="What is played: demo, or baseline.")] = "demo",
+    seconds: Annotated[float, typer.Option(min=5, help="Length.")] = 116,
+    policy: Annotated[str | None, typer.Option(help="Instead of the cell's.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of delays and losses.")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Run a real visual-servoing cell on this machine for two minutes, and report on it."""
+    from dwell.cli.live_demo import play
+
+    play(out, scenario, seconds, policy, seed, as_json=as_json)
+
+
+def _ask(cell: Path, what: str, about: str, *, as_json: bool) -> None:
+    import dwell
+    from dwell.live.visiting import Visitor
+
+    with Visitor(dwell.load(cell)) as visitor:
+        found = visitor.ask(what, about)
+    if as_json:
+        print_json(found)
+        return
+    for line in told(found):
+        typer.echo(line)
+
+
+def told(status: dict[str, Any]) -> list[str]:
+    """Return a status as lines of text."""
+    where = status["placement"] or "not known yet"
+    extras = [
+        f"{word} {status[key]}"
+        for word, key in (("moving to", "moving_to"), ("pinned to", "pinned"))
+        if status[key]
+    ]
+    if status["fallback"]:
+        extras.append("moved there by the guard")
+    if status["wanted"]:
+        extras.append(f"to leave for {status['wanted']} once that is proven")
+    if status["drained"]:
+        extras.append(f"without {', '.join(status['drained'])}")
+    if status["refused"]:
+        extras.append(f"last order refused: {status['refused']}")
+    lines = [f"{status['cell']}: {where}{''.join(f'; {extra}' for extra in extras)}"]
+    lines.append(f"mode {status['mode']}, term {status['term']}, guard {status['guard_moves']}")
+    for who, process in sorted(status["processes"].items()):
+        state = "ready" if process["ready"] else "not ready"
+        note = f"  {process['note']}" if process["note"] else ""
+        lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
+    return lines
+
+
+def _cpus(text: str | None) -> set[int] | None:
+    """Read a list of CPUs."""
+    if text is None:
+        return None
+    found: set[int] = set()
+    try:
+        for part in text.split(","):
+            first, _, last = part.partition("-")
+            found.update(range(int(first), int(last or first) + 1))
+    except ValueError:
+        raise typer.BadParameter(f"--cpus: {text!r} is no list of CPUs, as 0,2-3") from None
+    there = os.sched_getaffinity(0)
+    if not found or not found <= there:
+        raise typer.BadParameter(f"--cpus: {text} cannot be had; there are {sorted(there)}")
+    return found
+
+
+def _state_folder() -> Path:
+    home = os.environ.get("XDG_STATE_HOME")
+    return (Path(home) if home else Path.home() / ".local" / "state") / "dwell"
+
+
+def _until_told() -> threading.Event:
+    """Return an event that is set when this process is told to end."""
+    stopped = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.set())
+    return stopped
+
+
+def _say(line: str) -> None:
+    typer.echo(line, err=True)

@@ -1,0 +1,197 @@
+"""Foreign work on a node's CPUs: busy threads at normal priority, as many as asked for.
+
+Each is what the simulator calls a foreign thread (`stress_threads`): always runnable, pinned to the
+node's CPUs, no memory traffic to speak of. It is a process of its own, because threads of one
+Python process take turns instead of competing; the kernel knows no difference.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import heapq
+import os
+import select
+import signal
+import time
+from collections.abc import Collection
+from itertools import count
+from types import TracebackType
+from typing import NoReturn, Self, cast
+
+from dwell.demo.child import PARENT_CHECK_S, Child, Parent
+from dwell.errors import LiveError
+
+__all__ = ["Burner"]
+
+MAX_THREADS = 1_000
+# Turns of an empty loop between two looks at whether the parent lives: below a millisecond.
+TURNS = 20_000
+
+
+class Burner:
+    """Burns what it can get of some CPUs, on command.
+
+    Parameters
+    ----------
+    cpus : collection of int
+        Where the threads run; the kernel spreads them over these.
+    """
+
+    def __init__(self, cpus: Collection[int]) -> None:
+        allowed = os.sched_getaffinity(0)
+        missing = sorted(set(cpus) - allowed)
+        if missing or not cpus:
+            asked = f"CPU {', '.join(map(str, missing))}" if missing else "no CPU"
+            known = ", ".join(map(str, sorted(allowed)))
+            raise LiveError(f"a burner cannot run on {asked}; this process may use {known}")
+        #: Ids of the threads as of the last answer: each is a process.
+        self.pids: tuple[int, ...] = ()
+        self._cpus = sorted(cpus)
+        self._child = Child("dwell.demo.burner", f"burner on {','.join(map(str, self._cpus))}")
+
+    @property
+    def pid(self) -> int:
+        """Id of the process that starts and ends the threads, and uses next to nothing itself."""
+        return self._child.pid
+
+    def start(self, threads: int = 0) -> None:
+        """Start it with so many threads.
+
+        Raises
+        ------
+        ProblemError
+            If the number is out of its bounds.
+        LiveError
+            If it has been started before, or does not start.
+        """
+        _check(threads)
+        answer = self._child.start({"cpus": self._cpus, "threads": threads})
+        self.pids = tuple(cast("list[int]", answer["pids"]))
+
+    def set(self, threads: int, *, at_ns: int | None = None) -> int:
+        """Have so many threads from now on, or from an instant on.
+
+        Instants given ahead do not drift, whatever this process does meanwhile.
+
+        Parameters
+        ----------
+        threads : int
+        at_ns : int, optional
+            When, by the monotonic clock; at once if left out or past.
+
+        Returns
+        -------
+        int
+            That instant. `pids` are those of the threads when this returns.
+
+        Raises
+        ------
+        ProblemError
+            If the number is out of its bounds.
+        LiveError
+            If it does not run.
+        """
+        _check(threads)
+        answer = self._child.ask({"threads": threads, "at_ns": at_ns})
+        self.pids = tuple(cast("list[int]", answer["pids"]))
+        return cast("int", answer["at_ns"])
+
+    def stop(self) -> None:
+        """End it, and with it all threads; safe to call twice."""
+        self._child.stop()
+        self.pids = ()
+
+    def __enter__(self) -> Self:
+        """Start it, with no threads."""
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it."""
+        self.stop()
+
+
+def _check(threads: int) -> None:
+    from dwell.model.bounds import Bound  # the burner's own process does without the model
+
+    Bound(0, MAX_THREADS, whole=True).check("threads", threads)
+
+
+# ------------------------------------------------------------------------- the burner's process
+
+
+def main() -> None:
+    """Keep as many busy processes as the parent wants, until it ends."""
+    parent = Parent()
+    gc.freeze()
+    fire = _Fire()
+    try:
+        settings = parent.receive()
+        os.sched_setaffinity(0, cast("list[int]", settings["cpus"]))
+        fire.burn(cast("int", settings["threads"]))
+        parent.answer({"pids": fire.pids})
+        _serve(parent, fire)
+    except EOFError:
+        pass
+    finally:
+        fire.burn(0)
+
+
+def _serve(parent: Parent, fire: _Fire) -> NoReturn:
+    planned: list[tuple[int, int, int]] = []
+    order = count()
+    while True:
+        wait_s = PARENT_CHECK_S
+        if planned:
+            wait_s = min(wait_s, max(0, planned[0][0] - time.monotonic_ns()) / 1e9)
+        asked, _, _ = select.select([parent], [], [], wait_s)
+        at_ns = 0
+        if asked:
+            request = parent.receive()
+            at_ns = max(cast("int | None", request["at_ns"]) or 0, time.monotonic_ns())
+            heapq.heappush(planned, (at_ns, next(order), cast("int", request["threads"])))
+        now_ns = time.monotonic_ns()
+        while planned and planned[0][0] <= now_ns:
+            fire.burn(heapq.heappop(planned)[2])
+        if asked:
+            parent.answer({"pids": fire.pids, "at_ns": at_ns})
+        if not parent.alive:
+            raise EOFError
+
+
+class _Fire:
+    """The busy processes."""
+
+    def __init__(self) -> None:
+        self.pids: list[int] = []
+
+    def burn(self, threads: int) -> None:
+        """Have so many of them."""
+        while len(self.pids) < threads:
+            self.pids.append(_fork())
+        ended, self.pids = self.pids[threads:], self.pids[:threads]
+        for pid in ended:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+
+
+def _fork() -> int:
+    parent = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        while os.getppid() == parent:
+            for _ in range(TURNS):
+                pass
+        os._exit(0)
+    return pid
+
+
+if __name__ == "__main__":
+    main()

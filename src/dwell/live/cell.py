@@ -1,0 +1,440 @@
+"""Cell: one live cell as its controller sees it: windows in, orders out.
+
+The decisions are those of `dwell.control.Controller`, the object that the simulator runs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, TypeAlias
+
+from dwell.control import ClosedWindow, Controller
+from dwell.errors import LiveError
+from dwell.live.messages import (
+    Accepted,
+    Answer,
+    Ask,
+    Completion,
+    Load,
+    Order,
+    Restored,
+    Snapshot,
+    Stamp,
+    decode,
+    encode,
+)
+from dwell.live.role import Place, Pulse
+from dwell.live.transport.protocol import Sample
+from dwell.live.windows import LiveWindows, Resume, Rows
+
+__all__ = ["Cell", "Recorder"]
+
+#: Time between two looks at the stamper, and two sendings of an order that is not answered.
+ASK_NS = 250_000_000
+RESEND_NS = 40_000_000
+#: Time after which a migration that does not come about is given up.
+PATIENCE_NS = 2_000_000_000
+
+Phase: TypeAlias = Literal["fork", "state", "order"]
+
+
+class Recorder(Protocol):
+    """Keeps the rows of a run."""
+
+    def open(self, run: int) -> Resume:
+        """Begin to keep a run, or go on; returns where."""
+        ...
+
+    def append(self, rows: Rows, **meta: object) -> None:
+        """Keep rows that belong together, and what is to be said of the run from now on."""
+        ...
+
+
+@dataclass(slots=True)
+class _Move:
+    """A migration on its way.
+
+    A task with a state goes first: its inputs are forked to where it will run, its state follows,
+    and only when all have said that they are ready is the placement ordered.
+    """
+
+    name: str
+    since_ns: int
+    phase: Phase
+    forks: tuple[tuple[str, str], ...] = ()
+    awaited: dict[int, str] = field(default_factory=dict)
+    order: Order | None = None
+    sent_ns: int = 0
+
+
+class Cell:
+    """See the module.
+
+    Parameters
+    ----------
+    place : Place
+    controller : Controller
+    recorder : Recorder
+    name : str
+        Of this controller among others that would like to be in charge.
+    """
+
+    def __init__(
+        self, place: Place, controller: Controller, recorder: Recorder, name: str, now_ns: int
+    ) -> None:
+        self.place, self.controller, self.name = place, controller, name
+        self._recorder = recorder
+        self.offsets = place.offsets()
+        self.windows: LiveWindows | None = None
+        self.pulse = Pulse(place, lambda: (True, ""))
+        self.held: Accepted | None = None
+        self.refused = ""
+        self.pinned = ""
+        self.drained: set[str] = set()
+        self._move: _Move | None = None
+        self._number = now_ns
+        self._ask_ns = 0
+        self.guard_moves = self.migrations = 0
+        self._window: dict[str, Any] = {}
+
+    # ------------------------------------------------------------------------ hearing
+
+    def subscriptions(self) -> Iterable[str]:
+        """Key expressions that it wants to hear."""
+        keys = self.place.keys
+        yield from self.pulse.subscriptions()
+        for key in (keys.done("*"), keys.probed(), keys.accepted(), keys.load("*")):
+            yield key
+            yield keys.detour(key)
+        yield keys.stamped()
+        yield keys.restored()
+        yield keys.ask()
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        """Take a message in."""
+        if self.pulse.hears(sample):
+            beat = self.pulse.receive(sample, now_ns)
+            if beat is not None and "/detour/" not in sample.key:
+                self.offsets.hear(beat, now_ns)
+            return
+        windows = self.windows
+        word = sample.key.removeprefix(self.place.keys.root + "/").removeprefix("detour/")
+        try:
+            match word.partition("/")[0]:
+                case "stamped":
+                    self._stamped(decode(sample.payload, Stamp), now_ns)
+                case "done" | "probed" if windows is not None:
+                    windows.completed(decode(sample.payload, Completion), now_ns)
+                case "load" if windows is not None:
+                    windows.loaded(decode(sample.payload, Load))
+                case "accepted":
+                    self._answered(decode(sample.payload, Accepted), now_ns)
+                case "restored":
+                    self._restored(decode(sample.payload, Restored), now_ns)
+                case "ask":
+                    self._asked(decode(sample.payload, Ask), now_ns)
+        except LiveError as error:
+            self.place.complain(error)
+
+    def _stamped(self, stamp: Stamp, now_ns: int) -> None:
+        held = self.held
+        if self.windows is not None:
+            self.windows.stamped(stamp, now_ns)
+        if held is None or stamp.run < held.run or (stamp.run, stamp.term) <= (held.run, held.term):
+            return
+        move = self._move
+        ours = (
+            move is not None
+            and move.order is not None
+            and stamp.term == move.order.term + 1
+            and stamp.placement == move.name
+        )
+        self._now_at(stamp.run, stamp.term, stamp.placement, by_guard=not ours)
+
+    def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
+        """Take note of the placement that holds since a term began."""
+        held = self.held
+        before = held.placement if held is not None else placement
+        self.held = Accepted(0, self.name, "", run, term, placement, 0, by_guard)
+        if not by_guard:
+            self._move = None
+            self.migrations += 1
+            self.controller.on_fallback = False
+            return
+        self._move = None
+        if self.windows is not None:
+            self.windows.refused()
+        self.guard_moves += 1
+        self.controller.adopt(placement, left=before)
+
+    def _begin_run(self, answer: Accepted) -> None:
+        """Begin where the stamper says that the cell is."""
+        self.held = answer
+        self.controller.resume(answer.placement)
+        self.controller.on_fallback = answer.fallback
+        resume = self._recorder.open(answer.run)
+        self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
+
+    # ------------------------------------------------------------------------- orders
+
+    def _answered(self, answer: Accepted, now_ns: int) -> None:
+        if answer.controller != self.name:
+            return
+        held = self.held
+        if held is None:
+            self._begin_run(answer)
+            return
+        if (answer.run, answer.term) < (held.run, held.term):
+            return
+        move = self._move
+        mine = move is not None and move.order is not None and answer.number == move.order.number
+        if (answer.run, answer.term) > (held.run, held.term):
+            ours = mine and not answer.refused and not answer.fallback
+            self._now_at(answer.run, answer.term, answer.placement, by_guard=not ours)
+        self.held = answer
+        if not mine or move is None:
+            return
+        self.refused = answer.refused
+        if answer.refused:
+            if not answer.refused.startswith(("not ready", "not proven")):
+                self._give_up()
+        elif move.phase == "fork":
+            self._ask_for_states(move)
+
+    def _send(self, order: Order) -> None:
+        self.place.transport.put(self.place.keys.order(), encode(order))
+
+    def _next_number(self) -> int:
+        self._number += 1
+        return self._number
+
+    def _order(self, placement: str, forks: tuple[tuple[str, str], ...] = ()) -> Order:
+        held = self.held
+        run, term = (held.run, held.term) if held is not None else (0, 0)
+        want = self.controller.wanted or ""
+        fraction = self.controller.shadow_fraction
+        return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
+
+    def _begin(self, name: str, now_ns: int) -> None:
+        """Begin a migration."""
+        held = self.held
+        if held is None:
+            return
+        problem = self.place.problem
+        old, new = problem.candidates[held.placement], problem.candidates[name]
+        forks = tuple(
+            (task.name, new[task.name])
+            for task in problem.pipeline.tasks.values()
+            if task.state_bytes and old[task.name] != new[task.name]
+        )
+        self._move = _Move(name, now_ns, "fork" if forks else "order", forks)
+        self.refused = ""
+        if self.windows is not None:
+            self.windows.ordered()
+        self._push(self._move, now_ns)
+
+    def _push(self, move: _Move, now_ns: int) -> None:
+        """Send what the present phase of a migration asks for."""
+        if move.phase == "state":
+            return
+        if move.order is None:
+            placement = move.name if move.phase == "order" else ""
+            move.order = self._order(placement, move.forks)
+        elif self.refused:
+            # An order that was refused for now is asked for anew; one without answer, again.
+            move.order = self._order(move.order.placement, move.forks)
+            self.refused = ""
+        move.sent_ns = now_ns
+        self._send(move.order)
+
+    def _ask_for_states(self, move: _Move) -> None:
+        """The inputs are forked: have the states follow."""
+        move.phase = "state"
+        held, keys = self.held, self.place.keys
+        if held is None:
+            return
+        old = self.place.problem.candidates[held.placement]
+        for task, to in move.forks:
+            number = self._next_number()
+            move.awaited[number] = task
+            asked = Snapshot(number, task, old[task], to)
+            self.place.transport.put(keys.snapshot(task, old[task]), encode(asked))
+
+    def _restored(self, restored: Restored, now_ns: int) -> None:
+        move = self._move
+        if move is None or restored.number not in move.awaited:
+            return
+        del move.awaited[restored.number]
+        if restored.failed:
+            self.place.complain(LiveError(restored.failed))
+            self._give_up()
+        elif not move.awaited:
+            move.phase, move.order = "order", None
+            self._push(move, now_ns)
+
+    def _give_up(self) -> None:
+        """A migration has not come about: the cell is where it was."""
+        move, held = self._move, self.held
+        self._move = None
+        if held is None:
+            return
+        self.controller.resume(held.placement)
+        if self.windows is not None:
+            self.windows.refused()
+        if move is not None and move.forks:
+            self._send(self._order(""))
+
+    # ------------------------------------------------------------------------- windows
+
+    def wake(self, now_ns: int) -> int:
+        """Close the windows that are due, push a migration on, beat; returns what is due next."""
+        windows = self.windows
+        due_ns = None
+        while windows is not None:
+            due_ns = windows.due_ns(now_ns)
+            if due_ns is None or due_ns > now_ns:
+                break
+            self._close(windows, now_ns)
+        move = self._move
+        if move is not None:
+            if now_ns - move.since_ns > PATIENCE_NS:
+                self._give_up()
+            elif now_ns - move.sent_ns >= RESEND_NS:
+                self._push(move, now_ns)
+        if now_ns >= self._ask_ns:
+            self._ask_ns = now_ns + ASK_NS
+            # Also says that this controller is there, and what it would have proven.
+            self._send(self._order("") if self.held is not None else self._hello())
+        wakes = [self.pulse.wake(now_ns), self._ask_ns]
+        if due_ns is not None:
+            wakes.append(due_ns)
+        if self._move is not None:
+            wakes.append(self._move.sent_ns + RESEND_NS)
+        return min(wakes)
+
+    def _hello(self) -> Order:
+        return Order(self._next_number(), self.name, 0, 0)
+
+    def _close(self, windows: LiveWindows, now_ns: int) -> None:
+        """Close a window and act on what the policy makes of it."""
+        closed = windows.close(unix_ns=time.time_ns())
+        held = self.held
+        if self._move is not None:
+            # The order before has not come about within a whole window.
+            self._give_up()
+        # Of a window that was mostly not heard of, what was heard says little.
+        last = windows.last
+        if held is None or last is None or 2 * last.heard < self.place.problem.window_cycles:
+            self.controller.miss()
+            self._recorder.append(windows.rows())
+            return
+        wanted = self.controller.close(closed, proven=held.proven or None)
+        self._recorder.append(windows.rows())
+        self._window = self._shown(last.number, last.cycles[0].placement, closed)
+        target = self._allowed(wanted)
+        if self.place.problem.live.mode == "advise" and not self.pinned:
+            target = held.placement
+        if target != wanted:
+            self.controller.resume(target if target == held.placement else held.placement)
+        if target != held.placement:
+            self._begin(target, now_ns)
+
+    def _allowed(self, wanted: str) -> str:
+        """Return what people let the policy have."""
+        held = self.held
+        if self.pinned:
+            return self.pinned
+        candidates = self.place.problem.candidates
+
+        def clear(name: str) -> bool:
+            return not self.drained.intersection(candidates[name].values())
+
+        if not self.drained or clear(wanted):
+            return wanted
+        if held is not None and clear(held.placement):
+            return held.placement
+        order = (*self.place.problem.controller.fallbacks, *candidates)
+        return next((name for name in order if clear(name)), wanted)
+
+    def _shown(self, number: int, placement: str, closed: ClosedWindow) -> dict[str, Any]:
+        """Return the last window as people look at it."""
+        log, names = self.controller.log, tuple(self.place.problem.candidates)
+        l95_ms, violation_rate, cost = log.seen[-1]
+        decision = dict(zip(log.columns(names), log.decisions[-1], strict=False))
+        used = self.controller.utilisation(closed)[0].tolist()
+        return {
+            "number": number,
+            "placement": placement,
+            "l95_ms": l95_ms,
+            "violation_rate": violation_rate,
+            "cost": cost,
+            "reason": decision["reason"],
+            "estimates": {name: decision[f"j_{name}"] for name in names},
+            "utilisation": dict(zip(self.controller.nodes, used, strict=True)),
+        }
+
+    # -------------------------------------------------------------------------- people
+
+    def _asked(self, ask: Ask, now_ns: int) -> None:
+        refused = self._do(ask, now_ns)
+        answer = Answer(ask.number, refused, self.status(now_ns))
+        self.place.transport.put(self.place.keys.answer(ask.number), encode(answer))
+
+    def _do(self, ask: Ask, now_ns: int) -> str:
+        problem = self.place.problem
+        match ask.what:
+            case "status":
+                return ""
+            case "pin":
+                if ask.about not in problem.candidates:
+                    return f"no candidate {ask.about!r}; there are {', '.join(problem.candidates)}"
+                self.pinned = ask.about
+            case "unpin":
+                self.pinned = ""
+            case "drain":
+                return self._drain(ask.about)
+            case "undrain":
+                self.drained.discard(ask.about)
+            case _:
+                return f"unknown question {ask.what!r}"
+        if self.pinned and self.held is not None and self.held.placement != self.pinned:
+            self._begin(self.pinned, now_ns)
+        return ""
+
+    def _drain(self, node: str) -> str:
+        problem = self.place.problem
+        if node not in problem.fabric.nodes:
+            return f"no node {node!r}; there are {', '.join(problem.fabric.nodes)}"
+        drained = {*self.drained, node}
+        if all(drained.intersection(p.values()) for p in problem.candidates.values()):
+            return f"every candidate needs {node}; nothing could run"
+        self.drained = drained
+        return ""
+
+    def status(self, now_ns: int) -> dict[str, Any]:
+        """Return how the cell is, as plain values."""
+        held = self.held
+        return {
+            "cell": self.place.problem.name,
+            "controller": self.name,
+            "mode": self.place.problem.live.mode,
+            "run": held.run if held is not None else None,
+            "term": held.term if held is not None else None,
+            "placement": held.placement if held is not None else None,
+            "fallback": self.controller.on_fallback,
+            "wanted": self.controller.wanted,
+            "pinned": self.pinned or None,
+            "drained": sorted(self.drained),
+            "moving_to": self._move.name if self._move is not None else None,
+            "refused": self.refused or None,
+            "migrations": self.migrations,
+            "guard_moves": self.guard_moves,
+            "window": self._window,
+            **(self.windows.status() if self.windows is not None else {}),
+            "processes": {
+                who: {"age_ms": round(age_ns / 1e6, 1), "ready": beat.ready, "note": beat.note}
+                for who, beat, age_ns in self.pulse.hearing.everybody(now_ns)
+            },
+        }

@@ -1,0 +1,304 @@
+"""LiveCycle: what is known of one cycle; Ledger: what follows from what its messages say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import NEVER_NS, Evidence, Instants
+from dwell.live.messages import Completion, Hop, Stamp
+from dwell.live.offsets import UNBOUNDED_NS, Offsets
+from dwell.model import Problem
+
+__all__ = ["Ledger", "LiveCycle"]
+
+Ints: TypeAlias = NDArray[np.int64]
+
+UNKNOWN = -1
+#: Shadow completions remembered of one cycle.
+MAX_SHADOWS = 16
+
+
+@dataclass(eq=False, slots=True)
+class LiveCycle:
+    """One cycle of a live run.
+
+    Parameters
+    ----------
+    run, number, term : int
+    placement, shadow : str
+        As stamped.
+    at_ns : int
+        Release since the origin.
+    origin_ns : int
+        First release of the run, on the stamper's clock.
+    heard : bool
+        Whether its stamp is known, and not only its neighbours'.
+
+    Attributes
+    ----------
+    stamped_ns : int or None
+        When its stamp was heard, on the controller's clock.
+    reports : dict of str to (Completion, int or None)
+        By sink, with the instant it was heard.
+    shadows : list of Completion
+    latency_ns : int
+        `NEVER_NS` while it has not completed.
+    parts_ns : tuple of int, or None
+        Compute, queue, network.
+    bound_ns : int
+        Of the error of its latency, by the clocks.
+    interval_ns : int or None
+        From its stamp to its last completion, as both arrived at the controller.
+    row : int
+        In the record; -1 while it is in no closed window.
+    close_ns : int or None
+        Close of its window since the origin; None where it belongs to none.
+    """
+
+    run: int
+    number: int
+    term: int
+    placement: str
+    shadow: str
+    at_ns: int
+    origin_ns: int
+    heard: bool
+    stamped_ns: int | None = None
+    reports: dict[str, tuple[Completion, int | None]] = field(default_factory=dict)
+    shadows: list[Completion] = field(default_factory=list)
+    latency_ns: int = NEVER_NS
+    parts_ns: tuple[int, int, int] | None = None
+    bound_ns: int = 0
+    interval_ns: int | None = None
+    row: int = -1
+    window: int | None = None
+    close_ns: int | None = None
+    outcome: str = ""
+    shifts: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, stamp: Stamp, origin_ns: int) -> LiveCycle:
+        """Return the cycle that a stamp is about."""
+        at_ns = stamp.released_ns - origin_ns
+        who = stamp.run, stamp.cycle, stamp.term, stamp.placement, stamp.shadow
+        return cls(*who, at_ns, origin_ns, heard=True)
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Its place among all cycles."""
+        return self.run, self.number
+
+    @property
+    def segment(self) -> tuple[int, int, str]:
+        """What changes with every migration."""
+        return self.run, self.term, self.placement
+
+    def identify(self, stamp: Stamp) -> None:
+        """Take in the stamp of a cycle that was known by its neighbours only."""
+        self.heard = True
+        self.term, self.placement, self.shadow = stamp.term, stamp.placement, stamp.shadow
+        if self.row < 0:
+            self.at_ns = stamp.released_ns - self.origin_ns
+
+    def take(self, completion: Completion, at_ns: int | None) -> bool:
+        """Take in a completion; False if it is a copy."""
+        if completion.outcome == "shadow":
+            new = len(self.shadows) < MAX_SHADOWS and completion not in self.shadows
+            if new:
+                self.shadows.append(completion)
+            return new
+        if completion.sink in self.reports:
+            return False
+        self.reports[completion.sink] = completion, at_ns
+        return True
+
+    @property
+    def actuated(self) -> bool:
+        """Whether all its commands were applied, as far as is known."""
+        reports = self.reports.values()
+        return bool(reports) and all(done.outcome == "actuated" for done, _ in reports)
+
+    def missed(self, deadline_ns: int) -> bool:
+        """Whether it was later than D, or unfinished when its window closed."""
+        age_ns = NEVER_NS - 1 if self.close_ns is None else self.close_ns - self.at_ns
+        return self.latency_ns > min(deadline_ns, age_ns)
+
+
+class Ledger:
+    """Puts what messages say of cycles on the stamper's clock, and adds it up.
+
+    Parameters
+    ----------
+    problem : Problem
+    offsets : Offsets
+    """
+
+    def __init__(self, problem: Problem, offsets: Offsets) -> None:
+        pipeline = problem.pipeline
+        self.sinks = frozenset(name for name in pipeline.tasks if not pipeline.outputs(name))
+        self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
+        self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
+        self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
+        self._codes = {name: code for code, name in enumerate(problem.candidates)}
+        self._every = frozenset(pipeline.tasks)
+        self._apart: dict[tuple[str, str], frozenset[str]] = {}
+
+    # ------------------------------------------------------------------------ latency
+
+    def complete(self, cycle: LiveCycle) -> bool:
+        """Whether every sink has reported a cycle."""
+        return len(cycle.reports) == len(self.sinks)
+
+    def settle(self, cycle: LiveCycle) -> None:
+        """Work out latency and parts of a cycle that is complete."""
+        if cycle.latency_ns < NEVER_NS or not self.complete(cycle):
+            return
+        reports = cycle.reports.values()
+        ends = [(self._since_origin(cycle, done.node, done.done_ns), done) for done, _ in reports]
+        done_ns, last = max(ends, key=lambda pair: pair[0])
+        heard_ns = [at_ns for _, at_ns in reports if at_ns is not None]
+        if cycle.stamped_ns is not None and len(heard_ns) == len(reports):
+            cycle.interval_ns = max(max(heard_ns) - cycle.stamped_ns, 0)
+        cycle.bound_ns = max(cycle.shifts[done.node][1] for done, _ in reports)
+        if cycle.bound_ns < UNBOUNDED_NS:
+            cycle.latency_ns = max(done_ns - cycle.at_ns, 0)
+            cycle.parts_ns = self._split(cycle, last)
+        elif cycle.interval_ns is not None:
+            # Clocks have not been compared: what the controller's own shows is all there is.
+            cycle.latency_ns = cycle.interval_ns
+
+    def _since_origin(self, cycle: LiveCycle, node: str, instant_ns: int) -> int:
+        """Put an instant of a node's clock on the stamper's, since the origin.
+
+        All instants of a cycle on a node are moved alike: clocks part by microseconds in that time.
+        """
+        if node not in cycle.shifts:
+            found = self._offsets.to_reference(node, instant_ns)
+            cycle.shifts[node] = found.instant_ns - instant_ns, found.bound_ns
+        return instant_ns + cycle.shifts[node][0] - cycle.origin_ns
+
+    def _split(self, cycle: LiveCycle, last: Completion) -> tuple[int, int, int] | None:
+        """Part a latency into compute, queue and network along its critical path.
+
+        Going back from the sink, each job waited for the input that came last. What messages take
+        on one node counts as queueing, as do the ways to the first job and to the actuator.
+        """
+        hops = {hop.task: hop for hop in last.hops}
+        hop = hops.pop(last.sink, None)
+        if hop is None:
+            return None
+        compute_ns = network_ns = 0
+        while hop is not None:
+            compute_ns += max(hop.ended_ns - hop.started_ns, 0)
+            source, arrived_ns = max(hop.inputs, key=lambda given: given[1], default=("", 0))
+            sender = hops.pop(source, None)
+            if sender is not None and sender.node != hop.node:
+                network_ns += self._since_origin(cycle, hop.node, arrived_ns)
+                network_ns -= self._since_origin(cycle, sender.node, sender.ended_ns)
+            hop = sender
+        # Clocks that are a little off must not make a part negative, or the sum wrong.
+        compute_ns = min(compute_ns, cycle.latency_ns)
+        network_ns = min(max(network_ns, 0), cycle.latency_ns - compute_ns)
+        return compute_ns, cycle.latency_ns - compute_ns - network_ns, network_ns
+
+    # ----------------------------------------------------------------------- evidence
+
+    def evidence(
+        self, cycles: Sequence[LiveCycle], release_ns: Ints, close_ns: int, *, shadows: bool
+    ) -> Evidence:
+        """Return the instants of a window's jobs and messages, as known at its close.
+
+        Parameters
+        ----------
+        cycles : sequence of LiveCycle
+        release_ns : int64 array, shape (W,)
+        close_ns : int
+        shadows : bool
+            Whether cycles may have been sent through alternatives.
+        """
+        known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
+        through = np.full(len(cycles), -1, np.int64)
+        for row, cycle in enumerate(cycles):
+            for report, _ in cycle.reports.values():
+                self._enter(known, row, cycle, report.hops, self._every)
+            if cycle.shadow in self._codes:
+                through[row] = self._codes[cycle.shadow]
+                apart = self._diverging(cycle)
+                for report in cycle.shadows:
+                    self._enter(of_shadows, row, cycle, report.hops, apart)
+        for found in (known, of_shadows):
+            for instants in (found.ready_ns, found.end_ns, found.arrived_ns):
+                instants[instants > close_ns] = UNKNOWN
+        return Evidence(
+            close_ns=close_ns,
+            release_ns=release_ns,
+            placement=np.array([self._codes[cycle.placement] for cycle in cycles], np.int64),
+            cycles=known,
+            shadow_placement=through,
+            shadows=of_shadows if shadows else None,
+        )
+
+    def _unknown(self, cycles: int) -> Instants:
+        tasks, flows = (cycles, len(self._tasks)), (cycles, len(self._flows))
+        return Instants(*(np.full(shape, UNKNOWN, np.int64) for shape in (tasks, tasks, flows)))
+
+    def _enter(
+        self,
+        known: Instants,
+        row: int,
+        cycle: LiveCycle,
+        hops: Iterable[Hop],
+        apart: frozenset[str],
+    ) -> None:
+        """Enter the instants of jobs, and of the messages that reached them."""
+        for hop in hops:
+            column = self._tasks.get(hop.task)
+            if column is None or hop.task not in apart:
+                continue
+            ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
+            if cycle.shifts[hop.node][1] >= UNBOUNDED_NS:
+                continue
+            shift_ns = ready_ns - hop.arrived_ns
+            # Where a shadow stops, its last messages arrive for a job that never runs.
+            if hop.ended_ns != UNKNOWN:
+                known.ready_ns[row, column] = max(ready_ns, 0)
+                known.end_ns[row, column] = max(hop.ended_ns + shift_ns, 0)
+            for source, arrived_ns in hop.inputs:
+                flow = self._flows.get((source, hop.task))
+                if flow is not None:
+                    known.arrived_ns[row, flow] = max(arrived_ns + shift_ns, 0)
+
+    def _diverging(self, cycle: LiveCycle) -> frozenset[str]:
+        """Tasks that a cycle does not share with its shadow."""
+        pair = cycle.placement, cycle.shadow
+        if pair not in self._apart:
+            here, there = (self._candidates[name] for name in pair)
+            self._apart[pair] = self._pipeline.diverging(here, there)
+        return self._apart[pair]
+
+    def shadow_bytes(self, cycles: Iterable[LiveCycle]) -> tuple[int, int]:
+        """Cycles that were sent through an alternative, and the bytes that this put on links.
+
+        Only the messages that are known to have been sent are counted.
+        """
+        sent = total = 0
+        for cycle in cycles:
+            if cycle.shadow not in self._codes:
+                continue
+            sent += 1
+            apart, there = self._diverging(cycle), self._candidates[cycle.shadow]
+            hops = [hop for report in cycle.shadows for hop in report.hops]
+            ended = {hop.task for hop in hops if hop.ended_ns != UNKNOWN}
+            total += sum(
+                flow.payload_bytes
+                for flow in self._pipeline.flows
+                if flow.target in apart
+                and flow.source in ended
+                and there[flow.source] != there[flow.target]
+            )
+        return sent, total

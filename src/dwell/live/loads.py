@@ -1,0 +1,68 @@
+"""Loads: what the CPU counters of a node showed at any instant between two reports."""
+
+from __future__ import annotations
+
+import bisect
+from collections import deque
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.live.messages import Load
+
+__all__ = ["NodeLoad"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Reports remembered of a node.
+KEPT = 4_096
+
+
+class NodeLoad:
+    """Core-nanoseconds of one node over its own time: of all work, the cell's jobs, its shadows."""
+
+    def __init__(self) -> None:
+        self._at_ns: deque[int] = deque(maxlen=KEPT)
+        self._total: deque[Floats] = deque(maxlen=KEPT)
+        self._life = -1
+        self._read = np.zeros(3)
+
+    def report(self, load: Load) -> None:
+        """Take a report in; copies and late ones change nothing."""
+        read = np.array((load.busy_ns, load.own_ns, load.shadow_ns), np.float64)
+        if load.life < self._life:
+            return
+        if load.life == self._life and self._at_ns and load.at_ns <= self._at_ns[-1]:
+            return
+        total = self._total[-1] if self._total else np.zeros(3)
+        if load.life == self._life:
+            total = total + np.maximum(read - self._read, 0.0)
+        elif self._at_ns and load.at_ns <= self._at_ns[-1]:
+            # Not only the agent began anew, but its node's clock.
+            self._at_ns.clear()
+            self._total.clear()
+        self._life, self._read = load.life, read
+        self._at_ns.append(load.at_ns)
+        self._total.append(total)
+
+    def at(self, instant_ns: int) -> Floats:
+        """Core-nanoseconds at an instant, shape (3,).
+
+        In proportion between two reports; beyond the first or last one for no longer than from one
+        report to the next, so that a node that falls silent counts as idle.
+        """
+        at_ns, total = self._at_ns, self._total
+        if len(at_ns) < 2:
+            return np.zeros(3)
+        place = min(max(bisect.bisect(at_ns, instant_ns), 1), len(at_ns) - 1)
+        begin_ns, end_ns = at_ns[place - 1], at_ns[place]
+        share = min(max((instant_ns - begin_ns) / (end_ns - begin_ns), -1.0), 2.0)
+        found: Floats = total[place - 1] + share * (total[place] - total[place - 1])
+        return found
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the reports that only instants before this one need."""
+        while len(self._at_ns) > 2 and self._at_ns[1] < before_ns:
+            self._at_ns.popleft()
+            self._total.popleft()

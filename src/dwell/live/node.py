@@ -1,0 +1,152 @@
+"""What runs on a node: its agent, and on one of them the controller of some cells."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from dwell.control import Controller
+from dwell.errors import LiveError
+from dwell.live.agent import Agent, CpuCount
+from dwell.live.cell import Cell
+from dwell.live.files import make_folder
+from dwell.live.hosting import Hosted
+from dwell.live.recording import RunRecorder
+from dwell.live.role import Place
+from dwell.live.supervision import Supervisor
+from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wiring import wire
+from dwell.model import Problem
+
+__all__ = ["run_agent", "run_controller"]
+
+
+def run_agent(
+    problem: Problem,
+    node: str,
+    folder: Path,
+    command: Callable[[str], Sequence[str]],
+    stopped: threading.Event,
+    *,
+    cpus: Iterable[int] | None = None,
+    accelerator: Callable[[], float] | None = None,
+    say: Callable[[str], None] = print,
+) -> None:
+    """Keep a node's processes running until told to stop; then end them.
+
+    Parameters
+    ----------
+    problem : Problem
+    node : str
+    folder : Path
+        Where they keep their files.
+    command : callable
+        Returns the command that starts a process, by its name.
+    stopped : Event
+    cpus : iterable of int, optional
+        Those that the node may use.
+    accelerator : callable, optional
+        Returns the utilisation of the node's accelerator.
+    say : callable
+        Takes lines for the log.
+
+    Raises
+    ------
+    LiveError
+        If there is no such node, or its ports or its folder cannot be had.
+    """
+    if node not in problem.fabric.nodes:
+        known = ", ".join(problem.fabric.nodes)
+        raise LiveError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
+    if cpus is not None:
+        _use_cpus(cpus)
+    wiring = wire(problem)
+    who = f"agent@{node}"
+    transport = ZenohTransport(wiring.entry(who))
+    supervisor = Supervisor(make_folder(folder), say)
+    try:
+        for role in wiring.on(node):
+            if role.kind not in ("agent", "controller"):
+                supervisor.keep(role.who, command(role.who))
+        place = Place(problem, who, node, transport, time.time_ns())
+        agent = Agent(place, supervisor, CpuCount(), accelerator)
+        Hosted(agent, transport, stopped=stopped).run()
+    finally:
+        supervisor.stop()
+        transport.close()
+
+
+def _use_cpus(cpus: Iterable[int]) -> None:
+    wanted, there = set(cpus), os.sched_getaffinity(0)
+    if not wanted or not wanted <= there:
+        raise LiveError(f"CPUs {sorted(wanted)} cannot be had; there are {sorted(there)}")
+    os.sched_setaffinity(0, wanted)
+
+
+def run_controller(
+    problems: Sequence[Problem],
+    out: Path,
+    stopped: threading.Event,
+    *,
+    policy: str | None = None,
+    name: str | None = None,
+    say: Callable[[str], None] = print,
+) -> list[Path]:
+    """Control cells until told to stop.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+    out : Path
+        Where the runs' folders go, one a cell and run.
+    stopped : Event
+    policy : str, optional
+        Instead of the cells' own.
+    name : str, optional
+        Of this controller, among others that would like to be in charge.
+    say : callable
+        Takes lines for the log.
+
+    Returns
+    -------
+    list of Path
+        Folders of the runs.
+
+    Raises
+    ------
+    LiveError
+        If two cells have one name, or ports cannot be had.
+    """
+    names = [problem.name for problem in problems]
+    if len(set(names)) < len(names):
+        raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
+    name = name or f"controller-{os.getpid()}"
+    recorders = []
+    with ExitStack() as stack:
+        threads = []
+        for problem in problems:
+            node = problem.controller_node
+            transport = ZenohTransport(wire(problem).entry(f"controller@{node}"))
+            stack.callback(transport.close)
+            place = Place(problem, f"controller@{node}", node, transport, time.time_ns())
+            controller = Controller(problem, policy)
+            recorder = RunRecorder(out, problem, controller, say)
+            cell = Cell(place, controller, recorder, name, time.monotonic_ns())
+            hosted = Hosted(cell, transport, stopped=stopped)
+            threads.append(threading.Thread(target=hosted.run, name=problem.name, daemon=True))
+            recorders.append((recorder, cell))
+        for thread in threads:
+            thread.start()
+        stopped.wait()
+        for thread in threads:
+            thread.join()
+        return [
+            folder
+            for recorder, cell in recorders
+            if (folder := recorder.finish(cell.windows.rows() if cell.windows else None))
+            is not None
+        ]

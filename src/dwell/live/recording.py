@@ -1,0 +1,92 @@
+"""Recording: the folder of a live run, written while it goes on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from collections.abc import Callable
+from pathlib import Path
+
+from dwell.control import Controller
+from dwell.errors import RunError
+from dwell.live.tables import columns_of
+from dwell.live.windows import Resume, Rows
+from dwell.model import Problem
+from dwell.model.document import to_document
+from dwell.record import seal_run
+from dwell.record.journal import Journal
+
+__all__ = ["RunRecorder"]
+
+
+class RunRecorder:
+    """Keeps the rows of a cell's runs, one folder a run id.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of folders.
+    problem : Problem
+    controller : Controller
+    say : callable
+        Takes lines for the log.
+    """
+
+    def __init__(
+        self, out: Path, problem: Problem, controller: Controller, say: Callable[[str], None]
+    ) -> None:
+        self.out, self.problem, self.controller = out, problem, controller
+        self._say = say
+        self._journal: Journal | None = None
+
+    def open(self, run: int) -> Resume:
+        """Begin to keep a run, or go on with it; returns where."""
+        self.finish()
+        folder = self.out / f"{self.problem.name}-{run}"
+        journal = Journal(
+            folder, run=str(run), meta=self._meta(), columns=columns_of(self.controller)
+        )
+        self._journal = journal
+        self._say(f"{self.problem.name}: the run is kept in {folder}")
+        window, cycle = journal.following("windows"), journal.following("cycles")
+        return Resume(window, cycle)
+
+    def append(self, rows: Rows, **meta: object) -> None:
+        """Keep rows; a disk that is full costs the rows and not the control."""
+        if self._journal is None:
+            return
+        try:
+            self._journal.append(rows, **meta)
+        except RunError as error:
+            self._say(f"error: {error}")
+
+    def finish(self, rows: Rows | None = None) -> Path | None:
+        """Write the tables of the run; returns its folder, None where there was none."""
+        journal, self._journal = self._journal, None
+        if journal is None:
+            return None
+        try:
+            if rows is not None:
+                journal.append(rows)
+            journal.close()
+            seal_run(journal.folder)
+        except RunError as error:
+            self._say(f"error: {error}")
+        return journal.folder
+
+    def _meta(self) -> dict[str, object]:
+        policy = self.controller.policy
+        known = type(policy).__repr__ is not object.__repr__
+        packages = ("dwell", "numpy", "eclipse-zenoh")
+        return {
+            "kind": "live",
+            "cell": self.problem.name,
+            "scenario": "live",
+            "policy": repr(policy) if known else type(policy).__name__,
+            "estimator": type(self.controller.estimator).__name__,
+            "problem": to_document(self.problem),
+            "versions": {
+                **{name: importlib.metadata.version(name) for name in packages},
+                "python": platform.python_version(),
+            },
+        }

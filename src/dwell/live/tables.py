@@ -1,0 +1,199 @@
+"""Columns and rows of a live run's tables: those of a simulated one, and some beside them.
+
+Cycles and windows count from 0 without gaps, as in any run; what the stamps say stands beside it.
+
+==================  ================================================================================
+column of cycles    what it is
+==================  ================================================================================
+run, number, term   as stamped
+lead                whether it belongs to no window
+heard               false where it is known by its neighbours only
+actuated            whether all its commands were applied
+interval_ns         from its stamp to its last completion, as both arrived at the controller: one
+                    clock alone, but with what the two messages' ways differ by
+bound_ns            of the error of its latency, by the clocks; null where they were not compared
+==================  ================================================================================
+
+==================  ================================================================================
+column of windows   what it is
+==================  ================================================================================
+term                of its last cycle
+lead                cycles before it that belong to no window
+heard               cycles of which anything was heard
+bound_ms            largest of its cycles'
+unproven            whether that is more than 20 % of D
+closed_unix_ns      time of day of its close
+==================  ================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
+
+from dwell.control import NEVER_NS, Controller
+from dwell.live.cycles import LiveCycle
+from dwell.live.offsets import UNBOUNDED_NS
+from dwell.record import OUTCOMES, Columns
+
+if TYPE_CHECKING:
+    from dwell.live.windows import LiveWindow
+
+__all__ = ["Row", "columns_of", "cycle_row", "decision_rows", "sends_shadows", "window_row"]
+
+Row: TypeAlias = tuple[object, ...]
+
+REASONS = ("dwell", "hold", "migrate", "infeasible", "guard")
+
+
+def sends_shadows(controller: Controller) -> bool:
+    """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
+    return controller.shadow_fraction > 0 or controller.guarded
+
+
+def columns_of(controller: Controller) -> Columns:
+    """Type of every column of the tables that a live run under this controller has."""
+    problem = controller.problem
+    placements = list(problem.candidates)
+    nodes = list(problem.fabric.nodes)
+    shadows = sends_shadows(controller)
+    names = controller.log.columns(placements, support=controller.supports)
+    decisions: dict[str, str | list[str]] = dict.fromkeys(names, "Float64")
+    decisions.update(
+        window="Int64",
+        incumbent=placements,
+        placement=placements,
+        migrated="Boolean",
+        reason=list(REASONS),
+        dwell="Int64",
+    )
+    return {
+        "cycles": {
+            "cycle": "Int64",
+            "release_ns": "Int64",
+            "placement": placements,
+            "latency_ns": "Int64",
+            "missed": "Boolean",
+            "outcome": list(OUTCOMES),
+            "compute_ns": "Int64",
+            "queue_ns": "Int64",
+            "network_ns": "Int64",
+            "run": "Int64",
+            "number": "Int64",
+            "term": "Int64",
+            "lead": "Boolean",
+            "heard": "Boolean",
+            "actuated": "Boolean",
+            "interval_ns": "Int64",
+            "bound_ns": "Int64",
+        },
+        "windows": {
+            "window": "Int64",
+            "first_cycle": "Int64",
+            "warmup": "Boolean",
+            "placement": placements,
+            "mixed": "Boolean",
+            "l95_ms": "Float64",
+            "violation_rate": "Float64",
+            "seen_l95_ms": "Float64",
+            "seen_violation_rate": "Float64",
+            **{f"u_{node}": "Float64" for node in nodes},
+            "cost": "Float64",
+            **({"shadow_cycles": "Int64", "shadow_bytes": "Int64"} if shadows else {}),
+            **({f"shadow_{node}": "Float64" for node in nodes} if shadows else {}),
+            "term": "Int64",
+            "lead": "Int64",
+            "heard": "Int64",
+            "bound_ms": "Float64",
+            "unproven": "Boolean",
+            "closed_unix_ns": "Int64",
+        },
+        "decisions": decisions,
+    }
+
+
+def cycle_row(cycle: LiveCycle, *, missed: bool) -> Row:
+    """Row of ``cycles``."""
+    return (
+        cycle.row,
+        cycle.at_ns,
+        cycle.placement,
+        None if cycle.latency_ns >= NEVER_NS else cycle.latency_ns,
+        missed,
+        cycle.outcome,
+        *(cycle.parts_ns or (None, None, None)),
+        cycle.run,
+        cycle.number,
+        cycle.term,
+        cycle.window is None,
+        cycle.heard,
+        cycle.actuated,
+        cycle.interval_ns,
+        None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
+    )
+
+
+def window_row(
+    window: LiveWindow,
+    *,
+    warmup: bool,
+    l95_ms: float,
+    missed: int,
+    seen: Sequence[float | None],
+    shadows: tuple[int, int] | None,
+) -> Row:
+    """Row of ``windows``.
+
+    Parameters
+    ----------
+    window : LiveWindow
+    warmup : bool
+    l95_ms : float
+        Of final latencies.
+    missed : int
+        Cycles.
+    seen : sequence of 3 float or None
+        L95 (ms), violation rate and cost as the controller saw them.
+    shadows : tuple of int, optional
+        Cycles that were sent twice, and their bytes, where cycles may be.
+    """
+    cycles = window.cycles
+    busy, _, by_shadows = window.used.tolist()
+    seen_l95_ms, seen_violation_rate, cost = (_known(value) for value in seen)
+    return (
+        window.number,
+        cycles[0].row,
+        warmup,
+        cycles[0].placement,
+        any(cycle.placement != cycles[0].placement for cycle in cycles),
+        l95_ms,
+        missed / len(cycles),
+        seen_l95_ms,
+        seen_violation_rate,
+        *busy,
+        cost,
+        *((*shadows, *by_shadows) if shadows is not None else ()),
+        cycles[-1].term,
+        window.lead,
+        window.heard,
+        None if window.bound_ns >= UNBOUNDED_NS else window.bound_ns / 1e6,
+        window.unproven,
+        window.closed_unix_ns,
+    )
+
+
+def decision_rows(decisions: Iterable[Sequence[object]], first_window: int) -> list[Row]:
+    """Rows of ``decisions`` from the log of a controller whose first window had this number."""
+    return [(first_window + _count(row[0]), *map(_known, row[1:])) for row in decisions]
+
+
+def _count(value: object) -> int:
+    if not isinstance(value, int):
+        raise TypeError(f"{value!r} is no number of a window")
+    return value
+
+
+def _known(value: object) -> object:
+    """Return None for what is not a number."""
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,82 @@
+"""Visiting: questions of a person to a cell's controller."""
+
+from __future__ import annotations
+
+import queue
+import uuid
+from typing import Any
+
+from dwell.errors import LiveError
+from dwell.live.keys import Keys
+from dwell.live.messages import Answer, Ask, decode, encode
+from dwell.live.transport.protocol import Sample
+from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wiring import wire
+from dwell.model import Problem
+
+__all__ = ["Visitor"]
+
+RESEND_S = 0.2
+
+
+class Visitor:
+    """Somebody who is no part of a cell and talks to its controller; a context manager.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._name = f"visitor-{uuid.uuid4().hex[:8]}"
+        self._controller = f"controller@{problem.controller_node}"
+        self._keys = Keys(problem.name)
+        self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._transport = ZenohTransport(wire(problem).visitor(self._name, self._controller))
+        self._transport.subscribe(self._keys.answer(self._name), self._heard)
+
+    def __enter__(self) -> Visitor:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the connection."""
+        self._transport.close()
+
+    def _heard(self, sample: Sample) -> None:
+        try:
+            self._answers.put(decode(sample.payload, Answer))
+        except LiveError:
+            return
+
+    def ask(self, what: str, about: str = "", *, patience_s: float = 3.0) -> dict[str, Any]:
+        """Ask, and return how the cell is.
+
+        Parameters
+        ----------
+        what : str
+            ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``.
+        about : str
+            Candidate to pin, node to drain.
+        patience_s : float
+
+        Raises
+        ------
+        LiveError
+            If it is refused, or nobody answers.
+        """
+        ask = encode(Ask(self._name, what, about))
+        for _ in range(max(round(patience_s / RESEND_S), 1)):
+            self._transport.put(self._keys.ask(), ask)
+            try:
+                answer = self._answers.get(timeout=RESEND_S)
+            except queue.Empty:
+                continue
+            if answer.refused:
+                raise LiveError(f"refused: {answer.refused}")
+            return answer.status
+        raise LiveError(
+            f"no controller of cell {self.problem.name!r} answers; is `dwell controller` running "
+            f"on {self.problem.controller_node}?"
+        )

@@ -1,0 +1,487 @@
+"""LiveWindows: stamps, completions and loads of a running cell in, closed windows out.
+
+Everything is put on the stamper's clock (see `offsets`), counted from the first release of the run.
+A window is W consecutive cycles by release and closes `close_grace_ms` after the release of the
+first cycle beyond them. Where the term or the placement changes before W cycles are there, or while
+an order is under way, the next window starts at the first cycle stamped anew; the cycles before it
+are lead, and belong to no window.
+
+Messages are lost, late, and come twice. A cycle is known by its stamp or by its completion; one of
+which neither was heard, between two that are known, is taken to have been released between them,
+and never to have completed. Numbers that a restarted stamper has left out were never cycles: there,
+fewer periods have passed than numbers.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import ClosedWindow, Controller, final_l95_ms
+from dwell.errors import LiveError
+from dwell.live.cycles import Ledger, LiveCycle
+from dwell.live.loads import NodeLoad
+from dwell.live.messages import Completion, Load, Stamp
+from dwell.live.offsets import UNBOUNDED_NS, Offsets
+from dwell.live.tables import Row, cycle_row, decision_rows, sends_shadows, window_row
+from dwell.model import Problem
+
+__all__ = ["LiveWindow", "LiveWindows", "Resume", "Rows"]
+
+Rows: TypeAlias = dict[str, list[Row]]
+
+#: A window whose latencies may be off by more than this share of D is marked unproven.
+PROVEN_SHARE = 0.2
+#: Numbers between two cycles were cycles if they had this share of a period each.
+NEAR_PERIOD = (0.75, 1.25)
+#: Where the stamper's clock and the controller's disagree by this much on the time since the last
+#: stamp, one of them has begun anew.
+CLOCK_BREAK_NS = 60_000_000_000
+#: Cycles remembered beyond some windows.
+KEPT_CYCLES = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Where a run is gone on with, after its controller has been restarted.
+
+    Parameters
+    ----------
+    window, cycle : int
+        Numbers of the first window and cycle that will be recorded.
+    origin_ns : int, optional
+        First release of the run, on the stamper's clock; that of the first stamp heard where None.
+    """
+
+    window: int = 0
+    cycle: int = 0
+    origin_ns: int | None = None
+
+
+@dataclass(eq=False, slots=True)
+class LiveWindow:
+    """A closed window as it is recorded.
+
+    Parameters
+    ----------
+    number : int
+    cycles : list of LiveCycle
+    close_ns : int
+        Since the origin.
+    lead : int
+        Cycles between the window before and this one.
+    heard : int
+        Cycles of which anything was heard. Of a window with none nothing is known, and it is none
+        to decide on (`Controller.miss`).
+    bound_ns : int
+        Of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
+    unproven : bool
+        Whether that is more than 20 % of D.
+    used : float64 array, shape (3, nodes)
+        Busy, own and shadow share of the cores.
+    closed_unix_ns : int, optional
+        Time of day of its close.
+    """
+
+    number: int
+    cycles: list[LiveCycle]
+    close_ns: int
+    lead: int
+    heard: int
+    bound_ns: int
+    unproven: bool
+    used: NDArray[np.float64]
+    closed_unix_ns: int | None
+
+
+class LiveWindows:
+    """Closes the windows of one cell.
+
+    Every window that `close` returns goes to the controller's `close` or `miss`, one for one: the
+    record takes what the controller saw and decided from its log.
+
+    Parameters
+    ----------
+    problem : Problem
+    offsets : Offsets
+        Its reference is the stamper's node, its node the controller's.
+    controller : Controller
+    resume : Resume, optional
+
+    Attributes
+    ----------
+    origin_ns : int or None
+        First release of the run, on the stamper's clock; None before a stamp was heard.
+    last : LiveWindow or None
+        The window that closed last.
+    ignored : int
+        Messages about unknown placements, sinks or nodes, or cycles of long ago.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        offsets: Offsets,
+        controller: Controller,
+        *,
+        resume: Resume | None = None,
+    ) -> None:
+        resume = resume or Resume()
+        self.problem, self.offsets, self._controller = problem, offsets, controller
+        self.origin_ns = resume.origin_ns
+        self.last: LiveWindow | None = None
+        self.ignored = 0
+        self._ledger = Ledger(problem, offsets)
+        self._loads = {node: NodeLoad() for node in problem.fabric.nodes}
+        self._size = problem.window_cycles
+        self._period_ns = round(problem.pipeline.period_ms * 1e6)
+        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._grace_ns = round(problem.controller.close_grace_ms * 1e6)
+        self._longest = 8 * self._size + KEPT_CYCLES
+        self._kept = 4 * self._size + KEPT_CYCLES
+        # Cycles that are in no closed window yet, by release; and all that are remembered.
+        self._line: list[LiveCycle] = []
+        self._by_key: dict[tuple[int, int], LiveCycle] = {}
+        self._recorded: deque[LiveCycle] = deque()
+        self._newest: tuple[LiveCycle, int | None] | None = None
+        self._newest_done = (-1, -1)
+        self._mixed = self._ordered = False
+        self._lead = 0
+        self._first_window = self._next_window = resume.window
+        self._next_row = resume.cycle
+        self._windows: dict[int, LiveWindow] = {}
+        self._changed: dict[int, LiveCycle] = {}
+        self._changed_windows: set[int] = set()
+        self._in_flight: dict[int, LiveCycle] = {}
+        self._decisions_taken = 0
+
+    # ------------------------------------------------------------------ what is heard
+
+    def stamped(self, stamp: Stamp, at_ns: int | None = None) -> None:
+        """A cycle was released.
+
+        Parameters
+        ----------
+        stamp : Stamp
+        at_ns : int, optional
+            When this was heard, on the controller's clock.
+        """
+        cycle = self._note(stamp, at_ns)
+        if cycle is not None and cycle.stamped_ns is None:
+            cycle.stamped_ns = at_ns
+
+    def completed(self, completion: Completion, at_ns: int | None = None) -> None:
+        """A sink has had a cycle's command, or a cycle's shadow has come to its end."""
+        if completion.sink not in self._ledger.sinks:
+            self.ignored += 1
+            return
+        cycle = self._note(completion.stamp, at_ns)
+        if cycle is None or not cycle.take(completion, at_ns):
+            return
+        if self._ledger.complete(cycle):
+            self._newest_done = max(self._newest_done, cycle.key)
+        if cycle.row >= 0:
+            self._ledger.settle(cycle)
+            self._touch(cycle)
+
+    def loaded(self, load: Load) -> None:
+        """A node's agent has read its counters."""
+        if load.node in self._loads:
+            self._loads[load.node].report(load)
+        else:
+            self.ignored += 1
+
+    def ordered(self) -> None:
+        """A migration is under way: the next window begins with it, or goes on when `refused`."""
+        self._ordered = True
+
+    def refused(self) -> None:
+        """The migration will not come about: windows go on where they were."""
+        self._ordered = False
+
+    def _note(self, stamp: Stamp, at_ns: int | None) -> LiveCycle | None:
+        key = stamp.run, stamp.cycle
+        known = self._by_key.get(key)
+        if stamp.placement not in self.problem.candidates:
+            self.ignored += 1
+        elif known is not None:
+            if not known.heard:
+                self._identify(known, stamp)
+        elif self._newest is None or key > self._newest[0].key:
+            return self._append(stamp, at_ns)
+        elif self._line and key > self._line[0].key:
+            return self._insert(stamp)
+        else:
+            # Before the first one heard, or of long ago.
+            self.ignored += 1
+        return known
+
+    def _identify(self, cycle: LiveCycle, stamp: Stamp) -> None:
+        cycle.identify(stamp)
+        if cycle.row >= 0:
+            self._touch(cycle)
+        else:
+            self._mixed = self._mixed or cycle.segment != self._line[0].segment
+
+    def _append(self, stamp: Stamp, at_ns: int | None) -> LiveCycle:
+        if self.origin_ns is None:
+            self.origin_ns = stamp.released_ns
+        if self._newest is not None:
+            self._follow(*self._newest, stamp, at_ns)
+        cycle = LiveCycle.of(stamp, self.origin_ns)
+        line = self._line
+        between = self._between(line[-1], cycle) if line else ()
+        for other in (*between, cycle):
+            line.append(other)
+            self._by_key[other.key] = other
+        self._newest = cycle, at_ns
+        self._mixed = self._mixed or cycle.segment != line[0].segment
+        if len(line) > self._longest:
+            # Nobody has said what became of an order.
+            self._drop(len(line) - self._size)
+        return cycle
+
+    def _follow(
+        self, newest: LiveCycle, heard_ns: int | None, stamp: Stamp, at_ns: int | None
+    ) -> None:
+        """Begin a window anew where the stamper's clock has begun anew, with its node."""
+        passed_ns = stamp.released_ns - newest.origin_ns - newest.at_ns
+        own_ns = passed_ns if heard_ns is None or at_ns is None else at_ns - heard_ns
+        if passed_ns >= 0 and abs(passed_ns - own_ns) < CLOCK_BREAK_NS:
+            return
+        own_ns = max(own_ns, self._period_ns)
+        self.origin_ns = stamp.released_ns - newest.at_ns - own_ns
+        self._drop(len(self._line))
+
+    def _between(self, last: LiveCycle, following: LiveCycle) -> Iterable[LiveCycle]:
+        """Cycles nobody heard of between two that are known."""
+        steps, span_ns = following.number - last.number, following.at_ns - last.at_ns
+        least, most = (steps * self._period_ns * share for share in NEAR_PERIOD)
+        if last.run != following.run or not 1 < steps <= self._longest:
+            return
+        if least <= span_ns <= most:
+            for step in range(1, steps):
+                who = last.run, last.number + step, last.term, last.placement, ""
+                at_ns = last.at_ns + span_ns * step // steps
+                yield LiveCycle(*who, at_ns, last.origin_ns, heard=False)
+
+    def _insert(self, stamp: Stamp) -> LiveCycle | None:
+        """Put a cycle where it belongs, among numbers that seemed to have been left out."""
+        line = self._line
+        cycle = LiveCycle.of(stamp, line[0].origin_ns)
+        place = bisect.bisect(line, cycle.key, key=lambda other: other.key)
+        if not line[place - 1].at_ns <= cycle.at_ns <= line[place].at_ns:
+            self.ignored += 1
+            return None
+        line.insert(place, cycle)
+        self._by_key[cycle.key] = cycle
+        self._mixed = self._mixed or cycle.segment != line[0].segment
+        return cycle
+
+    # -------------------------------------------------------------- when a window closes
+
+    def _begin(self) -> tuple[int, bool]:
+        """Place in the line where the open window starts, and whether an order is awaited."""
+        start, ordered = 0, self._ordered
+        if self._mixed:
+            segment = self._line[0].segment
+            for place, cycle in enumerate(self._line):
+                if not cycle.heard or cycle.segment == segment:
+                    continue
+                if place - start >= self._size and not ordered:
+                    break
+                start, segment, ordered = place, cycle.segment, False
+        return start, ordered
+
+    def due_ns(self, now_ns: int) -> int | None:
+        """Return when the next window closes, on the controller's clock; None if that is not known.
+
+        Parameters
+        ----------
+        now_ns : int
+            What the clock shows: a cycle that has been heard of has been released.
+        """
+        start, ordered = self._begin()
+        if ordered or len(self._line) <= start + self._size:
+            return None
+        beyond = self._line[start + self._size]
+        if beyond.stamped_ns is None:
+            beyond.stamped_ns = now_ns
+        released_ns, bound_ns = self.offsets.from_reference(
+            self.offsets.node, beyond.at_ns + beyond.origin_ns
+        )
+        if bound_ns >= UNBOUNDED_NS:
+            released_ns = beyond.stamped_ns
+        return min(released_ns, beyond.stamped_ns) + self._grace_ns
+
+    def close(self, *, unix_ns: int | None = None) -> ClosedWindow:
+        """Close the window that is due.
+
+        Parameters
+        ----------
+        unix_ns : int, optional
+            Time of day, for the record.
+
+        Returns
+        -------
+        ClosedWindow
+            Its instants count from the first release of the run; more is in `last`.
+
+        Raises
+        ------
+        LiveError
+            If none is due: fewer than W + 1 cycles are known, or a migration is under way.
+        """
+        start, ordered = self._begin()
+        if ordered or len(self._line) <= start + self._size:
+            raise LiveError("no window is due")
+        self._drop(start)
+        self._ordered = False
+        cycles = self._line[: self._size]
+        close_ns = self._line[self._size].at_ns + self._grace_ns
+        for cycle in cycles:
+            self._ledger.settle(cycle)
+            cycle.window, cycle.close_ns = self._next_window, close_ns
+        self._take_off(self._size)
+        release_ns = np.array([cycle.at_ns for cycle in cycles], np.int64)
+        shadows = sends_shadows(self._controller)
+        closed = ClosedWindow(
+            latency_ns=np.array([cycle.latency_ns for cycle in cycles], np.int64),
+            release_ns=release_ns,
+            close_ns=close_ns,
+            open_ns=int(release_ns[0]),
+            core_ns=self._core_ns(cycles[0], close_ns),
+            evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
+        )
+        bound_ns = max(cycle.bound_ns for cycle in cycles)
+        self.last = LiveWindow(
+            number=self._next_window,
+            cycles=cycles,
+            close_ns=close_ns,
+            lead=self._lead,
+            heard=sum(cycle.heard for cycle in cycles),
+            bound_ns=bound_ns,
+            unproven=bound_ns > PROVEN_SHARE * self._deadline_ns,
+            used=self._controller.utilisation(closed),
+            closed_unix_ns=unix_ns,
+        )
+        self._windows[self.last.number] = self.last
+        self._changed_windows.add(self.last.number)
+        self._next_window += 1
+        self._lead = 0
+        return closed
+
+    def _drop(self, count: int) -> None:
+        """Leave cycles at the line's beginning to no window."""
+        for cycle in self._line[:count]:
+            self._ledger.settle(cycle)
+        self._lead += count
+        self._take_off(count)
+
+    def _take_off(self, count: int) -> None:
+        """Move cycles from the line to the record, and forget those of long ago."""
+        for cycle in self._line[:count]:
+            cycle.row = self._next_row
+            self._next_row += 1
+            self._changed[cycle.row] = cycle
+            self._recorded.append(cycle)
+        del self._line[:count]
+        self._mixed = any(cycle.segment != self._line[0].segment for cycle in self._line)
+        while len(self._recorded) > self._kept:
+            old = self._recorded.popleft()
+            del self._by_key[old.key]
+            self._in_flight.pop(old.row, None)
+            if old.window is not None:
+                self._windows.pop(old.window, None)
+
+    def _core_ns(self, first: LiveCycle, close_ns: int) -> NDArray[np.float64]:
+        """Core-nanoseconds of every node in a window, shape (3, nodes)."""
+        used = np.zeros((3, len(self._loads)))
+        for column, (node, load) in enumerate(self._loads.items()):
+            begin_ns, end_ns = (
+                self.offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
+                for at_ns in (first.at_ns, close_ns)
+            )
+            used[:, column] = load.at(end_ns) - load.at(begin_ns)
+            load.forget(begin_ns)
+        return used
+
+    # --------------------------------------------------------------------- the record
+
+    def rows(self) -> Rows:
+        """Rows of the tables that are new, or have changed since the last call."""
+        for row, cycle in self._in_flight.items():
+            if self._outcome(cycle) != cycle.outcome:
+                self._changed[row] = cycle
+        cycles = [self._cycle_row(self._changed[row]) for row in sorted(self._changed)]
+        windows = [
+            self._window_row(self._windows[number])
+            for number in sorted(self._changed_windows)
+            if number in self._windows
+        ]
+        decisions = self._controller.log.decisions[self._decisions_taken :]
+        self._decisions_taken += len(decisions)
+        self._changed.clear()
+        self._changed_windows.clear()
+        return {
+            "cycles": cycles,
+            "windows": windows,
+            "decisions": decision_rows(decisions, self._first_window),
+        }
+
+    def status(self) -> dict[str, object]:
+        """Return how the windows are, as plain values."""
+        last = self.last
+        status: dict[str, object] = {
+            "windows": self._next_window,
+            "cycles": self._next_row + len(self._line),
+            "ignored_messages": self.ignored,
+            "clock_breaks": self.offsets.breaks,
+        }
+        if last is not None:
+            known = last.bound_ns < UNBOUNDED_NS
+            status["bound_ms"] = last.bound_ns / 1e6 if known else None
+            status["unproven"] = last.unproven
+            status["heard_cycles"] = last.heard
+        return status
+
+    def _touch(self, cycle: LiveCycle) -> None:
+        self._changed[cycle.row] = cycle
+        if cycle.window is not None:
+            self._changed_windows.add(cycle.window)
+
+    def _outcome(self, cycle: LiveCycle) -> str:
+        if self._ledger.complete(cycle):
+            return "done"
+        return "dropped" if cycle.key < self._newest_done else "in_flight"
+
+    def _cycle_row(self, cycle: LiveCycle) -> Row:
+        cycle.outcome = self._outcome(cycle)
+        if cycle.outcome == "in_flight":
+            self._in_flight[cycle.row] = cycle
+        else:
+            self._in_flight.pop(cycle.row, None)
+        return cycle_row(cycle, missed=cycle.missed(self._deadline_ns))
+
+    def _window_row(self, window: LiveWindow) -> Row:
+        cycles = window.cycles
+        place = window.number - self._first_window
+        seen = self._controller.log.seen
+        latency_ns = np.array([cycle.latency_ns for cycle in cycles], np.int64)
+        return window_row(
+            window,
+            warmup=window.number < self.problem.warmup_windows,
+            l95_ms=float(final_l95_ms(latency_ns)),
+            missed=sum(cycle.missed(self._deadline_ns) for cycle in cycles),
+            seen=seen[place] if place < len(seen) else (None, None, None),
+            shadows=(
+                self._ledger.shadow_bytes(cycles) if sends_shadows(self._controller) else None
+            ),
+        )

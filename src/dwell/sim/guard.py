@@ -1,0 +1,333 @@
+"""The guard in the simulator: when it looks, what it finds whole, and the probes of the return."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import Probation, parts_of
+from dwell.kernels import layout as k
+from dwell.kernels.heaps import post_event
+from dwell.model import Placement, Problem
+from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
+
+__all__ = ["Watch", "back_ns"]
+
+FOREVER = 1 << 62
+
+
+def back_ns(problem: Problem, placement: Placement) -> int:
+    """Time from a completion until the guard hears of it, nanoseconds.
+
+    A completion is a small message that takes whichever way is shortest: the least sum of mean
+    delays from the sink's node to the stamper's, of the sink that is farthest; 0 where no links
+    lead there.
+    """
+    pipeline, links = problem.pipeline, problem.fabric.links.values()
+    sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
+    to_ms = {problem.stamper_node: 0.0}
+    reached = [(0.0, problem.stamper_node)]
+    while reached:
+        ms, node = heapq.heappop(reached)
+        for link in links:
+            further_ms = ms + link.delay_ms.expectation
+            if link.target == node and further_ms < to_ms.get(link.source, np.inf):
+                to_ms[link.source] = further_ms
+                heapq.heappush(reached, (further_ms, link.source))
+    return round(max(to_ms.get(node, 0.0) for node in sinks) * 1e6)
+
+
+class Watch:
+    """The guard of one cell: `dwell.kernels.advance` says when it fires, this says what then.
+
+    Parameters
+    ----------
+    problem : Problem
+        With fallbacks.
+    realisation : Realisation
+    tables : Tables
+        What is about to be played; the guard is armed in it.
+    """
+
+    def __init__(self, problem: Problem, realisation: Realisation, tables: k.Tables) -> None:
+        self.problem = problem
+        self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
+        self.names = tuple(problem.candidates)
+        period_ns = round(problem.pipeline.period_ms * 1e6)
+        self.patience_ns = problem.controller.guard_cycles * period_ns
+        self.probation = Probation.of(problem)
+        self.probes = _Probes(problem, realisation)
+        self.since: int | None = 0
+        self._outages = _Outages(problem, realisation)
+        self._arm(tables, 0)
+
+    @property
+    def on_fallback(self) -> bool:
+        """Whether the guard's own move holds."""
+        return self.since is None
+
+    def _arm(self, tables: k.Tables, first: int) -> None:
+        """Wait for the completions of the cycles from `first` on, the first of a placement."""
+        cell = tables.cells[0]
+        cell[k.GUARD_NS] = self.patience_ns
+        cell[k.WAITED] = cell[k.MOVED] = first
+        if first < self.cycles:
+            self._look_at(tables, self._due_ns(first))
+
+    def _due_ns(self, first: int) -> int:
+        """When the guard fires if no cycle from `first` on completes."""
+        return int(self.release_ns[first]) + self.patience_ns if first < self.cycles else FOREVER
+
+    def _look_at(self, tables: k.Tables, at_ns: int) -> None:
+        """Look at an instant, and not before."""
+        tables.cells[0, k.GUARD_T] = at_ns
+        key = k.GUARD << k.KIND_SHIFT
+        post_event(tables.clock, tables.event_t, tables.event_key, at_ns, key)
+
+    def fire(self, tables: k.Tables, now: int, active: str) -> str | None:
+        """Return the fallback that the cell moves to now; None where it has to wait for one.
+
+        It waits where its own node is down, or was since the release of the cycle it waits for,
+        until cycles released since then are missing; and where no fallback is whole, until one is.
+        """
+        own = self._outages.of(self.problem.stamper_node)
+        waited = int(tables.cells[0, k.WAITED])
+        back_at = max((up for down, up in own if down <= now), default=0)
+        if back_at > self.release_ns[waited]:
+            first = int(np.searchsorted(self.release_ns[: self.cycles], back_at))
+            tables.cells[0, k.WAITED] = first
+            again = max(back_at, now)
+        else:
+            others = [name for name in self.problem.controller.fallbacks if name != active]
+            since_ns = now - self.patience_ns
+            for name in others:
+                if not any(
+                    self._outages.missing(part, since_ns, now) for part in self._parts(name)
+                ):
+                    return name
+            ends = (
+                up
+                for name in others
+                for part in self._parts(name)
+                for _, up in self._outages.of(part)
+                if up > now
+            )
+            again = min(ends, default=FOREVER)
+            moved = int(tables.cells[0, k.MOVED])
+            if self.release_ns[moved] >= now:
+                again = min(again, self._due_ns(moved))
+        if again < FOREVER:
+            self._look_at(tables, again)
+        return None
+
+    def _parts(self, name: str) -> Iterable[str]:
+        return sorted(parts_of(self.problem, name))
+
+    def fell(self, tables: k.Tables, now: int) -> None:
+        """Hold on: the cell has moved to a fallback."""
+        self._note_health(tables, now)
+        self.probation.fell()
+        self.since = None
+
+    def moved(self, tables: k.Tables, first: int) -> None:
+        """Take note of an order that takes effect at a cycle."""
+        if self.since is None:
+            self.probation.left()
+            self.probes.end(first)
+            self.since = first
+            self._arm(tables, first)
+            return
+        cell = tables.cells[0]
+        # The placement before has been stamped with: a window of it has closed.
+        cell[k.WAITED] = max(cell[k.WAITED], cell[k.MOVED])
+        cell[k.MOVED] = first
+        # Other fallbacks may be open to the new placement than those that were not whole.
+        due_ns, next_ns = self._due_ns(first), int(cell[k.GUARD_T])
+        if due_ns < FOREVER and not 0 <= next_ns <= due_ns:
+            self._look_at(tables, due_ns)
+
+    def _note_health(self, tables: k.Tables, now: int) -> None:
+        """Count what was heard to complete since the cell has been under orders."""
+        if self.since is None:
+            return
+        last = int(np.searchsorted(self.release_ns[: self.cycles], now))
+        cycles = slice(self.since, last)
+        code = tables.stamps[0, cycles].astype(np.int64)
+        heard = self.release_ns[cycles] + tables.latency_ns[0, cycles] + tables.back_ns[code]
+        done = tables.outcome[0, cycles] == k.DONE
+        self.probation.healthy(int(np.count_nonzero(done & (heard <= now))))
+
+    def proven(self, tables: k.Tables, now: int) -> str | None:
+        """Return the candidate that probes have proven by now."""
+        wanted = self.probation.wanted
+        if not self.on_fallback or wanted is None:
+            return None
+        for at_ns, completed, cycle in self.probes.news(tables, now):
+            if completed:
+                self.probation.completed(cycle, at_ns)
+            else:
+                self.probation.released(cycle, at_ns)
+        return wanted if self.probation.proven(wanted, now) else None
+
+    def want(self, name: str | None, first: int) -> None:
+        """Send every cycle from `first` on through what is wanted, too."""
+        if name != self.probation.wanted:
+            self.probation.want(name)
+            self.probes.begin(None if name is None else self.names.index(name), first)
+
+
+class _Outages:
+    """When nodes, links and workers cannot be heard."""
+
+    def __init__(self, problem: Problem, realisation: Realisation) -> None:
+        self.problem = problem
+        self._changes = NodeChanges.of(realisation.node_changes)
+        self._segments = LinkSegments.of(realisation.link_segments)
+        self._known: dict[str, list[tuple[int, int]]] = {}
+
+    def of(self, part: str) -> list[tuple[int, int]]:
+        """Return the outages of a node, a link or a worker: from when, until when."""
+        if part not in self._known:
+            self._known[part] = list(self._find(part))
+        return self._known[part]
+
+    def missing(self, part: str, since_ns: int, now: int) -> bool:
+        """Whether a part could not be heard from `since_ns` until now."""
+        return any(down <= since_ns and now < up for down, up in self.of(part))
+
+    def _find(self, part: str) -> Iterator[tuple[int, int]]:
+        task, at, node = part.partition("@")
+        if at:
+            start_ns = round(self.problem.pipeline.tasks[task].start_ms * 1e6)
+            return _joined((down, up + start_ns) for down, up in self.of(node))
+        if part in self.problem.fabric.nodes:
+            nodes, table = self._changes.nodes, self._changes.table
+            mine = table[table[:, 1] == nodes.index(part)] if part in nodes else table[:0]
+            return _joined(_spells(mine[:, 0], mine[:, 3]))
+        links, table = self._segments.links, self._segments.table
+        mine = table[table[:, 1] == links.index(part)] if part in links else table[:0]
+        return _joined(_spells(mine[:, 0], mine[:, 2]))
+
+
+def _spells(at_ns: NDArray[np.int64], down: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """Yield from when until when something is down."""
+    begun: int | None = None
+    for at, is_down in zip(at_ns.tolist(), down.tolist(), strict=True):
+        if is_down and begun is None:
+            begun = at
+        elif not is_down and begun is not None:
+            yield begun, at
+            begun = None
+    if begun is not None:
+        yield begun, FOREVER
+
+
+def _joined(spells: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Join spells of which one begins before the other has ended."""
+    last: tuple[int, int] | None = None
+    for down, up in spells:
+        if last is not None and down <= last[1]:
+            last = (last[0], max(up, last[1]))
+            continue
+        if last is not None:
+            yield last
+        last = (down, up)
+    if last is not None:
+        yield last
+
+
+@dataclass(slots=True)
+class _Wish:
+    """Cycles from `first` on are also sent through a candidate; through none where it is None."""
+
+    first: int
+    code: int | None
+
+
+class _Probes:
+    """Which cycles are probes, and what became of them."""
+
+    def __init__(self, problem: Problem, realisation: Realisation) -> None:
+        self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
+        names = list(problem.pipeline.tasks)
+        flows = sorted(problem.pipeline.flows, key=lambda flow: names.index(flow.target))
+        #: Row of every sink, and the columns of its inputs among the flows in the kernels' order.
+        self.sinks = [
+            (row, [i for i, flow in enumerate(flows) if flow.target == name])
+            for row, name in enumerate(names)
+            if not problem.pipeline.outputs(name)
+        ]
+        self.tasks, self.candidates = len(names), len(problem.candidates)
+        self._wishes: list[_Wish] = []
+        self._open: list[int] = []
+        self._next = 0
+
+    def begin(self, code: int | None, first: int) -> None:
+        """Send cycles from `first` on through another candidate, or no longer."""
+        self._wishes = [*(wish for wish in self._wishes if wish.first < first), _Wish(first, code)]
+        self._open, self._next = [], first
+
+    def end(self, first: int) -> None:
+        """Send none from `first` on."""
+        if self._wishes:
+            self.begin(None, first)
+
+    def stamp(self, tables: k.Tables, start: int, stop: int) -> None:
+        """Stamp the probes among some cycles; the others keep what they have."""
+        for i, wish in enumerate(self._wishes):
+            until = self._wishes[i + 1].first if i + 1 < len(self._wishes) else self.cycles
+            if wish.code is not None:
+                tables.stamps[1, max(start, wish.first) : min(stop, until, self.cycles)] = wish.code
+
+    def news(self, tables: k.Tables, now: int) -> list[tuple[int, bool, int]]:
+        """Return what has happened to probes: when, whether they completed, and which cycle.
+
+        In the order of time, completions first, unless one comes with the release; each once.
+        """
+        last = int(np.searchsorted(self.release_ns[: self.cycles], now))
+        release_ns = self.release_ns
+        found = [(int(release_ns[cycle]), False, cycle) for cycle in range(self._next, last)]
+        unknown = [*self._open, *range(self._next, last)]
+        self._next, self._open = max(self._next, last), []
+        for cycle in unknown:
+            heard_ns = self._heard_ns(tables, cycle)
+            if heard_ns is not None and heard_ns <= now:
+                found.append((heard_ns, True, cycle))
+            elif heard_ns is not None or self._under_way(tables, cycle):
+                self._open.append(cycle)
+
+        def order(news: tuple[int, bool, int]) -> tuple[int, int, int]:
+            at_ns, completed, cycle = news
+            return at_ns, (2 if at_ns == release_ns[cycle] else 0) if completed else 1, cycle
+
+        return sorted(found, key=order)
+
+    def _heard_ns(self, tables: k.Tables, cycle: int) -> int | None:
+        """When the completion of a probe is heard: all sinks have, or would have, what they need.
+
+        A sink that the probe shares with its cycle must have completed.
+        """
+        active, other = (int(code) for code in tables.stamps[:, cycle])
+        parts = tables.shadow_parts[active * self.candidates + other]
+        at_ns = 0
+        for row, inputs in self.sinks:
+            if parts[row] == k.SHARED:
+                entry = cycle * self.tasks + row
+                done = tables.log_outcome[entry] == k.DONE
+                ends = [int(tables.log[entry, k.LOG_END]) if done else -1]
+            else:
+                arrived = tables.log_arrived[self.cycles + cycle]
+                ends = [int(arrived[i]) for i in inputs] or [int(self.release_ns[cycle])]
+            if min(ends) < 0:
+                return None
+            at_ns = max(at_ns, *ends)
+        return at_ns + int(tables.back_ns[other])
+
+    def _under_way(self, tables: k.Tables, cycle: int) -> bool:
+        """Whether anything of a cycle or its probe may still happen."""
+        slots = [tables.slots[cell * tables.ring + (cycle & (tables.ring - 1))] for cell in (0, 1)]
+        return any(slot[k.CYCLE] == cycle and slot[k.LIVE] > 0 for slot in slots)

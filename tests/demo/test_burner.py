@@ -1,0 +1,115 @@
+"""Busy threads: how many, where, until when; how busy is the machine's business."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dwell.demo.burner import Burner
+from dwell.errors import LiveError, ProblemError
+from tests.demo.link_wire import PATIENCE_S, wait_until
+
+CPU = max(os.sched_getaffinity(0))
+
+
+@pytest.fixture
+def burner() -> Iterator[Burner]:
+    with Burner([CPU]) as started:
+        yield started
+
+
+def used_s(pid: int) -> float:
+    """CPU time of a process; its name has no spaces."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def gone(pid: int) -> bool:
+    return not Path(f"/proc/{pid}").exists()
+
+
+def test_as_many_threads_as_asked_for_are_busy_where_they_should_be(burner: Burner) -> None:
+    assert not burner.pids
+    burner.set(3)
+    three = burner.pids
+    assert len(set(three)) == 3
+    for pid in three:
+        assert os.sched_getaffinity(pid) == {CPU}
+        assert os.sched_getscheduler(pid) == os.SCHED_OTHER
+        assert os.getpriority(os.PRIO_PROCESS, pid) == os.getpriority(os.PRIO_PROCESS, 0)
+        # In one session with the others, or a kernel with autogroup counts all of them as one.
+        assert os.getsid(pid) == os.getsid(0)
+    wait_until(lambda: all(used_s(pid) >= 0.03 for pid in three))
+    burner.set(1)
+    assert burner.pids == three[:1]
+    assert gone(three[1])
+    assert gone(three[2])
+    burner.set(0)
+    assert gone(three[0])
+
+
+def test_episodes_begin_and_end_at_their_instants(burner: Burner) -> None:
+    now_ns = time.monotonic_ns()
+    begin_ns, end_ns = now_ns + 50_000_000, now_ns + 150_000_000
+    assert burner.set(2, at_ns=begin_ns) == begin_ns
+    assert burner.set(1, at_ns=end_ns) == end_ns
+    assert not burner.pids or time.monotonic_ns() >= begin_ns
+    children = Path(f"/proc/{burner.pid}/task/{burner.pid}/children")
+    wait_until(lambda: len(children.read_text().split()) == 2)
+    assert time.monotonic_ns() >= begin_ns
+    wait_until(lambda: len(children.read_text().split()) == 1)
+    assert time.monotonic_ns() >= end_ns
+
+
+def test_all_threads_end_with_the_burner() -> None:
+    burner = Burner([CPU])
+    burner.start(2)
+    pids = (burner.pid, *burner.pids)
+    assert len(pids) == 3
+    burner.stop()
+    assert all(map(gone, pids))
+    burner.stop()
+
+
+PARENT = f"""
+import sys
+from dwell.demo.burner import Burner
+burner = Burner([{CPU}])
+burner.start(2)
+print(burner.pid, *burner.pids, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("victim", ["parent", "burner"])
+def test_all_threads_end_with_what_they_belong_to(victim: str) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as parent:
+        assert parent.stdout is not None
+        pids = [int(word) for word in parent.stdout.readline().split()]
+        descriptors = [os.pidfd_open(pid) for pid in pids]
+        os.kill(parent.pid if victim == "parent" else pids[0], signal.SIGKILL)
+        for descriptor in descriptors:
+            assert select.select([descriptor], [], [], PATIENCE_S)[0]
+            os.close(descriptor)
+        parent.kill()
+
+
+def test_mistakes_are_named(burner: Burner) -> None:
+    with pytest.raises(LiveError, match="a burner cannot run on CPU 4095; this process may use"):
+        Burner([CPU, 4095])
+    with pytest.raises(LiveError, match="a burner cannot run on no CPU"):
+        Burner([])
+    with pytest.raises(ProblemError, match="threads: -1 is not allowed"):
+        burner.set(-1)
+    with pytest.raises(LiveError, match="has been started before"):
+        burner.start()

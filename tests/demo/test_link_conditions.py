@@ -1,0 +1,80 @@
+"""Conditions on their way to a link's process, and the delays drawn from them."""
+
+from __future__ import annotations
+
+import json
+import math
+from itertools import islice
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dwell.demo.link_conditions import Conditions, changed, delays_ns, to_json
+from dwell.errors import LiveError, ProblemError
+from dwell.model import (
+    AR1,
+    Constant,
+    Exponential,
+    Gamma,
+    LogNormal,
+    Normal,
+    Process,
+    Trace,
+    TraceTable,
+    Uniform,
+)
+
+PROCESSES = [
+    Constant(3.0),
+    Uniform(1.0, 9.0),
+    Normal(25.0, 5.0),
+    LogNormal(8.0, 0.4),
+    Gamma(8.0, 0.5),
+    Exponential(4.0),
+    AR1(20.0, 0.2, 0.9),
+]
+
+
+@pytest.mark.parametrize("process", PROCESSES, ids=lambda process: type(process).__name__)
+def test_processes_arrive(process: Process) -> None:
+    sent = json.dumps(to_json({"delay_ms": process, "rate_mbps": math.inf, "cut": None}))
+    assert changed(Conditions(cut="drop"), json.loads(sent)) == Conditions(process)
+
+
+@pytest.mark.parametrize("process", PROCESSES, ids=lambda process: type(process).__name__)
+def test_delays_have_the_mean_of_their_process(process: Process) -> None:
+    count = 4_000
+    drawn = np.array(list(islice(delays_ns(process, np.random.default_rng(1)), count))) / 1e6
+    # Even values with a correlation of 0.9 are worth a twentieth of as many.
+    error = float(drawn.std()) / math.sqrt(count / 20)
+    assert drawn.mean() == pytest.approx(process.expectation, abs=5 * error + 1e-6)
+    assert drawn.min() >= 0
+
+
+def test_a_process_with_memory_remembers() -> None:
+    values = np.array(list(islice(delays_ns(AR1(20.0, 0.2, 0.9), np.random.default_rng(2)), 4_000)))
+    assert np.corrcoef(values[:-1], values[1:])[0, 1] > 0.8
+
+
+def test_a_trace_is_replayed_in_order_and_begins_again() -> None:
+    rows = [1.0, 2.0, 3.0, 4.0, 5.0]
+    trace = Trace(TraceTable("file", {"ms": np.array(rows)}), "ms")
+    sent = json.dumps(to_json({"delay_ms": trace}))
+    arrived = changed(Conditions(), json.loads(sent)).delay_ms
+    drawn = [value / 1e6 for value in islice(delays_ns(arrived, np.random.default_rng(3)), 10)]
+    begin = rows.index(drawn[0])
+    assert drawn == (rows[begin:] + rows[:begin]) * 2
+
+
+def test_unknown_processes_are_refused() -> None:
+    class Odd:
+        expectation = 1.0
+
+        def marginal(self, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+            return np.ones(size)
+
+    with pytest.raises(LiveError, match="knows no Odd; it knows constant, uniform"):
+        to_json({"delay_ms": Odd()})
+    with pytest.raises(ProblemError, match="loss"):
+        changed(Conditions(), {"loss": 1.0})

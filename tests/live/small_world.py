@@ -1,0 +1,243 @@
+"""A whole cell in one thread: its real roles on the in-memory network, its stages simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+from dwell.control import Controller
+from dwell.live.agent import Agent, CpuCount
+from dwell.live.cell import Cell
+from dwell.live.role import Place
+from dwell.live.routing import STAMPER
+from dwell.live.sink import Sink
+from dwell.live.stage import Message
+from dwell.live.stamper import Entry, Stamper
+from dwell.live.supervision import Supervisor
+from dwell.live.transport.memory import Clock, MemoryTransport, Network
+from dwell.live.transport.protocol import Sample
+from dwell.live.windows import Resume, Rows
+from dwell.live.wiring import roles
+from dwell.live.worker import Worker
+from dwell.model import Problem
+
+MS = 1_000_000
+
+
+class MemoryBook:
+    """A book that outlives its stamper."""
+
+    def __init__(self) -> None:
+        self.entry: Entry | None = None
+
+    def read(self) -> Entry | None:
+        return self.entry
+
+    def write(self, entry: Entry) -> None:
+        self.entry = entry
+
+
+class MemoryHighest:
+    """A memory that outlives its sink."""
+
+    def __init__(self) -> None:
+        self.highest = (-1, -1)
+
+    def load(self) -> tuple[int, int]:
+        return self.highest
+
+    def store(self, run: int, cycle: int) -> None:
+        self.highest = run, cycle
+
+
+@dataclass
+class Arm:
+    """An actuator that remembers."""
+
+    applied: list[tuple[int, float]] = field(default_factory=list)
+    silences: int = 0
+
+    def apply(self, command: Message) -> None:
+        self.applied.append((command.cycle, command.age_ms))
+
+    def hold(self) -> None:
+        self.silences += 1
+
+    zero = hold
+
+
+class Passing:
+    """A stage that passes on who was there."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        return Message(self.name.encode())
+
+
+class Counting(Passing):
+    """A stage with a state: how many cycles it has seen."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.count = 0
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        self.count += 1
+        return Message(str(self.count).encode())
+
+    def snapshot(self) -> bytes:
+        return str(self.count).encode()
+
+    def restore(self, state: bytes) -> None:
+        self.count = int(state)
+
+
+class MemoryRecorder:
+    """Rows as they come."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, list[tuple[object, ...]]] = {}
+
+    def open(self, run: int) -> Resume:
+        cycles = self.rows.get("cycles", [])
+        return Resume(len(self.rows.get("windows", [])), len(cycles))
+
+    def append(self, rows: Rows, **meta: object) -> None:
+        for table, found in rows.items():
+            self.rows.setdefault(table, []).extend(found)
+
+
+class Bench:
+    """Drives a worker: runs its jobs for as long as they take."""
+
+    def __init__(
+        self, network: Network, end: MemoryTransport, worker: Worker, exec_ns: int
+    ) -> None:
+        self.network, self.end, self.worker, self.exec_ns = network, end, worker, exec_ns
+        worker.started = True
+
+    def subscriptions(self) -> Iterable[str]:
+        return self.worker.subscriptions()
+
+    def receive(self, sample: Sample, now_ns: int) -> None:
+        self.worker.receive(sample, now_ns)
+        self.work(now_ns)
+
+    def wake(self, now_ns: int) -> int:
+        self.work(now_ns)
+        return self.worker.wake(now_ns)
+
+    def work(self, now_ns: int) -> None:
+        while (chore := self.worker.next_chore()) is not None:
+            self.worker.do_chore(chore)
+        job = self.worker.next_job(now_ns)
+        if job is None:
+            return
+        output, age = self.worker.run(job, now_ns)
+
+        def finish() -> None:
+            if self.end.closed:
+                return
+            if self.end.frozen:
+                self.end.wakes.append(finish)
+                return
+            ended_ns = self.end.now_ns
+            self.worker.finish(job, output, now_ns, ended_ns, age)
+            self.work(ended_ns)
+
+        self.network.call_at(self.network.now_ns + self.exec_ns, finish)
+
+
+class World:
+    """A cell, and what outlives its processes.
+
+    Parameters
+    ----------
+    problem : Problem
+    exec_ms : mapping of task to float
+        How long a job takes.
+    delay_ms : float
+        Of every message.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        exec_ms: Mapping[str, float],
+        delay_ms: float = 0.2,
+        clocks: Mapping[str, Clock] | None = None,
+        stages: Mapping[str, Callable[[str], Passing]] | None = None,
+        policy: str | None = None,
+    ) -> None:
+        self.problem = problem
+        self.network = Network(delay_ns=round(delay_ms * MS), start_ns=MS)
+        self.clocks = clocks or {}
+        self.exec_ms = exec_ms
+        self.stages = stages or {}
+        self.book, self.highest, self.arm = MemoryBook(), MemoryHighest(), Arm()
+        self.roles: dict[str, object] = {}
+        self.lives = 0
+        self.policy: str | None = policy
+        self.recorder = MemoryRecorder()
+        for role in roles(problem):
+            if role.kind != "controller" or policy is not None:
+                self.start(role.who)
+
+    def start(self, who: str) -> None:
+        """Start a process, or start it again."""
+        self.lives += 1
+        role = next(role for role in roles(self.problem) if role.who == who)
+        clock = self.clocks.get(role.node, Clock())
+        end = self.network.transport(who, role.node, clock=clock)
+        place = Place(self.problem, who, role.node, end, self.lives)
+        if role.kind == "stamper":
+            made = Stamper(place, self.book, 1, end.now_ns)
+        elif role.kind == "sink":
+            made = Sink(place, role.task, self.arm, self.highest)
+        elif role.kind == "agent":
+            made = Quiet(place)
+        elif role.kind == "controller":
+            controller = Controller(self.problem, self.policy)
+            made = Cell(place, controller, self.recorder, f"c{self.lives}", end.now_ns)
+        else:
+            stage = self.stages.get(role.task, Passing)(role.task)
+            standby = f"{role.task}@{role.node}" if role.kind == "standby" else ""
+            worker = Worker(
+                place, role.task, stage, shadow=role.kind == "shadow", stands_by=standby
+            )
+            exec_ns = round(self.exec_ms[role.task] * MS)
+            made = Bench(self.network, end, worker, exec_ns)
+        self.roles[who] = made
+        self.network.attach(end, made)
+
+    def kill(self, who: str) -> None:
+        """End a process."""
+        self.network.kill(who)
+
+    def run(self, ms: float) -> None:
+        """Let time pass."""
+        self.network.advance(self.network.now_ns + round(ms * MS))
+
+    @property
+    def stamper(self) -> Stamper:
+        return next(role for role in self.roles.values() if isinstance(role, Stamper))
+
+    def worker(self, who: str) -> Worker:
+        bench = self.roles[who]
+        assert isinstance(bench, Bench)
+        return bench.worker
+
+    @property
+    def cycles(self) -> list[int]:
+        """Cycles that were actuated, in order."""
+        return [cycle for cycle, _ in self.arm.applied]
+
+
+class Quiet(Agent):
+    """An agent without processes to look after."""
+
+    def __init__(self, place: Place) -> None:
+        super().__init__(place, Supervisor(None, print), CpuCount())  # type: ignore[arg-type]

@@ -1,0 +1,812 @@
+"""LiveWindows: what the simulator's messages would have shown is what the simulator's windows do;
+and every way in which messages are lost, late, doubled, or about something that has changed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import random
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import polars.testing
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dwell
+from dwell.control import NEVER_NS, ClosedWindow, Controller, Evidence
+from dwell.errors import LiveError
+from dwell.live.messages import Completion, Hop, Load, Stamp
+from dwell.live.offsets import Offsets
+from dwell.live.tables import columns_of
+from dwell.live.windows import LiveWindows, Resume, Rows
+from dwell.model import Execution, Flow, Link, Node, Problem, Task
+from dwell.model.process import Constant
+from dwell.record import Journal, Run, seal_run
+from tests.generate import make_problem
+
+MS, S = 1_000_000, 1_000_000_000
+CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
+UNKNOWN = -1
+
+# ------------------------------------------------------------------- a simulated run, played live
+
+
+@dataclass(slots=True)
+class Seen:
+    """What the simulator's controller was given."""
+
+    controller: Controller
+    windows: list[ClosedWindow] = field(default_factory=list)
+    evidence: list[Evidence] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Played:
+    problem: Problem
+    run: Run
+    seen: Seen
+
+
+@pytest.fixture(scope="module")
+def cell() -> Problem:
+    problem = dwell.load(CANONICAL)
+    controller = dataclasses.replace(
+        problem.controller,
+        estimator="shadow",
+        shadow_fraction=0.1,
+        order_lead_cycles=2,
+        min_dwell=1,
+        min_improvement=0.0,
+        fallbacks=(),
+    )
+    return dataclasses.replace(problem, controller=controller, window_cycles=40)
+
+
+def simulate(problem: Problem, scenario: str, windows: int = 25) -> Played:
+    """Simulate a run and keep what its controller was given."""
+    kept: list[Seen] = []
+    close = Controller.close
+
+    def spy(self: Controller, window: ClosedWindow, **more: Any) -> str:
+        if not kept:
+            kept.append(Seen(self))
+        kept[0].windows.append(window)
+        assert window.evidence is not None
+        kept[0].evidence.append(window.evidence())
+        return close(self, window, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Controller, "close", spy)
+        run = dwell.simulate(problem, scenario=scenario, seed=5, windows=windows, jobs=True)
+    return Played(problem, run, kept[0])
+
+
+@pytest.fixture(scope="module")
+def stressed(cell: Problem) -> Played:
+    return simulate(cell, "robot-cpu-stress")
+
+
+@pytest.fixture(scope="module")
+def impaired(cell: Problem) -> Played:
+    return simulate(cell, "network-impairment")
+
+
+Event = tuple[int, int, Callable[[LiveWindows, int], None]]
+
+
+@dataclass(slots=True)
+class Clocks:
+    """What nodes' clocks show; the reference's shows simulated time."""
+
+    ahead_ns: Mapping[str, int] = field(default_factory=dict)
+
+    def at(self, node: str, t_ns: int) -> int:
+        return t_ns + self.ahead_ns.get(node, 0)
+
+
+def messages_of(played: Played, clocks: Clocks) -> list[Event]:
+    """Return what the processes of a live cell would have said in a simulated run."""
+    problem, run = played.problem, played.run
+    flows = problem.pipeline.flows
+    into = {flow.target: flow.source for flow in flows}
+    through: dict[int, str] = {}
+    discarded: dict[int, int] = {}
+    names = list(problem.candidates)
+    firsts = run.windows["first_cycle"].to_list()
+    for first, evidence in zip(firsts, played.seen.evidence, strict=True):
+        assert evidence.shadows is not None
+        for row, code in enumerate(evidence.shadow_placement.tolist()):
+            if code >= 0:
+                through[first + row] = names[code]
+                discarded[first + row] = int(evidence.shadows.arrived_ns[row, -1])
+    hops: dict[tuple[int, bool], list[Hop]] = {}
+    jobs = run.jobs.filter(pl.col("end_ns").is_not_null(), pl.col("outcome") == "done")
+    for job in jobs.sort("cycle", "ready_ns", "end_ns").iter_rows(named=True):
+        task, node = job["task"], job["node"]
+        ready_ns = clocks.at(node, job["ready_ns"])
+        inputs = ((into[task], ready_ns),) if task in into else ()
+        start_ns, end_ns = (clocks.at(node, job[name]) for name in ("start_ns", "end_ns"))
+        hop = Hop(task, node, ready_ns, start_ns, end_ns, inputs)
+        hops.setdefault((job["cycle"], bool(job.get("shadow"))), []).append(hop)
+    events: list[Event] = []
+    term, before = 1, None
+    for entry in run.cycles.iter_rows(named=True):
+        cycle, placement, released_ns = entry["cycle"], entry["placement"], entry["release_ns"]
+        term += before is not None and placement != before
+        before = placement
+        stamp = Stamp(7, 5000 + cycle, term, placement, released_ns, through.get(cycle, ""))
+        events.append((released_ns, 3, stamping(stamp)))
+        if entry["latency_ns"] is not None:
+            done_ns = released_ns + entry["latency_ns"]
+            mine = tuple(hops[cycle, False])
+            shown_ns = clocks.at("R2", done_ns)
+            done = Completion(stamp, "control", shown_ns, "actuated", mine, "R2")
+            events.append((done_ns, 1, completing(done)))
+        stop_ns = discarded.get(cycle, -1)
+        if stop_ns >= 0:
+            shown_ns = clocks.at("R2", stop_ns)
+            arrived = Hop("control", "R2", shown_ns, -1, -1, (("planning", shown_ns),))
+            own = [hop for hop in hops.get((cycle, True), ()) if hop.task != "control"]
+            ran = {hop.task for hop in own}
+            shared = [hop for hop in hops.get((cycle, False), ()) if hop.task not in ran]
+            shared = [hop for hop in shared if hop.task != "control"]
+            all_hops = (*shared, *own, arrived)
+            stopped = Completion(stamp, "control", shown_ns, "shadow", all_hops, "R2")
+            events.append((stop_ns, 1, completing(stopped)))
+    return events + loads_of(played, clocks)
+
+
+def stamping(stamp: Stamp) -> Callable[[LiveWindows, int], None]:
+    return lambda windows, at_ns: windows.stamped(stamp, at_ns)
+
+
+def completing(done: Completion) -> Callable[[LiveWindows, int], None]:
+    return lambda windows, at_ns: windows.completed(done, at_ns)
+
+
+def loading(load: Load) -> Callable[[LiveWindows, int], None]:
+    return lambda windows, at_ns: windows.loaded(load)
+
+
+def loads_of(played: Played, clocks: Clocks) -> list[Event]:
+    events: list[Event] = []
+    nodes = list(played.problem.fabric.nodes)
+    total = np.zeros((3, len(nodes)))
+    for window in played.seen.windows:
+        for at_ns in (window.open_ns, window.close_ns):
+            if at_ns == window.close_ns:
+                total += window.core_ns
+            for column, node in enumerate(nodes):
+                used = [round(value) for value in total[:, column]]
+                load = Load(node, 1, clocks.at(node, int(at_ns)), *used)
+                events.append((int(at_ns), 0, loading(load)))
+    return events
+
+
+def replay(
+    played: Played,
+    offsets: Offsets,
+    events: Iterable[Event],
+    *,
+    late: Callable[[Event], int] = lambda event: 0,
+    now: Callable[[int], int] = lambda t_ns: t_ns,
+    on_close: Callable[[LiveWindows, ClosedWindow, Rows], None] = lambda *_: None,
+) -> tuple[LiveWindows, Controller, list[ClosedWindow], list[Evidence], list[Rows]]:
+    """Play messages in the order of their arrival; close windows when they are due."""
+    controller = Controller(played.problem)
+    windows = LiveWindows(played.problem, offsets, controller)
+    closed: list[ClosedWindow] = []
+    evidence: list[Evidence] = []
+    rows: list[Rows] = []
+    timed = sorted(((event[0] + late(event), *event[1:]) for event in events), key=lambda e: e[:2])
+    for number, (t_ns, _, hear) in enumerate(timed):
+        hear(windows, now(t_ns))
+        following_ns = timed[number + 1][0] if number + 1 < len(timed) else t_ns
+        while (due_ns := windows.due_ns(now(t_ns))) is not None and due_ns <= now(following_ns):
+            window = windows.close()
+            assert window.evidence is not None
+            evidence.append(window.evidence())
+            closed.append(window)
+            controller.close(window)
+            rows.append(windows.rows())
+            on_close(windows, window, rows[-1])
+    rows.append(windows.rows())
+    return windows, controller, closed, evidence, rows
+
+
+def recorded(tmp_path: Path, controller: Controller, rows: Sequence[Rows]) -> Run:
+    """Bring rows to tables, through the journal."""
+    meta = {"kind": "live", "cell": "canonical"}
+    journal = Journal(tmp_path / "run", run="7", meta=meta, columns=columns_of(controller))
+    for some in rows:
+        journal.append(some)
+    journal.close()
+    return seal_run(tmp_path / "run")
+
+
+SYNCHRONOUS = Offsets("E", "R1", system_bound_ns=0)
+
+
+def known_at_close(evidence: Evidence, window: ClosedWindow) -> np.ndarray[Any, Any]:
+    """Cycles that had completed at the close: of the others no message tells."""
+    return np.asarray(window.latency_ns <= window.close_ns - window.release_ns)
+
+
+@pytest.mark.parametrize("name", ["stressed", "impaired"])
+def test_the_controller_is_given_what_the_simulators_is(
+    name: str, request: pytest.FixtureRequest
+) -> None:
+    played: Played = request.getfixturevalue(name)
+    _, _, closed, evidence, _ = replay(played, SYNCHRONOUS, messages_of(played, Clocks()))
+    # The last window closes with a release that is not in the record.
+    assert len(closed) == len(played.seen.windows) - 1
+    assert (played.run.cycles["placement"].to_physical().diff() != 0).sum() >= 1
+    for mine, theirs, shown, there in zip(
+        closed, played.seen.windows, evidence, played.seen.evidence, strict=False
+    ):
+        assert (mine.open_ns, mine.close_ns) == (theirs.open_ns, theirs.close_ns)
+        assert np.array_equal(mine.release_ns, theirs.release_ns)
+        done = known_at_close(there, theirs)
+        assert np.array_equal(mine.latency_ns[done], theirs.latency_ns[done])
+        assert (mine.latency_ns[~done] == NEVER_NS).all()
+        assert np.allclose(mine.core_ns, theirs.core_ns, rtol=1e-9, atol=10)
+        assert np.array_equal(shown.placement, there.placement)
+        assert np.array_equal(shown.shadow_placement, there.shadow_placement)
+        for what in ("ready_ns", "end_ns", "arrived_ns"):
+            ours, known = getattr(shown.cycles, what), getattr(there.cycles, what)
+            assert np.array_equal(ours[done], known[done])
+            assert (ours[~done] == UNKNOWN).all()
+            assert shown.shadows is not None
+            assert there.shadows is not None
+            ours, known = getattr(shown.shadows, what), getattr(there.shadows, what)
+            stopped = (there.shadows.arrived_ns[:, -1] >= 0) & (there.shadow_placement >= 0)
+            assert np.array_equal(ours[stopped], known[stopped])
+            assert (ours[~stopped] == UNKNOWN).all()
+            assert stopped.any() or name == "impaired"
+
+
+def test_the_record_is_the_simulators(stressed: Played, tmp_path: Path) -> None:
+    _, controller, _, _, rows = replay(stressed, SYNCHRONOUS, messages_of(stressed, Clocks()))
+    live, simulated = recorded(tmp_path, controller, rows), stressed.run
+    for table in ("cycles", "windows", "decisions"):
+        mine, theirs = getattr(live, table), getattr(simulated, table)
+        common = theirs.columns
+        assert mine.columns[: len(common)] == common
+        assert mine.select(common).schema == theirs.schema
+    count = len(live.windows)
+    assert count == len(simulated.windows) - 1
+    same = pl.col("window") < count
+    left = ["shadow_bytes"]
+    for mine, theirs in (
+        (live.windows, simulated.windows.filter(same)),
+        (live.decisions, simulated.decisions.filter(same)),
+    ):
+        theirs = theirs.drop(left, strict=False)
+        # Utilisation goes through whole nanoseconds.
+        pl.testing.assert_frame_equal(mine.select(theirs.columns), theirs, abs_tol=1e-6)
+    assert live.decisions["migrated"].sum() >= 2
+    # Bytes of shadows that never came to their end are not known.
+    assert (live.windows["shadow_bytes"] <= simulated.windows["shadow_bytes"][:count]).all()
+    assert live.windows["shadow_bytes"].sum() > 0
+    cycles = simulated.cycles[: len(live.cycles)]
+    parts = ["latency_ns", "compute_ns", "queue_ns", "network_ns"]
+    for name in ("cycle", "release_ns", "placement", "missed", *parts):
+        assert live.cycles[name].to_list() == cycles[name].to_list(), name
+    done = cycles["outcome"] == "done"
+    assert (live.cycles["outcome"] == "done").to_list() == done.to_list()
+    assert set(live.cycles["outcome"].cast(pl.String)) <= {"done", "dropped"}
+    assert live.cycles["number"].to_list() == [5000 + cycle for cycle in cycles["cycle"]]
+    assert live.cycles["lead"].sum() == live.windows["lead"].sum() > 0
+    assert live.cycles.columns == list(columns_of(controller)["cycles"])
+    assert not live.windows["unproven"].any()
+
+
+def test_late_completions_are_recorded_though_they_came_too_late_to_be_seen(
+    stressed: Played, tmp_path: Path
+) -> None:
+    chosen = random.Random(2)
+
+    def late(event: Event) -> int:
+        return 3 * S if event[1] == 1 and chosen.random() < 0.1 else 0
+
+    _, controller, closed, _, rows = replay(
+        stressed, SYNCHRONOUS, messages_of(stressed, Clocks()), late=late
+    )
+    run = recorded(tmp_path, controller, rows)
+    count = len(run.windows) - 2
+    final = stressed.run.windows[:count]
+    # The late ones come for several windows more; their last ones are known by then.
+    for name in ("l95_ms", "violation_rate"):
+        assert run.windows[name][:count].to_list() == final[name].to_list()
+    seen, theirs = run.windows["seen_violation_rate"][:count], final["seen_violation_rate"]
+    assert (seen > theirs).sum() > count / 2
+    assert sum((window.latency_ns == NEVER_NS).sum() for window in closed) > 40
+
+
+def test_clocks_that_are_apart(stressed: Played, tmp_path: Path) -> None:
+    clocks = Clocks({"E": -3_000_000 * S, "R2": 10 * S})
+    offsets = Offsets("E", "R1")
+    delay_ns = 200_000
+    end_ns = stressed.run.cycles["release_ns"].max()
+    assert isinstance(end_ns, int)
+
+    def comparing(t_ns: int) -> Callable[[LiveWindows, int], None]:
+        def compare(windows: LiveWindows, at_ns: int) -> None:
+            for one in ("R1", "E", "R2"):
+                for other in ("R1", "E", "R2"):
+                    sent_ns = clocks.at(one, t_ns - delay_ns)
+                    offsets.sample(one, other, sent_ns, clocks.at(other, t_ns))
+
+        return compare
+
+    samples = [(t_ns, 0, comparing(t_ns)) for t_ns in range(0, end_ns, 100 * MS)]
+    exact, _, reference, _, _ = replay(stressed, SYNCHRONOUS, messages_of(stressed, Clocks()))
+    windows, controller, closed, evidence, rows = replay(
+        stressed,
+        offsets,
+        [*samples, *messages_of(stressed, clocks)],
+        late=lambda event: 100_000 if event[1] in {1, 3} else 0,
+        now=lambda t_ns: clocks.at("E", t_ns),
+    )
+    assert exact.last is not None
+    assert windows.last is not None
+    assert windows.last.number == exact.last.number
+    bound_ns = windows.last.bound_ns
+    assert delay_ns <= bound_ns <= delay_ns + 50_000
+    for mine, theirs in zip(closed, reference, strict=True):
+        both = (mine.latency_ns < NEVER_NS) & (theirs.latency_ns < NEVER_NS)
+        assert both.sum() >= 30
+        assert np.abs(mine.latency_ns - theirs.latency_ns)[both].max() <= bound_ns
+    first = evidence[0].cycles
+    assert ((first.end_ns >= first.ready_ns) | (first.end_ns < 0)).all()
+    cycles = recorded(tmp_path, controller, rows).cycles.drop_nulls("compute_ns")
+    total = pl.col("compute_ns") + pl.col("queue_ns") + pl.col("network_ns")
+    assert (cycles.select(total).to_series() == cycles["latency_ns"]).all()
+    assert (
+        (cycles.select(pl.min_horizontal("compute_ns", "queue_ns", "network_ns")) >= 0)
+        .to_series()
+        .all()
+    )
+
+
+# ---------------------------------------------------------------------------- a cell made by hand
+
+W = 5
+P = 40 * MS
+
+
+def small(*, sinks: int = 1, grace_ms: float = 0.0, window_cycles: int = W) -> Problem:
+    """One source, and as many sinks behind it; the source may run on A or B."""
+    either = {node: Execution(Constant(1.0)) for node in ("A", "B")}
+    tasks = [Task("see", either)]
+    tasks += [Task(f"act{i}", {"A": Execution(Constant(1.0))}) for i in range(sinks)]
+    problem = make_problem(
+        [Node("A", "robot", cores=2), Node("B", "edge", cores=2)],
+        tasks,
+        [Flow("see", f"act{i}", 1000) for i in range(sinks)],
+        links=[Link("A", "B", Constant(1.0)), Link("B", "A", Constant(1.0))],
+        candidates={
+            name: {"see": node, **{f"act{i}": "A" for i in range(sinks)}}
+            for name, node in (("NEAR", "A"), ("FAR", "B"))
+        },
+    )
+    pipeline = dataclasses.replace(problem.pipeline, period_ms=40.0, deadline_ms=40.0)
+    settings_ = dataclasses.replace(problem.controller, close_grace_ms=grace_ms, on="B")
+    return dataclasses.replace(
+        problem, pipeline=pipeline, controller=settings_, window_cycles=window_cycles
+    )
+
+
+class Hand:
+    """A cell whose messages are made one by one; latency is 10 ms."""
+
+    def __init__(self, problem: Problem | None = None, *, resume: Resume | None = None) -> None:
+        self.problem = problem or small()
+        self.controller = Controller(self.problem, "NEAR")
+        self.offsets = Offsets("B", "A", system_bound_ns=0)
+        self.windows = LiveWindows(self.problem, self.offsets, self.controller, resume=resume)
+        self.table: dict[str, dict[Any, dict[str, Any]]] = {"cycles": {}, "windows": {}}
+
+    def stamp(self, cycle: int, term: int = 1, *, at_ns: int | None = None, run: int = 1) -> Stamp:
+        at_ns = cycle * P if at_ns is None else at_ns
+        return Stamp(run, cycle, term, "NEAR" if term % 2 else "FAR", at_ns)
+
+    def release(self, cycles: Iterable[int], term: int = 1, **more: Any) -> None:
+        for cycle in cycles:
+            stamp = self.stamp(cycle, term, **more)
+            self.windows.stamped(stamp, stamp.released_ns)
+
+    def done(
+        self, cycle: int, term: int = 1, *, sink: int = 0, ms: float = 10, **more: Any
+    ) -> None:
+        stamp = self.stamp(cycle, term, **more)
+        done_ns = stamp.released_ns + round(ms * MS)
+        done = Completion(stamp, f"act{sink}", done_ns, "actuated", (), "A")
+        self.windows.completed(done, done_ns)
+
+    def close(self) -> list[int]:
+        """Close every window that is due; return the numbers of the last one's cycles."""
+        numbers: list[int] = []
+        while self.windows.due_ns(1 << 60) is not None:
+            self.controller.close(self.windows.close())
+            assert self.windows.last is not None
+            numbers = [cycle.number for cycle in self.windows.last.cycles]
+        return numbers
+
+    def record(self) -> None:
+        columns = columns_of(self.controller)
+        for table, rows in self.windows.rows().items():
+            for row in rows:
+                named = dict(zip(columns[table], row, strict=True))
+                if table in self.table:
+                    self.table[table][row[0]] = named
+
+    def column(self, table: str, name: str) -> list[Any]:
+        return [row[name] for _, row in sorted(self.table[table].items())]
+
+
+def test_a_window_closes_a_grace_after_the_first_cycle_beyond_it() -> None:
+    hand = Hand(small(grace_ms=7))
+    hand.release(range(W))
+    assert hand.windows.due_ns(W * P) is None
+    with pytest.raises(LiveError, match="no window is due"):
+        hand.windows.close()
+    hand.release([W])
+    assert hand.windows.due_ns(W * P) == W * P + 7 * MS
+    hand.done(0)
+    hand.done(4, ms=46)
+    window = hand.windows.close()
+    assert window.latency_ns.tolist() == [10 * MS, NEVER_NS, NEVER_NS, NEVER_NS, 46 * MS]
+    assert (window.open_ns, window.close_ns) == (0, W * P + 7 * MS)
+    assert hand.windows.due_ns(W * P) is None
+    hand.release(range(W + 1, 2 * W + 1))
+    hand.controller.close(window)
+    assert hand.close() == [5, 6, 7, 8, 9]
+
+
+def test_after_a_migration_the_window_starts_with_the_first_cycle_of_the_new_placement() -> None:
+    hand = Hand()
+    hand.release(range(W + 2))
+    assert hand.close() == [0, 1, 2, 3, 4]
+    hand.release(range(W + 2, 3 * W), 2)
+    assert hand.close() == [7, 8, 9, 10, 11]
+    hand.record()
+    assert hand.column("cycles", "number") == list(range(12))
+    assert hand.column("cycles", "lead") == [False] * 5 + [True] * 2 + [False] * 5
+    assert hand.column("windows", "first_cycle") == [0, 7]
+    assert hand.column("windows", "lead") == [0, 2]
+    assert hand.column("windows", "term") == [1, 2]
+    assert hand.column("windows", "placement") == ["NEAR", "FAR"]
+    assert hand.column("windows", "mixed") == [False, False]
+
+
+def test_a_guard_move_in_the_middle_of_a_window_ends_it() -> None:
+    hand = Hand()
+    hand.release(range(3))
+    hand.release(range(3, 6), 2)
+    # And at once another.
+    hand.release(range(6, 12), 3)
+    assert hand.close() == [6, 7, 8, 9, 10]
+    hand.record()
+    assert hand.column("windows", "lead") == [6]
+
+
+def test_a_window_that_is_complete_closes_though_the_guard_moves_in_its_grace() -> None:
+    hand = Hand(small(grace_ms=100))
+    hand.release(range(W + 1))
+    hand.release(range(W + 1, W + 3), 2)
+    assert hand.windows.due_ns(0) is not None
+    assert hand.close() == [0, 1, 2, 3, 4]
+    hand.release(range(W + 3, 2 * W + 2), 2)
+    assert hand.close() == [6, 7, 8, 9, 10]
+
+
+def test_while_an_order_is_under_way_no_window_begins() -> None:
+    hand = Hand()
+    hand.release(range(W + 1))
+    hand.close()
+    hand.windows.ordered()
+    hand.release(range(W + 1, 4 * W))
+    assert hand.windows.due_ns(0) is None
+    hand.release(range(4 * W, 5 * W + 1), 2)
+    assert hand.close() == [20, 21, 22, 23, 24]
+    hand.record()
+    assert hand.column("windows", "lead") == [0, 15]
+    # One that is refused: windows were contiguous all the time.
+    hand.windows.ordered()
+    hand.release(range(5 * W + 1, 7 * W + 1), 2)
+    assert hand.windows.due_ns(0) is None
+    hand.windows.refused()
+    assert hand.close() == [30, 31, 32, 33, 34]
+
+
+def test_cycles_are_known_by_stamp_or_by_completion_and_doubles_are_dropped() -> None:
+    hand = Hand()
+    hand.release([0, 1, 3])
+    for cycle in (1, 2, 2, 1, 0):
+        hand.done(cycle)
+    hand.done(1, ms=99)
+    # Of cycle 4 nothing is heard.
+    hand.release([5, 3, 0])
+    window = hand.windows.close()
+    assert window.latency_ns.tolist() == [10 * MS] * 3 + [NEVER_NS] * 2
+    assert window.release_ns.tolist() == [0, P, 2 * P, 3 * P, 4 * P]
+    assert hand.windows.last is not None
+    assert hand.windows.last.heard == 4
+    hand.controller.close(window)
+    hand.record()
+    assert hand.column("cycles", "heard") == [True] * 4 + [False]
+    # Now it is.
+    hand.done(4, at_ns=4 * P + MS)
+    hand.record()
+    assert hand.column("cycles", "heard") == [True] * 5
+    assert hand.column("cycles", "latency_ns")[4] is not None
+    assert hand.column("windows", "heard") == [4]
+
+
+def test_numbers_that_a_restarted_stamper_left_out_were_no_cycles() -> None:
+    hand = Hand()
+    hand.release(range(3))
+    # 1000 numbers on, three periods later.
+    for i in range(3):
+        stamp = hand.stamp(1000 + i, at_ns=(6 + i) * P)
+        hand.windows.stamped(stamp, stamp.released_ns)
+    assert hand.close() == [0, 1, 2, 1000, 1001]
+    hand.record()
+    assert hand.column("cycles", "cycle") == [0, 1, 2, 3, 4]
+    assert hand.column("cycles", "number") == [0, 1, 2, 1000, 1001]
+
+
+def test_a_later_run_begins_a_window() -> None:
+    hand = Hand()
+    hand.release(range(3))
+    for i in range(W + 1):
+        stamp = hand.stamp(i, run=2, at_ns=(10 + i) * P)
+        hand.windows.stamped(stamp, stamp.released_ns)
+    # Late news of the one before; one of them cannot be.
+    hand.release([4])
+    hand.release([5], at_ns=12 * P)
+    assert hand.close() == [0, 1, 2, 3, 4]
+    hand.record()
+    assert hand.column("cycles", "run") == [1] * 4 + [2] * 5
+    assert hand.windows.ignored == 1
+
+
+def test_a_stamper_whose_clock_begins_anew() -> None:
+    hand = Hand()
+    hand.release(range(100, 103))
+    for i in range(W + 1):
+        stamp = hand.stamp(2000 + i, at_ns=5 + i * P)
+        hand.windows.stamped(stamp, (105 + i) * P)
+    assert hand.close() == [2000, 2001, 2002, 2003, 2004]
+    hand.record()
+    # The record goes on at the controller's clock.
+    assert hand.column("cycles", "release_ns") == [i * P for i in (0, 1, 2, 5, 6, 7, 8, 9)]
+
+
+def test_every_sink_has_to_report() -> None:
+    hand = Hand(small(sinks=3))
+    hand.release(range(W + 1))
+    for sink in (0, 1, 2):
+        hand.done(0, sink=sink, ms=10 + sink)
+        if sink != 1:
+            hand.done(1, sink=sink)
+    hand.done(1, sink=0)
+    window = hand.windows.close()
+    assert window.latency_ns[:2].tolist() == [12 * MS, NEVER_NS]
+    hand.controller.close(window)
+    hand.done(1, sink=1, ms=31)
+    hand.record()
+    assert hand.column("cycles", "latency_ns")[:2] == [12 * MS, 31 * MS]
+
+
+def test_what_is_lost_is_told_from_what_is_under_way() -> None:
+    hand = Hand()
+    hand.release(range(W + 1))
+    for cycle in (0, 2):
+        hand.done(cycle)
+    hand.close()
+    hand.record()
+    assert hand.column("cycles", "outcome") == ["done", "dropped", "done", "in_flight", "in_flight"]
+    hand.done(4, ms=38)
+    hand.record()
+    assert hand.column("cycles", "outcome") == ["done", "dropped", "done", "dropped", "done"]
+    assert hand.column("cycles", "missed") == [False, True, False, True, False]
+    assert hand.column("windows", "violation_rate") == [0.4]
+    # The controller had seen three misses.
+    assert hand.column("windows", "seen_violation_rate") == [0.6]
+
+
+def test_a_restarted_controller_starts_at_the_first_stamp_it_hears() -> None:
+    before = Hand()
+    before.release(range(8))
+    before.close()
+    before.record()
+    hand = Hand(resume=Resume(window=1, cycle=5, origin_ns=0))
+    # The completion of a cycle before it is of no use to it.
+    hand.release([9])
+    hand.done(7)
+    hand.release(range(10, 15))
+    assert hand.close() == [9, 10, 11, 12, 13]
+    hand.record()
+    assert list(hand.table["windows"]) == [1]
+    assert list(hand.table["cycles"]) == [5, 6, 7, 8, 9]
+    assert hand.column("cycles", "release_ns") == [i * P for i in range(9, 14)]
+    assert hand.windows.ignored == 1
+
+
+def test_a_window_of_which_nothing_was_heard_says_so() -> None:
+    hand = Hand()
+    hand.release([0, *range(11, 16)])
+    for heard in (1, 0, 4):
+        hand.controller.close(hand.windows.close())
+        assert hand.windows.last is not None
+        assert hand.windows.last.heard == heard
+    hand.record()
+    assert hand.column("cycles", "number") == list(range(15))
+    assert hand.column("windows", "heard") == [1, 0, 4]
+
+
+def test_clocks_that_were_never_compared() -> None:
+    hand = Hand()
+    hand.offsets = Offsets("B", "A")
+    hand.windows = LiveWindows(hand.problem, hand.offsets, hand.controller)
+    for cycle in range(W + 1):
+        stamp = hand.stamp(cycle)
+        hand.windows.stamped(stamp, stamp.released_ns + 500 * S)
+        done = Completion(stamp, "act0", 77, "actuated", (), "B")
+        hand.windows.completed(done, stamp.released_ns + 500 * S + 12 * MS)
+    # By the controller's own clock.
+    assert hand.windows.due_ns(600 * S) == W * P + 500 * S
+    window = hand.windows.close()
+    assert window.latency_ns.tolist() == [12 * MS] * W
+    assert hand.windows.last is not None
+    assert hand.windows.last.unproven
+    hand.controller.close(window)
+    hand.record()
+    assert hand.column("windows", "bound_ms") == [None]
+    assert hand.column("windows", "unproven") == [True]
+
+
+@pytest.mark.parametrize(("bound_ms", "unproven"), [(7.9, False), (8.1, True)])
+def test_a_bound_beyond_a_fifth_of_the_deadline_is_marked(bound_ms: float, unproven: bool) -> None:
+    hand = Hand()
+    hand.offsets = Offsets("B", "A", system_bound_ns=round(bound_ms * MS))
+    hand.windows = LiveWindows(hand.problem, hand.offsets, hand.controller)
+    hand.release(range(W + 1))
+    stamp = hand.stamp(2)
+    hand.windows.completed(Completion(stamp, "act0", 2 * P + 5 * MS, "actuated", (), "B"))
+    hand.close()
+    hand.record()
+    assert hand.column("windows", "unproven") == [unproven]
+    assert hand.column("windows", "bound_ms") == [bound_ms]
+
+
+def test_messages_about_what_does_not_exist_are_ignored() -> None:
+    hand = Hand()
+    hand.windows.stamped(Stamp(1, 0, 1, "NOWHERE", 0))
+    hand.windows.completed(Completion(hand.stamp(0), "see", 5, "actuated", (), "A"))
+    hand.windows.loaded(Load("C", 1, 0, 0, 0, 0))
+    assert hand.windows.ignored == 3
+    assert hand.windows.origin_ns is None
+    hops = (Hop("no", "X", 1, 2, 3, (("see", 1),)), Hop("act0", "A", 1, 2, 3, (("act0", 1),)))
+    hand.release(range(W + 1))
+    hand.windows.completed(Completion(hand.stamp(0), "act0", 5 * MS, "behind", hops, "A"))
+    window = hand.windows.close()
+    assert window.evidence is not None
+    assert window.evidence().cycles.end_ns[0].tolist() == [UNKNOWN, 3]
+    hand.controller.close(window)
+    hand.record()
+    assert hand.column("cycles", "actuated")[0] is False
+    assert hand.column("cycles", "compute_ns")[0] == 1
+
+
+def test_memory_is_bounded() -> None:
+    hand = Hand()
+    for first in range(0, 4_000, 100):
+        hand.release(range(first, first + 100))
+        if first % 3:
+            hand.done(first)
+        hand.close()
+        hand.record()
+        hand.table["cycles"].clear()
+    windows = hand.windows
+    assert len(windows._by_key) < 2000
+    assert len(windows._windows) < 2000 / W
+    assert len(windows._in_flight) < 2000
+    # Nobody says what has become of an order.
+    windows.ordered()
+    hand.release(range(4_000, 12_000))
+    assert len(windows._by_key) < 4000
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_in_any_order_and_with_any_losses_windows_are_w_cycles_apart(data: st.DataObject) -> None:
+    """Stamps and completions lost, doubled and late: releases never go back, nothing is twice."""
+    generator = random.Random(data.draw(st.integers(0, 10_000)))
+    hand = Hand()
+    term = 1
+    events: list[tuple[float, Stamp, Completion | None]] = []
+    for cycle in range(data.draw(st.integers(20, 120))):
+        term += generator.random() < 0.05
+        stamp = hand.stamp(cycle, term)
+        for _ in range(generator.choice((0, 1, 1, 1, 2))):
+            late = generator.choice((0, 0, 0, 1, 5)) * P * generator.random()
+            stamp = hand.stamp(cycle, term)
+            events.append((stamp.released_ns + late, stamp, None))
+        for _ in range(generator.choice((0, 1, 2))):
+            done = Completion(stamp, "act0", stamp.released_ns + 9 * MS, "actuated", (), "A")
+            if stamp.cycle == cycle:
+                events.append((stamp.released_ns + 9 * MS + late, stamp, done))
+    for at_ns, about, report in sorted(events, key=lambda event: event[0]):
+        if report is None:
+            hand.windows.stamped(about, round(at_ns))
+        else:
+            hand.windows.completed(report, round(at_ns))
+        hand.close()
+        hand.record()
+    numbers = hand.column("cycles", "number")
+    assert numbers == sorted(set(numbers))
+    releases = hand.column("cycles", "release_ns")
+    assert releases == sorted(releases)
+    assert list(hand.table["cycles"]) == list(range(len(numbers)))
+    firsts = hand.column("windows", "first_cycle")
+    assert all(b - a >= W for a, b in itertools.pairwise(firsts))
+    lead = hand.column("cycles", "lead")
+    assert all(not any(lead[first : first + W]) for first in firsts)
+    assert sum(lead) == len(lead) - W * len(firsts)
+
+
+# ------------------------------------------------------------------------------- utilisation
+
+
+def load(at_ms: float, busy_ms: float, *, node: str = "A", life: int = 1) -> Load:
+    return Load(node, life, round(at_ms * MS), round(busy_ms * MS), 0, 0)
+
+
+def used_ms(hand: Hand) -> float:
+    hand.release(range(W + 1))
+    return float(hand.windows.close().core_ns[0, 0]) / 1e6
+
+
+def test_counters_are_read_between_reports() -> None:
+    hand = Hand()
+    # 2 cores of work from -50 ms on, in reports every 100 ms that a window of 200 ms cuts.
+    for at_ms in range(-50, 351, 100):
+        hand.windows.loaded(load(at_ms, 1000 + 2 * at_ms))
+    assert used_ms(hand) == pytest.approx(400)
+
+
+@pytest.mark.parametrize(("last_ms", "expected_ms"), [(150, 200), (50, 150), (-50, 50)])
+def test_a_node_that_falls_silent_is_taken_for_idle_after_one_report(
+    last_ms: int, expected_ms: float
+) -> None:
+    hand = Hand()
+    for at_ms in range(-250, last_ms + 1, 100):
+        hand.windows.loaded(load(at_ms, 1000 + at_ms))
+    assert used_ms(hand) == pytest.approx(expected_ms)
+
+
+def test_an_agent_that_begins_to_count_anew_costs_one_report() -> None:
+    hand = Hand()
+    for at_ms in (-100, 0, 100):
+        hand.windows.loaded(load(at_ms, 5000 + at_ms))
+    for at_ms in (150, 200, 250):
+        hand.windows.loaded(load(at_ms, at_ms - 150, life=2))
+    hand.windows.loaded(load(220, 9000))
+    hand.windows.loaded(load(200, 50, life=2))
+    assert used_ms(hand) == pytest.approx(150)
+
+
+def test_a_node_nobody_reports_of_is_idle() -> None:
+    hand = Hand()
+    hand.windows.loaded(load(100, 5000))
+    assert used_ms(hand) == 0.0
