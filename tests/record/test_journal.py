@@ -108,11 +108,14 @@ def test_a_run_is_gone_on_with(tmp_path: Path) -> None:
     assert (journal.following("windows"), journal.following("cycles")) == (2, 2 * W)
     assert journal.cut_bytes == 0
     journal.append(rows_of(2), origin_ns=5)
+    assert journal.meta == {**META, "policy": "dtp", "origin_ns": 5}
     run = open_run(tmp_path / "run")
     assert_holds(run, 3)
     assert run.meta["recovered"]["opened"] == 2
     assert run.meta["policy"] == "dtp"
     assert run.meta["origin_ns"] == 5
+    journal.close()
+    assert start(tmp_path / "run").meta["origin_ns"] == 5
 
 
 def test_sealing_writes_what_a_run_has(tmp_path: Path) -> None:
@@ -334,3 +337,42 @@ def test_a_process_that_is_killed_loses_no_more_than_the_window_it_was_writing(
         said = there
         assert run.meta["recovered"]["opened"] == attempt + 1
     assert_holds(seal_run(folder), said)
+
+
+SEALER = """
+import sys
+import polars
+from dwell.record import seal_run
+print("begun", flush=True)
+seal_run(sys.argv[1])
+"""
+
+
+def test_a_process_that_is_killed_while_it_seals_loses_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "run", 50)
+    generator = random.Random(os.urandom(8))
+    for _ in range(4):
+        with subprocess.Popen(
+            [sys.executable, "-c", SEALER, str(tmp_path / "run")], stdout=subprocess.PIPE
+        ) as sealer:
+            assert sealer.stdout is not None
+            sealer.stdout.readline()
+            time.sleep(generator.random() * 15e-3)
+            sealer.send_signal(signal.SIGKILL)
+        assert_holds(open_run(tmp_path / "run"), 50)
+    assert_holds(seal_run(tmp_path / "run"), 50)
+
+
+READER = """
+import sys
+for extra in ("msgspec", "zenoh", "psutil"):
+    sys.modules[extra] = None
+from dwell.record import open_run
+print(open_run(sys.argv[1]).meta["windows"])
+"""
+
+
+def test_a_journal_is_read_without_what_wrote_it(tmp_path: Path) -> None:
+    write(tmp_path / "run", 3)
+    command = [sys.executable, "-c", READER, str(tmp_path / "run")]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "3\n"

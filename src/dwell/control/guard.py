@@ -157,7 +157,7 @@ class Guard:
 
     @property
     def patience_ns(self) -> int:
-        """G periods."""
+        """What is waited for a cycle: g periods."""
         return self._silence.patience_ns
 
     def released(self, cycle: int, at_ns: int) -> None:

@@ -118,11 +118,11 @@ class Renderer:
 
 
 def _table(random: np.random.Generator, clutter: int) -> Picture:
-    """Draw the table: a grain, and patches and rings that a detector has to look at."""
+    """Draw the table: a grain, and dark patches that a detector has to look at."""
     side = int(_TABLE_M * _TABLE_PPM)
     grain = random.normal(150, 12, (side // 8, side // 8)).astype(np.float32)
-    table = np.asarray(cv2.resize(grain, (side, side), interpolation=cv2.INTER_LINEAR))
-    table = np.clip(table, 0, 255).astype(np.uint8)
+    smooth = np.asarray(cv2.resize(grain, (side, side), interpolation=cv2.INTER_LINEAR))
+    table = np.clip(smooth, 0, 255).astype(np.uint8)
     for _ in range(clutter):
         middle, size = random.uniform(0, side, 2), random.uniform(15, 60, 2)
         box = (middle.tolist(), size.tolist(), float(random.uniform(0, 90)))

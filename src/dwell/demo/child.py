@@ -19,7 +19,9 @@ __all__ = ["PARENT_CHECK_S", "Child", "Json", "Parent"]
 
 Json: TypeAlias = dict[str, object]
 
-ANSWER_S = 10.0
+# A start imports NumPy, and what else runs on the CPU may be a lot of busy threads.
+START_S = 60.0
+ANSWER_S = 20.0
 STOP_S = 2.0
 RECEIVE_BYTES = 2**16
 #: How often a child looks for its parent, beside the end of their connection.
@@ -76,15 +78,14 @@ class Child:
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
                 [sys.executable, "-P", "-m", self._module], stdin=theirs.fileno()
             )
-        ours.settimeout(ANSWER_S)
         self._socket = ours
         try:
-            return self.ask(settings)
+            return self.ask(settings, START_S)
         except LiveError:
             self.stop()
             raise
 
-    def ask(self, request: Mapping[str, object]) -> Json:
+    def ask(self, request: Mapping[str, object], timeout_s: float = ANSWER_S) -> Json:
         """Send a request and return the answer; safe from any thread.
 
         Raises
@@ -95,12 +96,13 @@ class Child:
         with self._lock:
             if self._socket is None:
                 raise LiveError(f"{self._name} does not run")
+            self._socket.settimeout(timeout_s)
             try:
                 self._socket.sendall(json.dumps(request).encode() + b"\n")
                 answer = self._receive(self._socket)
             except TimeoutError:
                 raise LiveError(
-                    f"{self._name} (process {self.pid}) has not answered within {ANSWER_S:g} s"
+                    f"{self._name} (process {self.pid}) has not answered within {timeout_s:g} s"
                 ) from None
             except (EOFError, OSError):
                 raise LiveError(f"{self._name} (process {self.pid}) has ended") from None

@@ -30,13 +30,10 @@ def velocities(plan: Plan, since_ns: Array) -> Array:
     -------
     float array, shape (n, 4)
     """
-    planned = np.array(plan.velocities)
-    steps = (since_ns - plan.start_ns) / plan.step_ns
-    low = np.clip(steps.astype(np.int64), 0, len(planned) - 2)
-    share = np.clip(steps - low, 0.0, 1.0)[:, None]
-    between: Array = (1 - share) * planned[low] + share * planned[low + 1]
-    between[steps > len(planned) - 1] = 0.0
-    return between
+    steps = ((since_ns - plan.start_ns) // plan.step_ns).astype(np.int64)
+    planned: Array = np.array(plan.velocities)[np.clip(steps, 0, len(plan.velocities) - 1)]
+    planned[steps >= len(plan.velocities)] = 0.0
+    return planned
 
 
 class Control:

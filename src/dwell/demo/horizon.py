@@ -1,9 +1,8 @@
 """A model-predictive step: the camera's best motion over a horizon, a sparse quadratic program.
 
-The camera's axes are double integrators, exactly discretised: an acceleration a[k] is held over a
-step h,
+The arm holds a commanded velocity, and its ramps are short: so does each step h here,
 
-    p[k+1] = p[k] + h v[k] + h^2/2 a[k],   v[k+1] = v[k] + h a[k]
+    p[k+1] = p[k] + h v[k+1],   v[k+1] = v[k] + h a[k]
 
 The tag's future is several scenarios at once, each with a weight: the first accelerations are
 common to all, since nobody knows by then which of them it is (Bernardini and Bemporad 2009, DOI
@@ -60,22 +59,22 @@ class HorizonSettings:
     tolerance : float
         Of the solver, absolute and relative.
     iterations : int
-        At most; what it has by then is used. The usual ones take about all of them, so that a
-        step always takes about as long.
+        At most; what it has by then is used. With the usual tolerance nearly every step takes all
+        of them, and so about as long as any other; each goes on where the last one stopped.
     """
 
     steps: int = 30
     step_s: float = 0.04
-    decays: tuple[float, ...] = (0.0, 1.5, -1.5)
+    decays: tuple[float, ...] = (0.0, 0.7, -0.7)
     weights: tuple[float, ...] = (0.5, 0.25, 0.25)
     common: int = 4
-    track: tuple[float, ...] = (4e4, 4e4, 4e4, 1e3)
+    track: tuple[float, ...] = (4e4, 4e4, 4e4, 4e3)
     pace: float = 5e-4
-    effort: float = 2e-7
+    effort: float = 1e-6
     smooth: float = 1e-7
     slack: float = 2000.0
-    rho: float = 0.3
-    tolerance: float = 1e-3
+    rho: float = 3.0
+    tolerance: float = 1e-6
     iterations: int = 160
 
 
@@ -86,9 +85,9 @@ class Motions:
     Parameters
     ----------
     positions, velocities : float array
-        At the end of each step.
+        At the end of each step, and over it.
     accelerations : float array
-        Over each step.
+        From the step before to each step, as if they took all of it.
     out_of_view_m : float array, shape (scenarios, steps)
     iterations : int
         Of the solver; `HorizonSettings.iterations` where it was stopped.
@@ -158,13 +157,10 @@ class Horizon:
         scenarios, steps, _ = goals.shape
         moves = result.x.reshape(scenarios, 13 * steps)
         states = moves[:, : 12 * steps].reshape(scenarios, 3, steps, 4)
-        return Motions(
-            target + states[:, 0],
-            states[:, 1],
-            states[:, 2],
-            moves[:, 12 * steps :],
-            result.info.iter,
-        )
+        positions, velocities, accelerations = (states[:, part] for part in range(3))
+        out_of_view_m = moves[:, 12 * steps :]
+        iterations = int(result.info.iter)
+        return Motions(target + positions, velocities, accelerations, out_of_view_m, iterations)
 
     def goals(self, target: Array, speed: Array) -> tuple[Array, Array]:
         """Return where the camera should be at the end of each step, and how fast.
@@ -213,12 +209,11 @@ class Horizon:
         settings = self.settings
         steps, h, scenarios = settings.steps, settings.step_s, len(settings.weights)
         every, change = sparse.eye(4 * steps), self._change()
-        before = sparse.eye(4 * steps, k=-4)
         sides = sparse.kron(sparse.eye(steps), self._sides)
         slack = sparse.kron(sparse.eye(steps), np.ones((4, 1)))
         one = sparse.bmat(
             [
-                [change, -h * before, -(h**2) / 2 * every, None],
+                [change, -h * every, None, None],
                 [None, change, -h * every, None],
                 [None, every, None, None],
                 [None, None, every, None],
@@ -238,7 +233,7 @@ class Horizon:
         settings, limits = self.settings, self.scene.limits
         scenarios, steps, _ = goals.shape
         start = np.zeros((2, steps, 4))
-        start[:, 0] = position + settings.step_s * velocity, velocity
+        start[:, 0] = position, velocity
         # The camera's goal is the tag less the distance, which the view's depth has to include.
         depth = self.scene.camera.slope * self.scene.distance_m - self._radius_m
         view = goals @ self._sides.T + depth

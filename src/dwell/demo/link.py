@@ -13,6 +13,8 @@ What differs from a real link:
 * One delay is drawn for a batch: small messages that their sender has put into one travel together.
 * TCP between sender and link never loses a segment: after a cut of `hold`, what waited goes on at
   once and not after a retransmission timeout. Headers of TCP and IP do not count at the rate.
+* What a sender's kernel holds in front of a full queue is bounded by that kernel only (up to 4 MB;
+  Zenoh's ``#so_sndbuf=...`` at the end of an endpoint makes it less). Shared memory passes it by.
 * A cut hides the end of a connection too, and new ones wait until it is healed.
 """
 

@@ -53,8 +53,8 @@ class Plan(msgspec.Struct, array_like=True, frozen=True):
     taken_ns, waited_ns : int
         Of the picture behind it; see `Pose`.
     start_ns, step_ns : int
-        Velocity k is the one for ``start_ns + k * step_ns`` after the picture was taken, with
-        straight lines between.
+        Velocity k is the one from ``start_ns + k * step_ns`` after the picture was taken, for a
+        step.
     velocities : tuple of tuple of float
         Of the arm's axes.
     tracking : bool

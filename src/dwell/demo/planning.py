@@ -104,8 +104,7 @@ class Planning:
             target = predicted(track, begin_ns) - [0, 0, self.scene.distance_m, 0]
             speed = np.array(track.velocity)
         motions = self.horizon.solve(position, velocity, target, speed)
-        planned = np.vstack([velocity, motions.velocities[0]])
-        planned = np.clip(planned, -np.array(limits.velocity), limits.velocity)
+        planned = np.clip(motions.velocities[0], -np.array(limits.velocity), limits.velocity)
         step_ns = round(self.horizon.settings.step_s * 1e9)
         way = tuple(map(axes, planned))
         state.plan = Plan(
@@ -122,7 +121,7 @@ class Planning:
         if plan is not None and 0 < pose.taken_ns - plan.taken_ns < _FOLLOWED_STEPS * plan.step_ns:
             earlier_ns = pose.taken_ns - plan.taken_ns
             moving = velocities(plan, samples + earlier_ns)
-            velocity = velocities(plan, np.array([earlier_ns + start_ns]))[0]
+            velocity = velocities(plan, np.array([earlier_ns + start_ns - 1]))[0]
         most = np.array(self.scene.limits.velocity)
         return position + moving.mean(axis=0) * start_ns * 1e-9, np.clip(velocity, -most, most)
 

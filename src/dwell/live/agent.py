@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
-from dwell.live.messages import Load, encode
+from dwell.live.messages import Carried, Load, encode
 from dwell.live.role import Place, Pulse
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.protocol import Sample
@@ -19,7 +19,10 @@ __all__ = ["Agent", "CpuCount"]
 
 #: Time between two looks at the processes, and between two reports of what the CPU does.
 LOOK_NS = 20_000_000
-LOAD_NS = 100_000_000
+LOAD_NS = 250_000_000
+#: Messages that the detour carries on together at most; more within that time are dropped.
+MOST_CARRIED = 1_000
+NEVER_NS = 1 << 62
 
 
 class CpuCount:
@@ -69,6 +72,8 @@ class Agent:
         self.pulse = Pulse(place, self._state)
         self._relays = place.node == place.relay
         self._look_ns = self._load_ns = 0
+        self._carried: list[tuple[str, bytes]] = []
+        self._carry_ns = NEVER_NS
         self._spent: dict[str, int] = {"own": 0, "shadow": 0}
 
     def subscriptions(self) -> Iterable[str]:
@@ -84,9 +89,9 @@ class Agent:
             return
         keys = self.place.keys
         prefix = f"{keys.root}/relay/"
-        if self._relays and sample.key.startswith(prefix):
-            onward = keys.detour(f"{keys.root}/{sample.key.removeprefix(prefix)}")
-            self.place.transport.put(onward, sample.payload, sample.header)
+        if self._relays and sample.key.startswith(prefix) and len(self._carried) < MOST_CARRIED:
+            self._carried.append((sample.key.removeprefix(prefix), sample.payload))
+            self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
 
     def _state(self) -> tuple[bool, str]:
         return True, self.supervisor.notes()
@@ -99,7 +104,11 @@ class Agent:
         if now_ns >= self._load_ns:
             self._report(now_ns)
             self._load_ns = now_ns + LOAD_NS
-        return min(self.pulse.wake(now_ns), self._look_ns, self._load_ns)
+        if now_ns >= self._carry_ns:
+            carried, self._carried = self._carried, []
+            self._carry_ns = NEVER_NS
+            self.place.transport.put(self.place.keys.carried(), encode(Carried(tuple(carried))))
+        return min(self.pulse.wake(now_ns), self._look_ns, self._load_ns, self._carry_ns)
 
     def _report(self, now_ns: int) -> None:
         place = self.place

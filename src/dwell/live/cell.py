@@ -6,7 +6,7 @@ The decisions are those of `dwell.control.Controller`, the object that the simul
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -16,6 +16,7 @@ from dwell.live.messages import (
     Accepted,
     Answer,
     Ask,
+    Beat,
     Completion,
     Load,
     Order,
@@ -88,7 +89,9 @@ class Cell:
         self._recorder = recorder
         self.offsets = place.offsets()
         self.windows: LiveWindows | None = None
-        self.pulse = Pulse(place, lambda: (True, ""))
+        # Of the others it hears over the detour.
+        direct = [(node, f"{kind}@{node}") for kind, node in self._nearest()]
+        self.pulse = Pulse(place, lambda: (True, ""), hears=direct)
         self.held: Accepted | None = None
         self.refused = ""
         self.pinned = ""
@@ -105,19 +108,21 @@ class Cell:
         """Key expressions that it wants to hear."""
         keys = self.place.keys
         yield from self.pulse.subscriptions()
-        for key in (keys.done("*"), keys.probed(), keys.accepted(), keys.load("*")):
-            yield key
-            yield keys.detour(key)
-        yield keys.stamped()
+        yield from (keys.done("*"), keys.probed(), keys.accepted(), keys.load("*"))
+        yield from (keys.carried(), keys.stamped())
         yield keys.restored()
         yield keys.ask()
 
     def receive(self, sample: Sample, now_ns: int) -> None:
         """Take a message in."""
+        if sample.key == self.place.keys.carried():
+            for one in self.place.around(sample):
+                self.receive(one, now_ns)
+            return
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
-            if beat is not None and "/detour/" not in sample.key:
-                self.offsets.hear(beat, now_ns)
+            if beat is not None:
+                self._compare_clocks(beat, now_ns, direct="/detour/" not in sample.key)
             return
         windows = self.windows
         word = sample.key.removeprefix(self.place.keys.root + "/").removeprefix("detour/")
@@ -137,6 +142,23 @@ class Cell:
                     self._asked(decode(sample.payload, Ask), now_ns)
         except LiveError as error:
             self.place.complain(error)
+
+    def _nearest(self) -> Iterator[tuple[str, str]]:
+        """Processes that this one is connected to: the ends of a cycle."""
+        problem = self.place.problem
+        yield "stamper", problem.stamper_node
+        yield "agent", self.place.relay
+        for task in problem.pipeline.tasks.values():
+            if not problem.pipeline.outputs(task.name):
+                yield from ((f"sink.{task.name}", node) for node in task.on)
+
+    def _compare_clocks(self, beat: Beat, now_ns: int, *, direct: bool) -> None:
+        """Learn what a beat tells of the clocks; over the detour, of others than this node's."""
+        if direct:
+            self.offsets.hear(beat, now_ns)
+        else:
+            for heard in beat.heard:
+                self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
     def _stamped(self, stamp: Stamp, now_ns: int) -> None:
         held = self.held

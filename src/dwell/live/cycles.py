@@ -1,4 +1,9 @@
-"""LiveCycle: what is known of one cycle; Ledger: what follows from what its messages say."""
+"""LiveCycle: what is known of one cycle; Ledger: what follows from what its messages say.
+
+A job's instants travel with its output, so that of a cycle that never arrives nothing is told of
+where it went: unless a worker has said that it replaced it by a newer one, the first message to
+another node of which nothing is known is taken to have been lost.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +26,8 @@ Ints: TypeAlias = NDArray[np.int64]
 UNKNOWN = -1
 #: Shadow completions remembered of one cycle.
 MAX_SHADOWS = 16
+#: Outcomes of what came to its end before a sink.
+SHADOW, REPLACED = "shadow", "replaced"
 
 
 @dataclass(eq=False, slots=True)
@@ -46,6 +53,8 @@ class LiveCycle:
     reports : dict of str to (Completion, int or None)
         By sink, with the instant it was heard.
     shadows : list of Completion
+    replaced : dict of str to Completion
+        By task where a newer cycle took its place.
     latency_ns : int
         `NEVER_NS` while it has not completed.
     parts_ns : tuple of int, or None
@@ -71,6 +80,7 @@ class LiveCycle:
     stamped_ns: int | None = None
     reports: dict[str, tuple[Completion, int | None]] = field(default_factory=dict)
     shadows: list[Completion] = field(default_factory=list)
+    replaced: dict[str, Completion] = field(default_factory=dict)
     latency_ns: int = NEVER_NS
     parts_ns: tuple[int, int, int] | None = None
     bound_ns: int = 0
@@ -107,11 +117,13 @@ class LiveCycle:
 
     def take(self, completion: Completion, at_ns: int | None) -> bool:
         """Take in a completion; False if it is a copy."""
-        if completion.outcome == "shadow":
+        if completion.outcome == SHADOW:
             new = len(self.shadows) < MAX_SHADOWS and completion not in self.shadows
             if new:
                 self.shadows.append(completion)
             return new
+        if completion.outcome == REPLACED:
+            return self.replaced.setdefault(completion.sink, completion) is completion
         if completion.sink in self.reports:
             return False
         self.reports[completion.sink] = completion, at_ns
@@ -146,7 +158,14 @@ class Ledger:
         self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
         self._codes = {name: code for code, name in enumerate(problem.candidates)}
         self._every = frozenset(pipeline.tasks)
+        order = pipeline.topological()
+        self._forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
         self._apart: dict[tuple[str, str], frozenset[str]] = {}
+
+    def tells(self, completion: Completion) -> bool:
+        """Whether a completion is about a task that can say so."""
+        early = completion.outcome in {SHADOW, REPLACED}
+        return completion.sink in (self._every if early else self.sinks)
 
     # ------------------------------------------------------------------------ latency
 
@@ -224,13 +243,17 @@ class Ledger:
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
         through = np.full(len(cycles), -1, np.int64)
         for row, cycle in enumerate(cycles):
-            for report, _ in cycle.reports.values():
-                self._enter(known, row, cycle, report.hops, self._every)
             if cycle.shadow in self._codes:
                 through[row] = self._codes[cycle.shadow]
                 apart = self._diverging(cycle)
                 for report in cycle.shadows:
                     self._enter(of_shadows, row, cycle, report.hops, apart)
+                    # What both went through, should the cycle itself not have come so far.
+                    self._enter(known, row, cycle, report.hops, self._every - apart)
+            for report in (*cycle.replaced.values(), *(done for done, _ in cycle.reports.values())):
+                self._enter(known, row, cycle, report.hops, self._every)
+            if cycle.heard and not cycle.reports and not cycle.replaced:
+                self._blame(known, row, cycle)
         for found in (known, of_shadows):
             for instants in (found.ready_ns, found.end_ns, found.arrived_ns):
                 instants[instants > close_ns] = UNKNOWN
@@ -264,14 +287,26 @@ class Ledger:
             if cycle.shifts[hop.node][1] >= UNBOUNDED_NS:
                 continue
             shift_ns = ready_ns - hop.arrived_ns
-            # Where a shadow stops, its last messages arrive for a job that never runs.
             if hop.ended_ns != UNKNOWN:
-                known.ready_ns[row, column] = max(ready_ns, 0)
                 known.end_ns[row, column] = max(hop.ended_ns + shift_ns, 0)
+            # Where a shadow stops, its last messages arrive for a job that never runs.
+            if hop.ended_ns != UNKNOWN or hop.task not in self.sinks:
+                known.ready_ns[row, column] = max(ready_ns, 0)
             for source, arrived_ns in hop.inputs:
                 flow = self._flows.get((source, hop.task))
                 if flow is not None:
                     known.arrived_ns[row, flow] = max(arrived_ns + shift_ns, 0)
+
+    def _blame(self, known: Instants, row: int, cycle: LiveCycle) -> None:
+        """Take the first message to another node that is not known to have arrived as lost."""
+        nodes = self._candidates[cycle.placement]
+        for flow in self._forward:
+            column = self._flows[flow.source, flow.target]
+            if nodes[flow.source] != nodes[flow.target] and known.arrived_ns[row, column] < 0:
+                source = self._tasks[flow.source]
+                if known.end_ns[row, source] < 0:
+                    known.end_ns[row, source] = cycle.at_ns
+                return
 
     def _diverging(self, cycle: LiveCycle) -> frozenset[str]:
         """Tasks that a cycle does not share with its shadow."""

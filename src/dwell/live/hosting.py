@@ -30,7 +30,7 @@ class Hosted:
     clock : callable
         Nanoseconds; a clock that never steps.
     heard : callable, optional
-        Called, outside the role, after every message.
+        Called, outside the role, after every message; `news` is released where it says so.
     stopped : Event, optional
         Ends `run` within a fifth of a second.
     """
@@ -40,7 +40,7 @@ class Hosted:
         role: Role,
         transport: Transport,
         clock: Clock = time.monotonic_ns,
-        heard: Callable[[], None] | None = None,
+        heard: Callable[[], bool] | None = None,
         stopped: threading.Event | None = None,
     ) -> None:
         self.role, self.transport, self.clock = role, transport, clock
@@ -48,6 +48,7 @@ class Hosted:
         self.stopped = stopped or threading.Event()
         self._hurry = threading.Event()
         self._heard = heard
+        self.news = threading.Semaphore(0)
         self._due_ns = 0
         self.fault: BaseException | None = None
         for key in role.subscriptions():
@@ -58,8 +59,8 @@ class Hosted:
             return
         with self.lock:
             self.role.receive(sample, self.clock())
-        if self._heard is not None:
-            self._heard()
+        if self._heard is not None and self._heard():
+            self.news.release()
 
     def hurry(self) -> None:
         """Wake the role now: something has changed."""
@@ -109,8 +110,7 @@ def work(
     ready : callable, optional
         Called when the stage has started.
     """
-    news = threading.Semaphore(0)
-    hosted = Hosted(worker, transport, clock, heard=news.release)
+    hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work)
     beats = threading.Thread(target=hosted.run, name="beats", daemon=True)
     beats.start()
     stage = worker.stage
@@ -128,7 +128,7 @@ def work(
     try:
         while not stopped.is_set():
             _drain(worker, hosted, note, clock)
-            news.acquire(timeout=LONGEST_SLEEP_S if not worker.stands_by else 0.01)
+            hosted.news.acquire(timeout=LONGEST_SLEEP_S if not worker.stands_by else 0.01)
     finally:
         hosted.stop()
         stop = getattr(stage, "stop", None)

@@ -86,3 +86,7 @@ class Keys:
     def detour(self, key: str) -> str:
         """The copy as it arrives."""
         return f"{self.root}/detour/{key.removeprefix(self.root + '/')}"
+
+    def carried(self) -> str:
+        """All copies of a while, together."""
+        return f"{self.root}/carried"

@@ -20,6 +20,7 @@ __all__ = [
     "Answer",
     "Ask",
     "Beat",
+    "Carried",
     "Completion",
     "Header",
     "Heard",
@@ -233,6 +234,21 @@ class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
     shadow_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
     forks: Forks = ()
     want: Annotated[str, msgspec.Meta(max_length=120)] = ""
+
+
+class Carried(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """Small messages that the detour carries on together.
+
+    Parameters
+    ----------
+    messages : tuple of (str, bytes)
+        Keys, and what was sent under them.
+    """
+
+    messages: Annotated[
+        tuple[tuple[Annotated[str, msgspec.Meta(max_length=400)], bytes], ...],
+        msgspec.Meta(max_length=1_000),
+    ]
 
 
 class Ask(msgspec.Struct, array_like=True, frozen=True, gc=False):

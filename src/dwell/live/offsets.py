@@ -39,6 +39,9 @@ WANDER_PPB = 10_000
 MEMORY_NS = 120_000_000_000
 ANCHOR_NS = 2_000_000_000
 
+#: Nodes whose clocks are compared; what names more of them is none of the cell's.
+MAX_NODES = 64
+
 PPB = 1_000_000_000
 
 
@@ -195,6 +198,8 @@ class Offsets:
     def sample(self, source: str, target: str, sent_ns: int, arrived_ns: int) -> None:
         """Take in one message between two nodes, each instant on its own node's clock."""
         if source == target or self._system_bound_ns is not None:
+            return
+        if len({source, target} - self._known) + len(self._known) > MAX_NODES:
             return
         if source < target:
             self._pair(source, target).at_most(sent_ns, arrived_ns - sent_ns)

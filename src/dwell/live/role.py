@@ -9,7 +9,7 @@ from typing import Protocol
 from dwell.errors import LiveError
 from dwell.live.hearing import Hearing
 from dwell.live.keys import Keys
-from dwell.live.messages import MAX_HEADER_BYTES, Beat, Header, decode, encode
+from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Header, decode, encode
 from dwell.live.offsets import Offsets
 from dwell.live.transport.protocol import Sample, Transport
 from dwell.model import Problem
@@ -84,6 +84,12 @@ class Place:
         """Age beyond which what was heard counts no more: g periods."""
         return self.problem.controller.guard_cycles * self.period_ns
 
+    @property
+    def stamper(self) -> tuple[str, str]:
+        """Node and name of the stamper."""
+        node = self.problem.stamper_node
+        return node, f"stamper@{node}"
+
     def offsets(self) -> Offsets:
         """Make what compares clocks with that of the stamper's node."""
         system = self.problem.live.clock == "system"
@@ -101,6 +107,15 @@ class Place:
         """
         self.transport.put(key, payload)
         self.transport.put(self.keys.relay(key), payload)
+
+    def around(self, sample: Sample) -> list[Sample]:
+        """Return the messages that came over the detour together."""
+        try:
+            carried = decode(sample.payload, Carried)
+        except LiveError as error:
+            self.complain(error)
+            return []
+        return [Sample(self.keys.detour(key), payload) for key, payload in carried.messages]
 
     def complain(self, error: LiveError) -> None:
         """Count a message that could not be used; a flood of them takes no memory."""
@@ -127,8 +142,8 @@ class Pulse:
         Returns whether the process is ready, and what keeps it from that or went wrong last.
     holds : callable, optional
         Returns the stamper's term and placement.
-    loud : bool
-        Whether its beats take the detour, too.
+    hears : iterable of (str, str), optional
+        Nodes and processes, or ``*``, whose beats it wants; by default the stamper's only.
     """
 
     def __init__(
@@ -137,23 +152,23 @@ class Pulse:
         state: Callable[[], tuple[bool, str]],
         holds: Callable[[], tuple[int, str]] | None = None,
         *,
-        loud: bool = True,
+        hears: Iterable[tuple[str, str]] | None = None,
     ) -> None:
         self.place = place
+        self._hears = (place.stamper,) if hears is None else tuple(hears)
         self.hearing = Hearing(place.who, place.patience_ns)
         self._state, self._holds = state, holds
-        self._loud = loud
         self._digest = fingerprint(place.problem)
         self._next_ns = -(1 << 62)
         keys = place.keys
         self._key = keys.beat(place.node, place.who)
-        self._direct = keys.beat("*", "*")
-        self._around = keys.detour(self._direct)
-        self._prefix = (self._direct.removesuffix("*/*"), self._around.removesuffix("*/*"))
+        direct = keys.beat("", "").removesuffix("/")
+        self._prefix = direct, keys.detour(direct)
 
     def subscriptions(self) -> tuple[str, ...]:
         """Key expressions of beats."""
-        return self._direct, self._around
+        keys = self.place.keys
+        return tuple(keys.beat(node, who) for node, who in self._hears)
 
     def receive(self, sample: Sample, now_ns: int) -> Beat | None:
         """Take a beat in; None where it is none, or no news."""
@@ -195,8 +210,4 @@ class Pulse:
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
             *(self._digest, note[:2000]),
         )
-        data = encode(beat)
-        if self._loud:
-            place.put_twice(self._key, data)
-        else:
-            place.transport.put(self._key, data)
+        place.put_twice(self._key, encode(beat))

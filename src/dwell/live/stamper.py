@@ -98,7 +98,7 @@ class Stamper:
         self.probation = Probation.of(problem)
         if entry.on_fallback:
             self.probation.fell()
-        self.pulse = Pulse(place, self._ready, self._holds)
+        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
         self._names = tuple(problem.candidates)
@@ -121,14 +121,16 @@ class Stamper:
         """Key expressions that it wants to hear."""
         keys = self.place.keys
         yield from self.pulse.subscriptions()
-        for key in (keys.done("*"), keys.probed()):
-            yield key
-            yield keys.detour(key)
+        yield from (keys.done("*"), keys.probed(), keys.carried())
         yield keys.order()
         yield keys.frame()
 
     def receive(self, sample: Sample, now_ns: int) -> None:
         """Take a message in."""
+        if sample.key == self.place.keys.carried():
+            for one in self.place.around(sample):
+                self.receive(one, now_ns)
+            return
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
             if beat is not None:

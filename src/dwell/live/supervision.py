@@ -50,7 +50,7 @@ class Child:
     next_s: float = 0.0
     note: str = ""
     deaths: Counter[str] = field(default_factory=Counter)
-    spent_s: float = 0.0
+    watched: psutil.Process | None = None
 
     @property
     def pid(self) -> int | None:
@@ -174,12 +174,15 @@ class Supervisor:
         """CPU time of the processes whose names are selected, past ones included."""
         total = 0.0
         for child in self.children:
-            if select(child.who) and child.pid is not None:
-                try:
-                    times = psutil.Process(child.pid).cpu_times()
-                except psutil.Error:
-                    continue
-                total += times.user + times.system
+            if not select(child.who) or child.pid is None:
+                continue
+            try:
+                if child.watched is None or child.watched.pid != child.pid:
+                    child.watched = psutil.Process(child.pid)
+                times = child.watched.cpu_times()
+            except psutil.Error:
+                continue
+            total += times.user + times.system
         return total
 
     def notes(self) -> str:

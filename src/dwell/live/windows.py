@@ -178,8 +178,17 @@ class LiveWindows:
             cycle.stamped_ns = at_ns
 
     def completed(self, completion: Completion, at_ns: int | None = None) -> None:
-        """A sink has had a cycle's command, or a cycle's shadow has come to its end."""
-        if completion.sink not in self._ledger.sinks:
+        """A sink has had a cycle's command, or a cycle or its shadow has ended before that.
+
+        Parameters
+        ----------
+        completion : Completion
+            With the outcome ``replaced`` it is a worker's: a newer cycle has taken its place. Its
+            `sink` is the task, and its last hop says when that was ready, and nothing more.
+        at_ns : int, optional
+            When this was heard, on the controller's clock.
+        """
+        if not self._ledger.tells(completion):
             self.ignored += 1
             return
         cycle = self._note(completion.stamp, at_ns)
@@ -460,6 +469,8 @@ class LiveWindows:
     def _outcome(self, cycle: LiveCycle) -> str:
         if self._ledger.complete(cycle):
             return "done"
+        if cycle.replaced:
+            return "replaced"
         return "dropped" if cycle.key < self._newest_done else "in_flight"
 
     def _cycle_row(self, cycle: LiveCycle) -> Row:

@@ -148,7 +148,15 @@ class Worker:
         self.replaced = 0
         self.failures = 0
         self._now_ns = 0
-        self.pulse = Pulse(place, self._state, loud=True)
+        # Of each link that its inputs may take, and of the stamper, whose clock counts.
+        before = [
+            (node, f"{source}@{node}")
+            for source in sources - {STAMPER}
+            for node in problem.pipeline.tasks[source].on
+            if node != place.node
+        ]
+        primary = [(place.node, stands_by)] if stands_by else []
+        self.pulse = Pulse(place, self._state, hears=[place.stamper, *before, *primary])
 
     # ------------------------------------------------------------------------ hearing
 
@@ -315,6 +323,12 @@ class Worker:
         return not (
             beat and beat.ready and hearing.fresh(self.stands_by, self._now_ns, patience_ns)
         )
+
+    @property
+    def has_work(self) -> bool:
+        """Whether there may be something for `next_chore` or `next_job`."""
+        waits = self._jobs or self._asked is not None or self._restoring is not None
+        return bool(waits) and self.busy_since_ns is None
 
     def next_job(self, now_ns: int) -> Job | None:
         """Return the job to run now, if there is one; `run` has to follow."""

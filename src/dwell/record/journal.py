@@ -283,6 +283,8 @@ class Journal:
     ----------
     cut_bytes : int
         Length of the torn end that was cut off.
+    meta : dict
+        What is said of the run, now and by those who wrote it before.
 
     Raises
     ------
@@ -323,6 +325,7 @@ class Journal:
             self._lock()
             contents = self._go_on()
             self._following = contents.following
+            self.meta: dict[str, Any] = {**contents.meta, **meta}
             frame = _frame({**header, "opened": contents.opened + 1})
             # The header stands twice, so that damage at one place loses no more than that place.
             self._write(frame + frame if contents.opened == 0 else frame)
@@ -406,6 +409,7 @@ class Journal:
         if meta:
             content["meta"] = meta
         self._write(_frame(content))
+        self.meta.update(meta)
         for name in NUMBERED:
             for row in rows.get(name, ()):
                 self._following[name] = max(self._following.get(name, 0), int(row[0]) + 1)

@@ -35,7 +35,7 @@ WORDS = {
     **dict.fromkeys(("under", "agrees", "met", "holds", "yes"), "good"),
     **dict.fromkeys(("over", "above", "differs", "missed", "no"), "bad"),
     **dict.fromkeys(
-        ("open", "not shown", "in part", "agrees in part", "not asked", "no difference shown"),
+        ("open", "not shown", "in part", "agrees in part", "not asked"),
         "open",
     ),
 }
@@ -43,8 +43,10 @@ WORDS = {
 LONG, LONGEST = 24, 60
 # A text that is longer may break into lines.
 SHORT = 22
-# Columns from which on letters are smaller.
-SMALL = 8
+# Columns of a page from which on letters are smaller, and those from which on they are small.
+SMALL, TIGHT = 8, 15
+#: What is longer in the words of a study than a column has room for.
+SHORTER = {"no difference shown": "not shown"}
 
 
 class Column(NamedTuple):
@@ -118,20 +120,21 @@ def html(item: Table, look: Look, *, main: bool = False) -> str:
     shown = Shown.of(item)
     head, width = [], 0
     for i, column in enumerate(shown.columns):
-        text = marked(column.heading)
+        text = marked(look.prose(column.heading))
         kind = "pair" if column.interval else "" if column.unit == "text" else "num"
         head.append(Cell(text, kind if i else "", 2 if column.interval else 1))
         width += 2 if column.interval else 1
     rows: list[tuple[str, Sequence[Cell]]] = []
     for group, row in shown.lines():
         if group is not None:
-            rows.append(("group", [Cell(marked(look.shown(group)), columns=width)]))
+            rows.append(("group", [Cell(marked(look.titled(group)), columns=width)]))
         cells: list[Cell] = []
         for column in shown.columns:
             cells += _cells(row, column, look)
         rows.append(("", cells))
     note = noted(item, look)
-    size = "wide of-chapter small" if len(shown.columns) > SMALL else "wide of-chapter"
+    size = "wide of-chapter"
+    size += f" {'tight' if width > TIGHT else 'small'}" if len(shown.columns) > SMALL else ""
     text = table(head, rows, kind=size)
     if len(shown.rows) > (LONGEST if main else LONG):
         text = f"<details><summary>{len(shown.rows)} rows</summary>\n{text}\n</details>"
@@ -150,10 +153,10 @@ def latex(item: Table, look: Look, label: str) -> str:
     rows: list[tuple[str, Sequence[str]]] = []
     for group, row in shown.lines():
         if group is not None:
-            rows.append((look.shown(group), ()))
+            rows.append((look.titled(group), ()))
         rows.append(("", [str(_written(row, column, look, ends=True)) for column in shown.columns]))
     return tabular(
-        [column.heading for column in shown.columns],
+        [look.prose(column.heading) for column in shown.columns],
         "".join("l" if column.unit == "text" else "r" for column in shown.columns),
         rows,
         caption=f"{look.prose(item.title)}. {noted(item, look)}".strip(),
@@ -211,7 +214,7 @@ def _text(value: object, column: Column, look: Look) -> str:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    name = key(value)
+    name = SHORTER.get(key(value), key(value))
     if name in WORDS:
         return f'<span class="{WORDS[name]} nowrap">{escape(name)}</span>'
     if name in look.placements:
@@ -228,7 +231,7 @@ def _written(row: dict[str, object], column: Column, look: Look, *, ends: bool) 
     if isinstance(value, bool):
         return Written("yes" if value else "no", "")
     if column.unit == "text" or not isinstance(value, int | float):
-        return Written(look.prose(look.shown(value)), "")
+        return Written(look.prose(look.shown(SHORTER.get(key(value), value))), "")
     low, high = row.get(f"{column.name}_low"), row.get(f"{column.name}_high")
     if isinstance(low, int | float) and isinstance(high, int | float):
         interval = Interval(value, low, high)

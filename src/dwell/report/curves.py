@@ -47,6 +47,8 @@ ALONE_INCHES = 2.9
 # Points of a line up to which each has a mark, and which are kept of a longer one.
 MARKED = 16
 KEPT = 800
+# Values across, up to which each has its number.
+FEW = 4
 # Panels have an axis each where the largest of one is so many times that of another.
 APART = 4
 # Of cycles that took longer, in percent.
@@ -216,7 +218,8 @@ def _across(ax: Axes, values: Floats, *, log: bool) -> None:
         margin = (high / low) ** 0.03
         ax.set_xscale("log")
         ax.set_xlim(low / margin, high * margin)
-        set_log_ticks(ax.xaxis, low / margin, high * margin)
+        few = np.unique(values)
+        set_log_ticks(ax.xaxis, low / margin, high * margin, few if len(few) <= FEW else None)
         return
     margin = 0.03 * (high - low) or 0.1 * abs(high) or 1.0
     ax.set_xlim(0 if 0 <= low <= 0.05 * high else low - margin, high + margin)

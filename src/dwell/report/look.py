@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CONTENDERS", "Look", "key"]
 
-#: A contender's name as studies have it, in a sentence.
+#: A contender's name as studies have it, in a sentence; two words are what they say there.
 CALLED = re.compile(
-    rf"(?<![\w+-])(?:{'|'.join(FAMILIES)})(?:-(?:{'|'.join(VARIANTS)}))?"
+    rf"(?<![\w+-])(?:{'|'.join(name for name in FAMILIES if ' ' not in name)})(?:-(?:{'|'.join(VARIANTS)}))?"
     rf"(?:\+(?:{'|'.join(BELIEFS)}))?(?![\w+-])"
 )
 #: Columns of tables that hold contenders.
@@ -84,19 +84,28 @@ class Look:
     def shown(self, value: object) -> str:
         """Return what a value is called: a scenario, a contender, or itself."""
         text = key(value)
-        return shown_scenario(text) if text in self.scenarios else shown_contender(text)
+        if text in self.scenarios:
+            return shown_scenario(text)
+        return shown_contender(text).replace("->", "→")
+
+    def titled(self, value: object) -> str:
+        """Return what a value is called over a panel or a group of rows: it begins large."""
+        text = self.shown(value)
+        word = re.match(r"[a-z]{2,}(?![\w.])", text)
+        return text[:1].upper() + text[1:] if word else text
 
     def prose(self, text: str) -> str:
         """Return a sentence in which contenders are called as in tables and figures.
 
-        ``dtp+corrected`` becomes ``DTP (corrected)``; what stands in `code` stays.
+        ``dtp+corrected`` becomes ``DTP (corrected)``, ``R1->E`` becomes R1→E; what stands in
+        `code` stays.
         """
         parts = text.split("`")
         parts[::2] = [self._called(part) for part in parts[::2]]
         return "`".join(parts)
 
     def _called(self, text: str) -> str:
-        text = CALLED.sub(lambda found: shown_contender(found.group(0)), text)
+        text = CALLED.sub(lambda found: shown_contender(found.group(0)), text).replace("->", "→")
         for scenario in self.scenarios:
             # A word of a sentence is no name; one with a hyphen is.
             if "-" in scenario:

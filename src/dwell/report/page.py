@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from dwell.report.palette import INK, MUTED, RAMP
+from dwell.report.palette import INK, MUTED, PARTS, RAMP
 from dwell.report.wording import SYMBOL
 
 __all__ = [
@@ -43,7 +43,10 @@ class Cell(NamedTuple):
     columns: int = 1
 
 
-RAMPS = " ".join(f"--ramp-{i}: {colour};" for i, colour in enumerate(RAMP))
+RAMPS = " ".join(
+    [f"--ramp-{i}: {colour};" for i, colour in enumerate(RAMP)]
+    + [f"--{part}: {colour};" for part, colour in PARTS.items()]
+)
 STYLE = """
 :root { color-scheme: light dark;
   --paper: #fff; --ink: #1c1c1e; --muted: #66666b; --rule: #dededf;
@@ -52,7 +55,8 @@ STYLE = """
   --paper: #17181a; --ink: #e6e6e8; --muted: #a0a0a6; --rule: #38393d;
   --good: #4cc9a0; --bad: #ff9a52;
   --ramp-0: #6f4eb0; --ramp-1: #8766c8; --ramp-2: #9f80da; --ramp-3: #b79be8;
-  --ramp-4: #d0b9f3; --ramp-5: #ead9fd; } }
+  --ramp-4: #d0b9f3; --ramp-5: #ead9fd;
+  --compute: #d2d2d6; --queue: #85858b; --network: #4c4d52; } }
 @media print { :root { color-scheme: light;
   --paper: #fff; --ink: #000; --muted: #444; --rule: #bbb;
   --good: #00694d; --bad: #b04a00; RAMP } }
@@ -104,9 +108,13 @@ thead .pair { text-align: center; padding-left: 24px; white-space: nowrap; }
 thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .begin { padding-left: 36px; }
 .wide { width: 100%; }
-.of-chapter thead .pair { white-space: normal; } .of-chapter thead th { max-width: 11em; }
+.of-chapter thead :is(.pair, .num) { white-space: normal; }
+.of-chapter thead th { max-width: 11em; }
 .small { font-size: 13px; } .small th { font-size: 12.5px; } .small .err { font-size: 11.5px; }
 .small :not(:first-child):is(td, th) { padding-left: 9px; } .small .err.err { padding-left: 4px; }
+.tight { font-size: 12px; } .tight th { font-size: 12px; } .tight .err { font-size: 11px; }
+.tight :not(:first-child):is(td, th) { padding-left: 7px; } .tight .err.err { padding-left: 3px; }
+.tight .swatch { margin-right: 5px; } .tight small { font-size: 11px; }
 .summary { width: 100%; } .summary :is(th, td) { padding-top: 8px; padding-bottom: 8px; }
 .summary tbody th { white-space: normal; width: 30%; padding-right: 8px; }
 .text { min-width: 11em; }
@@ -124,11 +132,13 @@ tbody tr.group:first-child > * { padding-top: 16px; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: 6px 20px; font-size: 15px; }
 dt { color: var(--muted); } dd { margin: 0; }
 summary { cursor: pointer; color: var(--muted); font-size: 14px; margin: 12px 0; }
+.evidence { margin-bottom: 24px; } .evidence li { margin-bottom: 4px; }
 .files { margin-top: 4px; } .files a { color: inherit; }
 a { color: inherit; text-decoration-color: var(--muted); text-underline-offset: 2px; }
 @media (max-width: 640px) { main { padding: 40px 18px 80px; } dl { display: block; }
   dd { margin-bottom: 8px; } h1 { font-size: 27px; } h2 { margin-top: 56px; }
   .drawing svg, .drawing img { width: 760px; max-width: none; }
+  caption { position: sticky; left: 0; max-width: calc(100vw - 36px); }
   .of-chapter { min-width: 820px; }
   .of-chapter tr:not(.group) > :first-child { position: sticky; left: 0; padding-right: 6px;
     background: var(--paper); }
@@ -178,9 +188,10 @@ def paragraph(text: str, kind: str = "") -> str:
     return f"<p{attribute}>{marked(text)}</p>"
 
 
-def items(texts: Iterable[str]) -> str:
+def items(texts: Iterable[str], kind: str = "") -> str:
     """Return a list of plain texts; `code` in them is set as such."""
-    return "<ul>\n" + "\n".join(f"<li>{marked(text)}</li>" for text in texts) + "\n</ul>"
+    attribute = f' class="{kind}"' if kind else ""
+    return f"<ul{attribute}>\n" + "\n".join(f"<li>{marked(text)}</li>" for text in texts) + "\n</ul>"
 
 
 def definitions(entries: Mapping[str, str]) -> str:

@@ -42,7 +42,7 @@ PAPER = "#fefeff"
 #: Of values that have an order and are neither placements nor policies, the first to the last.
 RAMP = ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862")
 
-#: Where the time of a cycle goes: no placement's colours.
+#: Where the time of a cycle goes: no placement's colours. A page gives them others in the dark.
 PARTS = {"compute": "#4d4d4e", "queue": "#9a9a9b", "network": "#cfcfd0"}
 
 MARKERS = ("D", "s", "^", "v", "P", "X", "o", "<", ">")

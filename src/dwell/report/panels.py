@@ -221,7 +221,7 @@ def parted(figure: Figure, look: Look, most: int) -> Grid:
         if facet is None:
             return Place("", frame, shared, own=False)
         own = figure.panels.get(facet)
-        return Place(look.shown(facet), frame, own or shared, own=own is not None)
+        return Place(look.titled(facet), frame, own or shared, own=own is not None)
 
     if figure.facet is None:
         return Grid([[place(None, figure.frame)]], [])
@@ -241,11 +241,11 @@ def parted(figure: Figure, look: Look, most: int) -> Grid:
     if len(facets) > most >= len(sides):
         turned = [[row[i] for row in rows] for i in range(len(facets))]
         named = [
-            [_titled(one, look.shown(side)) for one, side in zip(row, sides, strict=True)]
+            [_titled(one, look.titled(side)) for one, side in zip(row, sides, strict=True)]
             for row in turned
         ]
-        return Grid(named, [look.shown(name) for name in facets], turned=True)
-    return Grid(rows, [look.shown(name) for name in sides])
+        return Grid(named, [look.titled(name) for name in facets], turned=True)
+    return Grid(rows, [look.titled(name) for name in sides])
 
 
 def _titled(place: Place | None, title: str) -> Place | None:

@@ -47,8 +47,8 @@ STATISTICS = (
     "1 − 0.05^(1/n) for n seeds, whatever the number of cycles.",
     "Differences are tested by flipping signs: p is the share of all assignments of signs to the "
     "seeds whose mean is at least as far from 0. All comparisons that answer one question on one "
-    "metric are a family, and their p values are adjusted together by Holm's procedure. “No "
-    "difference shown” is not “no difference”: the interval says what is left open.",
+    "metric are a family, and their p values are adjusted together by Holm's procedure. Where a "
+    "difference is “not shown”, none is excluded either: the interval says what is left open.",
     "Sobol indices part the variance of an output over a whole range of settings: S1 is the share "
     "that a setting makes alone, ST the share in which it takes part at all. They are taken of "
     "outputs that do not contain what is varied, at the same seeds in every point; their intervals "
@@ -196,7 +196,8 @@ def _chapter(
         f'<section id="{_anchor(chapter)}">',
         f"<h2>{marked(look.prose(chapter.title))}{tag}</h2>",
         paragraph(look.prose(chapter.verdict), "question"),
-        paragraph(look.prose(chapter.design), "note"),
+        *([items(map(look.prose, chapter.evidence), "evidence")] if chapter.evidence else []),
+        paragraph(_begun(look.prose(chapter.design)), "note"),
     ]
     for figure in chapter.figures:
         name = files[id(figure)]
@@ -212,8 +213,14 @@ def _chapter(
         parts.append(chapter_tables.html(item, look, main=item.slug == chapter.slug))
         parts.append(_files("tables", name, ("csv", "tex")))
     if chapter.findings:
-        parts += ["<h3>What else came out</h3>", items(map(look.prose, chapter.findings))]
+        found = (_begun(look.prose(text)) for text in chapter.findings)
+        parts += ["<h3>What else came out</h3>", items(found)]
     return "\n".join([*parts, "</section>"])
+
+
+def _begun(text: str) -> str:
+    """Begin a sentence with a capital, if it begins with a word."""
+    return text[:1].upper() + text[1:] if text[1:2].islower() else text
 
 
 def _files(folder: str, name: str, endings: Sequence[str]) -> str:

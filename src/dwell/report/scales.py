@@ -37,10 +37,12 @@ def log_ticks(low: float, high: float) -> list[float]:
     return ticks
 
 
-def set_log_ticks(axis: Axis, low: float, high: float) -> None:
-    """Give a logarithmic axis ticks in plain numbers."""
+def set_log_ticks(
+    axis: Axis, low: float, high: float, at: Iterable[float] | None = None
+) -> None:
+    """Give a logarithmic axis ticks in plain numbers, at some values or where they are round."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-    axis.set_major_locator(FixedLocator(log_ticks(low, high)))
+    axis.set_major_locator(FixedLocator(log_ticks(low, high) if at is None else [*at]))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

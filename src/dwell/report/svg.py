@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from dwell.report.palette import INK, MUTED, PAPER, RAMP, RULE
+from dwell.report.palette import INK, MUTED, PAPER, PARTS, RAMP, RULE
 from dwell.report.wording import SYMBOL
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ PAGE_COLOURS = {
     RULE: "var(--rule)",
     PAPER: "var(--paper)",
     **{colour: f"var(--ramp-{i})" for i, colour in enumerate(RAMP)},
+    **{colour: f"var(--{part})" for part, colour in PARTS.items()},
 }
 
 #: What a page of several figures must not have twice, needs not at all, or says itself.

@@ -12,7 +12,7 @@ from dwell.study.paper.chapter import Unit
 __all__ = ["factor", "labelled", "measure_of", "write", "write_over_seeds"]
 
 #: What stands behind a heading; the numbers below it have none.
-SIGNS: dict[Unit, str] = {"percent": "%", "change": "%", "ms": "ms"}
+SIGNS: dict[Unit, str] = {"percent": "%", "change": "points", "ms": "ms"}
 LEAST_P = 0.001
 
 
@@ -22,7 +22,7 @@ def factor(unit: Unit) -> float:
 
 
 def labelled(name: str, unit: Unit) -> str:
-    """Return a heading with its unit: ``V_D`` in percent as ``V_D (%)``; once, if it has it."""
+    """Return a heading with its unit, once: ``V_D (%)``, its differences ``V_D (points)``."""
     sign = SIGNS.get(unit, "")
     if not sign or not name or f"({sign}" in name or f" {sign}" in name:
         return name

@@ -156,7 +156,9 @@ def _legend(
         Patch(facecolor=colour, alpha=strong, lw=0) for colour in colours.values()
     ]
     if largest:
-        most = labelled(write(largest, figure.y_unit), figure.y_unit)
+        # Between shares there are points, not percent.
+        unit = "change" if figure.y_unit == "percent" else figure.y_unit
+        most = labelled(write(largest, unit).removeprefix("+"), unit)
         labels += ["wins by nothing", f"by {most.replace('(', '').replace(')', '')} or more"]
         handles += [Patch(facecolor=MUTED, alpha=alpha, lw=0) for alpha in (FAINT, STRONG)]
     if "marked" in figure.frame.columns and figure.frame["marked"].any():

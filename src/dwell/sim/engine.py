@@ -314,7 +314,10 @@ class _Stamper:
         if controller.wanted is not None and len(tables.cells) < 2:
             raise _ProbesWantedError
         if order == self.placement:
-            watch.want(controller.wanted, self._takes_effect(boundary, close_ns))
+            first = self._takes_effect(boundary, close_ns)
+            watch.want(controller.wanted, first)
+            # A cycle that is released at the very close has been stamped before.
+            self._stamp(min(first, self.stamped), self.stamped)
         return order
 
     def _go_on(self, boundary: int) -> None:

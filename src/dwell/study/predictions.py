@@ -247,8 +247,8 @@ class Judgement:
     ----------
     prediction : Prediction
     answer : {"agrees", "agrees in part", "differs", "open"}
-        In part: the predicted placement leads, with a smaller share than its words ask for. Open:
-        the interval over seeds allows for either.
+        In part: the predicted placement leads, and neither every seed nor the interval has the
+        share that its words ask for. Open: the interval over seeds allows for either.
     leader : str
         Placement with the largest mean share of the windows.
     share : Interval
@@ -300,7 +300,9 @@ def judge_placement(comparison: Comparison, prediction: Prediction, policy: str 
     elif not leads:
         answer = "differs"
     else:
-        answer = "agrees" if share.low >= prediction.share else "agrees in part"
+        # Few seeds that all have the whole share leave an interval below it, which says nothing.
+        enough = share.low >= prediction.share or together.min() >= prediction.share
+        answer = "agrees" if enough else "agrees in part"
     leader = max(shares, key=lambda name: shares[name].mean())
     return Judgement(prediction, answer, leader, share, lead)
 

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from dwell.model import FrozenDict
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Answer", "Chapter", "Figure", "FigureKind", "Panel", "Table", "Unit"]
+__all__ = ["Answer", "Chapter", "Figure", "FigureKind", "Outcome", "Panel", "Table", "Unit"]
 
 Answer: TypeAlias = Literal["yes", "no", "in part", "not shown", "none asked"]
 
@@ -23,6 +23,23 @@ Answer: TypeAlias = Literal["yes", "no", "in part", "not shown", "none asked"]
 Unit: TypeAlias = Literal["text", "count", "number", "percent", "change", "ms", "cost", "p"]
 
 FigureKind: TypeAlias = Literal["intervals", "lines", "bars", "map", "ecdf", "timeline"]
+
+
+class Outcome(NamedTuple):
+    """What came out of a chapter's question.
+
+    Parameters
+    ----------
+    answer : Answer
+    verdict : str
+        A sentence or two.
+    evidence : tuple of str
+        Sentences with the numbers that carry it.
+    """
+
+    answer: Answer
+    verdict: str
+    evidence: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +176,13 @@ class Chapter:
         What was compared, varied and held, on how many seeds and windows, and by which test.
     answer : Answer
     verdict : str
-        One or two sentences with the numbers that carry them.
+        One or two sentences.
     findings : tuple of str
         What else came out, the results that speak against the method included.
     tables : tuple of Table
     figures : tuple of Figure
+    evidence : tuple of str
+        Sentences with the numbers that carry the verdict.
     """
 
     slug: str
@@ -174,3 +193,4 @@ class Chapter:
     findings: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
+    evidence: tuple[str, ...] = ()

@@ -36,7 +36,7 @@ from dwell.study.family import Comparative, Family
 from dwell.study.intervals import mean_interval
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import RANDOM, present
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families
@@ -294,7 +294,7 @@ class Seen:
         return set(self.said.values()) == {"no difference shown"}
 
 
-def verdict(seen: Sequence[Seen], *, equivalent: bool) -> tuple[Answer, str]:
+def verdict(seen: Sequence[Seen], *, equivalent: bool) -> Outcome:
     """Answer whether the penalty suppresses chatter more finely than the threshold.
 
     Parameters
@@ -317,23 +317,25 @@ def verdict(seen: Sequence[Seen], *, equivalent: bool) -> tuple[Answer, str]:
         answer = "no"
     else:
         answer = "not shown"
-    texts = []
-    for dwell in sorted({one.dwell for one in seen}):
-        mine = [one for one in seen if one.dwell == dwell]
-        counts = ", ".join(
-            f"{CALM[name]} {_count(mine, name, 'lower')} and {_count(mine, name, 'higher')}"
-            for name in CALM
-        )
-        texts.append(f"with N_min = {dwell} ({len(mine)} comparisons) {counts}")
     sentence = (
-        "Beside a threshold of the same mean, the Hamming penalty is shown to lower, and to raise: "
-        f"{'; '.join(texts)}. It is calmer at no price in "
-        f"{counted(calmer, total, 'comparisons')}, less calm for nothing in {rougher}, a trade of "
+        "Beside a threshold of the same mean, the Hamming penalty is calmer at no price in "
+        f"{counted(calmer, total, 'comparisons')}, less calm for nothing in {rougher}, and trades "
         f"one for the other in {total - calmer - rougher - alike}; in {alike} nothing is shown."
     )
     if equivalent:
         sentence += f" Migrations agree within {number(100 * EQUIVALENT, 0)} % everywhere."
-    return answer, sentence
+    evidence = []
+    for dwell in sorted({one.dwell for one in seen}):
+        mine = [one for one in seen if one.dwell == dwell]
+        counts = "; ".join(
+            f"{CALM[name]} fewer in {_count(mine, name, 'lower')}, more in "
+            f"{_count(mine, name, 'higher')}"
+            for name in CALM
+        )
+        evidence.append(
+            f"With the penalty and N_min = {dwell}, of {len(mine)} comparisons: {counts}."
+        )
+    return Outcome(answer, sentence, tuple(evidence))
 
 
 def _count(seen: Iterable[Seen], metric: str, word: Comparative) -> int:
@@ -370,7 +372,7 @@ def written(result: StudyResult, check: StudyResult) -> Chapter:
         for place in places(study)
     ]
     equivalent = same_migrations(differences["migrations"], runs, study)
-    answer, sentence = verdict(seen, equivalent=equivalent)
+    outcome = verdict(seen, equivalent=equivalent)
     numbers = numbers_table(runs, study)
     return Chapter(
         slug="chatter",
@@ -378,8 +380,9 @@ def written(result: StudyResult, check: StudyResult) -> Chapter:
             "RQ3: Does the Hamming-distance penalty suppress chatter more finely than a threshold?"
         ),
         design=design(study),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(*two_found(check), *shown(differences)),
         tables=(
             numbers,
@@ -431,7 +434,7 @@ def two_found(check: StudyResult) -> tuple[str, ...]:
     found = []
     for dwell in DWELLS:
         same, total = identical(check, dwell)
-        expected = " as the rule implies" if dwell >= 1 and same == total else ""
+        expected = ", as the rule implies" if dwell >= 1 and same == total else ""
         found.append(
             f"With two candidates ({names}) and N_min = {dwell}, the two rules give the same run, "
             f"number by number, in {same} of {total} pairs{expected}."

@@ -20,7 +20,7 @@ from dwell.study.comparison import AIM
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
@@ -322,7 +322,7 @@ def against_single(
 
 def verdict(
     atp_family: Family, single_family: Family, stages: Sequence[str], static: str
-) -> tuple[Answer, str]:
+) -> Outcome:
     """Say where DTP on all candidates misses less than ATP, and whether that needs both stages.
 
     Parameters
@@ -349,26 +349,37 @@ def verdict(
         answer = "no"
     else:
         answer = "not shown"
-    single = [
-        f"{stage} alone in {len(_where(said, 'lower'))}"
-        f"{_sizes(single_family, f'{DTP}, {only(DTP, stage)}', _where(said, 'lower'))}, more in "
-        f"{len(_where(said, 'higher'))}"
-        for stage, said in too.items()
-    ]
-    still = _said(atp_family, f"{DTP}, {static}")
     text = (
         f"Against ATP with tuned thresholds, {DTP} has a lower V_D in "
-        f"{counted(len(lower), len(against), 'stress scenarios')}"
-        f"{_sizes(atp_family, f'{DTP}, {TUNED}', lower)} and a higher one in {len(higher)}"
-        f"{_sizes(atp_family, f'{DTP}, {TUNED}', higher)}. It misses less than the same rule that "
-        f"moves {'; than with '.join(single)}; less than with either in {len(gained)}. {static}, "
-        f"which never moves, misses less than it in {len(_where(still, 'higher'))}, and more in "
-        f"{len(_where(still, 'lower'))}"
+        f"{counted(len(lower), len(against), 'stress scenarios')} and a higher one in "
+        f"{len(higher)}; having both stages to move is better than either alone in {len(both)} of "
+        f"those {len(lower)}."
+    )
+    still = _said(atp_family, f"{DTP}, {static}")
+    evidence = [
+        f"V_D of {DTP} less that of {TUNED}: lower in {len(lower)}"
+        f"{_sizes(atp_family, f'{DTP}, {TUNED}', lower)}, higher in {len(higher)}"
+        f"{_sizes(atp_family, f'{DTP}, {TUNED}', higher)}."
+    ]
+    for stage, said in too.items():
+        pair = f"{DTP}, {only(DTP, stage)}"
+        less, more = _where(said, "lower"), _where(said, "higher")
+        evidence.append(
+            f"Less that of the same rule which moves {stage} alone: lower in {len(less)}"
+            f"{_sizes(single_family, pair, less)}, higher in {len(more)}"
+            f"{_sizes(single_family, pair, more)}."
+        )
+    evidence.append(
+        f"{static}, which never moves, misses less than {DTP} in {len(_where(still, 'higher'))}, "
+        f"and more in {len(_where(still, 'lower'))}."
     )
     rest = [name for name in lower if name not in gained]
     if rest:
-        text += f". In {listed(rest)} it is the rule and its estimates that gain over ATP"
-    return answer, f"{text}."
+        evidence.append(
+            f"Where it misses less than {TUNED} though not less than with either stage alone "
+            f"({listed(rest)}), that is owed to the rule and its estimates."
+        )
+    return Outcome(answer, text, tuple(evidence))
 
 
 def _said(family: Family, pair: str) -> dict[str, str]:
@@ -409,7 +420,7 @@ def written(
     scenarios = whole.study.scenarios
     atps = against_atp(runs, baselines)
     singles = against_single(runs, scenarios, stages)
-    answer, sentence = verdict(
+    outcome = verdict(
         atps["violation_rate"], singles["violation_rate"], stages, baselines.static
     )
     main = main_table(runs, baselines, stages)
@@ -420,8 +431,9 @@ def written(
             "CPU stress?"
         ),
         design=design(whole, tuning, baselines, stages),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(
             *metric_findings(atps, scenarios, (TUNED, BEST_HERE, baselines.static)),
             *stage_findings(singles, scenarios, stages),
@@ -464,11 +476,11 @@ def design(
         f"{study.windows} windows. ATP is our reconstruction; the stage it moves, its thresholds "
         f"and its dwell are chosen by V_D among {settings} settings on "
         f"{len(grid.seeds)} other seeds. {TUNED} has the one with the least mean over all "
-        "scenarios, as a controller that is deployed once has to; “atp best here” has the best for "
+        "scenarios, as a controller that is deployed once has to; “atp, best here” has the best for "
         "each scenario, the most favourable that can be had. The rules are also held against "
         f"{baselines.static}, the placement that misses least over all scenarios if it never "
-        "moves. The second comparison holds the rule "
-        f"and its estimator fast and takes away the candidates beyond one stage ({apart}; the "
+        "moves. The second comparison keeps the rule "
+        f"and its estimator and takes away the candidates beyond one stage ({apart}; the "
         "other stage stays where both have it). V_D, U_r and J are compared, each a family: "
         "sign-flip tests paired by seed, Holm over all comparisons of a question and metric; "
         "intervals are 95 % over seeds."

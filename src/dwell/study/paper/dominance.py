@@ -17,7 +17,7 @@ from dwell.study.family import Family
 from dwell.study.intervals import mean_interval
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import dynamic_scenarios, steady_scenarios
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
@@ -379,7 +379,7 @@ def verdict(
     won: Mapping[str, Mapping[str, float]],
     scenarios: int,
     maps: Mapping[str, Sequence[Cell]],
-) -> tuple[Answer, str]:
+) -> Outcome:
     """Say whether the fourth placement ever wins.
 
     Parameters
@@ -399,19 +399,20 @@ def verdict(
     answer: Answer = "yes" if by_both else "in part" if anywhere else "no"
     rates = [f"{name} {points(value)}" for name, value in won["violation_rate"].items()]
     costs = [f"{name} {number(value, 2)}" for name, value in won["cost"].items()]
+    cells = len(next(iter(maps.values())))
     text = (
         f"T2 on R1 and T3 on E ({FOURTH}) misses less than each of the paper's three placements in "
-        f"{counted(len(rates), scenarios, 'scenarios')}"
-    )
-    text += f" (against the next: {', '.join(rates)})" if rates else ""
-    text += f", and costs less in {len(costs)}"
-    text += f" ({', '.join(costs)})" if costs else ""
-    cells = len(next(iter(maps.values())))
-    text += (
-        f". Of {cells} cells of the map it wins {clear['violation_rate']} clearly by V_D and "
+        f"{counted(len(rates), scenarios, 'scenarios')}, and costs less in {len(costs)}. Of "
+        f"{cells} cells of the map it wins {clear['violation_rate']} clearly by V_D and "
         f"{clear['cost']} by J."
     )
-    return answer, text
+    evidence = [f"Against the next best, V_D: {', '.join(rates)}."] if rates else []
+    evidence += [f"Against the next best, J: {', '.join(costs)}."] if costs else []
+    for metric, every in maps.items():
+        mine = [cell.scenario for cell in every if cell.winner == FOURTH and cell.clear]
+        where = (f"{name} {mine.count(name)}" for name in dict.fromkeys(mine))
+        evidence += [f"Cells won clearly by {shown_as(metric)}: {', '.join(where)}."] * bool(mine)
+    return Outcome(answer, text, tuple(evidence))
 
 
 # ------------------------------------------------------------------------------- chapter
@@ -427,7 +428,7 @@ def written(mapped: StudyResult, settled: StudyResult, runs: pl.DataFrame) -> Ch
     alone, offered = fourth_alone(runs, three), fourth_offered(runs)
     won = {metric: wins(family, three) for metric, family in alone.items()}
     scenarios = runs["scenario"].n_unique()
-    answer, sentence = verdict(won, scenarios, maps)
+    outcome = verdict(won, scenarios, maps)
     return Chapter(
         slug="dominance",
         title=(
@@ -435,8 +436,9 @@ def written(mapped: StudyResult, settled: StudyResult, runs: pl.DataFrame) -> Ch
             "on E) ever win?"
         ),
         design=design(mapped, settled, runs),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(
             *map_findings(maps),
             *prediction_findings(held(papers, led)),
@@ -538,7 +540,8 @@ def offered_findings(offered: Mapping[str, Family], scenarios: int) -> tuple[str
             }
             for word in ("lower", "higher"):
                 named = [name for name, one in verdicts.items() if one == word]
-                said.append(f"{word} {shown_as(metric)} in {len(named)} ({listed(named)})")
+                names_ = f" ({listed(named)})" if named else ""
+                said.append(f"{word} {shown_as(metric)} in {len(named)}{names_}")
         found.append(
             f"{rule} with {FOURTH} as a fourth candidate has, of {scenarios} scenarios, a "
             f"{'; '.join(said)}."

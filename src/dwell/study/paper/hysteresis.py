@@ -20,7 +20,7 @@ from dwell.study.engine import StudyResult
 from dwell.study.family import Comparative, Family
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import by_length
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import difference_table, families
@@ -344,7 +344,7 @@ def of_cold(results: Sequence[StudyResult]) -> dict[str, Family]:
 # ------------------------------------------------------------------------------- verdict
 
 
-def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> tuple[Answer, str]:
+def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> Outcome:
     """Answer whether hysteresis calms DTP within its bound, and at no price.
 
     Parameters
@@ -377,15 +377,16 @@ def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> tup
         else f"No run of {held.runs} migrates more often than ⌊K/(N_min + 1)⌋"
     )
     prices = [
-        f"{METRICS[metric]} higher in {_where(shown[metric], 'higher')} and lower in "
+        f"{METRICS[metric]} is higher in {_where(shown[metric], 'higher')} and lower in "
         f"{_where(shown[metric], 'lower')}"
         for metric in ("violation_rate", "cost")
     ]
-    return answer, (
-        f"{bound} ({held.reached} reach it). Against no hysteresis at all, the cell's N_min = "
-        f"{CELLS[0]} and Δ_min = {CELLS[1]:g} are shown to migrate less in "
-        f"{counted(len(calmer), scenarios, 'scenarios')}; {' and '.join(prices)}."
+    sentence = (
+        f"{bound} ({held.reached} reach it). Against no hysteresis at all, DTP as it is set in the "
+        f"cell is shown to migrate less in {counted(len(calmer), scenarios, 'scenarios')}; "
+        f"{', and '.join(prices)}."
     )
+    return Outcome(answer, sentence)
 
 
 def _where(shown: Mapping[str, Comparative], word: Comparative) -> str:
@@ -412,15 +413,16 @@ def written(
         }
         for metric, one in calm.items()
     }
-    answer, sentence = verdict(bounds(rows), of_cells)
+    outcome = verdict(bounds(rows), of_cells)
     early, late = of_escape(escape), of_cold(cold)
     numbers = grid_table(grid)
     return Chapter(
         slug="hysteresis",
         title="Does hysteresis calm DTP, within its bound, without making it worse?",
         design=design(grid, escape, cold),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(
             *settings_found(calm),
             *best_found(numbers),
@@ -494,7 +496,7 @@ def best_found(numbers: Table) -> tuple[str, ...]:
         most = max(rows, key=lambda row: row["cost"])
         cells = next(row for row in rows if (row["min_dwell"], row["min_improvement"]) == CELLS)
         found.append(
-            f"{scenario}: J is least with N_min = {least['min_dwell']}, Δ_min = "
+            f"In {scenario} J is least with N_min = {least['min_dwell']}, Δ_min = "
             f"{least['min_improvement']:g} ({number(least['cost'], 2)}, regret "
             f"{percent(least['regret'], 0)}), {number(cells['cost'], 2)} in the cell, and at most "
             f"{number(most['cost'], 2)} (N_min = {most['min_dwell']}, Δ_min = "
@@ -533,8 +535,8 @@ def price_found(cold: Sequence[StudyResult]) -> tuple[str, ...]:
                 moved += float(values(result.runs, "migrations", labels).sum())
             if moved:
                 found.append(
-                    f"{scenario}: with cold migrations {number(added / moved, 1)} more cycles are "
-                    f"missed a migration than with warm ones (all policies, {number(moved, 0)} "
+                    f"In {scenario} {number(added / moved, 1)} more cycles a migration are missed "
+                    f"with cold migrations than with warm ones (all policies, {number(moved, 0)} "
                     "migrations; what they decide otherwise included)."
                 )
     return tuple(found)
@@ -619,7 +621,10 @@ def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) ->
 
     frame = numbers.frame.select(
         "scenario",
-        pl.format("Δ_min = {}", pl.col("min_improvement")).alias("threshold"),
+        pl.format(
+            "Δ_min = {}",
+            pl.col("min_improvement").cast(pl.String).str.strip_suffix(".0"),
+        ).alias("threshold"),
         pl.col("min_dwell").alias("x"),
         *(pl.col(f"{metric}{end}").alias(f"y{end}") for end in ("", "_low", "_high")),
     )

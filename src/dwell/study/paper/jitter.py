@@ -32,14 +32,14 @@ from numpy.typing import NDArray
 from dwell.model import Constant, FrozenDict, Link, LogNormal, Problem, Process, Uniform
 from dwell.study.comparison import AIM
 from dwell.study.engine import PARAMETER, StudyResult
-from dwell.study.family import Family
+from dwell.study.family import Comparative, Family
 from dwell.study.intervals import Interval, median_interval, under
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import present
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast, family_of, values
-from dwell.study.paper.differences import centre, difference_table
+from dwell.study.paper.differences import centre, difference_table, families, shown_as
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import listed, number, percent, with_interval
 from dwell.study.study import Contender, Point, Study
@@ -47,6 +47,8 @@ from dwell.study.study import Contender, Point, Study
 __all__ = ["Turn", "chapter", "turning_point", "verdict"]
 
 Floats: TypeAlias = NDArray[np.float64]
+#: What was shown, by the envelope in ms.
+Said: TypeAlias = Mapping[float, Comparative]
 
 #: Propagation of every message, one way.
 BASE_MS = 0.7
@@ -215,17 +217,16 @@ def with_delay(problem: Problem, delay_ms: Process) -> Problem:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """From which envelope on offloading is worse in a scenario, by a metric.
+    """From which envelope on offloading costs more in a scenario.
 
     Parameters
     ----------
-    scenario, metric : str
+    scenario : str
     at_ms : Interval
         Median over seeds; 0 where it is worse at every envelope, infinite where at none.
     """
 
     scenario: str
-    metric: str
     at_ms: Interval
 
     @property
@@ -289,20 +290,50 @@ def widths_of(study: Study) -> tuple[float, ...]:
 
 
 def turns(result: StudyResult) -> list[Turn]:
-    """Return where offloading ceases to pay, by J and by V_D, in every scenario."""
+    """Return where offloading ceases to pay by J, in every scenario."""
     found = []
     widths = widths_of(result.study)
     for scenario in result.study.scenarios:
-        for metric in ("cost", "violation_rate"):
-            excess = np.stack(
-                [
-                    values(result.runs, metric, _at(width, scenario, OFFLOADED))
-                    - values(result.runs, metric, _at(width, scenario, LOCAL))
-                    for width in widths
-                ]
-            )
-            points = [turning_point(widths, one) for one in excess.T]
-            found.append(Turn(scenario, metric, median_interval(points)))
+        excess = np.stack(
+            [
+                values(result.runs, "cost", _at(width, scenario, OFFLOADED))
+                - values(result.runs, "cost", _at(width, scenario, LOCAL))
+                for width in widths
+            ]
+        )
+        points = [turning_point(widths, one) for one in excess.T]
+        found.append(Turn(scenario, median_interval(points)))
+    return found
+
+
+def offloading(result: StudyResult) -> dict[str, Family]:
+    """Compare offloading both stages to none, at every envelope, by J and by V_D."""
+    pairs: dict[str, Contrast] = {
+        _widened(scenario, width): (
+            _at(width, scenario, OFFLOADED),
+            _at(width, scenario, LOCAL),
+        )
+        for scenario in result.study.scenarios
+        for width in widths_of(result.study)
+    }
+    return families(result.runs, "does offloading pay?", ("cost", "violation_rate"), pairs)
+
+
+def _widened(scenario: str, width: float) -> str:
+    return f"{scenario}: w = {width:g} ms"
+
+
+def said_of(compared: Mapping[str, Family], study: Study) -> dict[str, dict[str, Said]]:
+    """Return what was shown of offloading, by metric, scenario and envelope."""
+    found = {}
+    for metric, family in compared.items():
+        verdicts = family.verdicts
+        found[metric] = {
+            scenario: {
+                width: verdicts[_widened(scenario, width)] for width in widths_of(study)
+            }
+            for scenario in study.scenarios
+        }
     return found
 
 
@@ -355,37 +386,59 @@ def against_mean(result: StudyResult, mean: StudyResult) -> Family:
 # ------------------------------------------------------------------------------- verdict
 
 
-def verdict(found: Sequence[Turn]) -> tuple[Answer, str]:
+def verdict(found: Sequence[Turn], said: Mapping[str, Mapping[str, Said]]) -> Outcome:
     """Answer whether the jitter of the links decides where the stages should run.
 
     Parameters
     ----------
     found : sequence of Turn
-        By J and by V_D, in every scenario; the answer is about J.
+        In every scenario.
+    said : mapping of metric to mapping of scenario to mapping of float to verdict
+        Of offloading, against none, at every envelope (see `offloading`).
     """
-    by_cost = [one for one in found if one.metric == "cost"]
-    decided = [one for one in by_cost if one.within]
+    decided = [one for one in found if one.within]
     answer: Answer
-    if len(decided) == len(by_cost):
+    if len(decided) == len(found):
         answer = "yes"
     elif decided:
         answer = "in part"
-    elif all(one.never or one.always for one in by_cost):
+    elif all(one.never or one.always for one in found):
         answer = "no"
     else:
         answer = "not shown"
-    texts = []
-    for one in by_cost:
-        rate = next(
-            turn
-            for turn in found
-            if turn.scenario == one.scenario and turn.metric == "violation_rate"
-        )
-        texts.append(f"in {one.scenario} {one} by J, {rate} by V_D")
-    return answer, (
-        f"Offloading both stages ({OFFLOADED}) is better than {LOCAL} {'; '.join(texts)} "
-        "(envelope of the extra delay of each message; median over seeds with its 95 % interval)."
+    turns_ = "; ".join(f"in {one.scenario} {one}" for one in found)
+    rates = "; ".join(
+        f"in {scenario} {_stretches(mine, 'lower')}"
+        for scenario, mine in said["violation_rate"].items()
     )
+    evidence = tuple(
+        f"{shown_as(metric)} of {OFFLOADED} against that of {LOCAL} in {scenario}: lower "
+        f"{_stretches(mine, 'lower')}, higher {_stretches(mine, 'higher')}."
+        for metric, by_scenario in said.items()
+        for scenario, mine in by_scenario.items()
+    )
+    return Outcome(
+        answer,
+        f"By J, offloading both stages ({OFFLOADED}) costs less than {LOCAL} {turns_}, the width "
+        f"of the envelope. It is shown to miss less {rates}.",
+        evidence,
+    )
+
+
+def _stretches(said: Said, word: Comparative) -> str:
+    """``at 0.001 to 2 ms and at 8 ms``: the envelopes at which it was shown."""
+    stretches: list[list[float]] = []
+    before = False
+    for width, one in said.items():
+        if one == word:
+            stretches += [] if before else [[]]
+            stretches[-1].append(width)
+        before = one == word
+    texts = (
+        f"at {mine[0]:g} ms" if len(mine) == 1 else f"at {mine[0]:g} to {mine[-1]:g} ms"
+        for mine in stretches
+    )
+    return listed(texts) if stretches else "at no envelope"
 
 
 # ------------------------------------------------------------------------------- chapter
@@ -395,8 +448,8 @@ def written(
     result: StudyResult, mean: StudyResult, classes: StudyResult, periods: StudyResult
 ) -> Chapter:
     """Write the chapter of finished runs."""
-    found = turns(result)
-    answer, sentence = verdict(found)
+    pays = offloading(result)
+    outcome = verdict(turns(result), said_of(pays, result.study))
     widths = numbers_table(
         result, "jitter", "Envelopes of jitter", {PARAMETER + WIDTH: (WIDTH, "number")}
     )
@@ -411,8 +464,9 @@ def written(
         slug="jitter",
         title="Does the jitter of the links decide where the stages should run?",
         design=design(result.study, periods.study),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(
             *first_shown(tsn, result.study),
             variation(alone),
@@ -424,6 +478,11 @@ def written(
             widths,
             named,
             spans,
+            difference_table(
+                pays,
+                slug="jitter-offloading",
+                title=f"{OFFLOADED}, less {LOCAL}, over the envelope of jitter",
+            ),
             difference_table(
                 {"violation_rate": tsn},
                 slug="jitter-tsn",
@@ -455,8 +514,9 @@ def design(study: Study, periods: Study) -> str:
         f"{len(study.seeds)} seeds of {study.windows} windows, the same draws at every w. As a "
         "wider envelope is a longer mean, too, static placements are also run with all delays at "
         "their mean. Where offloading ceases to pay is found seed by seed, between the last "
-        f"envelope at which {OFFLOADED} is better than {LOCAL} and the next. Differences in V_D "
-        "are paired by seed (sign-flip test, Holm over each table). Classes of networks: "
+        f"envelope at which {OFFLOADED} has a lower J than {LOCAL} and the next, with the 95 % "
+        "interval of the median over seeds. Differences in J and V_D are paired by seed (sign-flip "
+        "test, Holm over each metric of a table). Classes of networks: "
         f"{classes}. Periods of {listed(f'{one:.3g}' for one in PERIODS_MS)} ms with D = P and "
         "the target of L95 at D, the work of a cycle as it is "
         f"({listed(periods.policies)})."

@@ -17,7 +17,7 @@ from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import under
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
@@ -135,7 +135,7 @@ def compared(runs: pl.DataFrame, candidates: Sequence[str]) -> dict[str, Family]
     return families(runs, "do the findings hold on recorded traces?", METRICS, pairs)
 
 
-def verdict(found: Mapping[str, Family], kept: Mapping[str, int]) -> tuple[Answer, str]:
+def verdict(found: Mapping[str, Family], kept: Mapping[str, int]) -> Outcome:
     """Say where DTP costs less with the estimator corrected, and who keeps the aim.
 
     Parameters
@@ -165,12 +165,11 @@ def verdict(found: Mapping[str, Family], kept: Mapping[str, int]) -> tuple[Answe
         f"With the estimator corrected in the place of static profiling DTP costs less in "
         f"{counted(len(lower), len(said), 'replayed scenarios')}"
     )
-    text += f" (J {', '.join(sizes)})" if sizes else ""
-    text += f" and more in {len(higher)}"
-    text += f" ({listed(higher)})" if higher else ""
-    text += f"; V_D is lower in {len(fewer)}. Shown to be under 5 % misses: "
-    text += f"{', '.join(f'{policy} in {count}' for policy, count in kept.items())}."
-    return answer, text
+    text += f" and more in {len(higher)}; V_D is lower in {len(fewer)}."
+    evidence = [f"J less, by: {', '.join(sizes)}."] if sizes else []
+    evidence += [f"J more in {listed(higher)}."] if higher else []
+    each = ", ".join(f"{policy} in {count}" for policy, count in kept.items())
+    return Outcome(answer, text, (*evidence, f"Shown to be under 5 % misses: {each}."))
 
 
 def _said(family: Family, pair: str) -> dict[str, str]:
@@ -205,14 +204,15 @@ def written(results: Sequence[StudyResult]) -> Chapter:
         policy: sum(one == "under" for (_, who), one in said.items() if who == policy)
         for policy in policies
     }
-    answer, sentence = verdict(found, kept)
+    outcome = verdict(found, kept)
     main = main_table(runs, said)
     return Chapter(
         slug="real",
         title="Do the findings hold where recorded measurements are replayed?",
         design=design(results),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(*pair_findings(found, candidates), *best_findings(runs, candidates)),
         tables=(
             main,

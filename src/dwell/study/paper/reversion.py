@@ -21,7 +21,7 @@ from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paired import paired_difference
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
@@ -306,7 +306,7 @@ def beyond_control(runs: pl.DataFrame, scenarios: Sequence[str]) -> dict[str, Fa
     }
 
 
-def verdict(family: Family, beyond: Family, *, papers: str = PAPERS) -> tuple[Answer, str]:
+def verdict(family: Family, beyond: Family, *, papers: str = PAPERS) -> Outcome:
     """Say where DTP misses less because it has HYB, and whether that is because of the fault.
 
     Parameters
@@ -332,25 +332,21 @@ def verdict(family: Family, beyond: Family, *, papers: str = PAPERS) -> tuple[An
     else:
         answer = "not shown"
     item = family.comparisons[f"{papers}: {pair}"]
-    ends = f"[{points(item.low)}, {points(item.high)}]"
-    word = {"lower": "lowers V_D", "higher": "raises V_D"}.get(said[papers], "is not shown to help")
-    text = (
-        f"With the paper's fault, coming and going on both links of the edge, having {HYBRID} "
-        f"beside {listed(BINARY)} {word} ({points(centre(family, f'{papers}: {pair}'))} {ends}, "
-        f"{DTP}). Over all {len(said)} faults it lowers V_D in {len(lower)} and raises it in "
-        f"{len(higher)}"
+    size = points(centre(family, f"{papers}: {pair}"), interval=(item.low, item.high))
+    word = {"lower": "lowers V_D", "higher": "raises V_D"}.get(
+        said[papers], "is not shown to change V_D"
     )
-    text += f" ({_sizes(family, pair, higher)}). " if higher else ". "
-    if owed:
-        text += (
-            f"In {len(owed)} it lowers it by more than the same stress without the fault does "
-            f"({_sizes(family, pair, owed)})."
-        )
-    elif lower:
-        text += (
-            "In none of them does it lower it by more than under the same stress without a fault."
-        )
-    return answer, text.strip()
+    text = (
+        f"With the paper's fault on both links of the edge, having {HYBRID} beside "
+        f"{listed(BINARY)} {word} under {DTP}. Of {len(said)} faults it lowers V_D in "
+        f"{len(lower)}, by more than under the same stress without the fault in {len(owed)}, and "
+        f"raises it in {len(higher)}."
+    )
+    evidence = [f"With the paper's fault on both links: V_D {size}."]
+    evidence += [f"Lower: {_sizes(family, pair, lower)}."] if lower else []
+    evidence += [f"Higher: {_sizes(family, pair, higher)}."] if higher else []
+    evidence += [f"Lower by more than without the fault: {listed(owed)}."] if owed else []
+    return Outcome(answer, text, tuple(evidence))
 
 
 #: A difference in V_D that would be of no use.
@@ -384,7 +380,7 @@ def written(whole: StudyResult, runs: pl.DataFrame, swept: StudyResult) -> Chapt
     compared = against_binary(runs, study.scenarios)
     alone = hybrid_alone(runs, study.scenarios)
     beyond = beyond_control(runs, faults_in(study.scenarios))
-    answer, sentence = verdict(compared["violation_rate"], beyond["violation_rate"])
+    outcome = verdict(compared["violation_rate"], beyond["violation_rate"])
     main = main_table(runs, study.scenarios)
     sweep = sweep_table(swept)
     return Chapter(
@@ -393,8 +389,9 @@ def written(whole: StudyResult, runs: pl.DataFrame, swept: StudyResult) -> Chapt
             "RQ2: Does routing T3 to R2 during network faults outperform binary R1/E reversion?"
         ),
         design=design(whole, swept),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(
             links_finding(problem),
             *alone_findings(alone, study.scenarios),
@@ -490,7 +487,7 @@ def alone_findings(alone: Mapping[str, Family], scenarios: Sequence[str]) -> tup
         each = [f"{other} in {count}" for other, count in counts.items()]
         found.append(
             f"{HYBRID} that never moves has a lower {shown_as(metric)} than both {listed(BINARY)} "
-            f"in {counted(len(wins), len(scenarios), 'scenarios')} ({listed(wins)}); than "
+            f"in {counted(len(wins), len(scenarios), 'scenarios')} ({'; '.join(wins) or 'none'}); than "
             f"{listed(each)}."
         )
     return tuple(found)
@@ -500,7 +497,7 @@ def rule_findings(compared: Mapping[str, Family], scenarios: Sequence[str]) -> t
     """Say what having HYB is worth to each rule in every metric, and how both stand to ATP."""
     found = []
     for rule in RULES:
-        for other, words in ((reverting(rule), "without HYB"), ("atp", "ATP")):
+        for other, words in ((reverting(rule), "the same without HYB"), ("atp", "ATP")):
             pair = f"{rule}, {other}"
             said = []
             for metric, family in compared.items():
@@ -525,7 +522,7 @@ def beyond_findings(beyond: Mapping[str, Family]) -> tuple[str, ...]:
             lower = [name for name, one in _said(family, rule).items() if one == "lower"]
             higher = [name for name, one in _said(family, rule).items() if one == "higher"]
             said.append(
-                f"{shown_as(metric)} in {len(lower)} ({listed(lower)}); less in {len(higher)}"
+                f"{shown_as(metric)} in {len(lower)} ({listed(lower)}), less in {len(higher)}"
             )
         found.append(
             f"{rule} gains more by {HYBRID} with the fault than without: {'; '.join(said)}."

@@ -16,11 +16,14 @@ def percent(share: float, decimals: int = 1) -> str:
     return f"{text} %"
 
 
-def points(share: float, decimals: int = 1) -> str:
-    """A difference of shares, with its sign: ``+1.3 points``."""
-    text = number(100 * share, decimals)
-    sign = "+" if share > 0 else ""
-    return f"{sign}{text} points"
+def points(share: float, decimals: int = 1, interval: tuple[float, float] | None = None) -> str:
+    """A difference of shares, with its sign: ``+1.3 points``, ``+1.3 [0.9, 1.8] points``."""
+
+    def signed(value: float) -> str:
+        return f"{'+' if value > 0 else ''}{number(100 * value, decimals)}"
+
+    ends = "" if interval is None else f" [{', '.join(map(signed, interval))}]"
+    return f"{signed(share)}{ends} points"
 
 
 def number(value: float, decimals: int = 1) -> str:

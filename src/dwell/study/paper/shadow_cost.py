@@ -196,7 +196,7 @@ def shadow_finding(result: StudyResult) -> tuple[str, ...]:
     }
     heaviest = max(sent, key=sent.__getitem__, default="")
     text = f"Shadow jobs are shown to raise V_D in {counted(len(higher), len(verdicts), 'cases')}"
-    text += f" ({listed(higher)})." if higher else "."
+    text += f" ({'; '.join(higher)})." if higher else "."
     if means:
         worst = max(means, key=means.__getitem__)
         text += (

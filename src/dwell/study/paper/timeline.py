@@ -91,7 +91,7 @@ def timeline_figure(
         x_label=f"window of {problem.window_cycles} cycles",
         note=(
             f"Seed {seed}. J of the active placement is the measured one; of the others, full: as "
-            "estimated, dashed: as each costs alone in the same cycles. Without the price of "
+            "estimated, dotted: as each costs alone in the same cycles. Without the price of "
             "moves. V_D and L95 as the controller saw them."
         ),
         panels={

@@ -29,7 +29,7 @@ from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import Interval
 from dwell.study.paper.cell import RANDOM, STEADY, TIMETABLE, by_length
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Table
+from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table
 from dwell.study.paper.contenders import believing
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import difference_table, families
@@ -286,7 +286,7 @@ def indices(
 # ------------------------------------------------------------------------------- verdict
 
 
-def verdict(reactions: Sequence[Reaction]) -> tuple[Answer, str]:
+def verdict(reactions: Sequence[Reaction]) -> Outcome:
     """Answer whether it matters how the weights are chosen, and which of them does it."""
     material = [one for one in reactions if one.material]
     unsure = [one for one in material if one.luck > MOSTLY_LUCK]
@@ -298,25 +298,31 @@ def verdict(reactions: Sequence[Reaction]) -> tuple[Answer, str]:
         answer = "in part"
     else:
         answer = "not shown" if unsure else "no"
-    named = listed(str(one) for one in sure)
+    named = listed(one.scenario for one in sure)
     sentence = (
         f"Over weights between a quarter and four times the cell's, V_D of DTP changes by more "
         f"than {number(100 * MATERIAL, 0)} point in {len(sure)} of {len(reactions)} scenarios"
-        + (f": {named}." if sure else ".")
+        + (f" ({named})." if sure else ".")
     )
     if unsure:
         sentence += (
-            f" In {listed(one.scenario for one in unsure)} it changes as much, but more than half "
-            "of that is the luck of the few realisations."
+            f" In {len(unsure)} more it changes as much, but more than half of that is the luck of "
+            "the few realisations."
         )
+    evidence = [
+        f"V_D over the middle 90 % of the points{', mostly luck' if mostly else ''}: "
+        f"{'; '.join(map(str, some))}."
+        for mostly, some in ((False, sure), (True, unsure))
+        if some
+    ]
     idle = [
         symbol
         for symbol in WEIGHTS.values()
         if sure and all(one.totals[symbol].high < NEGLIGIBLE for one in sure)
     ]
     if idle:
-        sentence += f" {listed(idle)} {'has' if len(idle) == 1 else 'have'} no part in it."
-    return answer, sentence
+        evidence.append(f"{listed(idle)} {'has' if len(idle) == 1 else 'have'} no part in it.")
+    return Outcome(answer, sentence, tuple(evidence))
 
 
 # ------------------------------------------------------------------------------- chapter
@@ -330,15 +336,16 @@ def written(
 ) -> Chapter:
     """Write the chapter of finished runs."""
     found, reactions = indices(problem, scale, together)
-    answer, sentence = verdict(reactions)
+    outcome = verdict(reactions)
     ranges = spread_table(together)
     steps = compared(alone)
     return Chapter(
         slug="weights",
         title="RQ4: Does it matter how the five weights are chosen?",
         design=design(problem, scale, together, alone),
-        answer=answer,
-        verdict=sentence,
+        answer=outcome.answer,
+        verdict=outcome.verdict,
+        evidence=outcome.evidence,
         findings=(*unchanging(found), *judged(ranges), *steps_found(steps)),
         tables=(indices_table(found), ranges, *steps_tables(steps)),
         figures=(
@@ -397,7 +404,7 @@ def unchanging(found: pl.DataFrame) -> tuple[str, ...]:
 
     same = found.filter(pl.col("insensitive")).unique(("scenario", "output"), maintain_order=True)
     return tuple(
-        f"{scenario}: {listed(OUTPUTS[name] for name in mine['output'])} "
+        f"In {scenario} {listed(OUTPUTS[name] for name in mine['output'])} "
         f"{'is' if mine.height == 1 else 'are'} the same whatever the weights."
         for (scenario,), mine in same.group_by(["scenario"], maintain_order=True)
     )
@@ -423,7 +430,7 @@ def steps_found(steps: Mapping[str, Family]) -> tuple[str, ...]:
         shown = {name: said for name, said in one.verdicts.items() if said != "no difference shown"}
         named = "; ".join(f"{name} ({said})" for name, said in shown.items())
         found.append(
-            f"One at a time, {OUTPUTS[one.metric]} is shown to change in {len(shown)} of "
+            f"One at a time, a change of {OUTPUTS[one.metric]} is shown in {len(shown)} of "
             f"{len(one.comparisons)} comparisons" + (f": {named}." if shown else ".")
         )
     return tuple(found)
@@ -520,12 +527,15 @@ def steps_tables(steps: Mapping[str, Family]) -> tuple[Table, ...]:
         difference_table(
             {name: steps[name] for name in mine},
             slug=f"weights-one{suffix}",
-            title="One weight changed, less the cell's weights",
+            title=f"One weight changed, less the cell's weights: {what}",
             note=note,
         )
-        for mine, suffix, note in (
-            (names[:3], "", ""),
-            (names[3:], "-more", "J by the cell's weights; tracking: median and sign test."),
+        for mine, suffix, what, note in (
+            (names[:3], "", "misses, latency, moves", ""),
+            (
+                *(names[3:], "-more", "tracking and J"),
+                "J by the cell's weights; tracking: median and sign test.",
+            ),
         )
         if mine
     )
@@ -555,7 +565,7 @@ def indices_figure(found: pl.DataFrame, output: str) -> Figure:
     left_out = f" Not in it, as nothing varies there: {listed(absent)}." if absent else ""
     return Figure(
         slug=f"weights-sobol-{output.replace('_', '-')}",
-        title=f"Which weights {OUTPUTS[output]} depends on",
+        title=f"Share of each weight in the variance of {OUTPUTS[output]}",
         kind="bars",
         frame=frame,
         x="parameter",
