@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
 from dwell.live.cell import Cell
+from dwell.live.keys import Keys
+from dwell.live.messages import Ask, Order, encode
 from dwell.live.role import Place
-from dwell.live.routing import STAMPER
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Entry, Stamper
@@ -55,10 +56,13 @@ class Arm:
     """An actuator that remembers."""
 
     applied: list[tuple[int, float]] = field(default_factory=list)
+    counts: list[tuple[int, int]] = field(default_factory=list)
     silences: int = 0
 
     def apply(self, command: Message) -> None:
         self.applied.append((command.cycle, command.age_ms))
+        if command.payload.isdigit():
+            self.counts.append((command.cycle, int(command.payload)))
 
     def hold(self) -> None:
         self.silences += 1
@@ -67,13 +71,14 @@ class Arm:
 
 
 class Passing:
-    """A stage that passes on who was there."""
+    """A stage that passes on what it gets."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        return Message(self.name.encode())
+        (message,) = inputs.values()
+        return Message(message.payload or b"-")
 
 
 class Counting(Passing):
@@ -180,6 +185,8 @@ class World:
         self.book, self.highest, self.arm = MemoryBook(), MemoryHighest(), Arm()
         self.roles: dict[str, object] = {}
         self.lives = 0
+        self.run_id = 1
+        self.number = 0
         self.policy: str | None = policy
         self.recorder = MemoryRecorder()
         for role in roles(problem):
@@ -194,7 +201,7 @@ class World:
         end = self.network.transport(who, role.node, clock=clock)
         place = Place(self.problem, who, role.node, end, self.lives)
         if role.kind == "stamper":
-            made = Stamper(place, self.book, 1, end.now_ns)
+            made = Stamper(place, self.book, self.run_id, end.now_ns)
         elif role.kind == "sink":
             made = Sink(place, role.task, self.arm, self.highest)
         elif role.kind == "agent":
@@ -221,9 +228,28 @@ class World:
         """Let time pass."""
         self.network.advance(self.network.now_ns + round(ms * MS))
 
+    def sample(self, order: Order) -> Sample:
+        """An order as it arrives."""
+        return Sample(Keys(self.problem.name).order(), encode(order))
+
+    def order(self, placement: str, *, run: int = 0, term: int = 0, controller: str = "me") -> str:
+        """Order a placement; returns why it was refused, or nothing."""
+        self.number += 1
+        stamper = self.stamper
+        order = Order(self.number, controller, run or stamper.run, term or stamper.term, placement)
+        stamper.receive(self.sample(order), self.network.now_ns)
+        assert stamper._answered is not None
+        return stamper._answered[2].refused
+
+    def pin(self, candidate: str) -> None:
+        """Have the controller move the cell, as a person does."""
+        cell = next(role for role in self.roles.values() if isinstance(role, Cell))
+        ask = Ask("me", "pin", candidate)
+        cell.receive(Sample(Keys(self.problem.name).ask(), encode(ask)), self.network.now_ns)
+
     @property
     def stamper(self) -> Stamper:
-        return next(role for role in self.roles.values() if isinstance(role, Stamper))
+        return next(role for role in reversed(self.roles.values()) if isinstance(role, Stamper))
 
     def worker(self, who: str) -> Worker:
         bench = self.roles[who]

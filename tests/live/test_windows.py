@@ -509,6 +509,52 @@ def test_a_window_that_is_complete_closes_though_the_guard_moves_in_its_grace() 
     assert hand.close() == [6, 7, 8, 9, 10]
 
 
+def test_a_window_is_complete_where_the_first_cycle_beyond_it_is_of_a_new_term() -> None:
+    hand = Hand()
+    hand.release(range(W))
+    hand.release(range(W, 2 * W + 1), 2)
+    hand.controller.close(hand.windows.close())
+    hand.controller.close(hand.windows.close())
+    hand.record()
+    assert hand.column("windows", "lead") == [0, 0]
+    assert hand.column("windows", "term") == [1, 2]
+
+
+def test_a_close_is_not_later_than_a_grace_after_the_stamp_was_heard() -> None:
+    hand = Hand(small(grace_ms=7))
+    hand.release(range(W))
+    # The clocks are not as good as their bound says.
+    hand.windows.stamped(hand.stamp(W), W * P - 3 * MS)
+    assert hand.windows.due_ns(W * P) == W * P + 4 * MS
+
+
+def test_what_happened_after_the_close_is_no_evidence_and_no_success() -> None:
+    hand = Hand()
+    hand.release(range(W))
+    # The camera was early: the window closes 30 ms after its last release.
+    close_ns = (W - 1) * P + 30 * MS
+    hand.release([W], at_ns=close_ns)
+    for cycle, ms in ((3, 35), (4, 35)):
+        end_ns = cycle * P + ms * MS
+        hop = Hop(
+            "act0", "A", end_ns - 9 * MS, end_ns - 8 * MS, end_ns, (("see", end_ns - 9 * MS),)
+        )
+        done = Completion(hand.stamp(cycle), "act0", end_ns, "actuated", (hop,), "A")
+        # The controller woke up late.
+        hand.windows.completed(done, end_ns)
+    window = hand.windows.close()
+    assert window.evidence is not None
+    known = window.evidence().cycles
+    assert known.end_ns[3:, 1].tolist() == [3 * P + 35 * MS, UNKNOWN]
+    assert known.ready_ns[4, 1] == 4 * P + 26 * MS
+    hand.controller.close(window)
+    hand.record()
+    assert hand.column("cycles", "latency_ns")[3:] == [35 * MS, 35 * MS]
+    assert hand.column("cycles", "missed")[3:] == [False, True]
+    rates = ("violation_rate", "seen_violation_rate")
+    assert [hand.column("windows", name) for name in rates] == [[0.8], [0.8]]
+
+
 def test_while_an_order_is_under_way_no_window_begins() -> None:
     hand = Hand()
     hand.release(range(W + 1))
@@ -641,6 +687,14 @@ def test_a_restarted_controller_starts_at_the_first_stamp_it_hears() -> None:
     assert list(hand.table["cycles"]) == [5, 6, 7, 8, 9]
     assert hand.column("cycles", "release_ns") == [i * P for i in range(9, 14)]
     assert hand.windows.ignored == 1
+
+
+def test_a_run_whose_stampers_clock_began_anew_while_no_controller_looked() -> None:
+    hand = Hand(resume=Resume(window=1, cycle=5, origin_ns=100 * P))
+    hand.release(range(W + 1))
+    assert hand.close() == [0, 1, 2, 3, 4]
+    hand.record()
+    assert hand.column("cycles", "release_ns") == [i * P for i in range(W)]
 
 
 def test_a_window_of_which_nothing_was_heard_says_so() -> None:

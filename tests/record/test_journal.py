@@ -351,7 +351,7 @@ seal_run(sys.argv[1])
 def test_a_process_that_is_killed_while_it_seals_loses_nothing(tmp_path: Path) -> None:
     write(tmp_path / "run", 50)
     generator = random.Random(os.urandom(8))
-    for _ in range(4):
+    for _ in range(2):
         with subprocess.Popen(
             [sys.executable, "-c", SEALER, str(tmp_path / "run")], stdout=subprocess.PIPE
         ) as sealer:

@@ -16,6 +16,7 @@ from dwell.cli.demo import find_examples
 from dwell.cli.output import Progress, print_json, progress, working
 from dwell.model import Problem
 from dwell.report import paper_report
+from dwell.report.look import Look
 from dwell.study.demo import REAL
 from dwell.study.paper import CHAPTERS, Chapter, Paper, Scale, paper_problem, paper_study
 from dwell.study.paper.paper import REAL as REPLAY
@@ -87,8 +88,10 @@ def run_paper(request: Request, *, as_json: bool) -> bool:
 
     def done(chapter: Chapter) -> None:
         if not as_json:
-            typer.echo(f"{chapter_line(chapter)}\n")
+            typer.echo(f"{look.prose(chapter_line(chapter))}\n")
 
+    look = Look.of(problem)
+    resumed = (request.folder / "runs").exists()
     begun_s = time.monotonic()
     with _resumable(request.folder):
         paper = paper_study(
@@ -110,7 +113,8 @@ def run_paper(request: Request, *, as_json: bool) -> bool:
                 problem,
                 request.folder,
                 scale=request.scale,
-                elapsed_s=time.monotonic() - begun_s,
+                # What went on from finished runs does not say how long they took.
+                elapsed_s=None if resumed else time.monotonic() - begun_s,
                 failures=paper.failures,
                 replayed=real,
             )
@@ -163,6 +167,7 @@ def _as_json(paper: Paper, page: Path | None, folder: Path) -> dict[str, Any]:
             "title": chapter.title,
             "answer": chapter.answer,
             "verdict": chapter.verdict,
+            "evidence": list(chapter.evidence),
             "findings": list(chapter.findings),
         }
         for chapter in paper.chapters

@@ -240,7 +240,7 @@ class Stageplay:
                 stdout=log,
                 stderr=log,
                 env={**os.environ, "DWELL_WORLD": str(self.folder / "world")},
-                start_new_session=True,
+                process_group=0,
             )
 
     def apply(self, change: Change) -> None:

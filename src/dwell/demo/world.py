@@ -18,6 +18,7 @@ import os
 import struct
 import tempfile
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +34,7 @@ FOREVER_NS = 1 << 62
 _MAGIC = b"dwell-world-1\n"
 _FRONT_BYTES = 2048
 _RECORDS = 64
+_NUMBER = struct.Struct("<q")
 _BODY = struct.Struct("<4q12d2dq2d")
 _SUM = struct.Struct("<I4x")
 _RECORD_BYTES = _BODY.size + _SUM.size
@@ -192,8 +194,8 @@ class World:
         """Let go of the file; it stays."""
         self._map.close()
 
-    def records(self) -> list[tuple[int, Motion, Worth]]:
-        """Return the newest records, oldest first, each with its number; 1 to 64 of them.
+    def records(self) -> Iterator[tuple[int, Motion, Worth]]:
+        """Go through the records, newest first, each with its number; 1 to 64 of them.
 
         Raises
         ------
@@ -201,24 +203,30 @@ class World:
             If none is whole: somebody else writes this file.
         """
         data = self._map[_FRONT_BYTES:_SIZE_BYTES]
-        found = [_read(data, slot * _RECORD_BYTES) for slot in range(_RECORDS)]
-        whole = sorted((record for record in found if record), key=lambda record: record[0])
-        if not whole:
+        starts = range(0, len(data), _RECORD_BYTES)
+        found = False
+        for _, start in sorted(
+            ((_NUMBER.unpack_from(data, at), at) for at in starts), reverse=True
+        ):
+            record = _read(data, start)
+            if record is not None:
+                found = True
+                yield record
+        if not found:
             raise LiveError(f"{self.path}: no whole record; delete it")
-        return whole
 
     def newest(self) -> tuple[int, Motion, Worth]:
         """Return the newest record."""
-        return self.records()[-1]
+        return next(self.records())
 
     def state(self, at_ns: int) -> tuple[Array, Array]:
         """Return the arm's position and velocity at an instant, shapes (4,).
 
-        An instant before the newest command is seen as it was, as long as the ring reaches back.
+        An instant before the newest command is seen as it was, as far as the ring reaches back.
         """
-        records = self.records()
-        motions = [motion for _, motion, _ in records if motion.at_ns <= at_ns]
-        motion = motions[-1] if motions else records[0][1]
+        for _, motion, _ in self.records():
+            if motion.at_ns <= at_ns:
+                break
         return motion.state(at_ns, self.scene.limits)
 
     def errors(self, at_ns: int) -> tuple[float, float]:

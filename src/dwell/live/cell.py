@@ -223,7 +223,7 @@ class Cell:
             if not answer.refused.startswith(("not ready", "not proven")):
                 self._give_up()
         elif move.phase == "fork":
-            self._ask_for_states(move)
+            self._ask_for_states(move, answer)
 
     def _send(self, order: Order) -> None:
         self.place.transport.put(self.place.keys.order(), encode(order))
@@ -271,17 +271,15 @@ class Cell:
         move.sent_ns = now_ns
         self._send(move.order)
 
-    def _ask_for_states(self, move: _Move) -> None:
+    def _ask_for_states(self, move: _Move, held: Accepted) -> None:
         """The inputs are forked: have the states follow."""
         move.phase = "state"
-        held, keys = self.held, self.place.keys
-        if held is None:
-            return
+        keys = self.place.keys
         old = self.place.problem.candidates[held.placement]
         for task, to in move.forks:
             number = self._next_number()
             move.awaited[number] = task
-            asked = Snapshot(number, task, old[task], to)
+            asked = Snapshot(number, task, old[task], to, held.run, held.cycle)
             self.place.transport.put(keys.snapshot(task, old[task]), encode(asked))
 
     def _restored(self, restored: Restored, now_ns: int) -> None:

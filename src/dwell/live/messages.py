@@ -320,12 +320,16 @@ class Snapshot(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Comes back in `Restored`.
     task, node, to : str
         Task, where its state is, and where it shall go.
+    run, cycle : int
+        The first cycle whose inputs are forked: the state has to have all before it.
     """
 
     number: Count
     task: Name
     node: Name
     to: Name
+    run: Count
+    cycle: Count
 
 
 class State(msgspec.Struct, array_like=True, frozen=True, gc=False):

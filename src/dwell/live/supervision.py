@@ -162,7 +162,9 @@ class Supervisor:
                 stdout=log,
                 stderr=log,
                 env=self._environment,
-                start_new_session=True,
+                # Ctrl-C in a terminal is for the agent; a session of its own would make each
+                # process one of the groups that share the CPU, whatever runs in it.
+                process_group=0,
             )
         child.started_s = time.monotonic()
         started = psutil.Process(child.process.pid).create_time()

@@ -240,7 +240,8 @@ class LiveWindows:
             self._mixed = self._mixed or cycle.segment != self._line[0].segment
 
     def _append(self, stamp: Stamp, at_ns: int | None) -> LiveCycle:
-        if self.origin_ns is None:
+        if self.origin_ns is None or (self._newest is None and stamp.released_ns < self.origin_ns):
+            # A clock that is behind the run's beginning has begun anew since.
             self.origin_ns = stamp.released_ns
         if self._newest is not None:
             self._follow(*self._newest, stamp, at_ns)

@@ -243,11 +243,11 @@ class Worker:
         """Return what to do with the state before the next job; `do_chore` has to follow."""
         if self.busy_since_ns is not None or not self.started:
             return None
-        chore: Snapshot | tuple[State, bytes] | None = self._asked or self._restoring
-        if chore is self._asked:
+        asked = self._asked
+        if asked is not None and self.state_at >= (asked.run, asked.cycle - 1):
             self._asked = None
-        else:
-            self._restoring = None
+            return asked
+        chore, self._restoring = self._restoring, None
         return chore
 
     def do_chore(self, chore: Snapshot | tuple[State, bytes]) -> None:

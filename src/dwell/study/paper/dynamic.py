@@ -340,7 +340,7 @@ def verdict(
         for at, what in enumerate(("cost", "V_D", "migrations"))
     }
     fails = [f"by {what} in {listed(names)}" for what, names in short.items() if names]
-    text += f" It is shown to fall short {', '.join(fails)}." if fails else ""
+    text += f" It is shown to fall short {listed(fails, ', and')}." if fails else ""
     evidence = (_cost_sentence(mine, parts[name]), _rate_sentence(mine), _moves_sentence(mine))
     return Outcome(answer, text, evidence)
 
@@ -531,7 +531,7 @@ def _family(found: Found, question: str, pairs: Sequence[tuple[str, str]]) -> Fa
 def estimator_findings(found: Found, family: Family) -> tuple[str, ...]:
     """Say by how much corrected lowers regret against each other estimator."""
     return tuple(
-        _compared(found, family, f"{DTP}, dtp+{name}", f"Against {name}, corrected", "DTP's regret")
+        _compared(found, family, f"{DTP}, dtp+{name}", f"Against dtp+{name}, {DTP}")
         for name in ESTIMATORS
     )
 
@@ -539,13 +539,13 @@ def estimator_findings(found: Found, family: Family) -> tuple[str, ...]:
 def rule_findings(found: Found, family: Family) -> tuple[str, ...]:
     """Say by how much each other rule lowers regret against DTP."""
     return tuple(
-        _compared(found, family, f"{name}, {DTP}", f"Against {DTP}, {name}", "regret")
+        _compared(found, family, f"{name}, {DTP}", f"Against {DTP}, {name}")
         for name in (CUSUM, TUNED_CUSUM, WORK, ESCAPE, TUNED_DTP)
     )
 
 
-def _compared(found: Found, family: Family, pair: str, who: str, what: str) -> str:
-    """``Against profile, corrected lowers DTP's regret in 4 of 10 scenarios (step −70 ...)``."""
+def _compared(found: Found, family: Family, pair: str, who: str) -> str:
+    """``Against dtp+profile, dtp+corrected lowers regret in 4 of 10 scenarios (step −70 ...)``."""
     verdicts = family.verdicts
     named = {
         said: [
@@ -557,7 +557,7 @@ def _compared(found: Found, family: Family, pair: str, who: str, what: str) -> s
     }
     total = len(found.scenarios)
     lower, higher = named["lower"], named["higher"]
-    text = f"{who} lowers {what} in {counted(len(lower), total, 'scenarios')}"
+    text = f"{who} lowers regret in {counted(len(lower), total, 'scenarios')}"
     text += f" ({', '.join(lower)})" if lower else ""
     text += f" and raises it in {len(higher)}"
     text += f" ({', '.join(higher)})" if higher else ""

@@ -379,6 +379,8 @@ def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> Out
     prices = [
         f"{METRICS[metric]} is higher in {_where(shown[metric], 'higher')} and lower in "
         f"{_where(shown[metric], 'lower')}"
+        if set(shown[metric].values()) != {"no difference shown"}
+        else f"no difference in {METRICS[metric]} is shown"
         for metric in ("violation_rate", "cost")
     ]
     sentence = (

@@ -406,9 +406,9 @@ def verdict(found: Sequence[Turn], said: Mapping[str, Mapping[str, Said]]) -> Ou
         answer = "no"
     else:
         answer = "not shown"
-    turns_ = "; ".join(f"in {one.scenario} {one}" for one in found)
-    rates = "; ".join(
-        f"in {scenario} {_stretches(mine, 'lower')}"
+    turns_ = ", ".join(f"{one} in {one.scenario}" for one in found)
+    rates = ", ".join(
+        f"{_stretches(mine, 'lower')} in {scenario}"
         for scenario, mine in said["violation_rate"].items()
     )
     evidence = tuple(
@@ -419,8 +419,8 @@ def verdict(found: Sequence[Turn], said: Mapping[str, Mapping[str, Said]]) -> Ou
     )
     return Outcome(
         answer,
-        f"By J, offloading both stages ({OFFLOADED}) costs less than {LOCAL} {turns_}, the width "
-        f"of the envelope. It is shown to miss less {rates}.",
+        f"Offloading both stages ({OFFLOADED}) costs less than {LOCAL}, by J, {turns_} (the width "
+        f"of the envelope of extra delays). It is shown to miss less {rates}.",
         evidence,
     )
 

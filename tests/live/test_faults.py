@@ -1,0 +1,333 @@
+"""The live protocol on the in-memory network: what holds when things die, by rule and number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import dwell
+from dwell.live.messages import Order
+from dwell.live.transport.memory import Clock
+from dwell.model import Problem
+from tests.live.small_world import MS, Counting, World
+
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+EDGE = ("perception@E", "perception@E.shadow", "planning@E", "planning@E.shadow", "agent@E")
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    cell = dwell.load("examples/canonical.yaml")
+    fallbacks = ("LOC", "HYB", "SO")
+    return replace(cell, controller=replace(cell.controller, fallbacks=fallbacks))
+
+
+def on(problem: Problem, candidate: str) -> Problem:
+    return replace(problem, controller=replace(problem.controller, initial=candidate))
+
+
+def longest_gap(cycles: list[int], last: int) -> int:
+    """Most consecutive cycles without an actuation, those at the end included."""
+    return max(later - earlier - 1 for earlier, later in pairwise([*cycles, last]))
+
+
+def require_ordered(world: World) -> None:
+    assert world.cycles == sorted(set(world.cycles)), "an actuation twice, or out of order"
+
+
+Fault = Callable[[World], None]
+
+
+def freeze(*names: str) -> Fault:
+    def apply(world: World) -> None:
+        for who in names:
+            world.network.freeze(who)
+
+    return apply
+
+
+def kill(*names: str) -> Fault:
+    def apply(world: World) -> None:
+        for who in names:
+            world.kill(who)
+
+    return apply
+
+
+def cut(source: str, target: str) -> Fault:
+    def apply(world: World) -> None:
+        world.network.cut(source, target)
+
+    return apply
+
+
+SINGLE_FAULTS: dict[str, tuple[str, Fault]] = {
+    "E frozen": ("SO", freeze(*EDGE)),
+    "E dead": ("SO", kill(*EDGE)),
+    "E dead under HYB": ("HYB", kill(*EDGE)),
+    "perception on E frozen": ("SO", freeze("perception@E")),
+    "planning on E killed": ("SO", kill("planning@E")),
+    "R1 to E cut": ("SO", cut("R1", "E")),
+    "E to R1 cut": ("SO", cut("E", "R1")),
+    "E to R2 cut": ("SO", cut("E", "R2")),
+    "R2 to E cut": ("HYB", cut("R2", "E")),
+    "R1 to R2 cut": ("LOC", cut("R1", "R2")),
+    "R2 to R1 cut": ("LOC", cut("R2", "R1")),
+    "perception on R1 frozen": ("LOC", freeze("perception@R1")),
+    "perception on R1 killed": ("LOC", kill("perception@R1")),
+    "planning on R2 frozen": ("LOC", freeze("planning@R2")),
+    "agent of E killed": ("SO", kill("agent@E")),
+    "agent of R1 killed": ("LOC", kill("agent@R1")),
+}
+
+
+@pytest.mark.parametrize("name", SINGLE_FAULTS)
+@settings(max_examples=4, deadline=None)
+@given(phase=st.floats(0, 1))
+def test_rule_5_bounds_what_a_single_fault_costs(problem: Problem, name: str, phase: float) -> None:
+    candidate, fault = SINGLE_FAULTS[name]
+    world = World(on(problem, candidate), exec_ms=EXEC_MS)
+    period_ms = problem.pipeline.period_ms
+    world.run((30 + phase) * period_ms)
+    assert world.stamper.placement == candidate
+    assert len(world.cycles) >= 28
+    fault(world)
+    world.run(30 * period_ms)
+    require_ordered(world)
+    # The last two cycles may be on their way.
+    lost = longest_gap(world.cycles, world.stamper.cycle - 2)
+    assert lost <= problem.controller.guard_cycles + 1
+    harmless = name.startswith("agent")
+    assert (world.stamper.placement == candidate) == (harmless or not lost)
+
+
+def test_rule_5_holds_without_a_controller(problem: Problem) -> None:
+    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
+    world.run(3_000)
+    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    assert world.stamper.placement == "SO"
+
+
+def test_rule_6_leaves_a_fallback_only_by_proof(problem: Problem) -> None:
+    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    cuts = [world.network.cut("R1", "E"), world.network.cut("E", "R1")]
+    world.run(500)
+    assert world.stamper.placement == "LOC"
+    number = 0
+
+    def ask() -> str:
+        nonlocal number
+        number += 1
+        stamper = world.stamper
+        stamper.receive(
+            world.sample(Order(number, "me", stamper.run, stamper.term, "SO")),
+            world.network.now_ns,
+        )
+        assert stamper._answered is not None
+        return stamper._answered[2].refused
+
+    assert ask().startswith("not ready")
+    for rule in cuts:
+        world.network.heal(rule)
+    world.run(500)
+    assert ask().startswith("not proven")
+    probes = world.stamper.probation.needed
+    world.run((probes - 5) * problem.pipeline.period_ms)
+    assert ask().startswith("not proven")
+    world.run(10 * problem.pipeline.period_ms)
+    assert not ask()
+    world.run(500)
+    assert world.stamper.placement == "SO"
+    require_ordered(world)
+
+
+def test_rule_6_doubles_the_proof_after_a_relapse(problem: Problem) -> None:
+    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    before = world.stamper.probation.needed
+    world.network.freeze("perception@E")
+    world.run(500)
+    world.network.thaw("perception@E")
+    world.run(500)
+    world.order("SO")
+    world.run((before + 10) * problem.pipeline.period_ms)
+    world.order("SO")
+    world.run(200)
+    assert world.stamper.placement == "SO"
+    world.network.freeze("perception@E")
+    world.run(500)
+    assert world.stamper.probation.needed == 2 * before
+
+
+def test_rule_1_numbers_grow_across_restarts_of_the_stamper(problem: Problem) -> None:
+    world = World(on(problem, "HYB"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    last = world.cycles[-1]
+    world.kill("stamper@R1")
+    world.run(200)
+    world.start("stamper@R1")
+    world.run(1_000)
+    assert world.cycles[-1] > last + 20
+    assert world.stamper.placement == "HYB"
+    require_ordered(world)
+
+
+def test_rule_1_a_stamper_that_lost_its_book_begins_a_later_run(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    count = len(world.cycles)
+    world.kill("stamper@R1")
+    world.book.entry = None
+    world.run_id += 1
+    world.start("stamper@R1")
+    world.run(1_000)
+    assert len(world.cycles) > count + 20
+
+
+def test_rule_2_orders_die_with_their_term(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    term = world.stamper.term
+    assert not world.order("SO")
+    assert world.order("HYB", term=term).startswith("stale term")
+    assert world.order("HYB", run=77).startswith("stale run")
+    assert world.order("NOWHERE").startswith("infeasible")
+    assert world.stamper.placement == "SO"
+
+
+def test_rule_2_an_order_twice_is_one_order(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    order = Order(5, "me", world.stamper.run, world.stamper.term, "SO")
+    for _ in range(3):
+        world.stamper.receive(world.sample(order), world.network.now_ns)
+    assert len(world.stamper.moves) == 1
+    assert world.stamper._answered is not None
+    assert not world.stamper._answered[2].refused
+
+
+def test_rule_2_a_second_controller_is_refused_by_name(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    assert not world.order("SO")
+    refused = world.order("LOC", controller="other")
+    assert refused == "another controller: me is in charge"
+    world.run(2_000)
+    assert not world.order("LOC", controller="other")
+
+
+@pytest.mark.parametrize("candidate", ["LOC", "SO", "HYB"])
+def test_rule_7_a_restarted_sink_replays_nothing(problem: Problem, candidate: str) -> None:
+    world = World(on(problem, candidate), exec_ms=EXEC_MS)
+    world.run(1_000)
+    world.kill("sink.control@R2")
+    world.run(60)
+    world.start("sink.control@R2")
+    world.run(1_000)
+    require_ordered(world)
+    assert world.cycles[-1] > 50
+
+
+def test_rule_7_the_watchdog_speaks_when_no_command_comes(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    assert world.arm.silences == 0
+    world.kill("control@R2")
+    world.run(1_000)
+    assert world.arm.silences == 1
+
+
+def test_rule_7_an_old_command_is_never_applied(problem: Problem) -> None:
+    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    stalled = world.network.stall("E", "R2")
+    world.run(70)
+    world.network.heal(stalled)
+    world.run(1_000)
+    limit_ms = 2 * problem.pipeline.period_ms
+    assert max(age_ms for _, age_ms in world.arm.applied) <= limit_ms
+    require_ordered(world)
+
+
+@pytest.mark.parametrize("offset_s", [0, 3_600, -86_400 * 365])
+def test_rule_11_ages_hold_whatever_the_clocks_show(problem: Problem, offset_s: int) -> None:
+    clocks = {"R2": Clock(offset_s * 1_000 * MS, 80.0), "E": Clock(5 * MS, -50.0)}
+    world = World(on(problem, "SO"), exec_ms=EXEC_MS, clocks=clocks)
+    world.run(3_000)
+    assert longest_gap(world.cycles[3:], world.stamper.cycle - 2) == 0
+    assert max(age_ms for _, age_ms in world.arm.applied[10:]) < 30
+
+
+@pytest.mark.parametrize("who", ["control@R2", "perception@R1"])
+def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
+    task, _, node = who.partition("@")
+    tasks = dict(problem.pipeline.tasks)
+    on_nodes = {**tasks[task].on, node: replace(tasks[task].on[node], standby=1)}
+    tasks[task] = replace(tasks[task], on=on_nodes)
+    cell = on(replace(problem, pipeline=replace(problem.pipeline, tasks=tasks)), "LOC")
+    cell = replace(cell, controller=replace(cell.controller, fallbacks=()))
+    world = World(cell, exec_ms=EXEC_MS)
+    world.run(1_000)
+    world.network.freeze(who)
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    assert longest_gap(world.cycles, world.stamper.cycle - 2) <= 4
+    world.network.thaw(who)
+    world.run(1_000)
+    assert longest_gap(world.cycles, world.stamper.cycle - 2) <= 4
+    require_ordered(world)
+
+
+def counting(problem: Problem, candidate: str) -> World:
+    """A world whose planning counts its cycles, and whose cell file says that it has a state."""
+    tasks = dict(problem.pipeline.tasks)
+    tasks["planning"] = replace(tasks["planning"], state_bytes=100)
+    cell = on(replace(problem, pipeline=replace(problem.pipeline, tasks=tasks)), candidate)
+    return World(cell, exec_ms=EXEC_MS, stages={"planning": Counting}, policy=candidate)
+
+
+def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
+    world = counting(problem, "LOC")
+    world.run(2_000)
+    world.pin("SO")
+    world.run(2_000)
+    assert world.stamper.placement == "SO"
+    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    # What the commands say is how many cycles the planner has seen: none is missing or twice.
+    assert [count for _, count in world.arm.counts] == [cycle + 1 for cycle in world.cycles]
+
+
+def test_rule_8_a_checkpoint_survives_its_node(problem: Problem) -> None:
+    world = counting(problem, "SO")
+    world.run(3_000)
+    kill(*EDGE)(world)
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    every = problem.live.checkpoint_cycles
+    cycle, count = world.arm.counts[-1]
+    assert cycle + 1 - 2 * every <= count <= cycle + 1
+    require_ordered(world)
+
+
+def test_rule_9_a_frozen_peer_costs_others_nothing(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    freeze(*EDGE)(world)
+    world.run(2_000)
+    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    assert world.stamper.placement == "LOC"
+
+
+def test_rule_4_the_detour_carries_completions(problem: Problem) -> None:
+    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    world.network.cut("R2", "R1")
+    world.run(2_000)
+    assert world.stamper.placement == "SO"
+    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
