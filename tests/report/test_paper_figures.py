@@ -247,7 +247,7 @@ def test_a_timeline_shows_placements_disturbances_and_levels(look: Look) -> None
 def test_panels_may_have_measures_of_their_own(look: Look) -> None:
     figure = next(figure for figure in figures() if figure.slug == "steps")
     first, second = draw(figure, look).axes
-    assert first.get_xlabel() == "change of V_D (%); dashed: no change"
+    assert first.get_xlabel() == "change of V_D (points); dashed: no change"
     assert second.get_xlabel() == "change of migrations; dashed: no change"
     assert first.get_xlim() != second.get_xlim()
 

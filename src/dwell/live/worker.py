@@ -141,6 +141,7 @@ class Worker:
         self._restoring: tuple[State, bytes] | None = None
         self._forked: list[Job] = []
         self._replayed: State | None = None
+        self._restored: Restored | None = None
         self.state_at: tuple[int, int] = (-1, -1)
         self.started = False
         self.trouble = ""
@@ -257,12 +258,17 @@ class Worker:
             return
         state, data = chore
         failed = self._take_over(state, data)
-        if not failed:
+        who = state.number, self.task, self.place.node
+        self._restored = Restored(*who, state.run, state.cycle, failed)
+        if failed:
+            self._say_restored()
+        else:
             self._replayed = state
-        restored = Restored(
-            state.number, self.task, self.place.node, state.run, state.cycle, failed
-        )
-        self.place.transport.put(self.place.keys.restored(), encode(restored))
+
+    def _say_restored(self) -> None:
+        if self._restored is not None:
+            self.place.transport.put(self.place.keys.restored(), encode(self._restored))
+            self._restored = None
 
     def _send_state(self, to: str, number: int) -> None:
         place, stage = self.place, self.stage
@@ -339,6 +345,8 @@ class Worker:
             # Inputs that came while the state was on its way, but for those that are in it.
             self._jobs.extend(job for job in self._forked if job.order > self.state_at)
             self._forked.clear()
+            if not self._jobs:
+                self._say_restored()
         if not self.active:
             horizon_ns = now_ns - 2 * self.place.period_ns
             while self._jobs and self._jobs[0].arrived_ns < horizon_ns:

@@ -191,7 +191,9 @@ def paragraph(text: str, kind: str = "") -> str:
 def items(texts: Iterable[str], kind: str = "") -> str:
     """Return a list of plain texts; `code` in them is set as such."""
     attribute = f' class="{kind}"' if kind else ""
-    return f"<ul{attribute}>\n" + "\n".join(f"<li>{marked(text)}</li>" for text in texts) + "\n</ul>"
+    return (
+        f"<ul{attribute}>\n" + "\n".join(f"<li>{marked(text)}</li>" for text in texts) + "\n</ul>"
+    )
 
 
 def definitions(entries: Mapping[str, str]) -> str:

@@ -37,9 +37,7 @@ def log_ticks(low: float, high: float) -> list[float]:
     return ticks
 
 
-def set_log_ticks(
-    axis: Axis, low: float, high: float, at: Iterable[float] | None = None
-) -> None:
+def set_log_ticks(axis: Axis, low: float, high: float, at: Iterable[float] | None = None) -> None:
     """Give a logarithmic axis ticks in plain numbers, at some values or where they are round."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 

@@ -39,6 +39,7 @@ from dwell.study.paper.chatter import (
 )
 from dwell.study.study import Point, Study
 from tests.study.paper.small_cell import SCALE, make_cell
+from tests.study.paper.written import told
 
 NO: Comparative = "no difference shown"
 
@@ -71,17 +72,20 @@ SPLIT = seen(migrations="higher", moved="lower")
 def test_the_answer_follows_from_what_is_shown(
     places: Sequence[Seen], equivalent: bool, expected: str
 ) -> None:
-    answer, sentence = verdict(places, equivalent=equivalent)
+    answer, sentence = told(verdict(places, equivalent=equivalent))
     assert answer == expected
     assert f"of {len(places)} comparisons" in sentence
     assert ("agree within 10 %" in sentence) == equivalent
 
 
 def test_the_sentence_counts_each_dwell_apart() -> None:
-    _, sentence = verdict([CALMER, SPLIT, ROUGHER], equivalent=False)
-    assert "N_min = 0 (1 comparisons) migrations 0 and 0, returns 0 and 1" in sentence
-    assert "N_min = 3 (2 comparisons) migrations 1 and 1, returns 0 and 0" in sentence
-    assert "tasks moved 1 and 0" in sentence
+    _, sentence = told(verdict([CALMER, SPLIT, ROUGHER], equivalent=False))
+    assert (
+        "N_min = 0, of 1 comparisons: migrations fewer in 0, more in 0; returns fewer in 0, more "
+        "in 1" in sentence
+    )
+    assert "N_min = 3, of 2 comparisons: migrations fewer in 1, more in 1" in sentence
+    assert "tasks moved fewer in 1, more in 0" in sentence
 
 
 def test_what_is_traded_is_neither_calmer_nor_rougher() -> None:

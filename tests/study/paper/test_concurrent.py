@@ -27,7 +27,7 @@ from dwell.study.paper.concurrent import (
 from dwell.study.paper.variants import with_candidates
 from tests.study.paper.families import make_family
 from tests.study.paper.small_cell import SCALE, make_cell
-from tests.study.paper.written import check_written
+from tests.study.paper.written import check_written, told
 
 WINDOWS = 12
 
@@ -53,23 +53,23 @@ def test_the_answer_asks_for_more_than_either_stage_alone(
     atps |= {"R0: dtp+corrected, SO": "higher", "R1: dtp+corrected, SO": "open"}
     single = {f"R{i}: {DTP}, {only(DTP, 'T2')}": one for i, one in enumerate(perception)}
     single |= {f"R{i}: {DTP}, {only(DTP, 'T3')}": one for i, one in enumerate(planning)}
-    answer, sentence = verdict(make_family(atps), make_family(single), ("T2", "T3"), "SO")
+    answer, sentence = told(verdict(make_family(atps), make_family(single), ("T2", "T3"), "SO"))
     assert answer == expected
     assert f"lower V_D in {against.count('lower')} of 2 stress scenarios" in sentence
-    assert f"moves T2 alone in {perception.count('lower')}" in sentence
-    assert f"than with T3 alone in {planning.count('lower')}" in sentence
-    assert "SO, which never moves, misses less than it in 1, and more in 0" in sentence
+    for stage, said in (("T2", perception), ("T3", planning)):
+        assert f"moves {stage} alone: lower in {said.count('lower')}" in sentence
+    assert f"SO, which never moves, misses less than {DTP} in 1, and more in 0" in sentence
     rest = [
         i for i in range(2) if against[i] == "lower" and not perception[i] == planning[i] == "lower"
     ]
-    assert ("it is the rule and its estimates" in sentence) == bool(rest)
+    assert ("owed to the rule and its estimates" in sentence) == bool(rest)
 
 
 def test_sizes_are_named_or_their_range_is() -> None:
     def said(count: int) -> str:
         atps = {f"R{i}: {DTP}, {TUNED}": "lower" for i in range(count)}
         single = {f"R{i}: {DTP}, {only(DTP, 'T2')}": "open" for i in range(count)}
-        return verdict(make_family(atps), make_family(single), ("T2",), "SO")[1]
+        return told(verdict(make_family(atps), make_family(single), ("T2",), "SO"))[1]
 
     assert "(R0 −10.0 points, R1 −10.0 points)" in said(2)
     assert "(from −10.0 points in R0 to" in said(5)

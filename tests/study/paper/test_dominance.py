@@ -28,7 +28,7 @@ from dwell.study.paper.dominance import (
 from dwell.study.paper.variants import with_candidate, with_scenarios, with_speed
 from tests.study.paper.families import make_family
 from tests.study.paper.small_cell import SCALE, make_cell
-from tests.study.paper.written import check_written
+from tests.study.paper.written import check_written, told
 
 CLEAR, UNCLEAR = (0.1, 0.05, 0.2), (0.1, -0.1, 0.3)
 LOCAL = Cell("robot-cpu-stress", 1.0, 0.0, "LOC", "SO", *CLEAR)
@@ -50,7 +50,7 @@ def test_the_answer_asks_for_a_clear_win(
     rates: dict[str, float], costs: dict[str, float], cell: Cell, expected: str
 ) -> None:
     won = {"violation_rate": rates, "cost": costs}
-    answer, sentence = verdict(won, 5, {"violation_rate": [cell], "cost": [LOCAL]})
+    answer, sentence = told(verdict(won, 5, {"violation_rate": [cell], "cost": [LOCAL]}))
     assert answer == expected
     assert f"in {len(rates)} of 5 scenarios" in sentence
     assert f"wins {int(cell is OURS)} clearly by V_D and 0 by J" in sentence

@@ -24,6 +24,7 @@ from dwell.study.paper.hysteresis import (
     verdict,
 )
 from tests.study.paper.small_cell import SCALE, make_cell
+from tests.study.paper.written import told
 
 KEPT = Bounds(runs=10, broken=0, reached=2)
 
@@ -54,11 +55,11 @@ def test_the_answer_follows_from_what_is_shown(
         metric: dict(zip(("baseline", "step"), said, strict=True))
         for metric, said in (("migrations", migrations), ("violation_rate", rate), ("cost", cost))
     }
-    answer, sentence = verdict(held, shown)
+    answer, sentence = told(verdict(held, shown))
     assert answer == expected
     assert ("broken in 1 of 10 runs" in sentence) == bool(held.broken)
     if rate[1] == "higher":
-        assert "V_D higher in 1 (step) and lower in none" in sentence
+        assert "V_D is higher in 1 (step) and lower in none" in sentence
 
 
 def test_bounds_count_what_breaks_and_what_reaches_them() -> None:

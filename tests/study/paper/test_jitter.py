@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -62,11 +63,28 @@ def test_the_answer_follows_from_where_it_turns(
     first: Interval, second: Interval, expected: str
 ) -> None:
     turns = [
-        Turn(scenario, metric, at)
-        for scenario, at in (("baseline", first), ("robot-cpu-stress", second))
-        for metric in ("cost", "violation_rate")
+        Turn(scenario, at) for scenario, at in (("baseline", first), ("robot-cpu-stress", second))
     ]
-    assert verdict(turns)[0] == expected
+    assert verdict(turns, {"violation_rate": {}}).answer == expected
+
+
+def test_misses_are_told_by_the_envelopes_at_which_they_were_shown() -> None:
+    # Where it costs less it need not miss less.
+    said: Mapping[float, Comparative] = {
+        0.1: "higher",
+        1.0: "lower",
+        2.0: "lower",
+        4.0: "no difference shown",
+        8.0: "lower",
+    }
+    outcome = verdict([Turn("baseline", WITHIN)], {"violation_rate": {"baseline": said}})
+    assert "miss less at 1 to 2 ms and at 8 ms in baseline" in outcome.verdict
+    assert outcome.evidence == (
+        "V_D of SO against that of LOC in baseline: lower at 1 to 2 ms and at 8 ms, higher at 0.1 "
+        "ms.",
+    )
+    never = verdict([Turn("baseline", WITHIN)], {"violation_rate": {"baseline": {1.0: "higher"}}})
+    assert "miss less at no envelope in baseline" in never.verdict
 
 
 @pytest.mark.parametrize(
@@ -82,7 +100,7 @@ def test_the_answer_follows_from_where_it_turns(
     ],
 )
 def test_a_turn_in_words(at: Interval, words: str) -> None:
-    assert str(Turn("baseline", "cost", at)) == words
+    assert str(Turn("baseline", at)) == words
 
 
 def test_an_envelope_is_on_every_link_and_its_mean_is_the_same() -> None:

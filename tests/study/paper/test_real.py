@@ -17,7 +17,7 @@ from dwell.study.paper.real import DTP, chapter, real_study, verdict
 from dwell.study.paper.variants import with_candidates
 from tests.study.paper.families import make_family
 from tests.study.paper.small_cell import SCALE, make_cell
-from tests.study.paper.written import check_written
+from tests.study.paper.written import check_written, told
 
 
 def recorded(name: str, *, rows: int = 4000, wrap: bool = True) -> Problem:
@@ -47,7 +47,7 @@ def test_the_answer_follows_from_the_cost(costs: Sequence[str], expected: str) -
         ),
         "violation_rate": make_family({f"{name}: {pair}": "open" for name in names}),
     }
-    answer, sentence = verdict(found, {"LOC": 1, DTP: 2})
+    answer, sentence = told(verdict(found, {"LOC": 1, DTP: 2}))
     assert answer == expected
     assert f"costs less in {costs.count('lower')} of 2 replayed scenarios" in sentence
     assert "LOC in 1, dtp+corrected in 2" in sentence

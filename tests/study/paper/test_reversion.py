@@ -29,7 +29,7 @@ from dwell.study.paper.reversion import (
 )
 from tests.study.paper.families import make_family
 from tests.study.paper.small_cell import SCALE, make_cell
-from tests.study.paper.written import check_written
+from tests.study.paper.written import check_written, told
 
 
 @pytest.mark.parametrize(
@@ -55,10 +55,12 @@ def test_the_answer_counts_what_is_the_faults(
         | {f"{name}: {pair}": one for name, one in zip(names, gains, strict=True)}
     )
     more = make_family({f"{name}: {DTP}": one for name, one in zip(names, beyond, strict=True)})
-    answer, sentence = verdict(family, more)
+    answer, sentence = told(verdict(family, more))
     assert answer == expected
-    assert f"Over all 2 faults it lowers V_D in {gains.count('lower')}" in sentence
-    words = {"lower": "lowers V_D", "higher": "raises V_D"}.get(gains[0], "is not shown to help")
+    assert f"Of 2 faults it lowers V_D in {gains.count('lower')}" in sentence
+    words = {"lower": "lowers V_D", "higher": "raises V_D"}.get(
+        gains[0], "is not shown to change V_D"
+    )
     assert words in sentence
 
 

@@ -15,6 +15,7 @@ from dwell.study.paper.contrasts import values
 from dwell.study.paper.table import chapter, verdict
 from dwell.study.predictions import Answer
 from tests.study.paper.small_cell import SCALE, make_cell
+from tests.study.paper.written import told
 
 STATIC, CORRECTED = "dtp+profile", "dtp+corrected"
 SCENARIOS = ("baseline", "robot-cpu-stress")
@@ -47,19 +48,20 @@ def judged(static: Sequence[Answer], corrected: Sequence[Answer]) -> dict[str, d
 def test_the_answer_follows_from_the_judgements(
     static: Sequence[Answer], corrected: Sequence[Answer], expected: str
 ) -> None:
-    answer, _ = verdict(judged(static, corrected), AIMS)
+    answer = verdict(judged(static, corrected), AIMS).answer
     assert answer == expected
 
 
 def test_the_sentence_names_the_scenarios_and_counts_the_aim() -> None:
-    _, sentence = verdict(judged(("agrees", "open"), ("agrees in part", "differs")), AIMS)
-    assert "1 of 2 scenarios (baseline), undecided in 1 (robot-cpu-stress)" in sentence
-    assert "0 of 2 scenarios, in part in 1 (baseline)" in sentence
-    assert f"LOC 1, {STATIC} 1." in sentence
+    _, sentence = told(verdict(judged(("agrees", "open"), ("agrees in part", "differs")), AIMS))
+    assert f"{STATIC}: as predicted in baseline; undecided in robot-cpu-stress." in sentence
+    assert "in part in baseline; otherwise in robot-cpu-stress." in sentence
+    assert "in 1 of 2 scenarios, and in part in 0; with the estimator corrected in 0" in sentence
+    assert f"LOC in 1, {STATIC} in 1." in sentence
 
 
 def test_without_predictions_nothing_was_asked() -> None:
-    answer, sentence = verdict({}, AIMS)
+    answer, sentence = told(verdict({}, AIMS))
     assert answer == "none asked"
     assert "predicts nothing" in sentence
 

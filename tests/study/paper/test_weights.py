@@ -21,6 +21,7 @@ from dwell.study.paper.weights import (
 )
 from dwell.study.sensitivity import sobol_design
 from tests.study.paper.small_cell import SCALE, make_cell
+from tests.study.paper.written import told
 
 SYMBOLS = tuple(WEIGHTS.values())
 
@@ -62,8 +63,9 @@ def test_the_answer_follows_from_the_reactions(reactions: list[Reaction], expect
 
 
 def test_the_sentence_names_the_leading_weight_and_the_idle_ones() -> None:
-    _, sentence = verdict([reaction(0.02, 0.1), reaction(0.03, 0.9)])
-    assert "1 of 2 scenarios: baseline (5.0 % to 7.0 %, most by α_V" in sentence
+    _, sentence = told(verdict([reaction(0.02, 0.1), reaction(0.03, 0.9)]))
+    assert "1 of 2 scenarios (baseline)" in sentence
+    assert "baseline (5.0 % to 7.0 %, most by α_V" in sentence
     assert "luck" in sentence
     assert sentence.endswith("α_L, α_r, α_e and α_S have no part in it.")
 

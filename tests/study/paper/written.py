@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dwell.study.paper import Chapter
+from dwell.study.paper.chapter import Answer, Outcome
 
-__all__ = ["check_written"]
+__all__ = ["check_written", "told"]
 
 ANSWERS = ("yes", "no", "in part", "not shown", "none asked")
 
@@ -13,9 +14,11 @@ def check_written(chapter: Chapter) -> None:
     """Assert that a chapter says something and can be drawn."""
     assert chapter.title
     assert chapter.design
+    # A verdict is a sentence or two; the numbers are evidence.
     assert chapter.verdict
+    assert len(chapter.verdict) < 340
     assert chapter.answer in ANSWERS
-    texts = (chapter.verdict, chapter.design, *chapter.findings)
+    texts = (chapter.verdict, *chapter.evidence, chapter.design, *chapter.findings)
     assert not any("nan" in text for text in texts)
     slugs = [table.slug for table in chapter.tables]
     assert len(set(slugs)) == len(slugs)
@@ -35,3 +38,8 @@ def check_written(chapter: Chapter) -> None:
             place = {figure.x, figure.series, figure.facet, figure.facet_row} - {None}
             place |= {figure.y} if figure.kind == "map" else set()
             assert not figure.frame.select(sorted(map(str, place))).is_duplicated().any()
+
+
+def told(outcome: Outcome) -> tuple[Answer, str]:
+    """Return an answer, and the verdict with its evidence as one text."""
+    return outcome.answer, " ".join((outcome.verdict, *outcome.evidence))

@@ -420,9 +420,7 @@ def written(
     scenarios = whole.study.scenarios
     atps = against_atp(runs, baselines)
     singles = against_single(runs, scenarios, stages)
-    outcome = verdict(
-        atps["violation_rate"], singles["violation_rate"], stages, baselines.static
-    )
+    outcome = verdict(atps["violation_rate"], singles["violation_rate"], stages, baselines.static)
     main = main_table(runs, baselines, stages)
     return Chapter(
         slug="concurrent",

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from dwell.model import Problem
 from dwell.policies import Cusum
-from dwell.study.comparison import AIM
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.hindsight import Hindsight
@@ -340,7 +339,7 @@ def verdict(
         for at, what in enumerate(("cost", "V_D", "migrations"))
     }
     fails = [f"by {what} in {listed(names)}" for what, names in short.items() if names]
-    text += f" It is shown to fall short {listed(fails, ', and')}." if fails else ""
+    text += f" It is shown to fall short {', and '.join(fails)}." if fails else ""
     evidence = (_cost_sentence(mine, parts[name]), _rate_sentence(mine), _moves_sentence(mine))
     return Outcome(answer, text, evidence)
 

@@ -329,9 +329,7 @@ def said_of(compared: Mapping[str, Family], study: Study) -> dict[str, dict[str,
     for metric, family in compared.items():
         verdicts = family.verdicts
         found[metric] = {
-            scenario: {
-                width: verdicts[_widened(scenario, width)] for width in widths_of(study)
-            }
+            scenario: {width: verdicts[_widened(scenario, width)] for width in widths_of(study)}
             for scenario in study.scenarios
         }
     return found

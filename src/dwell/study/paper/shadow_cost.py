@@ -15,7 +15,7 @@ from dwell.study.intervals import mean_interval
 from dwell.study.paper.chapter import Table, Unit
 from dwell.study.paper.contrasts import Contrast, family_of, values
 from dwell.study.paper.running import Scale
-from dwell.study.paper.sentences import counted, listed, number, percent, points
+from dwell.study.paper.sentences import counted, number, percent, points
 from dwell.study.study import Contender, Point, Study
 
 __all__ = [

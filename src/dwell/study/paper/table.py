@@ -232,9 +232,7 @@ def verdict(
         f"{_count(paper, 'agrees in part')}; with the estimator corrected in "
         f"{_count(better, 'agrees')}, and in part in {_count(better, 'agrees in part')}."
     )
-    return Outcome(
-        answer, sentence, (*(_agreement(policy, judged[policy]) for policy in DTP), aim)
-    )
+    return Outcome(answer, sentence, (*(_agreement(policy, judged[policy]) for policy in DTP), aim))
 
 
 def _count(mine: Mapping[str, Judged], word: Judged) -> int:
