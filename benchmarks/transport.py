@@ -152,24 +152,28 @@ def _partner(kind: str) -> Iterator[_Partner]:
         if kind == "tcp":
             connection = stack.enter_context(listener.accept()[0])
             partner.put = _framed(connection, partner.answer)
-        while partner.ask(b"", 0.05) is None:
-            if child.poll() is not None:
-                raise RuntimeError(f"{' '.join(command)} ended")
+        if all(partner.ask(b"", 0.05) is None for _ in range(400)):
+            raise RuntimeError(f"{' '.join(command)} does not answer")
         yield partner
 
 
 def _answer(kind: str, port: int) -> None:
     """Answer every message with its number and the present instant, for as long as it lives."""
+    opened = threading.Event()
     put: Put
 
     def arrived(payload: bytes) -> None:
         now_ns = time.monotonic_ns()
+        opened.wait()
         put(MARK.pack(int.from_bytes(payload[:8], "little"), now_ns))
 
-    if kind == "tcp":
-        put = _framed(socket.create_connection(("127.0.0.1", port)), arrived)
-        threading.Event().wait()
-    with _open(kind, port, NEAR if kind == "shared" else THERE, arrived) as put:
+    with ExitStack() as stack:
+        if kind == "tcp":
+            put = _framed(socket.create_connection(("127.0.0.1", port)), arrived)
+        else:
+            who = NEAR if kind == "shared" else THERE
+            put = stack.enter_context(_open(kind, port, who, arrived))
+        opened.set()
         threading.Event().wait()
 
 

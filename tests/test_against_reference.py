@@ -520,7 +520,7 @@ def compare(
 ) -> None:
     excluded = 0
     failures: list[str] = []
-    examples = LONGER if orders else EXAMPLES
+    examples = -(-LONGER // 2) if guarded else LONGER if orders else EXAMPLES
     for seed in range(examples):
         make = make_guarded if guarded else make_case
         case = make(seed, schedulers, whole_ms=whole_ms, orders=orders)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import polars as pl
@@ -21,7 +22,6 @@ from dwell.model import (
     Node,
     NodeDisturbance,
     Problem,
-    QoS,
     Task,
 )
 from dwell.sim import simulate_realisation
@@ -33,6 +33,7 @@ from tests.test_against_reference import Case, Played, Replay, differences
 from tests.test_against_reference import play as play_case
 from tests.test_against_reference import reference as reference_of
 
+CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 MOVES = {"LOC": {"act": "R"}, "OFF": {"act": "E"}, "ALT": {"act": "X"}}
 NODES = ("R", "E", "X")
 
@@ -411,6 +412,51 @@ def test_who_has_no_guard(
     assert "guard" not in run.decisions["reason"].to_list()
 
 
+@pytest.mark.parametrize("policy", ["dtp", "latency-first"])
+def test_the_bound_on_the_canonical_cell(policy: str) -> None:
+    problem = dwell.load(CANONICAL)
+    down = NodeDisturbance("E", at_s=60.0, for_s=40.0, down=True)
+    problem = replace(problem, scenarios={"down": (down,)})
+
+    def longest(guard: bool) -> int:
+        run = dwell.simulate(
+            problem, scenario="down", policy=policy, seed=2, windows=40, guard=guard
+        )
+        assert run.meta["guard"] is guard
+        missing = run.cycles["latency_ns"].is_null().to_list()
+        return max(sum(1 for _ in row) for gone, row in itertools.groupby(missing) if gone)
+
+    assert longest(guard=False) > 1000
+    assert longest(guard=True) <= problem.controller.guard_cycles + 1
+
+
+@pytest.mark.parametrize("estimator", ["shadow", "corrected", "scaling"])
+def test_probes_do_not_disturb_who_learns(estimator: str) -> None:
+    problem = dwell.load(CANONICAL)
+    run = dwell.simulate(
+        problem,
+        scenario="network-impairment",
+        policy="latency-first",
+        estimator=estimator,
+        seed=1,
+        windows=60,
+        guard=True,
+    )
+    plain = dwell.simulate(
+        problem,
+        scenario="network-impairment",
+        policy="latency-first",
+        estimator=estimator,
+        seed=1,
+        windows=60,
+    )
+    # Up to the first move of the guard nothing differs.
+    guarded = run.decisions.filter(pl.col("reason") == "guard")
+    until = guarded["window"].min() if guarded.height else run.windows.height
+    before = pl.col("window") < until
+    assert run.decisions.filter(before).equals(plain.decisions.filter(before))
+
+
 def test_where_it_does_not_fire_nothing_changes() -> None:
     problem = cell(order_delay_ms=3.0, close_grace_ms=4.0)
     problem = replace(
@@ -425,34 +471,20 @@ def test_where_it_does_not_fire_nothing_changes() -> None:
             assert getattr(on, table).equals(getattr(off, table))
 
 
-def test_orders_are_n_min_windows_apart_and_moves_of_the_guard_are_no_orders() -> None:
-    problem = cell(min_dwell=2, fallbacks=("ALT",))
-    spells = [(105 + 300 * k, 150 + 300 * k) for k in range(6)]
-    changes = [
-        NodeChange(round(at * MS), "E", 0, down)
-        for spell in spells
-        for at, down in zip(spell, (True, False), strict=True)
-    ]
-    real = make_realisation(problem, windows=50, node_changes=changes)
-
-    class Chatter:
-        """Wants another candidate at every close."""
-
-        def __init__(self) -> None:
-            self.names = itertools.cycle(["OFF", "LOC"])
-
-        def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
-            """Say the next one."""
-            return next(self.names)
-
-    run = simulate_realisation(problem, real, policy=Chatter(), guard=True)
-    dtp = simulate_realisation(problem, real, policy="dtp", guard=True)
-    for some in (run, dtp):
-        orders = some.decisions.filter((pl.col("reason") != "guard") & pl.col("migrated"))
-        assert orders["window"].is_sorted()
-        # Windows follow one another; a row of the guard is about the window that it begins.
-        assert some.decisions["window"].is_sorted()
-        assert some.decisions["window"].max() == some.windows.height - 1
-    orders = dtp.decisions.filter((pl.col("reason") != "guard") & pl.col("migrated"))
-    apart = [b - a for a, b in itertools.pairwise(orders["window"].to_list())]
-    assert all(windows > 2 for windows in apart)
+def test_orders_stay_apart_and_moves_of_the_guard_are_counted_apart() -> None:
+    problem = dwell.load(CANONICAL)
+    run = dwell.simulate(
+        problem, scenario="edge-cpu-stress", policy="dtp", seed=3, windows=150, guard=True
+    )
+    decisions = run.decisions
+    assert decisions["window"].is_sorted()
+    assert decisions["window"].max() == run.windows.height - 1
+    moves = decisions.filter("migrated").select("window", "reason").rows()
+    assert {reason for _, reason in moves} >= {"guard", "migrate"}
+    # A row of the guard has the number of the window that it begins, an order's that of the window
+    # at whose close it was given: N_min windows of dwell come before it in either case.
+    for (before, why), (window, reason) in itertools.pairwise(moves):
+        if reason != "guard":
+            assert window - before > problem.controller.min_dwell - (why == "guard")
+    # One row a window, and one for every move of the guard.
+    assert decisions.height == run.windows.height + [reason for _, reason in moves].count("guard")

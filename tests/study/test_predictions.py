@@ -62,6 +62,15 @@ def test_seeds_that_disagree_leave_it_open() -> None:
     assert judge_placement(comparison, BY_SCENARIO["baseline"]).answer == "open"
 
 
+def test_a_share_that_every_seed_has_is_enough() -> None:
+    # Few seeds that all stay leave an interval that begins below the share.
+    shown = {("network-impairment", "dtp"): shares(1.0, 0.0, np.zeros(len(SEEDS)).tolist())}
+    comparison = make_comparison(shown, scenarios=("network-impairment",))
+    judgement = judge_placement(comparison, BY_SCENARIO["network-impairment"])
+    assert judgement.share.low < judgement.prediction.share
+    assert judgement.answer == "agrees"
+
+
 def test_one_seed_leaves_it_open() -> None:
     shown = {("baseline", "dtp"): {"share_LOC": 1.0}}
     comparison = make_comparison(shown, seeds=(1,))

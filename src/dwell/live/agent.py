@@ -5,7 +5,6 @@ It also tells what the node's CPU does, and on one node it is the detour for sma
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable
 
 import psutil
@@ -22,6 +21,8 @@ LOOK_NS = 20_000_000
 LOAD_NS = 250_000_000
 #: Messages that the detour carries on together at most; more within that time are dropped.
 MOST_CARRIED = 1_000
+#: Periods between two beats of an agent.
+AGENT_BEAT = 5
 NEVER_NS = 1 << 62
 
 
@@ -69,7 +70,8 @@ class Agent:
     ) -> None:
         self.place, self.supervisor = place, supervisor
         self._cpu, self._accelerator = cpu, accelerator
-        self.pulse = Pulse(place, self._state)
+        # No guard waits for it: it carries nothing that a cycle needs.
+        self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.relay
         self._look_ns = self._load_ns = 0
         self._carried: list[tuple[str, bytes]] = []
@@ -115,9 +117,8 @@ class Agent:
         shadow = self._grown("shadow", lambda who: who.endswith(".shadow"))
         own = self._grown("own", lambda who: not who.endswith(".shadow"))
         busy_ns = self._cpu.busy_ns()
-        at_ns = now_ns if self._accelerator is None else time.monotonic_ns()
         used = -1.0 if self._accelerator is None else self._accelerator()
-        load = Load(place.node, place.life, at_ns, busy_ns, own, shadow, used)
+        load = Load(place.node, place.life, now_ns, busy_ns, own, shadow, used)
         place.put_twice(place.keys.load(place.node), encode(load))
 
     def _grown(self, what: str, select: Callable[[str], bool]) -> int:

@@ -108,7 +108,7 @@ class Cell:
         """Key expressions that it wants to hear."""
         keys = self.place.keys
         yield from self.pulse.subscriptions()
-        yield from (keys.done("*"), keys.probed(), keys.accepted(), keys.load("*"))
+        yield from (keys.done("*"), keys.ended(), keys.accepted(), keys.load("*"))
         yield from (keys.carried(), keys.stamped())
         yield keys.restored()
         yield keys.ask()
@@ -130,7 +130,7 @@ class Cell:
             match word.partition("/")[0]:
                 case "stamped":
                     self._stamped(decode(sample.payload, Stamp), now_ns)
-                case "done" | "probed" if windows is not None:
+                case "done" | "ended" if windows is not None:
                     windows.completed(decode(sample.payload, Completion), now_ns)
                 case "load" if windows is not None:
                     windows.loaded(decode(sample.payload, Load))
@@ -351,7 +351,7 @@ class Cell:
             self._recorder.append(windows.rows())
             return
         wanted = self.controller.close(closed, proven=held.proven or None)
-        self._recorder.append(windows.rows())
+        self._recorder.append(windows.rows(), origin_ns=windows.origin_ns)
         self._window = self._shown(last.number, last.cycles[0].placement, closed)
         target = self._allowed(wanted)
         if self.place.problem.live.mode == "advise" and not self.pinned:

@@ -11,13 +11,23 @@ from dwell.live.role import Role
 from dwell.live.stage import Message
 from dwell.live.transport.protocol import Sample, Transport
 from dwell.live.worker import Job, Worker
+from dwell.model import Problem
 
-__all__ = ["Clock", "Hosted", "work"]
+__all__ = ["Clock", "Hosted", "clock_of", "work"]
 
 Clock = Callable[[], int]
 
 #: No thread sleeps longer, so that it notices that it shall stop.
 LONGEST_SLEEP_S = 0.2
+
+
+def clock_of(problem: Problem) -> Clock:
+    """Return what all processes of a live cell read the time from.
+
+    Where clocks are kept synchronous by others, that is the time of day; elsewhere a clock that
+    nobody sets.
+    """
+    return time.time_ns if problem.live.clock == "system" else time.monotonic_ns
 
 
 class Hosted:
@@ -28,7 +38,7 @@ class Hosted:
     role : Role
     transport : Transport
     clock : callable
-        Nanoseconds; a clock that never steps.
+        The node's clock, nanoseconds.
     heard : callable, optional
         Called, outside the role, after every message; `news` is released where it says so.
     stopped : Event, optional

@@ -31,9 +31,9 @@ class Keys:
         """Completions of a sink; ``*`` for all."""
         return f"{self.root}/done/{sink}"
 
-    def probed(self) -> str:
-        """Completions of shadows."""
-        return f"{self.root}/probed"
+    def ended(self) -> str:
+        """Completions of cycles and shadows that ended before a sink."""
+        return f"{self.root}/ended"
 
     def beat(self, node: str, who: str) -> str:
         """Heartbeats; ``*`` for all nodes or processes."""

@@ -127,7 +127,7 @@ class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
 
 class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
-    """What a sink says once of every cycle that reached it.
+    """What a sink says once of every cycle that reached it, and a task of one that ended there.
 
     Parameters
     ----------
@@ -138,7 +138,8 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
         When the command was handed to the actuator, on the sink's clock.
     outcome : str
         ``actuated``, ``behind`` (a later cycle had been actuated), ``stale`` (older than
-        `max_age_ms`), ``shadow`` (stopped before the sink).
+        `max_age_ms`); ``shadow`` where a shadow ended; ``replaced`` where a later cycle took its
+        place.
     hops : tuple of Hop
     node : str
         Of the sink; where a shadow stopped.

@@ -14,7 +14,7 @@ from dwell.errors import LiveError
 from dwell.live.agent import Agent, CpuCount
 from dwell.live.cell import Cell
 from dwell.live.files import make_folder
-from dwell.live.hosting import Hosted
+from dwell.live.hosting import Hosted, clock_of
 from dwell.live.recording import RunRecorder
 from dwell.live.role import Place
 from dwell.live.supervision import Supervisor
@@ -74,7 +74,7 @@ def run_agent(
                 supervisor.keep(role.who, command(role.who))
         place = Place(problem, who, node, transport, time.time_ns())
         agent = Agent(place, supervisor, CpuCount(), accelerator)
-        Hosted(agent, transport, stopped=stopped).run()
+        Hosted(agent, transport, clock_of(problem), stopped=stopped).run()
     finally:
         supervisor.stop()
         transport.close()
@@ -135,8 +135,9 @@ def run_controller(
             place = Place(problem, f"controller@{node}", node, transport, time.time_ns())
             controller = Controller(problem, policy)
             recorder = RunRecorder(out, problem, controller, say)
-            cell = Cell(place, controller, recorder, name, time.monotonic_ns())
-            hosted = Hosted(cell, transport, stopped=stopped)
+            clock = clock_of(problem)
+            cell = Cell(place, controller, recorder, name, clock())
+            hosted = Hosted(cell, transport, clock, stopped=stopped)
             threads.append(threading.Thread(target=hosted.run, name=problem.name, daemon=True))
             recorders.append((recorder, cell))
         for thread in threads:

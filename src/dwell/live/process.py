@@ -11,13 +11,13 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
-from dwell.live.hosting import Hosted, work
+from dwell.live.hosting import Hosted, clock_of, work
 from dwell.live.messages import Header
 from dwell.live.role import Place, Pulse, Role
 from dwell.live.sink import Sink
 from dwell.live.stage import Actuator, load_actuator, load_stage
 from dwell.live.stamper import Stamper
-from dwell.live.transport.protocol import Sample, Transport
+from dwell.live.transport.protocol import Sample
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import Role as Named
 from dwell.live.wiring import wire
@@ -60,21 +60,20 @@ def _run(
     sys.setswitchinterval(0.0005)
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
-        stamper = Stamper(place, book, time.time_ns(), time.monotonic_ns())
-        _host(stamper, place.transport, stopped)
+        stamper = Stamper(place, book, time.time_ns(), clock_of(problem)())
+        _host(stamper, place, stopped)
     elif role.kind == "sink":
         actuator = _actuator(problem, role.task)
         highest = HighestFile(folder / f"{role.who}.highest")
         expected = getattr(actuator, "inputs", {}).get(role.task)
-        _host(Sink(place, role.task, actuator, highest, expected), place.transport, stopped)
+        _host(Sink(place, role.task, actuator, highest, expected), place, stopped)
     else:
         _work(problem, role, place, folder, stopped)
 
 
-def _host(role: Role, transport: Transport, stopped: threading.Event) -> None:
+def _host(role: Role, place: Place, stopped: threading.Event) -> None:
     """Run a role in this thread until the process is told to end."""
-    hosted = Hosted(role, transport, stopped=stopped)
-    hosted.run()
+    Hosted(role, place.transport, clock_of(place.problem), stopped=stopped).run()
 
 
 def _actuator(problem: Problem, task: str) -> Actuator:
@@ -97,7 +96,7 @@ def _work(
     except LiveError as error:
         # It stays, and says in its beats what is wrong: a crash loop would say it less well.
         print(error, file=sys.stderr, flush=True)
-        _host(_Broken(place, f"{role.who}: {error}"), place.transport, stopped)
+        _host(_Broken(place, f"{role.who}: {error}"), place, stopped)
         return
     worker = Worker(
         place,
@@ -115,7 +114,7 @@ def _work(
         else:
             inflight.begin(_written(job))
 
-    work(worker, place.transport, stopped=stopped, note=note)
+    work(worker, place.transport, stopped=stopped, note=note, clock=clock_of(problem))
 
 
 class _Broken:
@@ -151,4 +150,4 @@ def _again(worker: Worker, path: Path) -> None:
         path.unlink()
     except (OSError, msgspec.MsgspecError):
         return
-    worker.retry(shadow, inputs, time.monotonic_ns())
+    worker.retry(shadow, inputs, clock_of(worker.place.problem)())

@@ -42,14 +42,22 @@ class RunRecorder:
     def open(self, run: int) -> Resume:
         """Begin to keep a run, or go on with it; returns where."""
         self.finish()
-        folder = self.out / f"{self.problem.name}-{run}"
+        folder = self._free(f"{self.problem.name}-{run}")
         journal = Journal(
             folder, run=str(run), meta=self._meta(), columns=columns_of(self.controller)
         )
         self._journal = journal
         self._say(f"{self.problem.name}: the run is kept in {folder}")
         window, cycle = journal.following("windows"), journal.following("cycles")
-        return Resume(window, cycle)
+        return Resume(window, cycle, journal.meta.get("origin_ns"))
+
+    def _free(self, name: str) -> Path:
+        """Return the run's folder; a further one where a controller before has sealed it."""
+        folder, count = self.out / name, 1
+        while (folder / "run.json").exists():
+            count += 1
+            folder = self.out / f"{name}-{count}"
+        return folder
 
     def append(self, rows: Rows, **meta: object) -> None:
         """Keep rows; a disk that is full costs the rows and not the control."""

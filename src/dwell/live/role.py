@@ -144,6 +144,8 @@ class Pulse:
         Returns the stamper's term and placement.
     hears : iterable of (str, str), optional
         Nodes and processes, or ``*``, whose beats it wants; by default the stamper's only.
+    every : int
+        Periods between two of its beats.
     """
 
     def __init__(
@@ -153,11 +155,13 @@ class Pulse:
         holds: Callable[[], tuple[int, str]] | None = None,
         *,
         hears: Iterable[tuple[str, str]] | None = None,
+        every: int = 1,
     ) -> None:
         self.place = place
         self._hears = (place.stamper,) if hears is None else tuple(hears)
         self.hearing = Hearing(place.who, place.patience_ns)
         self._state, self._holds = state, holds
+        self._every_ns = every * place.period_ns
         self._digest = fingerprint(place.problem)
         self._next_ns = -(1 << 62)
         keys = place.keys
@@ -193,11 +197,10 @@ class Pulse:
 
     def wake(self, now_ns: int) -> int:
         """Send the beat that is due; returns when the next is."""
-        period_ns = self.place.period_ns
         if now_ns >= self._next_ns:
             self.send(now_ns)
-            late = now_ns >= self._next_ns + period_ns
-            self._next_ns = (now_ns if late else self._next_ns) + period_ns
+            late = now_ns >= self._next_ns + self._every_ns
+            self._next_ns = (now_ns if late else self._next_ns) + self._every_ns
         return self._next_ns
 
     def send(self, now_ns: int) -> None:

@@ -125,7 +125,7 @@ class Stamper:
         """Key expressions that it wants to hear."""
         keys = self.place.keys
         yield from self.pulse.subscriptions()
-        yield from (keys.done("*"), keys.probed(), keys.carried())
+        yield from (keys.done("*"), keys.ended(), keys.carried())
         yield keys.order()
         yield keys.frame()
 
@@ -172,6 +172,8 @@ class Stamper:
         if stamp.run != self.run:
             return
         if done.outcome == "shadow":
+            if done.sink not in self._sinks:
+                return
             if stamp.shadow == self.probation.wanted and stamp.cycle in self._probes:
                 self._probes.discard(stamp.cycle)
                 self.probation.completed(stamp.cycle, now_ns)

@@ -30,6 +30,8 @@ __all__ = ["IMAGE_BYTES", "Job", "Worker"]
 IMAGE_BYTES = 16_384
 #: Cycles that may wait for the rest of their inputs.
 MAX_JOINS = 64
+#: Periods between two beats of a shadow worker.
+SHADOW_BEAT = 10
 UNKNOWN = -1
 
 
@@ -157,7 +159,10 @@ class Worker:
             if node != place.node
         ]
         primary = [(place.node, stands_by)] if stands_by else []
-        self.pulse = Pulse(place, self._state, hears=[place.stamper, *before, *primary])
+        hears = [] if shadow else [*before, *primary]
+        # The guard waits for no shadow worker.
+        slow = SHADOW_BEAT if shadow else 1
+        self.pulse = Pulse(place, self._state, hears=[place.stamper, *hears], every=slow)
 
     # ------------------------------------------------------------------------ hearing
 
@@ -206,16 +211,26 @@ class Worker:
             del self._forked[:-MAX_JOINS]
         else:
             self._jobs.append(job)
-            if (self._depth and len(self._jobs) > self._depth) or len(self._jobs) > 10 * MAX_JOINS:
-                self._jobs.popleft()
-                self.replaced += 1
+            if len(self._jobs) > (self._depth or 10 * MAX_JOINS):
+                self._replace(self._jobs.popleft())
+
+    def _replace(self, job: Job) -> None:
+        """A later cycle has taken a job's place."""
+        self.replaced += 1
+        place, stamp, at_ns = self.place, job.header.stamp, job.arrived_ns
+        inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
+        here = Hop(self.task, place.node, at_ns, UNKNOWN, UNKNOWN, inputs)
+        outcome = "shadow" if job.shadow else "replaced"
+        hops = (*job.hops(), here)
+        ended = Completion(stamp, self.task, at_ns, outcome, hops, place.node)
+        place.put_twice(place.keys.ended(), encode(ended))
 
     def _stop_shadow(self, job: Job) -> None:
         """A shadow ends where the sink begins; what it showed is reported."""
         place = self.place
         stamp, at_ns = job.header.stamp, job.arrived_ns
         stopped = Completion(stamp, self.task, at_ns, "shadow", job.hops(), place.node)
-        place.put_twice(place.keys.probed(), encode(stopped))
+        place.put_twice(place.keys.ended(), encode(stopped))
 
     # -------------------------------------------------------------------------- state
 

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 __all__ = ["CONTENDERS", "Look", "key"]
 
 #: A contender's name as studies have it, in a sentence; two words are what they say there.
+WORDS = tuple(name for name in FAMILIES if " " not in name)
 CALLED = re.compile(
-    rf"(?<![\w+-])(?:{'|'.join(name for name in FAMILIES if ' ' not in name)})(?:-(?:{'|'.join(VARIANTS)}))?"
+    rf"(?<![\w+-])(?:{'|'.join(WORDS)})(?:-(?:{'|'.join(VARIANTS)}))?"
     rf"(?:\+(?:{'|'.join(BELIEFS)}))?(?![\w+-])"
 )
 #: Columns of tables that hold contenders.

@@ -111,7 +111,8 @@ def simulate_realisation(
         # Until the first probe is sent a shadow changes nothing, so that this repeats what has been
         # played. Drawing shadows for every run that may want probes would cost all runs more.
         played = _play(problem, realisation, policy, estimator, jobs, guard, by_window, shadow=True)
-    return Run(_meta(problem, realisation, played.controller), make_tables(played, jobs=jobs))
+    meta = _meta(problem, realisation, played.controller, guard=guard)
+    return Run(meta, make_tables(played, jobs=jobs))
 
 
 class _ProbesWantedError(Exception):
@@ -442,7 +443,9 @@ def _evidence(
     return cut
 
 
-def _meta(problem: Problem, realisation: Realisation, controller: Controller) -> dict[str, Any]:
+def _meta(
+    problem: Problem, realisation: Realisation, controller: Controller, *, guard: bool
+) -> dict[str, Any]:
     policy = controller.policy
     return {
         "kind": "simulated",
@@ -452,6 +455,7 @@ def _meta(problem: Problem, realisation: Realisation, controller: Controller) ->
         if type(policy).__repr__ is not object.__repr__
         else type(policy).__name__,
         "estimator": type(controller.estimator).__name__,
+        "guard": guard and controller.guarded,
         "seed": realisation.seed,
         "windows": realisation.windows,
         "problem": to_document(problem),

@@ -226,7 +226,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Chapter:
 
 def test_with_two_candidates_and_a_dwell_the_rules_are_one(written: Chapter) -> None:
     (said,) = [one for one in written.findings if "N_min = 3, the two rules" in one]
-    assert said.endswith("in 8 of 8 pairs as the rule implies.")
+    assert said.endswith("in 8 of 8 pairs, as the rule implies.")
 
 
 def test_two_candidates_are_the_farthest_apart() -> None:

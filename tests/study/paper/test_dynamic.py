@@ -267,10 +267,10 @@ def test_everybody_who_is_told_plays_by_the_same_rule() -> None:
         for name in (module.TUNED_DTP, module.TUNED_CUSUM)
     }
     by_name = {one.name: one for one in contenders(problem, chosen)}
-    for name, told in TOLD.items():
-        assert by_name[told].policy == by_name[name].policy
-        assert by_name[told].settings == by_name[name].settings
-        assert repr(by_name[told].estimator) == "Hindsight()"
+    for name, knowing in TOLD.items():
+        assert by_name[knowing].policy == by_name[name].policy
+        assert by_name[knowing].settings == by_name[name].settings
+        assert repr(by_name[knowing].estimator) == "Hindsight()"
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 
 from dwell.model import Uniform
 from dwell.study import Interval
+from dwell.study.family import Comparative
 from dwell.study.paper import Chapter, Runner
 from dwell.study.paper.jitter import (
     BASE_MS,

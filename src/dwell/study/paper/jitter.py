@@ -325,7 +325,7 @@ def _widened(scenario: str, width: float) -> str:
 
 def said_of(compared: Mapping[str, Family], study: Study) -> dict[str, dict[str, Said]]:
     """Return what was shown of offloading, by metric, scenario and envelope."""
-    found = {}
+    found: dict[str, dict[str, Said]] = {}
     for metric, family in compared.items():
         verdicts = family.verdicts
         found[metric] = {

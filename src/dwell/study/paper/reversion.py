@@ -485,9 +485,10 @@ def alone_findings(alone: Mapping[str, Family], scenarios: Sequence[str]) -> tup
             for other in BINARY
         }
         each = [f"{other} in {count}" for other, count in counts.items()]
+        where = "; ".join(wins) or "none"
         found.append(
             f"{HYBRID} that never moves has a lower {shown_as(metric)} than both {listed(BINARY)} "
-            f"in {counted(len(wins), len(scenarios), 'scenarios')} ({'; '.join(wins) or 'none'}); than "
+            f"in {counted(len(wins), len(scenarios), 'scenarios')} ({where}); than "
             f"{listed(each)}."
         )
     return tuple(found)
