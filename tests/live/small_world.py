@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
@@ -18,9 +18,9 @@ from dwell.live.supervision import Supervisor
 from dwell.live.transport.memory import Clock, MemoryTransport, Network
 from dwell.live.transport.protocol import Sample
 from dwell.live.windows import Resume, Rows
-from dwell.live.wiring import roles
+from dwell.live.wiring import roles, wire
 from dwell.live.worker import Worker
-from dwell.model import Problem
+from dwell.model import Host, Problem
 
 MS = 1_000_000
 
@@ -177,8 +177,15 @@ class World:
         stages: Mapping[str, Callable[[str], Passing]] | None = None,
         policy: str | None = None,
     ) -> None:
-        self.problem = problem
-        self.network = Network(delay_ns=round(delay_ms * MS), start_ns=MS)
+        hosts = {
+            node: Host("127.0.0.1", 10_000 + 1_000 * i)
+            for i, node in enumerate(problem.fabric.nodes)
+        }
+        live = replace(problem.live, hosts=hosts)
+        self.problem = problem = replace(problem, live=live)
+        # Nobody hears anybody that it would have no connection to.
+        reach = wire(problem).hears
+        self.network = Network(delay_ns=round(delay_ms * MS), start_ns=MS, reach=reach)
         self.clocks = clocks or {}
         self.exec_ms = exec_ms
         self.stages = stages or {}

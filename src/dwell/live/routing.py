@@ -94,11 +94,13 @@ class Routes:
         active = self._candidates[stamp.placement]
         other = self._candidates.get(stamp.shadow) if stamp.shadow else None
         apart = self._pipeline.diverging(active, other) if other is not None else frozenset()
+        # What the two do not share sends to the shadow by itself.
+        shares = shadow or task not in apart
         for target in self._targets[task]:
             if not shadow:
                 yield Destination(target, active[target], MAIN)
                 for forked, node in stamp.forks:
                     if forked == target and node in self._pipeline.tasks[target].on:
                         yield Destination(target, node, MAIN)
-            if other is not None and target in apart:
+            if other is not None and shares and target in apart:
                 yield Destination(target, other[target], SHADOW)

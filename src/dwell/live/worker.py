@@ -205,7 +205,8 @@ class Worker:
             return
         job = Job(header, complete, kind == SHADOW)
         if self.is_sink and job.shadow:
-            self._stop_shadow(job)
+            # A shadow ends where the sink begins.
+            self._end(job, "shadow")
         elif self._replaying(job):
             self._forked.append(job)
             del self._forked[:-MAX_JOINS]
@@ -217,20 +218,16 @@ class Worker:
     def _replace(self, job: Job) -> None:
         """A later cycle has taken a job's place."""
         self.replaced += 1
-        place, stamp, at_ns = self.place, job.header.stamp, job.arrived_ns
+        self._end(job, "shadow" if job.shadow else "replaced")
+
+    def _end(self, job: Job, outcome: str) -> None:
+        """Report a job that is here and will not run, with all that is known of its cycle."""
+        place, at_ns = self.place, job.arrived_ns
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
         here = Hop(self.task, place.node, at_ns, UNKNOWN, UNKNOWN, inputs)
-        outcome = "shadow" if job.shadow else "replaced"
         hops = (*job.hops(), here)
-        ended = Completion(stamp, self.task, at_ns, outcome, hops, place.node)
+        ended = Completion(job.header.stamp, self.task, at_ns, outcome, hops, place.node)
         place.put_twice(place.keys.ended(), encode(ended))
-
-    def _stop_shadow(self, job: Job) -> None:
-        """A shadow ends where the sink begins; what it showed is reported."""
-        place = self.place
-        stamp, at_ns = job.header.stamp, job.arrived_ns
-        stopped = Completion(stamp, self.task, at_ns, "shadow", job.hops(), place.node)
-        place.put_twice(place.keys.ended(), encode(stopped))
 
     # -------------------------------------------------------------------------- state
 

@@ -57,7 +57,7 @@ def test_the_answer_asks_for_more_than_either_stage_alone(
     assert answer == expected
     assert f"lower V_D in {against.count('lower')} of 2 stress scenarios" in sentence
     for stage, said in (("T2", perception), ("T3", planning)):
-        assert f"moves {stage} alone: lower in {said.count('lower')}" in sentence
+        assert f"moving {stage} alone: lower in {said.count('lower')}" in sentence
     assert f"SO, which never moves, misses less than {DTP} in 1, and more in 0" in sentence
     rest = [
         i for i in range(2) if against[i] == "lower" and not perception[i] == planning[i] == "lower"

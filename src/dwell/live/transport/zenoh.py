@@ -12,6 +12,7 @@ newest.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import os
@@ -260,6 +261,7 @@ class ZenohTransport:
         lock = self._locks[lane]
 
         def deliver(sample: zenoh.Sample) -> None:
+            _keep_thread_state()
             attachment = sample.attachment
             message = Sample(
                 str(sample.key_expr),
@@ -275,6 +277,19 @@ class ZenohTransport:
                     _LOG.exception("%s: a receiver of %s failed", self.entry.role.who, message.key)
 
         return deliver
+
+
+_kept = threading.local()
+
+
+def _keep_thread_state() -> None:
+    """Have Python keep what it knows of this thread, which is Zenoh's, until the thread ends.
+
+    It would be made anew for every message: a third of what taking one costs (55 instead of 80 µs).
+    """
+    if not getattr(_kept, "done", False):
+        ctypes.pythonapi.PyGILState_Ensure()
+        _kept.done = True
 
 
 @dataclass(slots=True)

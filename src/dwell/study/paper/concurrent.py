@@ -365,7 +365,7 @@ def verdict(
         pair = f"{DTP}, {only(DTP, stage)}"
         less, more = _where(said, "lower"), _where(said, "higher")
         evidence.append(
-            f"Less that of the same rule which moves {stage} alone: lower in {len(less)}"
+            f"V_D of {DTP} less that of the same rule moving {stage} alone: lower in {len(less)}"
             f"{_sizes(single_family, pair, less)}, higher in {len(more)}"
             f"{_sizes(single_family, pair, more)}."
         )

@@ -69,7 +69,7 @@ UNITS: Mapping[str, Unit] = {
     "migrations": "number",
     "returns": "number",
     "cost": "cost",
-    "regret": "change",
+    "regret": "percent",
     "violation_rate": "percent",
     "l95_ms": "ms",
 }
