@@ -509,6 +509,29 @@ def test_after_the_guard_dtp_dwells_then_wants_and_leaves_once_proven() -> None:
     assert shown(controller)[-1] == (4, "FAR", wanted, True, "migrate", 0)
 
 
+def test_an_order_that_was_refused_has_moved_nothing() -> None:
+    problem = cell(estimator="profile")
+    settings = replace(problem.controller, min_dwell=1)
+    controller = Controller(replace(problem, controller=settings), policy="dtp")
+    bad = replace(SEEN, l95_ms=60.0, violation_rate=1.0)
+    controller.decide(bad, OWN)
+    wanted = controller.decide(bad, OWN)
+    assert wanted != "LOC"
+    controller.refused()
+    assert (controller.incumbent, controller.previous, controller.dwell) == ("LOC", "LOC", 0)
+    controller.decide(bad, OWN)
+    # The same window costs the same as the first one, and the policy dwells on LOC again.
+    assert controller.log.seen[2] == controller.log.seen[0]
+    assert shown(controller)[2:] == [(2, "LOC", "LOC", False, "dwell", 1)]
+    controller.refused()
+    assert (controller.incumbent, controller.dwell) == ("LOC", 1)
+    controller.adopt("OFF")
+    controller.decide(bad, OWN)
+    assert controller.decide(bad, OWN, proven=wanted) == wanted
+    controller.refused(fallback=True)
+    assert (controller.incumbent, controller.on_fallback) == ("OFF", True)
+
+
 def test_a_fallback_that_is_no_candidate_is_refused() -> None:
     controller = Controller(cell(estimator="profile"))
     with pytest.raises(PolicyError, match="'NONE' is no candidate"):

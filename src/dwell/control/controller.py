@@ -313,6 +313,23 @@ class Controller:
         self.previous = self.incumbent = name
         self.dwell = 0
 
+    def refused(self, *, fallback: bool = False) -> None:
+        """Take note that the last order was not accepted: the cell has stayed where it was.
+
+        The incumbent is the one before, with n_d = 0, and nothing has been switched.
+
+        Parameters
+        ----------
+        fallback : bool
+            Whether that is the guard's own move.
+        """
+        if self.incumbent != self.previous:
+            # The second time there is no move to tell of, so that no switching term remains.
+            self._tell(self.previous)
+            self._tell(self.previous)
+            self.incumbent, self.dwell = self.previous, 0
+        self.on_fallback = fallback
+
     def _tell(self, name: str) -> None:
         """Tell the policy where the cell is, if it wants to know."""
         adopt = getattr(self.policy, "adopt", None)

@@ -29,6 +29,8 @@ __all__ = ["Book", "Entry", "Stamper"]
 RESERVED = 1_024
 #: Time after which a controller that is silent is in charge no more.
 LEASE_NS = 1_000_000_000
+#: Time that a new run waits for its placement; then it begins on any fallback that is whole.
+START_NS = 10_000_000_000
 #: Completions of a cycle by some sinks that are kept until the others come.
 MAX_PARTIAL = 1_024
 
@@ -105,6 +107,8 @@ class Stamper:
         self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
+        # A run that goes on does so at once; a new one waits until its placement is there.
+        self._begun, self._since_ns = entry.reserved > 0, now_ns
         self._names = tuple(problem.candidates)
         self._sinks = frozenset(
             name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
@@ -145,7 +149,7 @@ class Stamper:
             if sample.key == self.place.keys.order():
                 self._order(decode(sample.payload, Order), now_ns)
             elif sample.key == self.place.keys.frame():
-                if not self.timer:
+                if self._begun and not self.timer:
                     self._release(now_ns, now_ns)
             else:
                 self._completed(decode(sample.payload, Completion), now_ns)
@@ -287,6 +291,8 @@ class Stamper:
 
     def wake(self, now_ns: int) -> int:
         """Release the cycle that is due, let the guard look, beat; returns what is due next."""
+        if not self._begun and not self._begin(now_ns):
+            return min(self.pulse.wake(now_ns), now_ns + self.place.period_ns)
         fallback = self.guard.check(now_ns, lambda name: self.presence.whole(name, now_ns))
         if fallback is not None:
             self._move(fallback, by_guard=True)
@@ -304,6 +310,19 @@ class Stamper:
         # Where no fallback is whole, the guard looks again every quarter of a period.
         again_ns = now_ns + self.place.period_ns // 4
         return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
+
+    def _begin(self, now_ns: int) -> bool:
+        """Look whether the first cycle can be released."""
+        whole = [self.placement]
+        if now_ns - self._since_ns > START_NS:
+            whole += self.place.problem.controller.fallbacks
+        name = next((name for name in whole if self.presence.whole(name, now_ns)), None)
+        if name is None:
+            return False
+        if name != self.placement:
+            self._move(name, by_guard=True)
+        self._begun, self._next_ns = True, now_ns
+        return True
 
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""

@@ -20,6 +20,8 @@ SPECIAL = {
 }
 #: Rows that a page has room for.
 ONE_PAGE = 60
+#: Letters of a line, the room between columns included, up to which a size fits a page of A4.
+SIZES = ((92, "footnotesize"), (106, "scriptsize"))
 #: What is no letter of the engines that read the file as it is, and is written in its place.
 SIGNS = {
     "−": "$-$",
@@ -111,6 +113,7 @@ def tabular(
     label : str
         For references.
     """
+    rows = list(rows)
     body: list[str] = []
     for group, cells in rows:
         if group:
@@ -126,7 +129,8 @@ def tabular(
         return "\n".join(
             [
                 r"% needs \usepackage{booktabs,longtable}",
-                r"\begingroup\footnotesize\setlength{\tabcolsep}{3pt}",
+                rf"\begingroup\{_size([head, *(row for _, row in rows if row)])}"
+                r"\setlength{\tabcolsep}{3pt}",
                 rf"\begin{{longtable}}{shape}",
                 rf"{titled} \\",
                 *(*top, r"\endfirsthead"),
@@ -147,6 +151,13 @@ def tabular(
             *(r"\bottomrule", r"\end{tabular}%", "}", r"\end{table}", ""),
         ]
     )
+
+
+def _size(rows: Sequence[Sequence[str]]) -> str:
+    """Return the size of letters at which a table of several pages is no wider than the text."""
+    widest = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    letters = sum(widest) + 1.4 * len(widest)
+    return next((name for most, name in SIZES if letters <= most), "tiny")
 
 
 def _row(cells: Sequence[str]) -> str:

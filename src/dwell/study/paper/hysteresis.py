@@ -511,14 +511,15 @@ def shown(what: str, families: Mapping[str, Family]) -> tuple[str, ...]:
     """Say where a setting was shown to change a metric."""
     parts = []
     for metric, one in families.items():
-        named = [
-            f"{name} ({said})"
-            for name, said in one.verdicts.items()
-            if said != "no difference shown"
-        ]
-        listed_ = f" ({'; '.join(named)})" if named else ""
-        parts.append(f"{METRICS[metric]} in {len(named)} of {len(one.comparisons)}{listed_}")
-    return (f"{what} is shown to change {'; '.join(parts)}.",)
+        verdicts = one.verdicts
+        for word in ("lower", "higher"):
+            named = [name for name, said in verdicts.items() if said == word]
+            where = f": {'; '.join(named)}" if named else ""
+            parts.append(
+                f"{what} is shown to make {METRICS[metric]} {word} in {len(named)} of "
+                f"{len(verdicts)} comparisons{where}."
+            )
+    return tuple(parts)
 
 
 def price_found(cold: Sequence[StudyResult]) -> tuple[str, ...]:

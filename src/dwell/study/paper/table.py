@@ -579,7 +579,7 @@ def latencies_figure(result: StudyResult) -> Figure:
         line_label="D",
         note=(
             "All cycles after the warm-up of all seeds together; a curve levels off above 0 where "
-            "cycles are lost or later than four deadlines. Where LOC is not seen it lies below "
-            "dtp+corrected, which stays there."
+            "cycles are lost or later than four deadlines. Where LOC cannot be seen it lies "
+            "behind dtp+corrected, which stays there."
         ),
     )
