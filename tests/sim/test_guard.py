@@ -216,12 +216,14 @@ def test_it_begins_anew_when_its_own_node_was_down() -> None:
 def test_it_takes_the_first_fallback_whose_parts_were_heard() -> None:
     problem = cell(fallbacks=("ALT", "LOC"))
     assert moves(play(problem, down={"E": [(42, 10_000)]})) == [(1, "OFF", "ALT")]
-    # X was heard last 31 ms before; with a node, and with a link, that went down later it was not
-    # missed yet.
+    together = {"E": [(42, 10_000)], "X": [(42, 10_000)]}
+    assert moves(play(problem, down=together)) == [(1, "OFF", "LOC")]
+    # It fires at 70 ms. What was heard last 21 ms before is missed, node or link; 19 ms before, not
+    # yet. What went down with E is missed.
     for part in ("X", "R->X", "X->R"):
-        early = {"E": [(42, 10_000)], part: [(39, 10_000)]}
+        early = {"E": [(42, 10_000)], part: [(49, 10_000)]}
         assert moves(play(problem, down=early)) == [(1, "OFF", "LOC")]
-        late = {"E": [(42, 10_000)], part: [(41, 10_000)]}
+        late = {"E": [(42, 10_000)], part: [(51, 10_000)]}
         assert moves(play(problem, down=late)) == [(1, "OFF", "ALT")]
 
 

@@ -188,7 +188,7 @@ class Guard:
         ----------
         now_ns : int
         whole : callable of str to bool, or mapping
-            Whether all nodes, links and workers of a candidate were heard within g periods; see
+            Whether all nodes, links and workers of a candidate were heard lately; see
             `Presence`. Fallbacks are asked for in order, up to the first that is.
 
         Returns
@@ -246,7 +246,7 @@ class Presence:
     parts : mapping of str to collection of str
         Of each candidate; see `parts_of`.
     within_ns : int
-        g periods.
+        Age beyond which a sign of life counts no more.
     """
 
     __slots__ = ("_heard_ns", "parts", "within_ns")
@@ -258,10 +258,15 @@ class Presence:
 
     @classmethod
     def of(cls, problem: Problem) -> Presence:
-        """Make that of all candidates of a cell."""
+        """Make that of all candidates of a cell: heard within g - 1 periods.
+
+        What a fault has ended may have been heard up to a period after the release of the first
+        cycle that it cost. The guard looks g periods after that release: of what it takes for
+        whole, the last sign of life has to be younger than that.
+        """
         period_ns = round(problem.pipeline.period_ms * 1e6)
         parts = {name: parts_of(problem, name) for name in problem.candidates}
-        return cls(parts, problem.controller.guard_cycles * period_ns)
+        return cls(parts, max(problem.controller.guard_cycles - 1, 1) * period_ns)
 
     def heard(self, part: str, at_ns: int) -> None:
         """Note a sign of life."""
@@ -272,7 +277,7 @@ class Presence:
         self._heard_ns.pop(part, None)
 
     def missing(self, candidate: str, now_ns: int) -> frozenset[str]:
-        """Return the parts of a candidate that were not heard within g periods."""
+        """Return the parts of a candidate that were not heard lately."""
         since_ns = now_ns - self.within_ns
         heard_ns = self._heard_ns
         return frozenset(
@@ -280,7 +285,7 @@ class Presence:
         )
 
     def whole(self, candidate: str, now_ns: int) -> bool:
-        """Whether all parts of a candidate were heard less than g periods ago."""
+        """Whether all parts of a candidate were heard lately."""
         return not self.missing(candidate, now_ns)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from dwell.control import shadow_stamps
-from dwell.control.guard import Guard, Presence, Probation, parts_of
+from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
 from dwell.live.messages import (
     Accepted,
@@ -96,11 +96,7 @@ class Stamper:
         self.guard = Guard.of(problem, entry.placement)
         if entry.on_fallback:
             self.guard.adopt(entry.placement, fallback=True)
-        # What has failed may have been heard up to one period after the release of the first cycle
-        # that it cost. Counting g periods, it would still pass for whole when the guard looks.
-        parts = {name: parts_of(problem, name) for name in problem.candidates}
-        within = max(problem.controller.guard_cycles - 1, 1)
-        self.presence = Presence(parts, within * place.period_ns)
+        self.presence = Presence.of(problem)
         self.probation = Probation.of(problem)
         if entry.on_fallback:
             self.probation.fell()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import Probation, parts_of
+from dwell.control import Presence, Probation, parts_of
 from dwell.kernels import layout as k
 from dwell.kernels.heaps import post_event
 from dwell.model import Placement, Problem
@@ -59,6 +59,7 @@ class Watch:
         self.names = tuple(problem.candidates)
         period_ns = round(problem.pipeline.period_ms * 1e6)
         self.patience_ns = problem.controller.guard_cycles * period_ns
+        self.presence_ns = Presence.of(problem).within_ns
         self.probation = Probation.of(problem)
         self.probes = _Probes(problem, realisation)
         self.since: int | None = 0
@@ -103,7 +104,7 @@ class Watch:
             again = max(back_at, now)
         else:
             others = [name for name in self.problem.controller.fallbacks if name != active]
-            since_ns = now - self.patience_ns
+            since_ns = now - self.presence_ns
             for name in others:
                 if not any(
                     self._outages.missing(part, since_ns, now) for part in self._parts(name)
