@@ -154,7 +154,7 @@ def test_check_warns(cell: Path, old: str, new: str, words: tuple[str, ...]) -> 
     assert len(read_json(call("check", cell, "--json"))["warnings"]) == 1
 
 
-def test_no_warning_about_a_guard_that_is_off_or_on_a_fallback(cell: Path) -> None:
+def test_no_warning_about_a_guard_that_is_off_or_has_nowhere_to_go(cell: Path) -> None:
     slow = SMALL.replace("E: {exec_ms: 2}}}", "E: {exec_ms: 37.5}}}")
     for controller in ("", "controller: {fallbacks: [OFF]}\n"):
         cell.write_text(slow + controller, encoding="utf-8")

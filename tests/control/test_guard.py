@@ -517,18 +517,16 @@ def test_an_order_that_was_refused_has_moved_nothing() -> None:
     controller.decide(bad, OWN)
     wanted = controller.decide(bad, OWN)
     assert wanted != "LOC"
-    controller.refused()
+    controller.resume("LOC")
     assert (controller.incumbent, controller.previous, controller.dwell) == ("LOC", "LOC", 0)
     controller.decide(bad, OWN)
     # The same window costs the same as the first one, and the policy dwells on LOC again.
     assert controller.log.seen[2] == controller.log.seen[0]
     assert shown(controller)[2:] == [(2, "LOC", "LOC", False, "dwell", 1)]
-    controller.refused()
-    assert (controller.incumbent, controller.dwell) == ("LOC", 1)
     controller.adopt("OFF")
     controller.decide(bad, OWN)
     assert controller.decide(bad, OWN, proven=wanted) == wanted
-    controller.refused(fallback=True)
+    controller.resume("OFF", fallback=True)
     assert (controller.incumbent, controller.on_fallback) == ("OFF", True)
 
 

@@ -492,6 +492,7 @@ def every_kind() -> tuple[Chapter, ...]:
             answer="in part",
             verdict="SO keeps V_D under 5 % in 3 of 5 scenarios (2.1 % [1.9 %, 2.4 %] at most); "
             "no placement does in all five.",
+            evidence=("SO: 2.1 % [1.9 %, 2.4 %] at most.", "In the others 6 % at least."),
             findings=("U_r is 100 % under `robot-cpu-stress`.", "DTP loses < 3 % & gains nothing."),
             tables=(main_table(),),
             figures=(drawn[0], drawn[9], drawn[6]),

@@ -67,3 +67,19 @@ def test_a_table_of_more_than_a_page_goes_on_on_the_next() -> None:
     for word in ("longtable", r"\endfirsthead", r"\endhead", r"\endfoot"):
         assert word in text
     assert r"\begin{table}" not in text
+
+
+@pytest.mark.parametrize(
+    ("width", "size", "turned"),
+    [(30, "footnotesize", False), (50, "scriptsize", False), (60, "footnotesize", True)]
+    + [(75, "scriptsize", True), (200, "tiny", True)],
+)
+def test_a_wide_table_of_several_pages_has_small_letters_or_lies_on_its_side(
+    width: int, size: str, turned: bool
+) -> None:
+    rows = [("", ["x" * width, "1" * width])] * 70
+    text = tabular(["a", "b"], "lr", rows, caption="c", label="l")
+    assert rf"\begingroup\{size}\setlength" in text
+    assert (r"\begin{landscape}" in text) == turned
+    assert text.count(r"\begin{") == text.count(r"\end{")
+    assert ("lscape" in text.splitlines()[0]) == turned

@@ -90,3 +90,13 @@ def test_values_share_a_ramp() -> None:
 
 def test_long_sentences_are_no_contenders() -> None:
     assert contended("DTP loses in all of the scenarios that were looked at") is None
+
+
+def test_links_have_arrows_and_titles_begin_large(look: Look) -> None:
+    assert look.prose("R1->E carries what dtp+corrected sends") == (
+        "R1→E carries what DTP (corrected) sends"
+    )
+    assert look.prose("the best static placement") == "the best static placement"
+    assert look.shown("R1->E") == "R1→E"
+    titles = {"both links": "Both links", "link R1-R2": "Link R1-R2", "R1 2 a core": "R1 2 a core"}
+    assert {name: look.titled(name) for name in titles} == titles

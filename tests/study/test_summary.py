@@ -96,6 +96,7 @@ def make_run(
                 "window": range(count),
                 "incumbent": list(placements),
                 "placement": following,
+                "reason": ["hold"] * len(placements),
                 "migrated": [a != b for a, b in zip(placements, following, strict=True)],
                 "j_LOC": [1.0] * count,
                 "j_SO": [2.0] * count,

@@ -81,7 +81,7 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield candidates under which the guard would fire although nothing is wrong.
 
     It fires when the cycle after the newest completed one is older than `guard_cycles` periods,
-    never while a fallback is active.
+    never while its own move holds; a fallback that was ordered is watched like any other candidate.
     """
     settings = problem.controller
     if not settings.fallbacks:
@@ -89,7 +89,8 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
     bound_ms = (settings.guard_cycles - 1) * problem.pipeline.period_ms
     for name, l95_ms in profile.l95_ms.items():
         needed_ms = l95_ms + _return_ms(problem, name)
-        if name not in settings.fallbacks and needed_ms > bound_ms:
+        elsewhere = any(fallback != name for fallback in settings.fallbacks)
+        if elsewhere and needed_ms > bound_ms:
             yield Fault(
                 "controller.guard_cycles",
                 f"{settings.guard_cycles} is tight for {name}: L95 and the way back to the source "

@@ -127,12 +127,15 @@ def run(
     ] = None,
     traces: Traces = None,
     jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="Let the robots' guard move to a fallback by itself.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Simulate a policy on a scenario, save the run, sum it up."""
     from dwell.cli.run import Request, run_cell
 
-    request = Request(cell, scenario, policy, estimator, seed, windows, out, traces, jobs)
+    request = Request(cell, scenario, policy, estimator, seed, windows, out, traces, jobs, guard)
     if not run_cell(request, as_json=as_json):
         raise typer.Exit(FAILED)
 

@@ -33,6 +33,7 @@ class Request:
     out: Path | None
     traces: Path | None
     jobs: bool
+    guard: bool = False
 
 
 def run_cell(request: Request, *, as_json: bool) -> bool:
@@ -61,6 +62,7 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
             seed=request.seed,
             windows=request.windows,
             jobs=request.jobs,
+            guard=request.guard,
         )
         try:
             result.save(folder)
@@ -110,6 +112,7 @@ def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -
         ("longest run of misses", f"{row['longest_misses']}"),
         *_control(row),
         ("migrations", f"{row['migrations']}"),
+        *([("moves of the guard", f"{row['guard_moves']}")] if row["guard_moves"] else []),
         ("windows by placement", ", ".join(shares)),
         ("utilisation", ", ".join(used)),
     )

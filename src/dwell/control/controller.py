@@ -297,38 +297,25 @@ class Controller:
         fixed = (len(self.log.seen), left, name, name != left, "guard", 0, None)
         self.log.decisions.append((*fixed, *priced))
 
-    def resume(self, name: str) -> None:
+    def resume(self, name: str, *, fallback: bool = False) -> None:
         """Take note of where the cell is, though something else was decided, or nothing yet.
 
         An order was not carried out, or this controller takes over from another one. It counts as
-        a decision to be there: n_d is 0.
+        a decision to be there: n_d is 0, and nothing has been switched.
 
         Parameters
         ----------
         name : str
             Candidate.
-        """
-        if name != self.incumbent:
-            self._tell(name)
-        self.previous = self.incumbent = name
-        self.dwell = 0
-
-    def refused(self, *, fallback: bool = False) -> None:
-        """Take note that the last order was not accepted: the cell has stayed where it was.
-
-        The incumbent is the one before, with n_d = 0, and nothing has been switched.
-
-        Parameters
-        ----------
         fallback : bool
             Whether that is the guard's own move.
         """
-        if self.incumbent != self.previous:
+        if name != self.incumbent:
             # The second time there is no move to tell of, so that no switching term remains.
-            self._tell(self.previous)
-            self._tell(self.previous)
-            self.incumbent, self.dwell = self.previous, 0
-        self.on_fallback = fallback
+            self._tell(name)
+            self._tell(name)
+        self.previous = self.incumbent = name
+        self.dwell, self.on_fallback = 0, fallback
 
     def _tell(self, name: str) -> None:
         """Tell the policy where the cell is, if it wants to know."""

@@ -183,6 +183,9 @@ class Cell:
         if not by_guard:
             self._move = None
             self.migrations += 1
+            if placement != self.controller.incumbent:
+                # A person's choice, not the policy's.
+                self.controller.resume(placement)
             self.controller.on_fallback = False
             return
         self._move = None
@@ -194,8 +197,7 @@ class Cell:
     def _begin_run(self, answer: Accepted) -> None:
         """Begin where the stamper says that the cell is."""
         self.held = answer
-        self.controller.resume(answer.placement)
-        self.controller.on_fallback = answer.fallback
+        self.controller.resume(answer.placement, fallback=answer.fallback)
         resume = self._recorder.open(answer.run)
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
 
@@ -300,7 +302,7 @@ class Cell:
         self._move = None
         if held is None:
             return
-        self.controller.resume(held.placement)
+        self.controller.resume(held.placement, fallback=held.fallback)
         if self.windows is not None:
             self.windows.refused()
         if move is not None and move.forks:
@@ -357,7 +359,7 @@ class Cell:
         if self.place.problem.live.mode == "advise" and not self.pinned:
             target = held.placement
         if target != wanted:
-            self.controller.resume(target if target == held.placement else held.placement)
+            self.controller.resume(held.placement, fallback=held.fallback)
         if target != held.placement:
             self._begin(target, now_ns)
 
@@ -414,13 +416,15 @@ class Cell:
             case "unpin":
                 self.pinned = ""
             case "drain":
-                return self._drain(ask.about)
+                if refused := self._drain(ask.about):
+                    return refused
             case "undrain":
                 self.drained.discard(ask.about)
             case _:
                 return f"unknown question {ask.what!r}"
-        if self.pinned and self.held is not None and self.held.placement != self.pinned:
-            self._begin(self.pinned, now_ns)
+        held = self.held
+        if held is not None and (target := self._allowed(held.placement)) != held.placement:
+            self._begin(target, now_ns)
         return ""
 
     def _drain(self, node: str) -> str:

@@ -20,8 +20,10 @@ SPECIAL = {
 }
 #: Rows that a page has room for.
 ONE_PAGE = 60
-#: Letters of a line, the room between columns included, up to which a size fits a page of A4.
+#: Letters of a line, the room between columns included, up to which a size fits a page of A4:
+#: upright, and turned.
 SIZES = ((92, "footnotesize"), (106, "scriptsize"))
+TURNED = ((138, "footnotesize"), (160, "scriptsize"))
 #: What is no letter of the engines that read the file as it is, and is written in its place.
 SIGNS = {
     "−": "$-$",
@@ -126,18 +128,21 @@ def tabular(
     top = [r"\toprule", _row(head), r"\midrule"]
     shape = f"{{@{{}}{columns}@{{}}}}"
     if len(body) > ONE_PAGE:
+        size, turned = _size([head, *(row for _, row in rows if row)])
         return "\n".join(
             [
-                r"% needs \usepackage{booktabs,longtable}",
-                rf"\begingroup\{_size([head, *(row for _, row in rows if row)])}"
-                r"\setlength{\tabcolsep}{3pt}",
+                rf"% needs \usepackage{{booktabs,longtable{',lscape' * turned}}}",
+                *([r"\begin{landscape}"] * turned),
+                rf"\begingroup\{size}\setlength{{\tabcolsep}}{{3pt}}",
                 rf"\begin{{longtable}}{shape}",
                 rf"{titled} \\",
                 *(*top, r"\endfirsthead"),
                 *(*top, r"\endhead"),
                 *(r"\bottomrule", r"\endfoot"),
                 *body,
-                *(r"\end{longtable}", r"\endgroup", ""),
+                *(r"\end{longtable}", r"\endgroup"),
+                *([r"\end{landscape}"] * turned),
+                "",
             ]
         )
     return "\n".join(
@@ -153,11 +158,13 @@ def tabular(
     )
 
 
-def _size(rows: Sequence[Sequence[str]]) -> str:
-    """Return the size of letters at which a table of several pages is no wider than the text."""
+def _size(rows: Sequence[Sequence[str]]) -> tuple[str, bool]:
+    """Return the size of letters at which a table is no wider than the text, and if on its side."""
     widest = [max(map(len, column)) for column in zip(*rows, strict=True)]
     letters = sum(widest) + 1.4 * len(widest)
-    return next((name for most, name in SIZES if letters <= most), "tiny")
+    upright = [(name, False) for most, name in SIZES if letters <= most]
+    turned = [(name, True) for most, name in TURNED if letters <= most]
+    return next(iter(upright + turned), ("tiny", True))
 
 
 def _row(cells: Sequence[str]) -> str:

@@ -120,11 +120,11 @@ def _write_figure(figure: Figure, look: Look, folder: Path, name: str) -> str:
     canvas.draw_without_rendering()
     canvas.set_layout_engine("none")
     svg = drawn(canvas, name)
-    shown = in_page(svg, figure.title)
+    shown = in_page(svg, look.prose(figure.title))
     if len(shown) > LARGEST:
-        shown = _picture(canvas, figure.title)
-    _write(folder / f"{name}.svg", svg_file(svg, figure.title))
-    _write(folder / f"{name}.pdf", pdf_file(canvas, figure.title))
+        shown = _picture(canvas, look.prose(figure.title))
+    _write(folder / f"{name}.svg", svg_file(svg, look.prose(figure.title)))
+    _write(folder / f"{name}.pdf", pdf_file(canvas, look.prose(figure.title)))
     return shown
 
 

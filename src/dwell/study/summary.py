@@ -290,11 +290,13 @@ def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
 
 
 def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
-    """Count migrations, and those that undo the one before."""
-    moves = decisions.filter(decisions["migrated"]).select("incumbent", "placement")
+    """Count migrations, those that undo the one before, and the guard's moves, which are apart."""
+    by_guard = decisions["reason"] == "guard"
+    moves = decisions.filter(decisions["migrated"] & ~by_guard).select("incumbent", "placement")
     pairs: Sequence[tuple[str, str]] = moves.rows()
     undone = sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
-    return {"migrations": len(pairs), "returns": undone}
+    guard_moves = int((decisions["migrated"] & by_guard).sum())
+    return {"migrations": len(pairs), "returns": undone, "guard_moves": guard_moves}
 
 
 def _shares(placements: pl.Series, candidates: tuple[str, ...]) -> dict[str, float]:

@@ -534,7 +534,7 @@ def tuning_finding(tuning: StudyResult, baselines: Baselines) -> str:
     )
     return (
         f"ATP's setting for all scenarios is “{baselines.setting}” (stage, L95 over D, U_r, U_e, "
-        f"N_min), with a mean V_D of {percent(score[baselines.setting])} on the held-out seeds; "
+        f"N_min; inf is none), with a mean V_D of {percent(score[baselines.setting])} on the held-out seeds; "
         f"{baselines.static}, which never moves, has {percent(score[baselines.static])} there. "
         f"Single scenarios would have {len(settings)} different settings."
     )
@@ -603,7 +603,7 @@ def tuning_table(tuning: StudyResult, baselines: Baselines) -> Table:
         frame=pl.DataFrame(rows),
         units={"setting": "text", "violation_rate": "percent", "chosen": "text"},
         headings={"setting": "stage, L95 over D, U_r, U_e, N_min", "violation_rate": "mean V_D"},
-        note=f"{len(tuning.study.seeds)} seeds; mean over the scenarios.",
+        note=f"{len(tuning.study.seeds)} seeds; mean over the scenarios. A threshold inf is none.",
     )
 
 
