@@ -139,6 +139,7 @@ def test_a_row_holds_what_the_tables_show() -> None:
         "node_R2": pytest.approx(0.3),
         "migrations": 2,
         "returns": 1,
+        "guard_moves": 0,
         "share_LOC": pytest.approx(2 / 3),
         "share_SO": pytest.approx(1 / 3),
         "share_HYB": 0.0,

@@ -146,15 +146,24 @@ class Stageplay:
     folder : Path
         For the cell file, states, logs and runs.
     cpus : mapping of str to int
-        Of each node.
+        Of each node, and of its burners; a node that is not there uses any, and has none.
     seed : int
         Of delays and losses.
+    environment : mapping of str to str, optional
+        Variables that all processes get as well.
     """
 
     def __init__(
-        self, problem: Problem, folder: Path, cpus: Mapping[str, int], *, seed: int = 0
+        self,
+        problem: Problem,
+        folder: Path,
+        cpus: Mapping[str, int],
+        *,
+        seed: int = 0,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
+        self.environment = {"DWELL_WORLD": str(folder / "world"), **(environment or {})}
         self.cell = folder / "cell.yaml"
         self.links: dict[frozenset[str], LinkProcess] = {}
         self.burners: dict[str, Burner] = {}
@@ -222,14 +231,17 @@ class Stageplay:
 
     def start_agent(self, node: str) -> None:
         """Start a node's agent, or start it again."""
-        arguments = ["agent", "--node", node, "--cpus", str(self.cpus[node])]
-        self._start(f"agent@{node}", [*arguments, "--state", str(self.folder / node)])
+        arguments = ["agent", "--node", node, "--state", str(self.folder / node)]
+        self._start(f"agent@{node}", [*arguments, *self._on_cpus(node)])
 
     def start_controller(self) -> None:
         """Start the controller, or start it again."""
         node = self.problem.controller_node
-        arguments = ["controller", "--cpus", str(self.cpus[node])]
-        self._start(f"controller@{node}", [*arguments, "--out", str(self.folder / "runs")])
+        arguments = ["controller", "--out", str(self.folder / "runs")]
+        self._start(f"controller@{node}", [*arguments, *self._on_cpus(node)])
+
+    def _on_cpus(self, node: str) -> list[str]:
+        return ["--cpus", str(self.cpus[node])] if node in self.cpus else []
 
     def _start(self, who: str, arguments: Sequence[str]) -> None:
         command = [sys.executable, "-m", "dwell", *arguments, "--cell", str(self.cell)]
@@ -239,7 +251,7 @@ class Stageplay:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env={**os.environ, "DWELL_WORLD": str(self.folder / "world")},
+                env={**os.environ, **self.environment},
                 process_group=0,
             )
 
