@@ -9,18 +9,18 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import psutil
+import yaml
 
+import dwell
 from dwell.demo.stageplay import Stageplay, on_this_machine
 from dwell.errors import LiveError
 from dwell.live.visiting import Visitor
-from dwell.model import Problem
-from dwell.model.document import from_document
 from tests.live import real_stages
 from tests.live.real_stages import APPLY, HOLD, NODES, RECORD, ZERO
 
@@ -33,8 +33,8 @@ WINDOW_CYCLES = 5
 #: Where each cell's controller wants to be, and what makes it want that.
 HOMES = ("SO", "LOC")
 EXEC_MS = {
-    "SO": {"perception": {"R1": 10.0, "E": 3.0}, "planning": {"R2": 10.0, "E": 3.0}},
-    "LOC": {"perception": {"R1": 3.0, "E": 8.0}, "planning": {"R2": 3.0, "E": 8.0}},
+    "SO": {"perception": {"R1": 8.0, "E": 3.0}, "planning": {"R2": 14.0, "E": 3.0}},
+    "LOC": {"perception": {"R1": 3.0, "E": 14.0}, "planning": {"R2": 3.0, "E": 8.0}},
 }
 DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 4}, "LOC": {"R1-E": 2, "E-R2": 2, "R1-R2": 1}}
 CANDIDATES = {
@@ -79,14 +79,14 @@ def document(home: str, *, standby: bool = True) -> dict[str, Any]:
         "candidates": CANDIDATES,
         "objective": {
             "weights": {
-                "latency": 1.0, "violations": 1.0, "robot": 0.0, "edge": 0.0, "switching": 0.05,
+                "latency": 1.0, "violations": 0.5, "robot": 0.0, "edge": 0.0, "switching": 0.05,
             },
-            "targets": {"latency_ms": PERIOD_MS, "robot": 0.9, "edge": 0.9},
+            "targets": {"latency_ms": PERIOD_MS / 2, "robot": 0.9, "edge": 0.9},
             "caps": {"latency_ms": 3 * PERIOD_MS},
         },
         "controller": {
             "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
-            "min_improvement": 0.02, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
+            "min_improvement": 0.4, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
             "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": PERIOD_MS,
         },
         "live": {
@@ -226,12 +226,14 @@ class RealCell(Stageplay):
     """A cell on this machine, with the means to harm it."""
 
     def __init__(self, home: str, folder: Path, *, standby: bool = True, seed: int = 0) -> None:
-        made = from_document(document(home, standby=standby))
-        problem: Problem = on_this_machine(made)
+        folder.mkdir(parents=True, exist_ok=True)
+        written = folder / "written.yaml"
+        written.write_text(yaml.safe_dump(document(home, standby=standby)))
         self.home = home
         told = {"observed": str(folder / "observed"), "exec_ms": exec_ms(home)}
-        super().__init__(problem, folder, {}, seed=seed, environment={"REAL_CELL": json.dumps(told)})
-        folder.mkdir(parents=True, exist_ok=True)
+        environment = {"REAL_CELL": json.dumps(told)}
+        problem = on_this_machine(dwell.load(written))
+        super().__init__(problem, folder, {}, seed=seed, environment=environment)
         shutil.copy(Path(real_stages.__file__), folder / "real_stages.py")
         self.observed = Observed(folder / "observed")
         self.visitor: Visitor | None = None
@@ -275,7 +277,7 @@ class RealCell(Stageplay):
         """Process id of one of the cell's processes."""
         if who in self.processes:
             return self.processes[who].pid
-        node = who.split("@")[1].split(".")[0]
+        node = who.partition("@")[2].partition(".")[0]
         pid = pid_of(self.folder / node / f"{who}.pid")
         if pid is None:
             raise LiveError(f"{who} does not run")
@@ -606,8 +608,3 @@ def _weigh(
             if lost > fault.bound:
                 found.wrong.append(f"{lost} consecutive cycles lost {when}, not {fault.bound}")
     return found
-
-
-def bare(problem: Problem) -> Problem:
-    """The cell without hosts, for whoever wants to read it."""
-    return replace(problem, live=replace(problem.live, hosts={}))

@@ -15,12 +15,13 @@ from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Entry, Stamper
 from dwell.live.supervision import Supervisor
-from dwell.live.transport.memory import Clock, MemoryTransport, Network
+from dwell.live.transport.memory import Clock, Conditions, MemoryTransport, Network
 from dwell.live.transport.protocol import Sample
 from dwell.live.windows import Resume, Rows
 from dwell.live.wiring import roles, wire
 from dwell.live.worker import Worker
 from dwell.model import Host, Problem
+from dwell.policies import MinimalPolicy
 
 MS = 1_000_000
 
@@ -175,7 +176,7 @@ class World:
         delay_ms: float = 0.2,
         clocks: Mapping[str, Clock] | None = None,
         stages: Mapping[str, Callable[[str], Passing]] | None = None,
-        policy: str | None = None,
+        policy: str | MinimalPolicy | None = None,
     ) -> None:
         hosts = {
             node: Host("127.0.0.1", 10_000 + 1_000 * i)
@@ -194,7 +195,7 @@ class World:
         self.lives = 0
         self.run_id = 1
         self.number = 0
-        self.policy: str | None = policy
+        self.policy = policy
         self.recorder = MemoryRecorder()
         for role in roles(problem):
             if role.kind != "controller" or policy is not None:
@@ -207,6 +208,7 @@ class World:
         clock = self.clocks.get(role.node, Clock())
         end = self.network.transport(who, role.node, clock=clock)
         place = Place(self.problem, who, role.node, end, self.lives)
+        made: Stamper | Sink | Quiet | Cell | Bench
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.run_id, end.now_ns)
         elif role.kind == "sink":
@@ -247,6 +249,11 @@ class World:
         stamper.receive(self.sample(order), self.network.now_ns)
         assert stamper._answered is not None
         return stamper._answered[2].refused
+
+    @staticmethod
+    def losing(share: float) -> Conditions:
+        """Conditions that lose a share of the messages."""
+        return Conditions(loss=share)
 
     def pin(self, candidate: str) -> None:
         """Have the controller move the cell, as a person does."""

@@ -192,6 +192,8 @@ class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Digest of the cell file, so that different files are noticed.
     note : str
         What keeps it from being ready, or the last thing that went wrong.
+    version : str
+        Of Dwell.
     """
 
     who: Name
@@ -204,6 +206,7 @@ class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
     placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
     cell: Annotated[str, msgspec.Meta(max_length=64)] = ""
     note: Words = ""
+    version: Annotated[str, msgspec.Meta(max_length=64)] = ""
 
 
 class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from dwell import __version__
 from dwell.errors import LiveError
 from dwell.live.hearing import Hearing
 from dwell.live.keys import Keys
@@ -17,6 +18,14 @@ from dwell.model.document import fingerprint
 
 #: What PTP and chrony on one network keep to.
 SYSTEM_BOUND_NS = 1_000_000
+#: Different complaints that are counted; a new one takes the place of the oldest.
+MAX_COMPLAINTS = 100
+#: Processes that are remembered for not belonging to the cell as this one knows it.
+MAX_STRANGERS = 256
+#: How long a beat repeats a complaint, and a stranger who has fallen silent is remembered.
+REPEATED_NS = 10_000_000_000
+#: Beats of an earlier life, one after another, that no late message explains.
+RIVAL_BEATS = 5
 
 __all__ = ["Place", "Pulse", "Role"]
 
@@ -55,6 +64,8 @@ class Place:
         Grows with every start of the process.
     complaints : dict of str to int
         How often something arrived that could not be used, by what was wrong with it.
+    say : callable, optional
+        Takes every complaint for the process's log.
     """
 
     problem: Problem
@@ -63,6 +74,9 @@ class Place:
     transport: Transport
     life: int = 0
     complaints: dict[str, int] = field(default_factory=dict)
+    say: Callable[[str], None] | None = None
+    complained: int = 0
+    last_complaint: str = ""
 
     @property
     def keys(self) -> Keys:
@@ -119,16 +133,21 @@ class Place:
 
     def complain(self, error: LiveError) -> None:
         """Count a message that could not be used; a flood of them takes no memory."""
-        what = str(error)[:200]
-        if what in self.complaints or len(self.complaints) < 100:
-            self.complaints[what] = self.complaints.get(what, 0) + 1
+        what = str(error)[:300]
+        if what not in self.complaints and len(self.complaints) >= MAX_COMPLAINTS:
+            del self.complaints[next(iter(self.complaints))]
+        self.complaints[what] = self.complaints.get(what, 0) + 1
+        self.complained += 1
+        self.last_complaint = what
+        if self.say is not None:
+            self.say(what)
 
     def header(self, sample: Sample) -> Header | None:
         """Read the header of a data message; None, and a complaint, where it is none."""
         try:
             return decode(sample.header, Header, limit=MAX_HEADER_BYTES)
         except LiveError as error:
-            self.complain(error)
+            self.complain(LiveError(f"{sample.key}: {error}"))
             return None
 
 
@@ -164,6 +183,11 @@ class Pulse:
         self._every_ns = every * place.period_ns
         self._digest = fingerprint(place.problem)
         self._next_ns = -(1 << 62)
+        #: Who is not heard because of its cell file or version: why, and when it beat last.
+        self.strangers: dict[str, tuple[str, int]] = {}
+        self._rivals: dict[str, int] = {}
+        self._complained = 0
+        self._repeat_until_ns = -(1 << 62)
         keys = place.keys
         self._key = keys.beat(place.node, place.who)
         direct = keys.beat("", "").removesuffix("/")
@@ -181,15 +205,55 @@ class Pulse:
         try:
             beat = decode(sample.payload, Beat)
         except LiveError as error:
-            self.place.complain(error)
+            who = sample.key.rpartition("/")[2]
+            told = f"{who}: {error}; does Dwell {__version__} run there, as here?"
+            self.place.complain(LiveError(told))
             return None
-        if beat.cell != self._digest:
-            self.place.complain(
-                LiveError(f"{beat.who} has another cell file ({beat.cell} is not {self._digest})")
+        if differs := self._differs(beat):
+            self._estranged(beat.who, differs, now_ns)
+            return None
+        self.strangers.pop(beat.who, None)
+        direct = sample.key.startswith(self._prefix[0])
+        if self.hearing.hear(beat, now_ns, direct=direct):
+            return beat
+        if direct:
+            self._look_for_rival(beat)
+        return None
+
+    def _differs(self, beat: Beat) -> str:
+        """Return why a beat is not heard, or nothing."""
+        if beat.version and _series(beat.version) != _series(__version__):
+            return (
+                f"{beat.who} runs Dwell {beat.version}, and {self.place.who} {__version__}; "
+                "install one version on all nodes"
             )
-            return None
-        news = self.hearing.hear(beat, now_ns, direct=sample.key.startswith(self._prefix[0]))
-        return beat if news else None
+        if beat.cell != self._digest:
+            return (
+                f"{beat.who} has another cell file ({beat.cell}) than {self.place.who} "
+                f"({self._digest}); copy one file to all nodes"
+            )
+        return ""
+
+    def _estranged(self, who: str, differs: str, now_ns: int) -> None:
+        """Remember who is not heard, and say it once."""
+        known = self.strangers.get(who)
+        if known is None and len(self.strangers) >= MAX_STRANGERS:
+            del self.strangers[next(iter(self.strangers))]
+        self.strangers[who] = differs, now_ns
+        if known is None or known[0] != differs:
+            self.place.complain(LiveError(differs))
+
+    def _look_for_rival(self, beat: Beat) -> None:
+        """Notice two processes of one name: the earlier one of two lives goes on beating."""
+        last = self.hearing.last(beat.who)
+        if last is None or beat.life >= last.life:
+            return
+        count = self._rivals.get(beat.who, 0) + 1
+        if count >= RIVAL_BEATS:
+            count = 0
+            told = f"two processes say that they are {beat.who}; end one: its agent runs twice?"
+            self.place.complain(LiveError(told))
+        self._rivals[beat.who] = count
 
     def hears(self, sample: Sample) -> bool:
         """Whether a message is a beat."""
@@ -207,10 +271,24 @@ class Pulse:
         """Send a beat."""
         place = self.place
         ready, note = self._state()
+        note = note or self._repeated(now_ns)
         term, placement = self._holds() if self._holds is not None else (0, "")
         heard = self.hearing.heard()
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, note[:2000]),
+            *(self._digest, note[:2000], __version__),
         )
         place.put_twice(self._key, encode(beat))
+
+    def _repeated(self, now_ns: int) -> str:
+        """Return the last complaint, for a while after it was made."""
+        place = self.place
+        if place.complained != self._complained:
+            self._complained = place.complained
+            self._repeat_until_ns = now_ns + REPEATED_NS
+        return place.last_complaint if now_ns < self._repeat_until_ns else ""
+
+
+def _series(version: str) -> str:
+    """Return what two versions that understand each other have in common: major and minor."""
+    return ".".join(version.split(".")[:2])

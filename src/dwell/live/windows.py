@@ -451,6 +451,7 @@ class LiveWindows:
         last = self.last
         status: dict[str, object] = {
             "windows": self._next_window,
+            "origin_ns": self.origin_ns,
             "cycles": self._next_row + len(self._line),
             "ignored_messages": self.ignored,
             "clock_breaks": self.offsets.breaks,

@@ -201,9 +201,9 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
     Parameters
     ----------
     path : path-like
-        The run's folder. Nothing is done to one that is sealed already.
+        The run's folder. The tables of one that is sealed already are left as they are.
     **meta : JSON-able
-        Said of the run beside what its journal says.
+        Said of the run beside what its journal says, also of one that is sealed already.
 
     Raises
     ------
@@ -223,6 +223,12 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
                 frame = table() if callable(table) else table
                 _write(folder / f"{name}.parquet", frame.write_parquet)
             # From here on the folder is a finished run.
+            _write(file, lambda draft: draft.write_text(text, encoding="utf-8"))
+        except OSError as error:
+            raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    elif meta:
+        text = json.dumps({**open_run(folder).meta, **meta}, indent=2) + "\n"
+        try:
             _write(file, lambda draft: draft.write_text(text, encoding="utf-8"))
         except OSError as error:
             raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None

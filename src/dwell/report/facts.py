@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dwell.errors import RunError
 from dwell.record import Run
+from dwell.report.phases import Disturbed, disturbed
+from dwell.report.tracking import Tracking
 
 __all__ = ["Facts"]
 
@@ -28,6 +30,12 @@ class Facts(NamedTuple):
     window_cycles : int
         W.
     versions : mapping of str to str
+    disturbed : tuple of Disturbed
+        What was done to nodes and links: as it was played, where the run says so, and as its
+        scenario has it elsewhere.
+    tracking : Tracking, optional
+    recovered : mapping of str to object
+        What was lost of a live run's journal.
     """
 
     kind: str
@@ -42,6 +50,9 @@ class Facts(NamedTuple):
     deadline_ms: float
     window_cycles: int
     versions: Mapping[str, str]
+    disturbed: tuple[Disturbed, ...] = ()
+    tracking: Tracking | None = None
+    recovered: Mapping[str, Any] = {}
 
     @classmethod
     def of(cls, run: Run) -> Facts:
@@ -55,6 +66,8 @@ class Facts(NamedTuple):
         meta = run.meta
         try:
             problem = meta["problem"]
+            scenario = problem.get("scenarios", {}).get(meta.get("scenario"), ())
+            tiers = {name: str(node["tier"]) for name, node in problem["nodes"].items()}
             return cls(
                 kind=str(meta.get("kind", "simulated")),
                 cell=str(problem["name"]),
@@ -68,8 +81,11 @@ class Facts(NamedTuple):
                 deadline_ms=float(problem["deadline_ms"]),
                 window_cycles=int(problem["window_cycles"]),
                 versions=meta.get("versions", {}),
+                disturbed=tuple(disturbed(meta.get("played", scenario), tiers)),
+                tracking=Tracking.of(meta),
+                recovered=meta.get("recovered", {}),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise RunError(
                 f"this run cannot be reported: its record of the problem is incomplete ({error!r})"
             ) from None
@@ -78,3 +94,8 @@ class Facts(NamedTuple):
     def policy_name(self) -> str:
         """The policy without its parameters."""
         return re.split(r"[(\s]", self.policy, maxsplit=1)[0] or self.policy
+
+    @property
+    def live(self) -> bool:
+        """Whether real processes ran."""
+        return self.kind == "live"

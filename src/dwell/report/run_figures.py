@@ -86,9 +86,10 @@ def split_by_placement(
         return inline(figure, "split", "Mean latency by placement and part")
 
 
-def node_use_in_time(windows: pl.DataFrame, nodes: Sequence[str], period_ms: float) -> str:
-    """Utilisation of every node, window by window."""
-    begin_s = windows["first_cycle"].to_numpy() * (period_ms / 1e3)
+def node_use_in_time(
+    windows: pl.DataFrame, nodes: Sequence[str], begin_s: NDArray[np.float64]
+) -> str:
+    """Utilisation of every node, window by window; `begin_s` says when each began."""
     with new_figure(2.0) as figure:
         ax = figure.subplots()
         for i, node in enumerate(nodes):

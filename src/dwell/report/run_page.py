@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from dwell.report import run_figures
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.report import live_facts, run_figures
 from dwell.report.drawing import draw
 from dwell.report.facts import Facts
 from dwell.report.look import Look
@@ -25,6 +28,8 @@ from dwell.report.page import (
     table,
 )
 from dwell.report.palette import Palette
+from dwell.report.phase_rows import PhaseRow, phase_rows
+from dwell.report.phases import Disturbed
 from dwell.report.svg import inline
 from dwell.report.timeline import run_timeline
 from dwell.report.wording import listed, percent, shown_scenario, write_number
@@ -88,7 +93,7 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     seconds = counted.cycles.height * facts.period_ms / 1e3
     yield f"<h1>{escape(title)}</h1>"
     yield paragraph(
-        f"Scenario “{shown_scenario(facts.scenario)}”, {facts.kind}, seed {facts.seed}: "
+        f"Scenario “{shown_scenario(facts.scenario)}”, {_kind(facts)}, seed {facts.seed}: "
         f"{counted.windows.height} windows of {facts.window_cycles} cycles after the warm-up, "
         f"{write_number(seconds / 60)} minutes",
         "subtitle",
@@ -97,11 +102,28 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
         "Did the cell meet its deadline, and what did the policy do for it?", "question"
     )
     yield items(_verdict(facts, counted))
-    yield section("Through time", *_in_time(run, facts, palette))
+    begins = _begins(run, facts)
+    yield section("Through time", *_in_time(run, facts, palette, begins))
     yield section("Latency", *_latency(facts, counted, palette))
-    yield section("Decisions", *_decisions(run, facts, palette))
-    yield section("Worst windows", _worst_windows(facts, counted, palette))
+    yield section("Decisions", *_decisions(run, facts, palette, begins))
+    yield section("Worst windows", _worst_windows(facts, counted, palette, _by_window(run.windows, begins)))
+    if facts.live:
+        yield section("How well this is known", items(live_facts.known(run, facts)))
     yield section("What this is", *_about(facts))
+
+
+def _kind(facts: Facts) -> str:
+    return "live, on real processes" if facts.live else facts.kind
+
+
+def _begins(run: Run, facts: Facts) -> NDArray[np.float64]:
+    """When every window began, seconds; a live run's cycles do not come by their numbers."""
+    first = run.windows["first_cycle"].to_numpy()
+    if not facts.live:
+        nominal: NDArray[np.float64] = first * (facts.period_ms / 1e3)
+        return nominal
+    released = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
+    return np.array([released[cycle] / 1e9 for cycle in first.tolist()], np.float64)
 
 
 def _policy(facts: Facts, counted: Counted) -> str:
@@ -129,12 +151,19 @@ def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
     yield _lost(cycles)
     shares = windows["placement"].cast(str).value_counts(sort=True)
     where = listed(f"{percent(count / windows.height)} on {name}" for name, count in shares.rows())
-    moves = decisions.filter(decisions["migrated"])
+    moved_at_all = decisions.filter(decisions["migrated"])
+    by_guard = moved_at_all["reason"].cast(str) == "guard"
+    moves, guards = moved_at_all.filter(~by_guard), moved_at_all.filter(by_guard)
     moved = f"with {_count(moves.height, 'migration')}" if len(moves) else "and never migrated"
     text = f"Of its windows it spent {where}, {moved}"
     undone = _undone(moves)
     text += f", {undone} of which undid the one before" if undone else ""
     yield f"{text}."
+    if len(guards):
+        yield (
+            f"Beside these, the robot's guard moved it {_count(guards.height, 'time')}: nothing had "
+            "come through for longer than it waits."
+        )
     yield from _shadows(facts, counted.windows)
     yield (
         "One run is one sample: it says what happened, not what to expect. For intervals, compare "
@@ -188,7 +217,9 @@ def _count(number: int, what: str) -> str:
 # ----------------------------------------------------------------------------------- figures
 
 
-def _in_time(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
+def _in_time(
+    run: Run, facts: Facts, palette: Palette, begin_s: NDArray[np.float64]
+) -> Iterator[str]:
     shown = run_timeline(
         run.windows,
         run.decisions,
@@ -196,16 +227,75 @@ def _in_time(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
         period_ms=facts.period_ms,
         deadline_ms=facts.deadline_ms,
         slug="time",
+        begin_s=begin_s,
+        disturbed=facts.disturbed,
+        tracking=facts.tracking,
     )
+    error = " The tracking error is its root mean square." if facts.tracking is not None else ""
     yield figure(
         inline(draw(shown, Look(palette, frozenset())), shown.slug, shown.title),
-        "Each mark is a window and has the colour of the placement that was active. In the lowest "
-        "panel the lines without marks are what the other placements were estimated to cost.",
+        "Each mark is a window and has the colour of the placement that was active. In the panel "
+        "of J the lines without marks are what the other placements were estimated to cost."
+        + error,
     )
+    rows = phase_rows(run, facts)
+    if len(rows) > 1:
+        yield _by_phase(facts, palette, rows)
     yield figure(
-        run_figures.node_use_in_time(run.windows, facts.nodes, facts.period_ms),
+        run_figures.node_use_in_time(run.windows, facts.nodes, begin_s),
         "Utilisation of each node as its operating system shows it: foreign work included.",
     )
+
+
+def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str:
+    """Say what every phase showed."""
+    guarded = any(row.guard_moves for row in phases)
+    tracked = facts.tracking is not None
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for row in phases:
+        placed = "<br>".join(
+            f"{_placed(palette, name)} {percent(share)}" for name, share in row.shares.items()
+        )
+        cells = [
+            Cell(escape(row.name)),
+            Cell(f"{row.begin_s:.0f} to {row.end_s:.0f}", "num"),
+            Cell(placed),
+            Cell(write_number(100 * row.violation_rate), "num"),
+            Cell(write_number(row.l95_ms), "num"),
+            Cell(str(row.lost), "num"),
+            Cell(str(row.migrations), "num"),
+        ]
+        cells += [Cell(str(row.guard_moves), "num")] if guarded else []
+        if tracked:
+            cells += [Cell(write_number(row.rms_mm, 2), "num"), Cell(write_number(row.rms_px), "num")]
+        rows.append(("", cells))
+    head = [
+        Cell("phase"),
+        Cell("from (s)", "num"),
+        Cell("placed"),
+        Cell(marked("V_D (%)"), "num"),
+        Cell("L95 (ms)", "num"),
+        Cell("lost", "num"),
+        Cell("migrations", "num"),
+    ]
+    head += [Cell("by the guard", "num")] if guarded else []
+    head += [Cell("error (mm)", "num"), Cell("error (px)", "num")] if tracked else []
+    done = listed(f"{one.kind} ({one.what})" for one in _once(facts))
+    caption = (
+        f"All cycles by when they were released, the warm-up included. Played: {done}. Lost: cycles "
+        "that never finished."
+    )
+    if tracked:
+        caption += (
+            " Error: root mean square, over time, of how far the hand is from where it ought to "
+            "be, and the tag from the middle of the picture."
+        )
+    return table(head, rows, caption)
+
+
+def _once(facts: Facts) -> list[Disturbed]:
+    """Return what was done, each thing once."""
+    return list({(one.kind, one.what): one for one in facts.disturbed}.values())
 
 
 def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
@@ -225,7 +315,9 @@ def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
 # ------------------------------------------------------------------------------------ tables
 
 
-def _decisions(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
+def _decisions(
+    run: Run, facts: Facts, palette: Palette, begins: NDArray[np.float64]
+) -> Iterator[str]:
     decisions = run.decisions
     counts = dict(decisions["reason"].cast(str).value_counts().rows())
     yield items(
@@ -235,22 +327,30 @@ def _decisions(run: Run, facts: Facts, palette: Palette) -> Iterator[str]:
     )
     moves = decisions.filter(decisions["migrated"])
     if not moves.is_empty():
-        yield _migrations(run, facts, palette, moves)
+        yield _migrations(run, facts, palette, moves, begins)
 
 
-def _migrations(run: Run, facts: Facts, palette: Palette, moves: pl.DataFrame) -> str:
+def _migrations(
+    run: Run, facts: Facts, palette: Palette, moves: pl.DataFrame, begins: NDArray[np.float64]
+) -> str:
     cost = dict(run.windows.select("window", "cost").rows())
-    first = dict(run.windows.select("window", "first_cycle").rows())
+    begin_s = _by_window(run.windows, begins)
     rows: list[tuple[str, Sequence[Cell]]] = []
     for move in moves.head(MOST_ROWS).iter_rows(named=True):
         window, target = move["window"], move["placement"]
-        close_s = (first[window] + facts.window_cycles) * facts.period_ms / 1e3
-        numbers = (cost.get(window), move[f"j_{target}"], cost.get(window + 1))
+        by_guard = move["reason"] == "guard"
+        # A move of the guard is noted under the window that follows it.
+        before, after = (window - 1, window) if by_guard else (window, window + 1)
+        if by_guard or before not in begin_s:
+            at_s = begin_s.get(window, math.nan)
+        else:
+            at_s = begin_s[before] + facts.window_cycles * facts.period_ms / 1e3
+        numbers = (cost.get(before), move[f"j_{target}"], cost.get(after))
         cells = [
-            Cell(str(window)),
-            Cell(f"{close_s:.1f}", "num"),
+            Cell(str(before)),
+            Cell(write_number(at_s), "num"),
             Cell(f"{_placed(palette, move['incumbent'])} → {_placed(palette, target)}"),
-            Cell(escape(str(move["reason"]))),
+            Cell("by the guard" if by_guard else escape(str(move["reason"]))),
             *(Cell(write_number(_number(value), 2), "num") for value in numbers),
         ]
         rows.append(("", cells))
@@ -265,19 +365,25 @@ def _migrations(run: Run, facts: Facts, palette: Palette, moves: pl.DataFrame) -
     ]
     more = moves.height - MOST_ROWS
     caption = (
-        "Every migration: measured J of the window before it, J that was estimated for the "
+        "Every move: measured J of the window before it, J that was estimated for the "
         "target, and measured J of the first window on it."
     )
     return table(head, rows, f"{caption} {more} more are left out." if more > 0 else caption)
 
 
-def _worst_windows(facts: Facts, counted: Counted, palette: Palette) -> str:
+def _by_window(windows: pl.DataFrame, begins: NDArray[np.float64]) -> Mapping[int, float]:
+    return dict(zip(windows["window"].to_list(), begins.tolist(), strict=True))
+
+
+def _worst_windows(
+    facts: Facts, counted: Counted, palette: Palette, all_begins: Mapping[int, float]
+) -> str:
     worst = counted.windows.sort(
         "violation_rate", "seen_l95_ms", descending=True, nulls_last=True, maintain_order=True
     ).head(WORST)
     rows: list[tuple[str, Sequence[Cell]]] = []
     for window in worst.iter_rows(named=True):
-        begin_s = window["first_cycle"] * facts.period_ms / 1e3
+        begin_s = all_begins[window["window"]]
         used = [_number(window[f"u_{node}"]) for node in facts.nodes]
         cells = [
             Cell(str(window["window"])),

@@ -48,11 +48,16 @@ LONGEST_LABEL = 24
 
 
 class Span(NamedTuple):
-    """Something that happened for a while, in units of the horizontal axis."""
+    """Something that happened for a while, in units of the horizontal axis; or at an instant."""
 
     begin: float
     end: float
     label: str
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it is more than an instant."""
+        return self.end > self.begin
 
 
 def draw_timeline(figure: Figure, look: Look) -> Canvas:
@@ -67,7 +72,9 @@ def draw_timeline(figure: Figure, look: Look) -> Canvas:
     strips = (["placement"] if "placement" in figure.frame.columns else []) + (
         ["spans"] if spans else []
     )
-    names = list(dict.fromkeys(span.label for span in spans))
+    # What happened at instants stands below what went on for a while.
+    order = sorted(spans, key=lambda span: not span.lasts)
+    names = list(dict.fromkeys(span.label for span in order))
     inches = [
         *(STRIP_INCHES if strip == "placement" else SPAN_INCHES * len(names) for strip in strips),
         *(PANEL_INCHES for _ in places),
@@ -114,8 +121,11 @@ def _stretches(
 def _happened(ax: Axes, spans: Sequence[Span], names: Sequence[str]) -> None:
     """Draw a line for each thing that happened, and when it did."""
     for row, name in enumerate(names):
-        mine = [(span.begin, span.end - span.begin) for span in spans if span.label == name]
-        ax.broken_barh(mine, (row - 0.32, 0.64), color=MUTED, lw=0)
+        named = [span for span in spans if span.label == name]
+        lasting = [(span.begin, span.end - span.begin) for span in named if span.lasts]
+        instants = [span.begin for span in named if not span.lasts]
+        ax.broken_barh(lasting, (row - 0.32, 0.64), color=MUTED, lw=0)
+        ax.plot(instants, [row] * len(instants), "|", color=INK, ms=7, mew=1.6)
         ax.axhline(row, color=RULE, lw=0.6, zorder=0)
     ax.set_ylim(len(names) - 0.4, -0.6)
     ax.set_yticks(range(len(names)), [folded(name, LONGEST_LABEL) for name in names])
@@ -135,7 +145,7 @@ def _as_strip(ax: Axes, label: str) -> None:
 
 
 def _panel(ax: Axes, figure: Figure, look: Look, place: Place, spans: Sequence[Span]) -> None:
-    for span in spans:
+    for span in (span for span in spans if span.lasts):
         ax.axvspan(span.begin, span.end, color=RULE, alpha=0.4, lw=0, zorder=0)
     scale = _scale(place, figure.y)
     mark_level(ax, place.panel, scale, upright=True)

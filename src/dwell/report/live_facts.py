@@ -1,0 +1,93 @@
+"""What is to be said of a live run only: clocks, what was not heard, and what was recovered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from dwell.report.wording import listed, percent, write_number
+
+if TYPE_CHECKING:
+    from dwell.record import Run
+    from dwell.report.facts import Facts
+
+__all__ = ["known"]
+
+
+def known(run: Run, facts: Facts) -> Iterator[str]:
+    """Yield sentences on how well a live run is known."""
+    yield _clocks(run, facts)
+    yield from _unheard(run)
+    yield from _lead(run)
+    yield from _recovered(facts)
+
+
+def _clocks(run: Run, facts: Facts) -> str:
+    windows = run.windows
+    bounds = windows["bound_ms"].drop_nulls()
+    unproven = int(windows["unproven"].sum())
+    limit = "20 % of D"
+    if not unproven:
+        largest = write_number(float(str(bounds.max())), 2) if len(bounds) else "–"
+        return (
+            "Latencies are differences of clocks of several nodes: they are right to "
+            f"±{largest} ms in every window, below {limit}."
+        )
+    share = percent(unproven / windows.height)
+    whole = f"{unproven} of {windows.height} windows ({share})"
+    return (
+        f"{whole} are unproven: the clocks of the nodes agree there no better than {limit} "
+        f"({write_number(0.2 * facts.deadline_ms)} ms), or were not compared. Their latencies may "
+        "be off by more than that; the others' are not."
+    )
+
+
+def _unheard(run: Run) -> Iterator[str]:
+    cycles = run.cycles
+    silent = cycles.height - int(cycles["heard"].sum())
+    if silent:
+        yield (
+            f"Of {write_number(silent, 0)} of {write_number(cycles.height, 0)} cycles nothing was "
+            "heard: their neighbours' numbers say that they were released, and they count as lost."
+        )
+    away = int((cycles["outcome"].cast(str) == "done").sum()) - int(cycles["actuated"].sum())
+    if away > 0:
+        yield (
+            f"{write_number(away, 0)} commands arrived and were not applied: too old, or behind a "
+            "later one."
+        )
+
+
+def _lead(run: Run) -> Iterator[str]:
+    windows = run.windows
+    after = windows.filter((windows["lead"] > 0) & (windows["window"] > windows["window"][0]))
+    cycles = int(run.cycles["lead"].sum())
+    if cycles:
+        where = f", {after['lead'].sum()} of them before a window after a move" if len(after) else ""
+        yield (
+            f"{cycles} lead cycles belong to no window{where}: a window holds cycles of one "
+            "placement only."
+        )
+
+
+def _recovered(facts: Facts) -> Iterator[str]:
+    told = facts.recovered
+    opened = int(told.get("opened", 1))
+    if opened > 1:
+        yield f"The controller was started {opened} times while the run went on."
+    lost = [
+        text
+        for name, text in (
+            ("torn_bytes", "{} bytes at the journal's end were torn by a kill"),
+            ("damaged_bytes", "{} bytes within the journal were damaged"),
+        )
+        if told.get(name)
+        for text in [text.format(told[name])]
+    ]
+    if lost:
+        yield f"{listed(lost)}; what they said is not here."
+    if told and not told.get("sealed", True):
+        yield (
+            "The run was not closed: it goes on, or its controller was killed. This is what its "
+            "journal holds."
+        )

@@ -1,0 +1,228 @@
+"""The controller of a live cell on the in-memory network: windows, orders, people, and its absence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+import dwell
+from dwell.live.cell import Cell
+from dwell.live.keys import Keys
+from dwell.live.messages import Answer, Ask, decode, encode
+from dwell.live.transport.protocol import Sample
+from dwell.model import Problem
+from dwell.model.qos import QoS
+from tests.live.small_world import World
+
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+CONTROLLER = "controller@E"
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    cell = dwell.load("examples/canonical.yaml")
+    settings = replace(cell.controller, min_dwell=1, estimator="profile")
+    return replace(cell, window_cycles=20, warmup_windows=0, controller=settings)
+
+
+class Alternating:
+    """Moves at every window, from a candidate to the next."""
+
+    def __init__(self, *names: str) -> None:
+        self.names, self.place = names, 0
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        self.place += 1
+        return self.names[self.place % len(self.names)]
+
+
+def alternating(problem: Problem) -> World:
+    return World(problem, exec_ms=EXEC_MS, policy=Alternating("LOC", "SO"))
+
+
+def cell_of(world: World) -> Cell:
+    return next(role for role in reversed(world.roles.values()) if isinstance(role, Cell))
+
+
+def ask(world: World, what: str, about: str = "") -> str:
+    """Ask the controller as a person does; returns why it refuses, or nothing."""
+    keys, heard = Keys(world.problem.name), list[str]()
+    visitor = world.network.transport(f"visitor{world.network.now_ns}", "R1")
+    visitor.subscribe(keys.answer("me"), lambda s: heard.append(decode(s.payload, Answer).refused))
+    sample = Sample(keys.ask(), encode(Ask("me", what, about)))
+    # It has no wire of the cell's: it talks to the controller alone.
+    reach, world.network.reach = world.network.reach, None
+    cell_of(world).receive(sample, world.network.now_ns)
+    world.run(5)
+    world.network.reach = reach
+    visitor.close()
+    return heard[-1]
+
+
+def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
+    """Columns of a table's rows, later rows of a number in the place of earlier ones."""
+    from dwell.live.tables import columns_of
+
+    order = list(columns_of(cell_of(world).controller)[table])
+    rows = world.recorder.rows[table]
+    if table != "decisions":
+        rows = list({row[0]: row for row in rows}.values())
+    return [tuple(row[order.index(name)] for name in names) for row in rows]
+
+
+def test_every_order_takes_effect_and_no_cycle_is_lost(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(12_000)
+    moves = world.stamper.moves
+    assert len(moves) >= 12
+    assert {why for _, _, why in moves} == {"order"}
+    assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
+    decided = [
+        to
+        for _, to, moved in columns(world, "decisions", "window", "placement", "migrated")
+        if moved
+    ]
+    assert [to for _, to, _ in moves] == decided[: len(moves)]
+
+
+def test_windows_begin_with_the_first_cycle_of_a_new_placement(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(8_000)
+    windows = columns(world, "windows", "window", "first_cycle", "placement", "mixed", "lead")
+    assert len(windows) >= 8
+    assert not any(mixed for *_, mixed, _ in windows)
+    for (_, first, before, _, _), (_, following, after, _, lead) in zip(
+        windows, windows[1:], strict=False
+    ):
+        assert following == first + problem.window_cycles + lead
+        assert before != after
+        # The order travels: the close is at the release of a cycle that has the old stamp.
+        assert lead >= 1
+
+
+def test_what_is_not_moved_has_no_lead(problem: Problem) -> None:
+    world = World(problem, exec_ms=EXEC_MS, policy="LOC")
+    world.run(8_000)
+    assert {lead for (lead,) in columns(world, "windows", "lead")} == {0}
+
+
+def test_a_lost_order_is_sent_again(problem: Problem) -> None:
+    world = alternating(problem)
+    world.network.impair(world.losing(0.6), CONTROLLER, "stamper@R1")
+    world.run(12_000)
+    assert len(world.stamper.moves) >= 6
+    assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
+
+
+def test_without_answers_the_controller_knows_where_the_cell_is(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(3_000)
+    world.network.cut("stamper@R1", "*", key="dwell/*/accepted")
+    world.network.cut("agent@E", "*", key="dwell/*/carried")
+    world.run(6_000)
+    cell = cell_of(world)
+    assert cell.held is not None
+    assert cell.held.placement == world.stamper.placement
+    assert cell.controller.incumbent in problem.candidates
+
+
+def test_the_loop_runs_without_a_controller_and_one_that_returns_goes_on(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(5_000)
+    placement, term = world.stamper.placement, world.stamper.term
+    world.kill(CONTROLLER)
+    world.run(3_000)
+    assert (world.stamper.placement, world.stamper.term) == (placement, term)
+    before = len(columns(world, "windows", "window"))
+    world.start(CONTROLLER)
+    world.run(5_000)
+    assert world.stamper.term > term
+    windows = [number for (number,) in columns(world, "windows", "window")]
+    assert windows == list(range(len(windows)))
+    assert len(windows) > before
+    assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
+
+
+def test_a_controller_cut_off_holds(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(3_000)
+    cuts = [world.network.cut(CONTROLLER, "*"), world.network.cut("*", CONTROLLER)]
+    placement = world.stamper.placement
+    world.run(4_000)
+    assert world.stamper.placement == placement
+    for cut in cuts:
+        world.network.heal(cut)
+    world.run(4_000)
+    assert world.stamper.term > 3
+    assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
+
+
+def test_a_pinned_cell_stays_and_an_unpinned_one_goes_on(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(2_000)
+    assert not ask(world, "pin", "HYB")
+    world.run(300)
+    assert world.stamper.placement == "HYB"
+    term = world.stamper.term
+    world.run(4_000)
+    assert (world.stamper.placement, world.stamper.term) == ("HYB", term)
+    assert cell_of(world).controller.incumbent == "HYB"
+    assert not ask(world, "unpin")
+    world.run(4_000)
+    assert world.stamper.term > term
+
+
+def test_a_drained_node_is_left_and_not_returned_to(problem: Problem) -> None:
+    world = World(problem, exec_ms=EXEC_MS, policy=Alternating("SO", "HYB"))
+    world.run(2_000)
+    assert not ask(world, "drain", "E")
+    world.run(300)
+    assert world.stamper.placement == "LOC"
+    term = world.stamper.term
+    world.run(4_000)
+    assert (world.stamper.placement, world.stamper.term) == ("LOC", term)
+    assert not ask(world, "undrain", "E")
+    world.run(3_000)
+    assert world.stamper.placement in ("SO", "HYB")
+
+
+@pytest.mark.parametrize(
+    ("what", "about", "said"),
+    [
+        ("pin", "NOWHERE", "no candidate 'NOWHERE'; there are LOC, SO, HYB"),
+        ("drain", "R9", "no node 'R9'; there are R1, E, R2"),
+        ("drain", "R2", "every candidate needs R2"),
+        ("dance", "", "unknown question 'dance'"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(problem: Problem, what: str, about: str, said: str) -> None:
+    world = World(problem, exec_ms=EXEC_MS, policy="LOC")
+    world.run(1_000)
+    assert ask(world, what, about).startswith(said)
+
+
+def test_advice_orders_nothing(problem: Problem) -> None:
+    advised = replace(problem, live=replace(problem.live, mode="advise"))
+    world = alternating(advised)
+    world.run(5_000)
+    assert world.stamper.moves == []
+    decided = columns(world, "decisions", "incumbent", "placement", "migrated")
+    assert {incumbent for incumbent, _, _ in decided} == {"LOC"}
+    assert any(moved for _, _, moved in decided)
+
+
+def test_moves_of_the_guard_are_told_to_the_policy_and_recorded(problem: Problem) -> None:
+    settings = replace(problem.controller, initial="SO")
+    world = World(replace(problem, controller=settings), exec_ms=EXEC_MS, policy="dtp")
+    world.run(3_000)
+    world.network.freeze("perception@E")
+    world.run(2_000)
+    assert world.stamper.placement == "LOC"
+    cell = cell_of(world)
+    assert cell.controller.incumbent == "LOC"
+    rows = columns(world, "decisions", "incumbent", "placement", "migrated", "reason")
+    assert ("SO", "LOC", True, "guard") in rows
+    assert cell.guard_moves == 1
