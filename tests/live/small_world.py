@@ -78,7 +78,7 @@ class Passing:
         self.name = name
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        (message,) = inputs.values()
+        message = next(iter(inputs.values()))
         return Message(message.payload or b"-")
 
 
@@ -190,7 +190,11 @@ class World:
         self.clocks = clocks or {}
         self.exec_ms = exec_ms
         self.stages = stages or {}
-        self.book, self.highest, self.arm = MemoryBook(), MemoryHighest(), Arm()
+        self.book = MemoryBook()
+        sinks = [name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)]
+        self.highest = {name: MemoryHighest() for name in sinks}
+        self.arms = {name: Arm() for name in sinks}
+        self.arm = self.arms[sinks[0]]
         self.roles: dict[str, object] = {}
         self.lives = 0
         self.run_id = 1
@@ -212,7 +216,7 @@ class World:
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.run_id, end.now_ns)
         elif role.kind == "sink":
-            made = Sink(place, role.task, self.arm, self.highest)
+            made = Sink(place, role.task, self.arms[role.task], self.highest[role.task])
         elif role.kind == "agent":
             made = Quiet(place)
         elif role.kind == "controller":

@@ -71,8 +71,13 @@ def test_a_table_of_more_than_a_page_goes_on_on_the_next() -> None:
 
 @pytest.mark.parametrize(
     ("width", "size", "turned"),
-    [(30, "footnotesize", False), (50, "scriptsize", False), (60, "footnotesize", True)]
-    + [(75, "scriptsize", True), (200, "tiny", True)],
+    [
+        (30, "footnotesize", False),
+        (50, "scriptsize", False),
+        (60, "footnotesize", True),
+        (75, "scriptsize", True),
+        (200, "tiny", True),
+    ],
 )
 def test_a_wide_table_of_several_pages_has_small_letters_or_lies_on_its_side(
     width: int, size: str, turned: bool

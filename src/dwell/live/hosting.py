@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 
+from dwell.errors import LiveError
 from dwell.live.role import Role
 from dwell.live.stage import Message
 from dwell.live.transport.protocol import Sample, Transport
@@ -132,13 +132,13 @@ def work(
         worker.pulse.send(clock())
     if ready is not None:
         ready()
-    waits = getattr(stage, "wait", None)
-    if worker.triggers and callable(waits):
-        threading.Thread(target=_frames, args=(worker, waits, stopped), daemon=True).start()
+    if worker.triggers:
+        arguments = (worker, hosted, getattr(stage, "wait", None), stopped)
+        threading.Thread(target=_frames, args=arguments, name="frames", daemon=True).start()
     try:
         while not stopped.is_set():
             _drain(worker, hosted, note, clock)
-            hosted.news.acquire(timeout=LONGEST_SLEEP_S if not worker.stands_by else 0.01)
+            hosted.news.acquire(timeout=worker.rest_s(clock()))
     finally:
         hosted.stop()
         stop = getattr(stage, "stop", None)
@@ -171,11 +171,19 @@ def _drain(
             note(None)
 
 
-def _frames(worker: Worker, wait: Callable[[], object], stopped: threading.Event) -> None:
+def _frames(
+    worker: Worker, hosted: Hosted, wait: Callable[[], object] | None, stopped: threading.Event
+) -> None:
     """Ask the stamper for a cycle whenever the source has a frame."""
     while not stopped.is_set():
-        with suppress(Exception):  # the user's code; a camera that fails shows in its beats
+        try:
+            if wait is None:
+                raise LiveError(f"{worker.task} has no method wait(), and live.release is frames")
             wait()
-            worker.place.transport.put(worker.place.keys.frame(), b"")
+        except Exception as error:  # the user's code; a camera that fails shows in its beats
+            with hosted.lock:
+                worker.no_frame(error)
+            stopped.wait(LONGEST_SLEEP_S)
             continue
-        time.sleep(LONGEST_SLEEP_S)
+        with hosted.lock:
+            worker.framed(hosted.clock())

@@ -13,6 +13,7 @@ from dwell.live.keys import Keys
 from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Header, decode, encode
 from dwell.live.offsets import Offsets
 from dwell.live.transport.protocol import Sample, Transport
+from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import fingerprint
 
@@ -182,6 +183,8 @@ class Pulse:
         self._state, self._holds = state, holds
         self._every_ns = every * place.period_ns
         self._digest = fingerprint(place.problem)
+        self._nodes = frozenset(place.problem.fabric.nodes)
+        self._known = {role.who: role.node for role in roles(place.problem)}
         self._next_ns = -(1 << 62)
         #: Who is not heard because of its cell file or version: why, and when it beat last.
         self.strangers: dict[str, tuple[str, int]] = {}
@@ -222,16 +225,20 @@ class Pulse:
 
     def _differs(self, beat: Beat) -> str:
         """Return why a beat is not heard, or nothing."""
+        place = self.place
         if beat.version and _series(beat.version) != _series(__version__):
             return (
-                f"{beat.who} runs Dwell {beat.version}, and {self.place.who} {__version__}; "
+                f"{beat.who} runs Dwell {beat.version}, and {place.who} {__version__}; "
                 "install one version on all nodes"
             )
         if beat.cell != self._digest:
             return (
-                f"{beat.who} has another cell file ({beat.cell}) than {self.place.who} "
+                f"{beat.who} has another cell file ({beat.cell}) than {place.who} "
                 f"({self._digest}); copy one file to all nodes"
             )
+        strange = any(heard.node not in self._nodes for heard in beat.heard)
+        if self._known.get(beat.who) != beat.node or strange:
+            return f"{beat.who} on {beat.node} is no process of cell {place.problem.name!r}"
         return ""
 
     def _estranged(self, who: str, differs: str, now_ns: int) -> None:

@@ -12,6 +12,8 @@ from dwell.model import Problem
 
 __all__ = ["STAMPER", "Destination", "Routes"]
 
+#: Routes that are remembered at most.
+MAX_KNOWN = 1_024
 #: Source of the input that a source task gets.
 STAMPER = "stamper"
 
@@ -61,7 +63,7 @@ class Routes:
         task : str
             Who sends; `STAMPER` for the stamp itself.
         stamp : Stamp
-            Of the cycle; its placements are candidates.
+            Of the cycle; its placements are candidates. One of term 0 is a source's own guess.
         shadow : bool
             Whether it is the shadow's output and not the cycle's.
 
@@ -75,10 +77,12 @@ class Routes:
         LiveError
             If the stamp names a placement that is no candidate.
         """
-        key = (task, stamp.placement, stamp.shadow, stamp.forks, shadow)
+        key = (task, stamp.placement, stamp.shadow, stamp.forks, shadow, stamp.term == 0)
         known = self._known.get(key)
         if known is None:
             self._check(stamp)
+            if len(self._known) >= MAX_KNOWN:
+                self._known.clear()
             known = self._known[key] = tuple(dict.fromkeys(self._routed(task, stamp, shadow)))
         return known
 
@@ -91,6 +95,12 @@ class Routes:
                 )
 
     def _routed(self, task: str, stamp: Stamp, shadow: bool) -> Iterable[Destination]:
+        if not stamp.term:
+            # Nobody has said where the cycle runs: whoever may need it gets it.
+            for target in self._targets[task]:
+                for node in self._pipeline.tasks[target].on:
+                    yield Destination(target, node, MAIN)
+            return
         active = self._candidates[stamp.placement]
         other = self._candidates.get(stamp.shadow) if stamp.shadow else None
         apart = self._pipeline.diverging(active, other) if other is not None else frozenset()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -20,7 +20,7 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.live.role import Place, Pulse
-from dwell.live.routing import STAMPER, Routes
+from dwell.live.routing import STAMPER, Destination, Routes
 from dwell.live.transport.protocol import Sample
 
 __all__ = ["Book", "Entry", "Stamper"]
@@ -103,8 +103,12 @@ class Stamper:
         self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
+        self._framed_ns = now_ns - place.period_ns
         # A run that goes on does so at once; a new one waits until its placement is there.
         self._begun, self._since_ns = entry.reserved > 0, now_ns
+        # Sources on other nodes get their stamps a cycle early.
+        self._early = any(node != place.node for _, node, _ in self._sources())
+        self._ahead: Stamp | None = None
         self._names = tuple(problem.candidates)
         self._sinks = frozenset(
             name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
@@ -145,12 +149,21 @@ class Stamper:
             if sample.key == self.place.keys.order():
                 self._order(decode(sample.payload, Order), now_ns)
             elif sample.key == self.place.keys.frame():
-                if self._begun and not self.timer:
-                    self._release(now_ns, now_ns)
+                self._frame(now_ns)
             else:
                 self._completed(decode(sample.payload, Completion), now_ns)
         except LiveError as error:
             self.place.complain(error)
+
+    def _frame(self, now_ns: int) -> None:
+        """Release a cycle, because the source has a frame; of a flood of them, two a period."""
+        if self.timer or not self._begun:
+            return
+        if now_ns - self._framed_ns < self.place.period_ns // 2:
+            self.skipped += 1
+            return
+        self._framed_ns = now_ns
+        self._release(now_ns, now_ns)
 
     def _heard(self, beat: Beat, now_ns: int, direct: bool) -> None:
         presence = self.presence
@@ -271,6 +284,7 @@ class Stamper:
         self.term += 1
         self.placement = placement
         self._partial.clear()
+        self._ahead = None
         self._write(on_fallback=by_guard)
         self.guard.adopt(placement, fallback=by_guard)
         if by_guard:
@@ -322,10 +336,11 @@ class Stamper:
 
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""
-        if self.cycle >= self._reserved:
+        if self.cycle + 1 >= self._reserved:
             self._reserved = self.cycle + RESERVED
             self._write(on_fallback=self.guard.on_fallback)
-        stamp = self._stamp(released_ns)
+        early, self._ahead = self._ahead, None
+        stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
         self.guard.released(stamp.cycle, released_ns)
         if stamp.shadow and stamp.shadow == self.probation.wanted:
@@ -333,27 +348,38 @@ class Stamper:
             self._probes.add(stamp.cycle)
             if len(self._probes) > MAX_PARTIAL:
                 self._probes.discard(min(self._probes))
+        self._send(stamp, here=True, elsewhere=early is None)
+        self.place.transport.put(self.place.keys.stamped(), encode(stamp))
+        if self._early and self.timer:
+            self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
+            self._send(self._ahead, here=False, elsewhere=True)
+
+    def _sources(self) -> Iterator[Destination]:
+        """Source tasks wherever some candidate has them."""
+        for name in self.place.problem.candidates:
+            yield from self.routes.destinations(STAMPER, Stamp(0, 0, 1, name, 0))
+
+    def _send(self, stamp: Stamp, *, here: bool, elsewhere: bool) -> None:
+        """Send a stamp to the sources on this node, or on the others."""
         place = self.place
         header = encode(Header(stamp, STAMPER, place.node, "none"))
         for task, node, kind in self.routes.destinations(STAMPER, stamp):
-            place.transport.put(place.keys.inputs(task, node, kind), b"", header)
-        place.transport.put(place.keys.stamped(), encode(stamp))
+            if here if node == place.node else elsewhere:
+                place.transport.put(place.keys.inputs(task, node, kind), b"", header)
 
-    def _stamp(self, released_ns: int) -> Stamp:
+    def _stamp(self, cycle: int, released_ns: int) -> Stamp:
         wanted = self.probation.wanted if self.guard.on_fallback else None
-        shadow = wanted or self._shadowed()
+        shadow = wanted or self._shadowed(cycle)
         if shadow == self.placement:
             shadow = ""
-        return Stamp(
-            self.run, self.cycle, self.term, self.placement, released_ns, shadow, self._forks
-        )
+        return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self._forks)
 
-    def _shadowed(self) -> str:
+    def _shadowed(self, cycle: int) -> str:
         """Return the candidate that the estimator's plan sends this cycle through, too."""
         if not self._fraction:
             return ""
         code = self._names.index(self.placement)
-        plan = shadow_stamps(self.cycle, self.cycle + 1, code, len(self._names), self._fraction)
+        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self._fraction)
         return self._names[int(plan[0])] if plan[0] >= 0 else ""
 
     # --------------------------------------------------------------------------- beats

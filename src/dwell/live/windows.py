@@ -188,7 +188,10 @@ class LiveWindows:
         at_ns : int, optional
             When this was heard, on the controller's clock.
         """
-        if not self._ledger.tells(completion):
+        stamp = completion.stamp
+        # Of term 0 is a source's own guess: it counts where the stamper has released such a cycle.
+        guessed = not stamp.term and (stamp.run, stamp.cycle) not in self._by_key
+        if guessed or not self._ledger.tells(completion):
             self.ignored += 1
             return
         cycle = self._note(completion.stamp, at_ns)

@@ -14,10 +14,12 @@ from dwell.live.messages import (
     Hop,
     Restored,
     Snapshot,
+    Stamp,
     State,
     decode,
     encode,
 )
+from dwell.live.offsets import Offsets
 from dwell.live.payloads import read_payload, write_payload
 from dwell.live.role import Place, Pulse
 from dwell.live.routing import STAMPER, Routes
@@ -33,6 +35,7 @@ MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
 UNKNOWN = -1
+NEVER_NS = 1 << 62
 
 
 @dataclass(slots=True)
@@ -99,6 +102,65 @@ class _Joins:
         return inputs
 
 
+class _Source:
+    """Stamps of a source task, each until the instant at which its cycle begins here.
+
+    On another node than the stamper's they come a cycle early. Where one does not come, the source
+    goes on by itself for a while, with a guess that everybody who may need it gets.
+    """
+
+    def __init__(self, place: Place, offsets: Offsets, offset_ns: int) -> None:
+        self._place, self._offsets, self._offset_ns = place, offsets, offset_ns
+        self._guesses = place.problem.controller.guard_cycles
+        self._alone = place.node != place.stamper[0] and place.problem.live.release == "timer"
+        self._waiting: dict[tuple[int, int], tuple[Header, int]] = {}
+        self._last: Header | None = None
+        self._guessed = 0
+
+    def stamped(self, header: Header, now_ns: int) -> None:
+        """Take a stamp in; of one cycle the one with the highest term counts."""
+        cycle = header.stamp.run, header.stamp.cycle
+        if self._last is not None and cycle <= (self._last.stamp.run, self._last.stamp.cycle):
+            return
+        known = self._waiting.get(cycle)
+        if known is None or known[0].stamp.term < header.stamp.term:
+            self._waiting[cycle] = header, now_ns
+            if len(self._waiting) > MAX_JOINS:
+                del self._waiting[min(self._waiting)]
+
+    def _begins_ns(self, header: Header) -> int:
+        return self._offsets.from_reference(self._place.node, header.stamp.released_ns)[0]
+
+    @property
+    def due_ns(self) -> int:
+        """Instant at which the next cycle begins, or is guessed."""
+        if self._waiting:
+            header, _ = self._waiting[min(self._waiting)]
+            return self._begins_ns(header) + self._offset_ns
+        if self._last is None or not self._alone or self._guessed >= self._guesses:
+            return NEVER_NS
+        period_ns = self._place.period_ns
+        return self._begins_ns(self._last) + self._offset_ns + period_ns + period_ns // 4
+
+    def due(self, now_ns: int) -> Job | None:
+        """Return the cycle that begins now, if one does."""
+        if now_ns < self.due_ns:
+            return None
+        if self._waiting:
+            header, at_ns = self._waiting.pop(min(self._waiting))
+            self._guessed = 0
+        elif self._last is not None:
+            before, at_ns = self._last.stamp, now_ns
+            released_ns = before.released_ns + self._place.period_ns
+            guess = Stamp(before.run, before.cycle + 1, 0, before.placement, released_ns)
+            header = Header(guess, STAMPER, self._place.node, "none")
+            self._guessed += 1
+        else:
+            return None
+        self._last = header
+        return Job(header, {STAMPER: (header, b"", at_ns)}, False)
+
+
 class Worker:
     """A task on a node, for cycles or for their shadows.
 
@@ -126,8 +188,11 @@ class Worker:
         self.offsets = place.offsets()
         flows = problem.pipeline.inputs(task)
         sources = frozenset(flow.source for flow in flows) or frozenset([STAMPER])
-        #: Whether its stage's frames begin the cycles.
-        self.triggers = STAMPER in sources and problem.live.release == "frames" and not shadow
+        #: Whether its stage's frames begin the cycles: those of the first source do.
+        first = next(name for name in problem.pipeline.tasks if not problem.pipeline.inputs(name))
+        frames = problem.live.release == "frames" and task == first
+        self.triggers = frames and not shadow and not stands_by
+        self._framed_ns: int | None = None
         self.is_sink = not problem.pipeline.outputs(task)
         self._depth = problem.pipeline.tasks[task].depth
         self._joins = {MAIN: _Joins(sources), SHADOW: _Joins(sources)}
@@ -137,6 +202,8 @@ class Worker:
         }
         self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
         self._jobs: deque[Job] = deque()
+        offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
+        self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
         self._stateful = isinstance(stage, Stateful) and not shadow
         self._asked: Snapshot | None = None
         self._checkpoint: tuple[State, bytes] | None = None
@@ -148,6 +215,7 @@ class Worker:
         self.started = False
         self.trouble = ""
         self.busy_since_ns: int | None = None
+        self._busy_cycle = 0
         self.replaced = 0
         self.failures = 0
         self._now_ns = 0
@@ -200,10 +268,15 @@ class Worker:
         header = self.place.header(sample)
         if header is None:
             return
+        if header.source == STAMPER and self._source is not None:
+            self._source.stamped(header, now_ns)
+            return
         complete = self._joins[kind].add(header, sample.payload, now_ns)
         if complete is None:
             return
-        job = Job(header, complete, kind == SHADOW)
+        # A stamp of term 0 is a source's own guess; one that came from the stamper knows better.
+        stamped = max((one for one, _, _ in complete.values()), key=lambda one: one.stamp.term)
+        job = Job(stamped, complete, kind == SHADOW)
         if self.is_sink and job.shadow:
             # A shadow ends where the sink begins.
             self._end(job, "shadow")
@@ -342,10 +415,23 @@ class Worker:
             beat and beat.ready and hearing.fresh(self.stands_by, self._now_ns, patience_ns)
         )
 
+    def rest_s(self, now_ns: int) -> float:
+        """Seconds after which there may be something to do without any message."""
+        # A standby has to notice silence.
+        rest_s = 0.01 if self.stands_by else 0.2
+        if self._source is None:
+            return rest_s
+        return min(max((self._source.due_ns - now_ns) / 1e9, 0.0), rest_s)
+
     @property
     def has_work(self) -> bool:
         """Whether there may be something for `next_chore` or `next_job`."""
-        waits = self._jobs or self._asked is not None or self._restoring is not None
+        waits = (
+            self._jobs
+            or self._source is not None
+            or self._asked is not None
+            or self._restoring is not None
+        )
         return bool(waits) and self.busy_since_ns is None
 
     def next_job(self, now_ns: int) -> Job | None:
@@ -353,6 +439,8 @@ class Worker:
         self._now_ns = now_ns
         if self.busy_since_ns is not None or not self.started:
             return None
+        if self._source is not None and (job := self._source.due(now_ns)) is not None:
+            self._jobs.append(job)
         if self._replayed is not None:
             # Inputs that came while the state was on its way, but for those that are in it.
             self._jobs.extend(job for job in self._forked if job.order > self.state_at)
@@ -367,7 +455,9 @@ class Worker:
         if not self._jobs:
             return None
         self.busy_since_ns = now_ns
-        return self._jobs.popleft()
+        job = self._jobs.popleft()
+        self._busy_cycle = job.header.stamp.cycle
+        return job
 
     def retry(self, shadow: bool, inputs: list[tuple[Header, bytes]], now_ns: int) -> None:
         """Put a job that another process has not finished before all others."""
@@ -415,6 +505,7 @@ class Worker:
         place, stamp = self.place, job.header.stamp
         try:
             kind, data = write_payload(output.payload)
+            destinations = self.routes.destinations(self.task, stamp, shadow=job.shadow)
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return
@@ -426,12 +517,21 @@ class Worker:
         if self.is_sink:
             place.transport.put(place.keys.command(self.task), data, head)
         elif job.shadow or self.routes.runs(self.task, place.node, stamp):
-            for target, node, to in self.routes.destinations(self.task, stamp, shadow=job.shadow):
+            for target, node, to in destinations:
                 key = place.keys.inputs(target, node, to)
                 place.transport.put(key, data, head, lane=self._lanes[target])
             self._checkpoint_due(job)
         if self._replayed is not None and self.routes.runs(self.task, place.node, stamp):
             self._replayed = None
+
+    def framed(self, now_ns: int) -> None:
+        """Ask the stamper for a cycle: the source has a frame."""
+        self._framed_ns = now_ns
+        self.place.transport.put(self.place.keys.frame(), b"")
+
+    def no_frame(self, error: Exception) -> None:
+        """Take note that waiting for a frame has failed."""
+        self._failed(f"wait() raised {type(error).__name__}: {error}")
 
     def _failed(self, what: str) -> None:
         self.trouble = f"{self.task} on {self.place.node}: {what}"
@@ -441,13 +541,21 @@ class Worker:
     # -------------------------------------------------------------------------- beats
 
     def _state(self) -> tuple[bool, str]:
+        where = f"{self.task} on {self.place.node}"
         limit_ns = max(10 * self.place.period_ns, 1_000_000_000)
-        hangs = self.busy_since_ns is not None and self._now_ns - self.busy_since_ns > limit_ns
-        if hangs:
-            return False, f"{self.task} on {self.place.node}: process() does not return"
-        return self.started, self.trouble
+        if self.busy_since_ns is not None and self._now_ns - self.busy_since_ns > limit_ns:
+            since_s = (self._now_ns - self.busy_since_ns) / 1e9
+            cycle = self._busy_cycle
+            return False, f"{where}: cycle {cycle}: process() has not returned for {since_s:.0f} s"
+        if not self.started:
+            return False, self.trouble or f"{where}: start() has not returned yet"
+        if self._framed_ns is not None and self._now_ns - self._framed_ns > limit_ns:
+            silent_s = (self._now_ns - self._framed_ns) / 1e9
+            return True, self.trouble or f"{where}: wait() has brought no frame for {silent_s:.0f} s"
+        return True, self.trouble
 
     def wake(self, now_ns: int) -> int:
         """Beat; returns when the next beat is due."""
         self._now_ns = max(self._now_ns, now_ns)
-        return self.pulse.wake(now_ns)
+        due_ns = self.pulse.wake(now_ns)
+        return due_ns if self._source is None else min(due_ns, self._source.due_ns)

@@ -63,7 +63,9 @@ def _lead(run: Run) -> Iterator[str]:
     after = windows.filter((windows["lead"] > 0) & (windows["window"] > windows["window"][0]))
     cycles = int(run.cycles["lead"].sum())
     if cycles:
-        where = f", {after['lead'].sum()} of them before a window after a move" if len(after) else ""
+        where = (
+            f", {after['lead'].sum()} of them before a window after a move" if len(after) else ""
+        )
         yield (
             f"{cycles} lead cycles belong to no window{where}: a window holds cycles of one "
             "placement only."

@@ -113,7 +113,7 @@ thead .over { text-align: center; color: var(--ink); padding-left: 36px; }
 .small { font-size: 13px; } .small th { font-size: 12.5px; } .small .err { font-size: 11.5px; }
 .small :not(:first-child):is(td, th) { padding-left: 9px; } .small .err.err { padding-left: 4px; }
 .tight { font-size: 12px; } .tight th { font-size: 12px; } .tight .err { font-size: 11px; }
-.tight :not(:first-child):is(td, th) { padding-left: 7px; } .tight .err.err { padding-left: 3px; }
+.tight :not(:first-child):is(td, th) { padding-left: 5px; } .tight .err.err { padding-left: 2px; }
 .tight .swatch { margin-right: 5px; } .tight small { font-size: 11px; }
 .summary { width: 100%; } .summary :is(th, td) { padding-top: 8px; padding-bottom: 8px; }
 .summary tbody th { white-space: normal; width: 30%; padding-right: 8px; }

@@ -111,6 +111,4 @@ def _guarded(run: Run, released_s: Mapping[int, float]) -> list[float]:
     )
     first = dict(zip(run.windows["window"], run.windows["first_cycle"], strict=True))
     last_s = max(released_s.values())
-    return [
-        released_s.get(first.get(window, -1), last_s) for window in moves["window"].to_list()
-    ]
+    return [released_s.get(first.get(window, -1), last_s) for window in moves["window"].to_list()]

@@ -106,7 +106,9 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     yield section("Through time", *_in_time(run, facts, palette, begins))
     yield section("Latency", *_latency(facts, counted, palette))
     yield section("Decisions", *_decisions(run, facts, palette, begins))
-    yield section("Worst windows", _worst_windows(facts, counted, palette, _by_window(run.windows, begins)))
+    yield section(
+        "Worst windows", _worst_windows(facts, counted, palette, _by_window(run.windows, begins))
+    )
     if facts.live:
         yield section("How well this is known", items(live_facts.known(run, facts)))
     yield section("What this is", *_about(facts))
@@ -267,7 +269,10 @@ def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str
         ]
         cells += [Cell(str(row.guard_moves), "num")] if guarded else []
         if tracked:
-            cells += [Cell(write_number(row.rms_mm, 2), "num"), Cell(write_number(row.rms_px), "num")]
+            cells += [
+                Cell(write_number(row.rms_mm, 2), "num"),
+                Cell(write_number(row.rms_px), "num"),
+            ]
         rows.append(("", cells))
     head = [
         Cell("phase"),

@@ -14,6 +14,8 @@ __all__ = ["factor", "labelled", "measure_of", "write", "write_over_seeds"]
 #: What stands behind a heading; the numbers below it have none.
 SIGNS: dict[Unit, str] = {"percent": "%", "change": "points", "ms": "ms"}
 LEAST_P = 0.001
+#: Decimals up to which numbers are settings, and written as they are.
+EXACT = 3
 
 
 def factor(unit: Unit) -> float:
@@ -47,7 +49,9 @@ def measure_of(unit: Unit, values: Sequence[float]) -> Measure:
         return Measure("", "", "", 1.0, 0)
     large = finite[min(len(finite) - 1, math.floor(0.9 * len(finite)))]
     needed = max(len(f"{value:.6f}".rstrip("0").partition(".")[2]) for value in finite)
-    return Measure("", "", "", 1.0, max(0, min(2 - math.floor(math.log10(large)), needed)))
+    # Settings such as 0.001 and 32 need their own, each with three digits at most.
+    fitting = needed if needed <= EXACT else 2 - math.floor(math.log10(large))
+    return Measure("", "", "", 1.0, max(0, min(fitting, needed)))
 
 
 def write(value: float, unit: Unit, measure: Measure | None = None) -> str:

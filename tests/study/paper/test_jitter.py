@@ -82,7 +82,8 @@ def test_costs_and_misses_are_told_by_the_envelopes_at_which_they_were_shown() -
     outcome = verdict([Turn("baseline", WITHIN)], shown)
     assert "in baseline less at 1 to 2 ms and at 8 ms and more at 0.1 ms" in outcome.verdict
     assert outcome.evidence == (
-        "J of SO is below that of LOC up to 4.0 [3.0, 5.0] ms in baseline, seed by seed.",
+        "The widest envelope at which J of SO is below that of LOC, seed by seed: up to 4.0 [3.0, "
+        "5.0] ms in baseline.",
         "V_D of SO against that of LOC in baseline: lower at no envelope, higher at 1 ms.",
     )
 

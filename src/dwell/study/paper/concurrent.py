@@ -534,7 +534,8 @@ def tuning_finding(tuning: StudyResult, baselines: Baselines) -> str:
     )
     return (
         f"ATP's setting for all scenarios is “{baselines.setting}” (stage, L95 over D, U_r, U_e, "
-        f"N_min; inf is none), with a mean V_D of {percent(score[baselines.setting])} on the held-out seeds; "
+        f"N_min; inf is none), with a mean V_D of {percent(score[baselines.setting])} on the "
+        "held-out seeds; "
         f"{baselines.static}, which never moves, has {percent(score[baselines.static])} there. "
         f"Single scenarios would have {len(settings)} different settings."
     )

@@ -511,14 +511,14 @@ def shown(what: str, families: Mapping[str, Family]) -> tuple[str, ...]:
     """Say where a setting was shown to change a metric."""
     parts = []
     for metric, one in families.items():
-        verdicts = one.verdicts
+        verdicts, counts = one.verdicts, []
         for word in ("lower", "higher"):
             named = [name for name, said in verdicts.items() if said == word]
-            where = f": {'; '.join(named)}" if named else ""
-            parts.append(
-                f"{what} is shown to make {METRICS[metric]} {word} in {len(named)} of "
-                f"{len(verdicts)} comparisons{where}."
-            )
+            counts.append(f"{word} in {len(named)}" + f" ({'; '.join(named)})" * bool(named))
+        parts.append(
+            f"{what} is shown to make {METRICS[metric]} {' and '.join(counts)} of {len(verdicts)} "
+            "comparisons."
+        )
     return tuple(parts)
 
 

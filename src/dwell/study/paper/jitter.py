@@ -418,7 +418,11 @@ def verdict(found: Sequence[Turn], said: Mapping[str, Mapping[str, Said]]) -> Ou
         answer,
         f"Offloading both stages ({OFFLOADED}) is shown to cost, by J and against {LOCAL}, "
         f"{costs} (width of the envelope of extra delays).",
-        (f"J of {OFFLOADED} is below that of {LOCAL} {crossed}, seed by seed.", *rates),
+        (
+            f"The widest envelope at which J of {OFFLOADED} is below that of {LOCAL}, seed by "
+            f"seed: {crossed}.",
+            *rates,
+        ),
     )
 
 

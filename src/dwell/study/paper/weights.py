@@ -468,13 +468,14 @@ def spread_table(results: Iterable[StudyResult]) -> Table:
     for result in results:
         for scenario in result.study.scenarios:
             for name, outputs in outputs_of(result, scenario).items():
-                mean = outputs.mean(axis=0)
+                share = name == "violation_rate"
+                mean = outputs.mean(axis=0) * (100 if share else 1)
                 low, middle, high = np.quantile(mean, (0.05, 0.5, 0.95))
                 finite = np.isfinite(outputs).all()
                 rows.append(
                     {
                         "scenario": scenario,
-                        "output": OUTPUTS[name],
+                        "output": f"{OUTPUTS[name]} (%)" if share else OUTPUTS[name],
                         "low": float(low),
                         "median": float(middle),
                         "high": float(high),
@@ -495,7 +496,7 @@ def spread_table(results: Iterable[StudyResult]) -> Table:
         },
         headings={"low": "5 % of the points", "high": "95 % of the points"},
         note=(
-            "Means over seeds at the points of the design; V_D as a share. Luck: the part of the "
+            "Means over seeds at the points of the design. Luck: the part of the "
             "variance over points that other realisations would not repeat."
         ),
     )

@@ -1,0 +1,84 @@
+"""A live cell with two sources on two nodes, a join and two sinks."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+import dwell
+from dwell.live.transport.memory import Clock
+from dwell.model import Problem
+from tests.live.small_world import MS, World
+
+EXEC_MS = {
+    "overview_camera": 3.0,
+    "wrist_camera": 2.0,
+    "find_parts": 8.0,
+    "find_gripper": 5.0,
+    "fuse": 2.0,
+    "plan": 6.0,
+}
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return dwell.load("examples/fan-in.yaml")
+
+
+def world_of(problem: Problem, clocks: dict[str, Clock] | None = None) -> World:
+    exec_ms = {name: EXEC_MS.get(name, 0.5) for name in problem.pipeline.tasks}
+    return World(problem, exec_ms=exec_ms, clocks=clocks)
+
+
+@pytest.mark.parametrize("offset_s", [0, 777])
+def test_both_sources_begin_a_cycle_together(problem: Problem, offset_s: int) -> None:
+    world = world_of(problem, {"R2": Clock(offset_s * 1_000 * MS, 30.0)})
+    world.run(3_000)
+    for arm in world.arms.values():
+        cycles = [cycle for cycle, _ in arm.applied]
+        assert len(cycles) > 50
+        assert all(later - earlier == 1 for earlier, later in pairwise(cycles[5:]))
+    source = world.worker("wrist_camera@R2")
+    last = source._source._last if source._source is not None else None
+    assert last is not None
+    # The stamp was there before its cycle began: the source has waited for that instant.
+    assert last.stamp.cycle >= world.stamper.cycle - 1
+
+
+def test_a_completed_cycle_is_one_that_every_sink_has_reported(problem: Problem) -> None:
+    world = world_of(problem)
+    world.run(2_000)
+    newest = world.stamper.guard.newest
+    assert newest > 30
+    sinks = list(world.arms)
+    assert len(sinks) == 2
+    world.network.freeze(f"sink.{sinks[1]}@{next(iter(problem.pipeline.tasks[sinks[1]].on))}")
+    world.run(500)
+    assert world.stamper.guard.newest <= newest + 2
+
+
+def test_a_source_without_stamps_goes_on_for_a_while_by_itself(problem: Problem) -> None:
+    world = world_of(problem)
+    world.run(2_000)
+    rule = world.network.cut("stamper@R1", "wrist_camera@R2")
+    world.run(60 + 3 * problem.pipeline.period_ms)
+    before = world.arm.applied[-1][0]
+    # The join has the other camera's stamp, so that its cycles go where they should.
+    assert before >= world.stamper.cycle - 3
+    world.network.heal(rule)
+    world.run(1_000)
+    cycles = world.cycles
+    assert all(later > earlier for earlier, later in pairwise(cycles))
+    assert cycles[-1] >= world.stamper.cycle - 2
+
+
+def test_a_move_of_the_guard_reaches_all_sources(problem: Problem) -> None:
+    world = world_of(problem)
+    world.run(2_000)
+    other = next(name for name in problem.candidates if name != world.stamper.placement)
+    assert not world.order(other)
+    world.run(1_000)
+    assert world.stamper.placement == other
+    cycles = world.cycles
+    assert all(later - earlier == 1 for earlier, later in pairwise(cycles[5:]))
