@@ -201,8 +201,11 @@ def _state_folder() -> Path:
 
 
 def _until_told() -> threading.Event:
-    """Return an event that is set when this process is told to end."""
+    """Return an event that is set when this process is told to end, or its owner has ended."""
+    from dwell.live.leash import end_with_owner
+
     stopped = threading.Event()
+    end_with_owner(stopped)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     return stopped

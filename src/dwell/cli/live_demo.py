@@ -1,4 +1,4 @@
-"""`dwell live demo`: the cell on this machine, its scenario, and a live view."""
+"""`dwell live demo`: the cell on this machine, its scenario, and what came of it."""
 
 from __future__ import annotations
 
@@ -6,22 +6,33 @@ import importlib.resources
 import math
 import os
 import shutil
-import sys
+import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from types import FrameType
+from typing import Any, NoReturn
 
 import typer
 
 import dwell
-from dwell.cli.output import print_json
+from dwell.cli.live_view import Look, View, live_view
+from dwell.cli.output import aligned, print_json, write_file
+from dwell.demo.error_sampler import ErrorSampler
 from dwell.demo.stageplay import Change, Stageplay, changes_of, on_this_machine
-from dwell.errors import LiveError
+from dwell.demo.world import World
+from dwell.errors import DwellError, LiveError
 from dwell.live.visiting import Visitor
 from dwell.model import Problem
+from dwell.model.document import to_document
+from dwell.record import Run, open_run, seal_run
+from dwell.report import run_html
+from dwell.report.facts import Facts
+from dwell.report.phase_rows import PhaseRow, phase_rows
+from dwell.report.phases import Disturbed, disturbed
+from dwell.report.wording import listed, percent, write_number
 
 __all__ = ["play"]
 
@@ -29,7 +40,9 @@ __all__ = ["play"]
 MARK = ".dwell-live-demo"
 LOOK_S = 0.5
 START_S = 30.0
-BAR = 24
+#: What the cell did before everybody was there belongs to the run, up to so many seconds of it.
+MOST_BEFORE_S = 4.0
+INTERRUPTED = 130
 
 
 def play(
@@ -43,27 +56,112 @@ def play(
 ) -> None:
     """Run the demo, save the run, write its report, print what happened.
 
+    Interrupted, it ends everything and reports on what there is.
+
     Raises
     ------
     DwellError
         If the cell does not come up, or the folder holds something else.
     """
-    _make(out)
     with importlib.resources.as_file(importlib.resources.files("dwell.demo") / "cell.yaml") as file:
-        problem = on_this_machine(dwell.load(file))
+        problem = dwell.load(file)
     if policy is not None:
         problem = replace(problem, controller=replace(problem.controller, policy=policy))
     changes = changes_of(problem, scenario)
-    with Stageplay(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
-        with Visitor(problem) as visitor:
-            _come_up(visitor, cell)
-            with _view(problem, seconds) as view:
-                _watch(visitor, cell, changes, seconds, view)
+    _make(out)
+    problem = on_this_machine(problem)
+    told = _Told(problem, scenario, seed)
+    interrupted = False
+    with _interruptible(), Stageplay(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
+        try:
+            _watch_from_start(cell, changes, seconds, told)
+        except KeyboardInterrupt:
+            interrupted = True
+            typer.echo("interrupted; ending the cell", err=True)
         cell.stop_controller()
-    folder = next(iter(sorted((out / "runs").iterdir())), None)
+    folder = _run_folder(out)
+    if folder is None and interrupted:
+        raise typer.Exit(INTERRUPTED)
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    _sum_up(problem, folder, out, as_json=as_json)
+    run = told.note(folder)
+    _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Have whoever ends this process, or closes its terminal, interrupt it as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@dataclass(slots=True)
+class _Told:
+    """What the demo knows of a run, and its controller does not.
+
+    Instants are of the machine's monotonic clock, which the nodes of the demo have, too.
+    """
+
+    problem: Problem
+    scenario: str
+    seed: int
+    begun_ns: dict[int, int] = field(default_factory=dict)
+    ended_ns: dict[int, int] = field(default_factory=dict)
+    sampler: ErrorSampler | None = None
+
+    def changed(self, change: Change) -> None:
+        """Note that a change has been made."""
+        instants = self.begun_ns if change.begins else self.ended_ns
+        instants[id(change.item)] = time.monotonic_ns()
+
+    def items(self) -> list[tuple[object, Mapping[str, Any]]]:
+        """Return the scenario's items, each as the cell file has it."""
+        written = to_document(self.problem)["scenarios"].get(self.scenario, [])
+        return list(zip(self.problem.scenario(self.scenario), written, strict=True))
+
+    def plan(self) -> list[Disturbed]:
+        """Return what is to be played."""
+        return self._disturbed([written for _, written in self.items()])
+
+    def active(self) -> list[Disturbed]:
+        """Return what is on now."""
+        on = self.begun_ns.keys() - self.ended_ns.keys()
+        return self._disturbed([written for item, written in self.items() if id(item) in on])
+
+    def _disturbed(self, items: Sequence[Mapping[str, Any]]) -> list[Disturbed]:
+        tiers = {name: node.tier for name, node in self.problem.fabric.nodes.items()}
+        return disturbed(items, tiers)
+
+    def note(self, folder: Path) -> Run:
+        """Add it to the run, whose time begins with the first release."""
+        run = open_run(folder)
+        origin_ns, cycles = run.meta.get("origin_ns"), run.cycles
+        notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
+        if isinstance(origin_ns, int) and not cycles.is_empty():
+            end_ns = origin_ns + int(cycles["release_ns"][-1])
+            notes["played"] = [
+                {
+                    **written,
+                    "at_s": round((begun_ns - origin_ns) / 1e9, 3),
+                    "for_s": round((self.ended_ns.get(id(item), end_ns) - begun_ns) / 1e9, 3),
+                }
+                for item, written in self.items()
+                if (begun_ns := self.begun_ns.get(id(item))) is not None
+            ]
+            if self.sampler is not None:
+                notes["tracking"] = self.sampler.told(origin_ns)
+        return seal_run(folder, **notes)
 
 
 def _make(out: Path) -> None:
@@ -107,145 +205,132 @@ def _come_up(visitor: Visitor, cell: Stageplay) -> None:
         time.sleep(0.1)
 
 
-class View(Protocol):
-    """Shows how the cell is."""
-
-    def show(self, at_s: float, status: Mapping[str, Any], active: list[str]) -> None:
-        """Show it."""
-        ...
+def _watch_from_start(
+    cell: Stageplay, changes: Sequence[Change], seconds: float, told: _Told
+) -> None:
+    """Wait until everybody is there, and play the scenario."""
+    with Visitor(cell.problem) as visitor:
+        _come_up(visitor, cell)
+        now_ns = time.monotonic_ns()
+        origin_ns = visitor.ask("status").get("origin_ns") or now_ns
+        begin_ns = max(int(origin_ns), now_ns - round(MOST_BEFORE_S * 1e9))
+        world = World.open(cell.world, now_ns)
+        told.sampler = ErrorSampler(world, now_ns)
+        try:
+            with live_view(cell.problem, seconds, told.plan()) as view:
+                _watch(visitor, cell, changes, begin_ns, seconds, told, view)
+        finally:
+            told.sampler.sample(time.monotonic_ns())
+            world.close()
 
 
 def _watch(
-    visitor: Visitor, cell: Stageplay, changes: list[Change], seconds: float, view: View
+    visitor: Visitor,
+    cell: Stageplay,
+    changes: Sequence[Change],
+    begin_ns: int,
+    seconds: float,
+    told: _Told,
+    view: View,
 ) -> None:
     """Play the changes at their times, and show how the cell is."""
-    begin = time.monotonic()
-    waiting, active = list(changes), []
+    waiting = list(changes)
     status: Mapping[str, Any] = {}
-    while (at_s := time.monotonic() - begin) < seconds:
+    answered_s = 0.0
+    while (at_s := (time.monotonic_ns() - begin_ns) / 1e9) < seconds:
         while waiting and waiting[0].at_s <= at_s:
             change = waiting.pop(0)
             cell.apply(change)
-            if change.begins:
-                active.append(change)
-            else:
-                active = [other for other in active if other.item is not change.item]
+            told.changed(change)
         try:
             status = visitor.ask("status", patience_s=LOOK_S)
+            answered_s = (time.monotonic_ns() - begin_ns) / 1e9
         except LiveError:
-            status = {**status, "silent": True}
-        view.show(at_s, status, [str(change) for change in active])
-        following = waiting[0].at_s if waiting else math.inf
-        time.sleep(max(min(LOOK_S, following - (time.monotonic() - begin)), 0.0))
+            pass  # the view shows for how long nobody has answered
+        error = math.nan, math.nan
+        if told.sampler is not None:
+            told.sampler.sample(time.monotonic_ns())
+            error = told.sampler.newest()
+        view.show(Look(at_s, status, answered_s, *error, told.active()))
+        # Looks do not drift, and what begins or ends in between does so in time.
+        following_s = (math.floor(at_s / LOOK_S) + 1) * LOOK_S
+        if waiting:
+            following_s = min(following_s, waiting[0].at_s)
+        time.sleep(max(following_s - (time.monotonic_ns() - begin_ns) / 1e9, 0.0))
 
 
-@contextmanager
-def _view(problem: Problem, seconds: float) -> Iterator[View]:
-    if not sys.stderr.isatty():
-        yield _Lines()
-        return
-    from rich.live import Live
-
-    with Live(refresh_per_second=4, transient=True, screen=False) as screen:
-        yield _Screen(problem, seconds, screen)
-
-
-@dataclass(slots=True)
-class _Lines:
-    """A line whenever something has changed, for logs."""
-
-    last: tuple[object, ...] = ()
-    windows: set[int] = field(default_factory=set)
-
-    def show(self, at_s: float, status: Mapping[str, Any], active: list[str]) -> None:
-        key = (status.get("placement"), status.get("guard_moves"), tuple(active))
-        window = status.get("window") or {}
-        if key != self.last:
-            self.last = key
-            typer.echo(
-                f"{at_s:6.1f} s  {status.get('placement')}"
-                f"{'  guard' if status.get('fallback') else ''}  "
-                f"{window.get('l95_ms') or math.nan:6.1f} ms  "
-                f"{100 * (window.get('violation_rate') or 0):5.1f} %  {'; '.join(active)}",
-                err=True,
-            )
+def _run_folder(out: Path) -> Path | None:
+    """Return the longest of the runs that were written; None where there is none."""
+    found: list[tuple[int, Path]] = []
+    runs = out / "runs"
+    for folder in sorted(runs.iterdir()) if runs.is_dir() else ():
+        try:
+            found.append((int(open_run(folder).meta.get("windows", 0)), folder))
+        except DwellError:
+            continue
+    return max(found)[1] if found else None
 
 
-class _Screen:
-    """The whole cell on a terminal."""
-
-    def __init__(self, problem: Problem, seconds: float, screen: Any) -> None:
-        self.problem, self.seconds, self.screen = problem, seconds, screen
-        self.history: list[str] = []
-
-    def show(self, at_s: float, status: Mapping[str, Any], active: list[str]) -> None:
-        from rich.console import Group
-        from rich.panel import Panel
-        from rich.table import Table
-        from rich.text import Text
-
-        window = status.get("window") or {}
-        placement = status.get("placement") or "?"
-        self.history = [*self.history, placement][-60:]
-        head = Text(f"{at_s:5.0f} of {self.seconds:.0f} s   ")
-        head.append("; ".join(active) or "nothing disturbs it", style="bold")
-        stages = Table.grid(padding=(0, 2))
-        if placement in self.problem.candidates:
-            for task, node in self.problem.candidates[placement].items():
-                stages.add_row(task, Text(node, style="bold"))
-        numbers = Table.grid(padding=(0, 2))
-        numbers.add_row("L95", _number(window.get("l95_ms"), "ms"))
-        rate = window.get("violation_rate")
-        numbers.add_row("V_D", _number(None if rate is None else 100 * rate, "%"))
-        for name, cost in (window.get("estimates") or {}).items():
-            numbers.add_row(f"J of {name}", _number(cost, "", 2))
-        load = Table.grid(padding=(0, 2))
-        for node, share in (window.get("utilisation") or {}).items():
-            filled = round(BAR * min(share, 1.0))
-            load.add_row(node, "█" * filled + "·" * (BAR - filled), f"{100 * share:.0f} %")
-        moved = Text(
-            f"{status.get('migrations', 0)} migrations, {status.get('guard_moves', 0)} of the guard"
-        )
-        if status.get("fallback"):
-            moved.append("   on the guard's fallback", style="bold")
-        if status.get("silent"):
-            moved.append("   the controller does not answer", style="bold red")
-        columns = Table.grid(padding=(0, 4))
-        columns.add_row(stages, numbers, load)
-        title = f"{self.problem.name}: {placement}"
-        self.screen.update(Panel(Group(head, Text(), columns, Text(), moved), title=title))
-
-
-def _number(value: float | None, unit: str, digits: int = 1) -> str:
-    return "-" if value is None else f"{value:.{digits}f} {unit}".rstrip()
-
-
-def _sum_up(problem: Problem, folder: Path, out: Path, *, as_json: bool) -> None:
+def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:
     """Write the report, and print what the run was."""
-    from dwell.cli.report import report_run
-
-    run = dwell.open_run(folder)
-    cycles = run.cycles
-    decisions = run.decisions
-    guard = decisions.filter((decisions["reason"] == "guard") & decisions["migrated"])
-    lost = cycles.filter(cycles["latency_ns"].is_null())
-    rate = float(cycles["missed"].cast(float).mean() or 0.0)  # type: ignore[arg-type]
-    found = {
-        "cell": problem.name,
-        "cycles": len(cycles),
-        "violation_rate": rate,
-        "lost": len(lost),
-        "migrations": int(decisions["migrated"].sum()) - len(guard),
-        "guard_moves": len(guard),
-        "run": folder,
-    }
+    cycles, decisions = run.cycles, run.decisions
+    guard = decisions.filter((decisions["reason"].cast(str) == "guard") & decisions["migrated"])
+    missed = cycles["missed"].to_numpy()
+    phases = phase_rows(run, Facts.of(run))
+    page = out / "report.html"
+    report: Path | None = page
+    # A run that ended within its warm-up has nothing to report on.
+    if run.windows.filter(~run.windows["warmup"]).is_empty():
+        report = None
+    else:
+        write_file(page, run_html(run))
+    rate = float(missed.mean()) if len(missed) else math.nan
+    lost = int(cycles["latency_ns"].is_null().sum())
+    migrations = int(decisions["migrated"].sum()) - len(guard)
     if as_json:
-        print_json(found)
+        print_json(
+            {
+                "cell": run.meta["cell"],
+                "scenario": run.meta["scenario"],
+                "seed": run.meta["seed"],
+                "interrupted": interrupted,
+                "cycles": len(cycles),
+                "violation_rate": rate,
+                "lost": lost,
+                "migrations": migrations,
+                "guard_moves": len(guard),
+                "phases": [row._asdict() for row in phases],
+                "run": folder,
+                "report": report,
+            }
+        )
         return
     typer.echo(
-        f"{found['cycles']} cycles, {100 * rate:.1f} % missed, "
-        f"{found['lost']} without a command; {found['migrations']} migrations by the controller, "
-        f"{found['guard_moves']} by the guard"
+        f"{len(cycles)} cycles, {100 * rate:.1f} % missed, {lost} without a command; "
+        f"{migrations} migrations by the controller, {len(guard)} by the guard\n"
     )
+    if phases:
+        typer.echo(f"{_table(phases)}\n")
     typer.echo(f"run: {folder}")
-    report_run(folder, out / "report.html", None, as_json=False)
+    typer.echo(f"report: {report}" if report else "no report: the run ended within its warm-up")
+
+
+def _table(phases: Sequence[PhaseRow]) -> str:
+    head = ("phase", "from", "to", "V_D", "L95", "lost", "moves", "guard", "error", "", "placed")
+    rows = [
+        (
+            row.name,
+            f"{row.begin_s:.0f} s",
+            f"{row.end_s:.0f} s",
+            f"{100 * row.violation_rate:.1f} %",
+            f"{write_number(row.l95_ms)} ms",
+            str(row.lost),
+            str(row.migrations),
+            str(row.guard_moves),
+            f"{row.rms_mm:.2f} mm",
+            f"{row.rms_px:.1f} px",
+            listed(f"{name} {percent(share)}" for name, share in row.shares.items()),
+        )
+        for row in phases
+    ]
+    return aligned(head, rows)

@@ -33,8 +33,10 @@ def main(arguments: list[str] | None = None) -> int:
     sys.path.insert(0, str(asked.cell.resolve().parent))
     try:
         from dwell.io import load
+        from dwell.live.leash import end_with_owner
         from dwell.live.process import run_process
 
+        end_with_owner(stopped)
         run_process(load(asked.cell), asked.who, asked.state, stopped)
     except DwellError as error:
         print(error, file=sys.stderr)

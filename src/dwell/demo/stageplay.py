@@ -25,6 +25,7 @@ from dwell.demo.burner import Burner
 from dwell.demo.link import Forward, LinkProcess
 from dwell.demo.link_conditions import Conditions
 from dwell.errors import LiveError
+from dwell.live.leash import OWNER
 from dwell.live.wiring import PORTS_PER_ROLE, roles, wire
 from dwell.model import (
     Constant,
@@ -58,18 +59,6 @@ class Change:
     at_s: float
     item: NodeDisturbance | LinkDisturbance
     begins: bool
-
-    def __str__(self) -> str:
-        """Return it as the live view shows it."""
-        item = self.item
-        if isinstance(item, NodeDisturbance):
-            what = f"{item.stress_threads} busy threads on {item.node}"
-        else:
-            parts = [f"loss {100 * item.loss:g} %"] if item.loss else []
-            if item.add_delay_ms is not None:
-                parts.insert(0, f"+{item.add_delay_ms.expectation:.0f} ms")
-            what = f"{item.link}: {', '.join(parts) or 'disturbed'}"
-        return what if self.begins else f"end of {what}"
 
 
 def changes_of(problem: Problem, scenario: str) -> list[Change]:
@@ -151,6 +140,11 @@ class Stageplay:
         Of delays and losses.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
+
+    Attributes
+    ----------
+    world : Path
+        Where the world is that its camera and arm share (see `World`).
     """
 
     def __init__(
@@ -163,7 +157,9 @@ class Stageplay:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
-        self.environment = {"DWELL_WORLD": str(folder / "world"), **(environment or {})}
+        self.world = folder / "world"
+        own = {"DWELL_WORLD": str(self.world), OWNER: str(os.getpid())}
+        self.environment = {**own, **(environment or {})}
         self.cell = folder / "cell.yaml"
         self.links: dict[frozenset[str], LinkProcess] = {}
         self.burners: dict[str, Burner] = {}

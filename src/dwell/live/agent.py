@@ -5,6 +5,9 @@ It also tells what the node's CPU does, and on one node it is the detour for sma
 
 from __future__ import annotations
 
+import math
+import threading
+import time
 from collections.abc import Callable, Iterable
 
 import psutil
@@ -14,11 +17,15 @@ from dwell.live.role import Place, Pulse
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.protocol import Sample
 
-__all__ = ["Agent", "CpuCount"]
+__all__ = ["Agent", "CpuCount", "Gauge"]
 
 #: Time between two looks at the processes, and between two reports of what the CPU does.
 LOOK_NS = 20_000_000
 LOAD_NS = 250_000_000
+#: Time between two looks at the memory of the processes, and at how long their logs are.
+TEND_NS = 1_000_000_000
+#: Age from which what a gauge showed counts no more.
+GAUGE_S = 2.0
 #: Messages that the detour carries on together at most; more within that time are dropped.
 MOST_CARRIED = 1_000
 #: Periods between two beats of an agent.
@@ -49,6 +56,51 @@ class CpuCount:
         return round(busy_s * 1e9)
 
 
+class Gauge:
+    """Asks a user's function for a utilisation, in a thread of its own: it may fail, or hang.
+
+    Parameters
+    ----------
+    read : callable
+        Returns a share from 0 to 1.
+    every_s : float
+        Time between two calls.
+    """
+
+    def __init__(self, read: Callable[[], float], every_s: float = LOAD_NS / 1e9) -> None:
+        self._read, self._every_s = read, every_s
+        self._value, self._read_s = -1.0, time.monotonic()
+        self._trouble = ""
+        threading.Thread(target=self._run, name="gauge", daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                value = float(self._read())
+                if not 0.0 <= value <= 1.0 or math.isnan(value):
+                    raise ValueError(f"{value:g} is no share from 0 to 1")
+                self._value, self._trouble = value, ""
+            except Exception as error:  # the user's code
+                self._value = -1.0
+                self._trouble = f"the accelerator's utilisation: {type(error).__name__}: {error}"
+            self._read_s = time.monotonic()
+            time.sleep(self._every_s)
+
+    def value(self) -> float:
+        """Return the last value; -1 where there is none that counts."""
+        return self._value if self._silent_s() < GAUGE_S else -1.0
+
+    def trouble(self) -> str:
+        """Return what keeps it from telling, or nothing."""
+        silent_s = self._silent_s()
+        if silent_s < GAUGE_S:
+            return self._trouble
+        return f"the accelerator's utilisation: the function has not returned for {silent_s:.0f} s"
+
+    def _silent_s(self) -> float:
+        return time.monotonic() - self._read_s
+
+
 class Agent:
     """See the module.
 
@@ -57,8 +109,8 @@ class Agent:
     place : Place
     supervisor : Supervisor
     cpu : CpuCount
-    accelerator : callable, optional
-        Returns the utilisation of the node's accelerator.
+    accelerator : Gauge, optional
+        Tells the utilisation of the node's accelerator.
     """
 
     def __init__(
@@ -66,14 +118,14 @@ class Agent:
         place: Place,
         supervisor: Supervisor,
         cpu: CpuCount,
-        accelerator: Callable[[], float] | None = None,
+        accelerator: Gauge | None = None,
     ) -> None:
         self.place, self.supervisor = place, supervisor
         self._cpu, self._accelerator = cpu, accelerator
         # No guard waits for it: it carries nothing that a cycle needs.
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.relay
-        self._look_ns = self._load_ns = 0
+        self._look_ns = self._load_ns = self._tend_ns = 0
         self._carried: list[tuple[str, bytes]] = []
         self._carry_ns = NEVER_NS
         self._spent: dict[str, int] = {"own": 0, "shadow": 0}
@@ -96,13 +148,17 @@ class Agent:
             self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
 
     def _state(self) -> tuple[bool, str]:
-        return True, self.supervisor.notes()
+        trouble = "" if self._accelerator is None else self._accelerator.trouble()
+        return True, "; ".join(note for note in (trouble, self.supervisor.notes()) if note)
 
     def wake(self, now_ns: int) -> int:
         """Look after the processes, report the load, beat; returns what is due next."""
         if now_ns >= self._look_ns:
             self.supervisor.step()
             self._look_ns = now_ns + LOOK_NS
+        if now_ns >= self._tend_ns:
+            self.supervisor.tend()
+            self._tend_ns = now_ns + TEND_NS
         if now_ns >= self._load_ns:
             self._report(now_ns)
             self._load_ns = now_ns + LOAD_NS
@@ -117,7 +173,7 @@ class Agent:
         shadow = self._grown("shadow", lambda who: who.endswith(".shadow"))
         own = self._grown("own", lambda who: not who.endswith(".shadow"))
         busy_ns = self._cpu.busy_ns()
-        used = -1.0 if self._accelerator is None else self._accelerator()
+        used = -1.0 if self._accelerator is None else self._accelerator.value()
         load = Load(place.node, place.life, now_ns, busy_ns, own, shadow, used)
         place.put_twice(place.keys.load(place.node), encode(load))
 

@@ -26,9 +26,10 @@ from dwell.live.messages import (
     decode,
     encode,
 )
-from dwell.live.role import Place, Pulse
+from dwell.live.role import REPEATED_NS, Place, Pulse
 from dwell.live.transport.protocol import Sample
 from dwell.live.windows import LiveWindows, Resume, Rows
+from dwell.live.wiring import roles
 
 __all__ = ["Cell", "Recorder"]
 
@@ -228,6 +229,9 @@ class Cell:
             self._ask_for_states(move, answer)
 
     def _send(self, order: Order) -> None:
+        if self.place.stamper[1] in self.pulse.strangers:
+            # Its candidates may be others, of the same names.
+            return
         self.place.transport.put(self.place.keys.order(), encode(order))
 
     def _next_number(self) -> int:
@@ -461,4 +465,20 @@ class Cell:
                 who: {"age_ms": round(age_ns / 1e6, 1), "ready": beat.ready, "note": beat.note}
                 for who, beat, age_ns in self.pulse.hearing.everybody(now_ns)
             },
+            **self._missing(now_ns),
+            "complaints": dict(list(self.place.complaints.items())[-10:]),
         }
+
+    def _missing(self, now_ns: int) -> dict[str, Any]:
+        """Return who is not heard: those that differ, with why, and those that say nothing."""
+        strangers = self.pulse.strangers
+        differ = {
+            who: why for who, (why, at_ns) in strangers.items() if now_ns - at_ns < REPEATED_NS
+        }
+        heard = {who for who, _, _ in self.pulse.hearing.everybody(now_ns)}
+        silent = [
+            role.who
+            for role in roles(self.place.problem)
+            if role.who not in heard | differ.keys() and role.who != self.place.who
+        ]
+        return {"strangers": differ, "silent": silent}

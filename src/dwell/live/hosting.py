@@ -178,7 +178,7 @@ def _frames(
     while not stopped.is_set():
         try:
             if wait is None:
-                raise LiveError(f"{worker.task} has no method wait(), and live.release is frames")
+                raise LiveError("no method wait(), though live.release is frames")
             wait()
         except Exception as error:  # the user's code; a camera that fails shows in its beats
             with hosted.lock:

@@ -20,7 +20,11 @@ KEPT = 4_096
 
 
 class NodeLoad:
-    """Core-nanoseconds of one node over its own time: of all work, the cell's jobs, its shadows."""
+    """What one node has done over its own time.
+
+    Core-nanoseconds of all work, of the cell's jobs and of its shadows; and the nanoseconds that
+    its accelerator was busy.
+    """
 
     def __init__(self) -> None:
         self._at_ns: deque[int] = deque(maxlen=KEPT)
@@ -35,9 +39,10 @@ class NodeLoad:
             return
         if load.life == self._life and self._at_ns and load.at_ns <= self._at_ns[-1]:
             return
-        total = self._total[-1] if self._total else np.zeros(3)
+        total = self._total[-1] if self._total else np.zeros(4)
         if load.life == self._life:
-            total = total + np.maximum(read - self._read, 0.0)
+            busy_ns = max(load.accelerator, 0.0) * (load.at_ns - self._at_ns[-1])
+            total = total + np.append(np.maximum(read - self._read, 0.0), busy_ns)
         elif self._at_ns and load.at_ns <= self._at_ns[-1]:
             # Not only the agent began anew, but its node's clock.
             self._at_ns.clear()
@@ -47,14 +52,14 @@ class NodeLoad:
         self._total.append(total)
 
     def at(self, instant_ns: int) -> Floats:
-        """Core-nanoseconds at an instant, shape (3,).
+        """Core-nanoseconds, and those of the accelerator, at an instant; shape (4,).
 
         In proportion between two reports; beyond the first or last one for no longer than from one
         report to the next, so that a node that falls silent counts as idle.
         """
         at_ns, total = self._at_ns, self._total
         if len(at_ns) < 2:
-            return np.zeros(3)
+            return np.zeros(4)
         place = min(max(bisect.bisect(at_ns, instant_ns), 1), len(at_ns) - 1)
         begin_ns, end_ns = at_ns[place - 1], at_ns[place]
         share = min(max((instant_ns - begin_ns) / (end_ns - begin_ns), -1.0), 2.0)

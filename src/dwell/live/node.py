@@ -11,15 +11,16 @@ from pathlib import Path
 
 from dwell.control import Controller
 from dwell.errors import LiveError
-from dwell.live.agent import Agent, CpuCount
+from dwell.live.agent import Agent, CpuCount, Gauge
 from dwell.live.cell import Cell
 from dwell.live.files import make_folder
 from dwell.live.hosting import Hosted, clock_of
+from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.role import Place
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import wire
+from dwell.live.wiring import Wiring, wire
 from dwell.model import Problem
 
 __all__ = ["run_agent", "run_controller"]
@@ -50,7 +51,7 @@ def run_agent(
     cpus : iterable of int, optional
         Those that the node may use.
     accelerator : callable, optional
-        Returns the utilisation of the node's accelerator.
+        Returns the utilisation of the node's accelerator, a share from 0 to 1.
     say : callable
         Takes lines for the log.
 
@@ -66,18 +67,33 @@ def run_agent(
         _use_cpus(cpus)
     wiring = wire(problem)
     who = f"agent@{node}"
-    transport = ZenohTransport(wiring.entry(who))
+    transport = _listening(wiring, who, node)
     supervisor = Supervisor(make_folder(folder), say)
     try:
         for role in wiring.on(node):
             if role.kind not in ("agent", "controller"):
                 supervisor.keep(role.who, command(role.who))
-        place = Place(problem, who, node, transport, time.time_ns())
-        agent = Agent(place, supervisor, CpuCount(), accelerator)
+        place = Place(problem, who, node, transport, time.time_ns(), say=Log(say))
+        gauge = None if accelerator is None else Gauge(accelerator)
+        agent = Agent(place, supervisor, CpuCount(), gauge)
         Hosted(agent, transport, clock_of(problem), stopped=stopped).run()
     finally:
         supervisor.stop()
         transport.close()
+
+
+def _listening(wiring: Wiring, who: str, node: str) -> ZenohTransport:
+    """Open an agent's sessions.
+
+    Raises
+    ------
+    LiveError
+        If its port is taken: an agent of this node is there already.
+    """
+    try:
+        return ZenohTransport(wiring.entry(who))
+    except LiveError as error:
+        raise LiveError(f"{error}\nis there another agent for node {node} here?") from None
 
 
 def _use_cpus(cpus: Iterable[int]) -> None:
@@ -132,7 +148,9 @@ def run_controller(
             node = problem.controller_node
             transport = ZenohTransport(wire(problem).entry(f"controller@{node}"))
             stack.callback(transport.close)
-            place = Place(problem, f"controller@{node}", node, transport, time.time_ns())
+            place = Place(
+                *(problem, f"controller@{node}", node, transport, time.time_ns()), say=Log(say)
+            )
             controller = Controller(problem, policy)
             recorder = RunRecorder(out, problem, controller, say)
             clock = clock_of(problem)

@@ -13,6 +13,7 @@ from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
 from dwell.live.hosting import Hosted, clock_of, work
 from dwell.live.messages import Header
+from dwell.live.log import Log
 from dwell.live.role import Place, Pulse, Role
 from dwell.live.sink import Sink
 from dwell.live.stage import Actuator, load_actuator, load_stage
@@ -46,7 +47,7 @@ def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Eve
     """
     entry = wire(problem).entry(who)
     transport = ZenohTransport(entry)
-    place = Place(problem, who, entry.role.node, transport, time.time_ns())
+    place = Place(problem, who, entry.role.node, transport, time.time_ns(), say=Log(_print))
     try:
         _run(problem, entry.role, place, make_folder(folder), stopped)
     finally:
@@ -115,6 +116,10 @@ def _work(
             inflight.begin(_written(job))
 
     work(worker, place.transport, stopped=stopped, note=note, clock=clock_of(problem))
+
+
+def _print(line: str) -> None:
+    print(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {line}", file=sys.stderr, flush=True)
 
 
 class _Broken:

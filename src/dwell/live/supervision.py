@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -25,6 +26,11 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
 HEALTHY_S = 10.0
 #: Deaths of one message before it is put aside.
 POISONOUS = 2
+#: A process has warmed up after this time; it is reported when it has gained this much since, and
+#: has more than twice what it had then.
+WARM_S, GROWTH_BYTES = 30.0, 128 << 20
+#: A log that is longer becomes the older one, which is dropped.
+LOG_BYTES = 8 << 20
 
 
 @dataclass(slots=True)
@@ -51,6 +57,8 @@ class Child:
     note: str = ""
     deaths: Counter[str] = field(default_factory=Counter)
     watched: psutil.Process | None = None
+    warm_bytes: int | None = None
+    growth: str = ""
 
     @property
     def pid(self) -> int | None:
@@ -84,10 +92,21 @@ class Supervisor:
         The node's.
     say : callable
         Takes a line for the log of the agent.
+    warm_s, growth_bytes, log_bytes
+        From when on, and from what on, memory that grows is reported; length of a log.
     """
 
-    def __init__(self, folder: Path, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        say: Callable[[str], None],
+        *,
+        warm_s: float = WARM_S,
+        growth_bytes: int = GROWTH_BYTES,
+        log_bytes: int = LOG_BYTES,
+    ) -> None:
         self.folder = folder
+        self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
         self.children: list[Child] = []
         self._say = say
         self._environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -167,10 +186,38 @@ class Supervisor:
                 process_group=0,
             )
         child.started_s = time.monotonic()
+        child.warm_bytes, child.growth = None, ""
         started = psutil.Process(child.process.pid).create_time()
         draft = child.mark.with_suffix(".new")
         draft.write_text(json.dumps({"pid": child.process.pid, "started": started}))
         draft.replace(child.mark)
+
+    def tend(self) -> None:
+        """Look how much memory the processes have taken, and how much they have printed."""
+        for child in self.children:
+            _shorten(child.log, self._log_bytes)
+            self._weigh(child)
+
+    def _weigh(self, child: Child) -> None:
+        """Report a process whose memory has doubled since it had warmed up, at every doubling."""
+        if child.pid is None or time.monotonic() - child.started_s < self._warm_s:
+            return
+        try:
+            memory = psutil.Process(child.pid).memory_info()
+        except psutil.Error:
+            return
+        # Without what it shares with others: the payloads in shared memory.
+        has_bytes = memory.rss - memory.shared
+        before = child.warm_bytes
+        if before is None:
+            child.warm_bytes = has_bytes
+        elif has_bytes > max(2 * before, before + self._growth_bytes):
+            child.warm_bytes = has_bytes
+            child.growth = (
+                f"{child.who}: its memory has grown from {before >> 20} to {has_bytes >> 20} MB; "
+                "does its stage leak?"
+            )
+            self._say(child.growth)
 
     def cpu_seconds(self, select: Callable[[str], bool]) -> float:
         """CPU time of the processes whose names are selected, past ones included."""
@@ -188,8 +235,10 @@ class Supervisor:
         return total
 
     def notes(self) -> str:
-        """What went wrong last, of processes that keep dying."""
-        return "; ".join(child.note for child in self.children if child.failures > 1)[:2000]
+        """What went wrong last, of processes that keep dying or growing."""
+        found = [child.note for child in self.children if child.failures > 1]
+        found += [child.growth for child in self.children if child.growth]
+        return "; ".join(found)[:2000]
 
     def stop(self, patience_s: float = 2.0) -> None:
         """End all processes; those that do not listen are killed."""
@@ -205,6 +254,8 @@ class Supervisor:
         psutil.wait_procs(alive, timeout=patience_s)
         for child in self.children:
             child.mark.unlink(missing_ok=True)
+            if child.process is not None:
+                child.process.wait()
             child.process = child.adopted = None
 
 
@@ -233,6 +284,17 @@ def _reason(code: int) -> str:
         except ValueError:
             return f"was killed by signal {-code}"
     return f"ended with exit code {code}"
+
+
+def _shorten(path: Path, longest: int) -> None:
+    """Begin a log anew that is too long; its process goes on appending to the same file."""
+    try:
+        if path.stat().st_size <= longest:
+            return
+        shutil.copyfile(path, path.with_suffix(".log.1"))
+        os.truncate(path, 0)
+    except OSError:
+        return
 
 
 def _last_line(path: Path) -> str:

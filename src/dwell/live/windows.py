@@ -415,14 +415,19 @@ class LiveWindows:
                 self._windows.pop(old.window, None)
 
     def _core_ns(self, first: LiveCycle, close_ns: int) -> NDArray[np.float64]:
-        """Core-nanoseconds of every node in a window, shape (3, nodes)."""
+        """Core-nanoseconds of every node in a window, shape (3, nodes).
+
+        A node is as busy as the busier of its CPU and its accelerator.
+        """
         used = np.zeros((3, len(self._loads)))
         for column, (node, load) in enumerate(self._loads.items()):
             begin_ns, end_ns = (
                 self.offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
                 for at_ns in (first.at_ns, close_ns)
             )
-            used[:, column] = load.at(end_ns) - load.at(begin_ns)
+            busy_ns, own_ns, shadow_ns, accelerator_ns = load.at(end_ns) - load.at(begin_ns)
+            cores = self.problem.fabric.nodes[node].cores
+            used[:, column] = max(busy_ns, cores * accelerator_ns), own_ns, shadow_ns
             load.forget(begin_ns)
         return used
 

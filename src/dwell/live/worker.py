@@ -531,7 +531,8 @@ class Worker:
 
     def no_frame(self, error: Exception) -> None:
         """Take note that waiting for a frame has failed."""
-        self._failed(f"wait() raised {type(error).__name__}: {error}")
+        known = isinstance(error, LiveError)
+        self._failed(str(error) if known else f"wait() raised {type(error).__name__}: {error}")
 
     def _failed(self, what: str) -> None:
         self.trouble = f"{self.task} on {self.place.node}: {what}"
@@ -549,6 +550,8 @@ class Worker:
             return False, f"{where}: cycle {cycle}: process() has not returned for {since_s:.0f} s"
         if not self.started:
             return False, self.trouble or f"{where}: start() has not returned yet"
+        if self.triggers and self._framed_ns is None:
+            self._framed_ns = self._now_ns
         if self._framed_ns is not None and self._now_ns - self._framed_ns > limit_ns:
             silent_s = (self._now_ns - self._framed_ns) / 1e9
             return True, self.trouble or f"{where}: wait() has brought no frame for {silent_s:.0f} s"

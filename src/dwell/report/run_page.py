@@ -93,7 +93,7 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     seconds = counted.cycles.height * facts.period_ms / 1e3
     yield f"<h1>{escape(title)}</h1>"
     yield paragraph(
-        f"Scenario “{shown_scenario(facts.scenario)}”, {_kind(facts)}, seed {facts.seed}: "
+        f"{_what(facts)}: "
         f"{counted.windows.height} windows of {facts.window_cycles} cycles after the warm-up, "
         f"{write_number(seconds / 60)} minutes",
         "subtitle",
@@ -114,8 +114,12 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     yield section("What this is", *_about(facts))
 
 
-def _kind(facts: Facts) -> str:
-    return "live, on real processes" if facts.live else facts.kind
+def _what(facts: Facts) -> str:
+    if not facts.live:
+        return f"Scenario “{shown_scenario(facts.scenario)}”, {facts.kind}, seed {facts.seed}"
+    # A cell in earnest has no scenario but what happens to it.
+    played = facts.scenario not in ("live", "–")
+    return f"Live{f', scenario “{shown_scenario(facts.scenario)}”' if played else ''}"
 
 
 def _begins(run: Run, facts: Facts) -> NDArray[np.float64]:
@@ -163,8 +167,8 @@ def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
     yield f"{text}."
     if len(guards):
         yield (
-            f"Beside these, the robot's guard moved it {_count(guards.height, 'time')}: nothing had "
-            "come through for longer than it waits."
+            f"Beside these, the robot's guard moved it {_count(guards.height, 'time')}: nothing "
+            "had come through for longer than it waits."
         )
     yield from _shadows(facts, counted.windows)
     yield (
@@ -287,8 +291,8 @@ def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str
     head += [Cell("error (mm)", "num"), Cell("error (px)", "num")] if tracked else []
     done = listed(f"{one.kind} ({one.what})" for one in _once(facts))
     caption = (
-        f"All cycles by when they were released, the warm-up included. Played: {done}. Lost: cycles "
-        "that never finished."
+        f"All cycles by when they were released, the warm-up included. Played: {done}. Lost: "
+        "cycles that never finished."
     )
     if tracked:
         caption += (

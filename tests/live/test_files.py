@@ -1,0 +1,96 @@
+"""What outlives a process of a live cell."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.errors import LiveError
+from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
+from dwell.live.stamper import Entry
+
+
+def test_a_book_is_read_as_it_was_written(tmp_path: Path) -> None:
+    book = BookFile(tmp_path / "stamper.book")
+    assert book.read() is None
+    for term in range(1, 4):
+        entry = Entry(run=7, reserved=1024 * term, term=term, placement="SO", on_fallback=term == 2)
+        book.write(entry)
+        assert BookFile(tmp_path / "stamper.book").read() == entry
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"run": 1}', '{"run": -1, "reserved": 0, "term": 1}', '{"run": "x"}']
+)
+def test_a_book_that_cannot_be_read_is_none(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "stamper.book"
+    path.write_text(text)
+    assert BookFile(path).read() is None
+
+
+def test_the_highest_cycle_outlives_its_process(tmp_path: Path) -> None:
+    path = tmp_path / "sink.highest"
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from dwell.live.files import HighestFile\n"
+        "kept = HighestFile(Path(sys.argv[1]))\n"
+        "for cycle in range(1, 1000): kept.store(5, cycle)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert HighestFile(path).load() == (5, 999)
+
+
+@given(spoilt=st.integers(0, 39), value=st.integers(0, 255))
+def test_a_spoilt_slot_costs_one_cycle_at_most(
+    tmp_path_factory: pytest.TempPathFactory, spoilt: int, value: int
+) -> None:
+    path = tmp_path_factory.mktemp("sink") / "sink.highest"
+    kept = HighestFile(path)
+    assert kept.load() == (-1, -1)
+    for cycle in range(10):
+        kept.store(3, cycle)
+    data = bytearray(path.read_bytes())
+    data[spoilt] = value
+    path.write_bytes(data)
+    assert HighestFile(path).load() in ((3, 9), (3, 8))
+
+
+def test_a_job_in_flight_is_what_a_dead_worker_was_at(tmp_path: Path) -> None:
+    path = tmp_path / "worker.inflight"
+    assert InFlight.read(path) is None
+    inflight = InFlight(path)
+    inflight.begin(b"first")
+    assert InFlight.read(path) == b"first"
+    inflight.end()
+    assert InFlight.read(path) is None
+    large = os.urandom(300_000)
+    inflight.begin(large)
+    assert InFlight.read(path) == large
+    inflight.begin(b"small")
+    assert InFlight.read(path) == b"small"
+
+
+@given(st.binary(max_size=64))
+def test_no_content_of_the_file_is_more_than_no_job(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("worker") / "worker.inflight"
+    path.write_bytes(data)
+    found = InFlight.read(path)
+    assert found is None or len(found) <= len(data)
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(LiveError, match="file/inside: cannot be made"):
+        make_folder(tmp_path / "file" / "inside")

@@ -1,0 +1,147 @@
+"""An agent's supervisor with real processes that die in every way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from dwell.live import supervision
+from dwell.live.files import InFlight
+from dwell.live.supervision import Child, Supervisor
+
+PATIENCE_S = 20.0
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def supervisor(tmp_path: Path, said: list[str]) -> Iterator[Supervisor]:
+    made = Supervisor(tmp_path, said.append)
+    yield made
+    made.stop()
+
+
+def until(supervisor: Supervisor, done: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < end, "it has not happened"
+        supervisor.step()
+        time.sleep(0.005)
+
+
+def keep(supervisor: Supervisor, who: str, code: str) -> Child:
+    return supervisor.keep(who, [sys.executable, "-c", code])
+
+
+def test_a_killed_process_is_started_again(supervisor: Supervisor, said: list[str]) -> None:
+    child = keep(supervisor, "worker@E", "import time; time.sleep(1000)")
+    until(supervisor, lambda: child.starts == 1)
+    first = child.pid
+    assert first is not None
+    os.kill(first, signal.SIGKILL)
+    until(supervisor, lambda: child.starts == 2)
+    assert child.pid != first
+    assert said == ["worker@E was killed by SIGKILL"]
+
+
+def test_a_crash_loop_backs_off_and_is_reported(supervisor: Supervisor, said: list[str]) -> None:
+    child = keep(supervisor, "worker@E", "raise SystemExit('no camera here')")
+    until(supervisor, lambda: child.failures >= 4)
+    waits = [child.next_s - time.monotonic()]
+    assert waits[0] > 4 * supervision.FIRST_WAIT_S
+    assert "ended with exit code 1: no camera here" in supervisor.notes()
+    assert said[-1].startswith("worker@E ended with exit code 1: no camera here; start 5 in 0.4 s")
+
+
+def test_a_message_that_kills_twice_is_put_aside_with_its_bytes(
+    supervisor: Supervisor, tmp_path: Path, said: list[str]
+) -> None:
+    # It dies of what the one before it died of, as long as that is handed to it.
+    code = (
+        "import os, signal, sys, time\n"
+        "from pathlib import Path\n"
+        "from dwell.live.files import InFlight\n"
+        f"folder = Path({str(tmp_path)!r})\n"
+        "again = folder / 'worker@E.again'\n"
+        "first = not (folder / 'started').exists()\n"
+        "(folder / 'started').touch()\n"
+        "if first or again.exists():\n"
+        "    content = again.read_bytes() if again.exists() else b'poison'\n"
+        "    InFlight(folder / 'worker@E.inflight').begin(content)\n"
+        "    os.kill(os.getpid(), signal.SIGSEGV)\n"
+        "time.sleep(1000)\n"
+    )
+    child = keep(supervisor, "worker@E", code)
+    until(supervisor, lambda: child.starts == 3)
+    (kept,) = (tmp_path / "quarantine").iterdir()
+    assert kept.read_bytes() == b"poison"
+    assert any("has killed it twice" in line for line in said)
+    assert InFlight.read(child.inflight) is None
+    supervisor.step()
+    assert child.pid is not None
+    assert psutil.pid_exists(child.pid)
+
+
+def test_processes_outlive_their_agent_and_the_next_one_adopts_them(
+    tmp_path: Path, said: list[str]
+) -> None:
+    first = Supervisor(tmp_path, said.append)
+    child = keep(first, "stamper@R1", "import time; time.sleep(1000)")
+    until(first, lambda: child.starts == 1)
+    pid = child.pid
+    assert pid is not None
+    # The first agent is gone; nobody has told its children.
+    second = Supervisor(tmp_path, said.append)
+    adopted = keep(second, "stamper@R1", "raise SystemExit")
+    second.step()
+    assert (adopted.pid, adopted.starts) == (pid, 0)
+    assert second.cpu_seconds(lambda who: True) >= 0
+    os.kill(pid, signal.SIGKILL)
+    assert child.process is not None
+    child.process.wait()
+    until(second, lambda: adopted.starts >= 1)
+    second.stop()
+
+
+def test_a_mark_of_another_process_is_not_believed(tmp_path: Path, said: list[str]) -> None:
+    (tmp_path / "stamper@R1.pid").write_text(f'{{"pid": {os.getpid()}, "started": 12.5}}')
+    supervisor = Supervisor(tmp_path, said.append)
+    child = keep(supervisor, "stamper@R1", "import time; time.sleep(1000)")
+    assert child.adopted is None
+    until(supervisor, lambda: child.starts == 1)
+    supervisor.stop()
+
+
+def test_what_does_not_listen_is_killed(tmp_path: Path, said: list[str]) -> None:
+    supervisor = Supervisor(tmp_path, said.append)
+    ready = tmp_path / "ready"
+    deaf = (
+        "import signal, time\n"
+        "from pathlib import Path\n"
+        "signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        f"Path({str(ready)!r}).touch()\n"
+        "time.sleep(1000)\n"
+    )
+    children = [
+        keep(supervisor, "a@E", deaf),
+        keep(supervisor, "b@E", "import time; time.sleep(99)"),
+    ]
+    until(supervisor, ready.exists)
+    frozen = children[1].pid
+    assert frozen is not None
+    os.kill(frozen, signal.SIGSTOP)
+    pids = [child.pid for child in children]
+    supervisor.stop(patience_s=0.5)
+    for pid in pids:
+        assert pid is not None
+        assert not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
