@@ -49,8 +49,10 @@ def measure_of(unit: Unit, values: Sequence[float]) -> Measure:
         return Measure("", "", "", 1.0, 0)
     large = finite[min(len(finite) - 1, math.floor(0.9 * len(finite)))]
     needed = max(len(f"{value:.6f}".rstrip("0").partition(".")[2]) for value in finite)
-    # Settings such as 0.001 and 32 need their own, each with three digits at most.
-    fitting = needed if needed <= EXACT else 2 - math.floor(math.log10(large))
+    fitting = 2 - math.floor(math.log10(large))
+    # Of settings such as 0.001 to 32, each with three digits at most, none becomes nothing.
+    if needed <= EXACT and finite[0] < 0.5 * 10.0**-fitting:
+        fitting = needed
     return Measure("", "", "", 1.0, max(0, min(fitting, needed)))
 
 
