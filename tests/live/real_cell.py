@@ -30,6 +30,11 @@ GUARD_CYCLES = 3
 MAX_AGE_MS = 120
 MIN_DWELL = 2
 WINDOW_CYCLES = 5
+#: A window with lost cycles closes after the guard has looked: an order that comes of it, and that
+#: might be for what has just died, finds another term.
+GRACE_MS = GUARD_CYCLES * PERIOD_MS
+#: Cycles without a fault after which the next one is no relapse: ten windows, and one.
+HEALTH_CYCLES = 11 * WINDOW_CYCLES
 #: Where each cell's controller wants to be, and what makes it want that.
 HOMES = ("SO", "LOC")
 EXEC_MS = {
@@ -87,7 +92,7 @@ def document(home: str, *, standby: bool = True) -> dict[str, Any]:
         "controller": {
             "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
             "min_improvement": 0.4, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
-            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": PERIOD_MS,
+            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_MS,
         },
         "live": {
             "max_age_ms": MAX_AGE_MS, "silence": "hold",
@@ -143,6 +148,19 @@ class Observed:
     @property
     def applied(self) -> list[Seen]:
         return [seen for seen in self.all if seen.what == APPLY]
+
+    def healthy(self, home: str) -> int:
+        """Cycles since the last one that was lost, or took another placement."""
+        self.look()
+        count, following = 0, None
+        for seen in reversed(self.all):
+            if seen.what != APPLY:
+                continue
+            gap = following is not None and following - seen.cycle > 1
+            if gap or seen.placement != home:
+                break
+            count, following = count + 1, seen.cycle
+        return count
 
     def last(self) -> Seen | None:
         self.look()
@@ -237,6 +255,8 @@ class RealCell(Stageplay):
         shutil.copy(Path(real_stages.__file__), folder / "real_stages.py")
         self.observed = Observed(folder / "observed")
         self.visitor: Visitor | None = None
+        #: Whether the last fault made the cell move.
+        self.moved = False
 
     def __enter__(self) -> RealCell:
         super().__enter__()
@@ -345,6 +365,37 @@ class RealCell(Stageplay):
                 return f"{key} is {said[key]}"
         return "; ".join(self._unwell(said["processes"]))
 
+    def healthy(self) -> str:
+        """Look whether the guard takes the next fault for no relapse."""
+        count = self.observed.healthy(self.home)
+        return "" if count >= HEALTH_CYCLES else f"{count} of {HEALTH_CYCLES} cycles"
+
+    def check_run(self) -> list[str]:
+        """Return what is wrong with the record of the run, as far as it goes."""
+        if len(self.runs) != 1:
+            return [f"{len(self.runs)} runs instead of one"]
+        run = dwell.open_run(self.runs[0])
+        found = []
+        for table, column in ((run.cycles, "number"), (run.windows, "window")):
+            numbers = table[column].to_list()
+            if any(later <= before for before, later in pairwise(numbers)):
+                found.append(f"{column} does not grow")
+        ordered = run.decisions.filter(
+            run.decisions["migrated"] & (run.decisions["reason"] != "guard")
+        )
+        windows = ordered["window"].to_list()
+        found += [
+            f"migrations after windows {before} and {later}"
+            for before, later in pairwise(windows)
+            if later - before < MIN_DWELL + 1
+        ]
+        applied = {seen.cycle for seen in self.observed.applied}
+        told = run.cycles.filter(run.cycles["actuated"].cast(bool, strict=False))
+        unknown = set(told["number"].to_list()) - applied
+        if unknown:
+            found.append(f"actuated by the record, not by the actuator: {sorted(unknown)[:5]}")
+        return found
+
     def _unwell(self, processes: dict[str, Any]) -> Iterator[str]:
         for who in self.everybody:
             told = processes.get(who)
@@ -439,6 +490,24 @@ def _faults() -> Iterator[Fault]:
 FAULTS = {fault.name: fault for fault in _faults()}
 
 
+def moves(fault: Fault) -> bool:
+    """Whether the guard has to move the cell, after which it needs time to be healthy again."""
+    if fault.how == "cut":
+        return not {"R2->E", "R2->R1"} & {fault.whom[0]} or len(fault.whom) > 1
+    relocatable = any(who.startswith(("perception", "planning", "*E")) for who in fault.whom)
+    return fault.bound is not None and relocatable
+
+
+def mixed(home: str) -> list[Fault]:
+    """Return a home's faults, those that make the cell move apart from one another."""
+    mine = [fault for fault in FAULTS.values() if fault.home == home]
+    moving = [fault for fault in mine if moves(fault)]
+    others = [fault for fault in mine if not moves(fault)]
+    placed = [(index / len(moving), fault) for index, fault in enumerate(moving)]
+    placed += [((index + 0.5) / len(others), fault) for index, fault in enumerate(others)]
+    return [fault for _, fault in sorted(placed, key=lambda item: item[0])]
+
+
 @dataclass(slots=True)
 class Outcome:
     """What a fault has cost.
@@ -496,6 +565,8 @@ def strike(
         If an event that it waits for does not come.
     """
     cell.wait_for("the whole cell at home", cell.at_home, 30.0)
+    if cell.moved:
+        cell.wait_for("health", cell.healthy, 30.0)
     last = cell.observed.last()
     assert last is not None
     names = fault.names(cell) if fault.how != "cut" else []
@@ -506,12 +577,18 @@ def strike(
     _last(cell, fault, begin_ns, lasts)
     end_ns = time.monotonic_ns()
     _end(cell, fault, names)
+    if fault.how == "kill" and fault.bound is None:
+        # Its end is the first cycle again.
+        cell.wait_for("a cycle after it", lambda: _few(cell, end_ns, 1), 30.0)
+        end_ns = time.monotonic_ns()
     recovered = f"the whole cell at home after '{fault.name}'"
     cell.wait_for(recovered, cell.at_home, 60.0)
     back_ns = time.monotonic_ns()
     # What is on its way when the cell is back is seen, too.
     cell.wait_for("five more cycles", lambda: _few(cell, back_ns, 5), 5.0)
-    return _weigh(cell, fault, stalls, seed, phase, (begin_ns, end_ns, back_ns))
+    found = _weigh(cell, fault, stalls, seed, phase, (begin_ns, end_ns, back_ns))
+    cell.moved = " " in found.moved
+    return found
 
 
 def _act(cell: RealCell, fault: Fault, names: list[str], at_ns: int) -> int:
@@ -561,10 +638,6 @@ def _end(cell: RealCell, fault: Fault, names: list[str]) -> None:
         for who in names:
             if who.startswith(("agent", "controller")):
                 cell.start_again(who)
-        if fault.bound is None:
-            # Its end is the first cycle again.
-            begin_ns = time.monotonic_ns()
-            cell.wait_for("a cycle after it", lambda: _few(cell, begin_ns, 1), 30.0)
 
 
 def _few(cell: RealCell, since_ns: int, count: int) -> str:

@@ -243,6 +243,17 @@ def test_rule_7_the_watchdog_speaks_when_no_command_comes(problem: Problem) -> N
     assert world.arm.silences == 1
 
 
+def test_rule_7_a_sink_that_takes_over_is_impatient_at_once(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
+    world.run(1_000)
+    world.kill("sink.control@R2")
+    world.kill("control@R2")
+    assert world.arm.silences == 0
+    world.start("sink.control@R2")
+    world.run(1_000)
+    assert world.arm.silences == 1
+
+
 def test_rule_7_an_old_command_is_never_applied(problem: Problem) -> None:
     world = World(on(problem, "SO"), exec_ms=EXEC_MS)
     world.run(1_000)

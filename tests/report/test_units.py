@@ -58,7 +58,11 @@ def test_numbers_of_a_column_have_the_same_decimals() -> None:
         "0.20",
         "0.80",
     ]
-    wide = [0.003, 1.3, 17.0, 814.0, 12.0]
+    # Settings do not become nothing, as what is measured may.
+    envelopes = [0.001, 0.5, 4.0, 32.0]
+    measure = measure_of("number", envelopes)
+    assert [write(value, "number", measure) for value in envelopes[::3]] == ["0.001", "32.0"]
+    wide = [0.0034, 1.3, 17.0, 814.0, 12.0]
     measure = measure_of("number", wide)
     assert {write(value, "number", measure).rpartition(".")[2] for value in wide[:2]} == {"0", "1"}
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 import signal
 import sys
 import threading
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from dwell.cli.output import print_json
 
 __all__ = ["agent", "controller", "live"]
+
+T = TypeVar("T")
 
 Cell = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file.")]
 Cpus = Annotated[
@@ -37,22 +41,50 @@ def agent(
         ),
     ] = None,
     cpus: Cpus = None,
+    cpus_of: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PROCESS=LIST", help="CPUs of some processes, as perception@*=2-3; may repeat."
+        ),
+    ] = None,
+    realtime: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PROCESS=PRIORITY",
+            help="Real-time priority (SCHED_FIFO) of some processes, as sink.*=20; may repeat.",
+        ),
+    ] = None,
+    accelerator: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODULE:FUNCTION",
+            help="Returns the utilisation of the node's accelerator, from 0 to 1.",
+        ),
+    ] = None,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     import dwell
     from dwell.cli.process import command
     from dwell.live.node import run_agent
+    from dwell.live.stage import load_function
+    from dwell.live.wiring import roles
 
     problem = dwell.load(cell)
     folder = state or _state_folder() / problem.name / node
     sys.path.insert(0, str(cell.resolve().parent))
+    read = None if accelerator is None else load_function(accelerator, "--accelerator")
+    wanted = _cpus(cpus)
+    there = sorted(role.who for role in roles(problem) if role.node == node)
+    of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
+    priorities = _by_process("--realtime", realtime, there, _priority)
     run_agent(
         problem,
         node,
         folder,
-        lambda who: command(cell.resolve(), who, folder),
+        lambda who: command(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
         _until_told(),
-        cpus=_cpus(cpus),
+        cpus=wanted,
+        accelerator=read,
         say=_say,
     )
 
@@ -170,16 +202,49 @@ def told(status: dict[str, Any]) -> list[str]:
     if status["refused"]:
         extras.append(f"last order refused: {status['refused']}")
     lines = [f"{status['cell']}: {where}{''.join(f'; {extra}' for extra in extras)}"]
-    lines.append(f"mode {status['mode']}, term {status['term']}, guard {status['guard_moves']}")
+    lines.append(
+        f"mode {status['mode']}, term {status['term']}, migrations {status['migrations']}, moves "
+        f"of the guard {status['guard_moves']}"
+    )
+    if window := status["window"]:
+        used = ", ".join(f"{node} {share:.0%}" for node, share in window["utilisation"].items())
+        lines.append(
+            f"window {window['number']}: L95 {window['l95_ms']:.1f} ms, V_D "
+            f"{window['violation_rate']:.1%}, J {window['cost']:.3f}, {window['reason']}; "
+            f"utilisation {used}"
+        )
     for who, process in sorted(status["processes"].items()):
         state = "ready" if process["ready"] else "not ready"
         note = f"  {process['note']}" if process["note"] else ""
         lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
+    lines += [f"  {who:24} not heard" for who in status["silent"]]
+    lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]
     return lines
 
 
-def _cpus(text: str | None) -> set[int] | None:
-    """Read a list of CPUs."""
+def _by_process(
+    option: str, given: Sequence[str] | None, there: Sequence[str], read: Callable[[str], T]
+) -> dict[str, T]:
+    """Read options of the form PROCESS=VALUE, the process with ``*`` for any; the last counts."""
+    found: dict[str, T] = {}
+    for one in given or ():
+        pattern, equals, text = one.partition("=")
+        names = fnmatch.filter(there, pattern)
+        if not equals or not names:
+            known = ", ".join(there)
+            raise typer.BadParameter(f"{option}: {one!r} is for no process of the node: {known}")
+        found.update(dict.fromkeys(names, read(text)))
+    return found
+
+
+def _priority(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 99:
+        raise typer.BadParameter(f"--realtime: {text!r} is no priority from 1 to 99")
+    return int(text)
+
+
+def _cpus(text: str | None, option: str = "--cpus", of: set[int] | None = None) -> set[int] | None:
+    """Read a list of CPUs; they have to be among others."""
     if text is None:
         return None
     found: set[int] = set()
@@ -188,10 +253,10 @@ def _cpus(text: str | None) -> set[int] | None:
             first, _, last = part.partition("-")
             found.update(range(int(first), int(last or first) + 1))
     except ValueError:
-        raise typer.BadParameter(f"--cpus: {text!r} is no list of CPUs, as 0,2-3") from None
-    there = os.sched_getaffinity(0)
+        raise typer.BadParameter(f"{option}: {text!r} is no list of CPUs, as 0,2-3") from None
+    there = of or os.sched_getaffinity(0)
     if not found or not found <= there:
-        raise typer.BadParameter(f"--cpus: {text} cannot be had; there are {sorted(there)}")
+        raise typer.BadParameter(f"{option}: {text} cannot be had; there are {sorted(there)}")
     return found
 
 

@@ -42,6 +42,8 @@ LOOK_S = 0.5
 START_S = 30.0
 #: What the cell did before everybody was there belongs to the run, up to so many seconds of it.
 MOST_BEFORE_S = 4.0
+#: The arm comes from its home, and first has to get to the tag.
+SETTLED_S = 3.0
 INTERRUPTED = 130
 
 
@@ -215,7 +217,7 @@ def _watch_from_start(
         origin_ns = visitor.ask("status").get("origin_ns") or now_ns
         begin_ns = max(int(origin_ns), now_ns - round(MOST_BEFORE_S * 1e9))
         world = World.open(cell.world, now_ns)
-        told.sampler = ErrorSampler(world, now_ns)
+        told.sampler = ErrorSampler(world, begin_ns + round(SETTLED_S * 1e9))
         try:
             with live_view(cell.problem, seconds, told.plan()) as view:
                 _watch(visitor, cell, changes, begin_ns, seconds, told, view)
@@ -327,10 +329,14 @@ def _table(phases: Sequence[PhaseRow]) -> str:
             str(row.lost),
             str(row.migrations),
             str(row.guard_moves),
-            f"{row.rms_mm:.2f} mm",
-            f"{row.rms_px:.1f} px",
+            _known(row.rms_mm, "mm", 2),
+            _known(row.rms_px, "px", 1),
             listed(f"{name} {percent(share)}" for name, share in row.shares.items()),
         )
         for row in phases
     ]
     return aligned(head, rows)
+
+
+def _known(value: float, unit: str, digits: int) -> str:
+    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else "-"

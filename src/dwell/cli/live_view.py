@@ -259,7 +259,9 @@ class Screen:
             ("V_D", _number(_hundred(window.get("violation_rate")), "%"), MOST_RATE, 0.05),
             ("error", _number(look.error_mm, "mm"), MOST_MM, math.inf),
         ):
-            yield self._line(name, _sparkline(course.values.get(name, []), most, limit), value)
+            strip = _sparkline(course.values.get(name, []), most, limit)
+            strip.append(" " * (course.columns - len(strip)))
+            yield self._line(name, strip, value)
 
     @staticmethod
     def _line(label: str, strip: Text, value: str, style: str | None = None) -> Text:

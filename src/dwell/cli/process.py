@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 
 from dwell.errors import DwellError
@@ -13,10 +15,32 @@ from dwell.errors import DwellError
 __all__ = ["command", "main"]
 
 
-def command(cell: Path, who: str, state: Path) -> list[str]:
-    """Return the command of a process of a cell."""
-    files = ["--cell", str(cell), "--state", str(state)]
-    return [sys.executable, "-m", "dwell.cli.process", "--who", who, *files]
+def command(
+    cell: Path,
+    who: str,
+    state: Path,
+    cpus: Iterable[int] | None = None,
+    priority: int | None = None,
+) -> list[str]:
+    """Return the command of a process of a cell.
+
+    Parameters
+    ----------
+    cell : Path
+    who : str
+    state : Path
+        Folder of its node's files.
+    cpus : iterable of int, optional
+        Those that it may use; those of its agent where None.
+    priority : int, optional
+        Its real-time priority, 1 to 99.
+    """
+    words = ["--cell", str(cell), "--state", str(state)]
+    if cpus is not None:
+        words += ["--cpus", ",".join(map(str, sorted(cpus)))]
+    if priority is not None:
+        words += ["--realtime", str(priority)]
+    return [sys.executable, "-m", "dwell.cli.process", "--who", who, *words]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -25,7 +49,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--cell", type=Path, required=True)
     parser.add_argument("--who", required=True)
     parser.add_argument("--state", type=Path, required=True)
+    parser.add_argument("--cpus", default="")
+    parser.add_argument("--realtime", type=int, default=0)
     asked = parser.parse_args(arguments)
+    _schedule(asked.who, asked.cpus, asked.realtime)
     stopped = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
@@ -42,6 +69,21 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def _schedule(who: str, cpus: str, priority: int) -> None:
+    """Take CPUs and a priority; threads that are started later inherit both.
+
+    A process that may not goes on without: it says so, and the loop does not stop for it.
+    """
+    try:
+        if cpus:
+            os.sched_setaffinity(0, {int(cpu) for cpu in cpus.split(",")})
+        if priority:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError as error:
+        what = f"real-time priority {priority}" if priority else f"CPUs {cpus}"
+        print(f"{who}: no {what}: {error.strerror}; LimitRTPRIO?", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

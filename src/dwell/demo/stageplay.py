@@ -26,6 +26,7 @@ from dwell.demo.link import Forward, LinkProcess
 from dwell.demo.link_conditions import Conditions
 from dwell.errors import LiveError
 from dwell.live.leash import OWNER
+from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import PORTS_PER_ROLE, roles, wire
 from dwell.model import (
     Constant,
@@ -288,6 +289,7 @@ class Stageplay:
         self.stop_controller()
         self._end(list(self.processes), STOP_S)
         self._stack.close()
+        remove_orphans()
 
 
 def _disturbed(usual: Link, item: LinkDisturbance) -> Iterator[tuple[str, object]]:

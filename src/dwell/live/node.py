@@ -19,6 +19,7 @@ from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.role import Place
 from dwell.live.supervision import Supervisor
+from dwell.live.transport.orphans import remove_orphans
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import Wiring, wire
 from dwell.model import Problem
@@ -80,6 +81,8 @@ def run_agent(
     finally:
         supervisor.stop()
         transport.close()
+        # Those that have been killed could not remove theirs.
+        remove_orphans()
 
 
 def _listening(wiring: Wiring, who: str, node: str) -> ZenohTransport:

@@ -12,8 +12,8 @@ import msgspec
 from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
 from dwell.live.hosting import Hosted, clock_of, work
-from dwell.live.messages import Header
 from dwell.live.log import Log
+from dwell.live.messages import Header
 from dwell.live.role import Place, Pulse, Role
 from dwell.live.sink import Sink
 from dwell.live.stage import Actuator, load_actuator, load_stage

@@ -62,6 +62,8 @@ class Sink:
         self.counts = {"actuated": 0, "behind": 0, "stale": 0, "silences": 0}
         self.trouble = ""
         self._alarm_ns: int | None = None
+        # One that takes over from another is as impatient for the next command as that one was.
+        self._takes_over = self.newest >= (0, 0)
 
     def subscriptions(self) -> Iterable[str]:
         """Key expressions that it wants to hear."""
@@ -119,6 +121,9 @@ class Sink:
 
     def wake(self, now_ns: int) -> int:
         """Beat, and call the watchdog where no command came; returns when something is due."""
+        if self._takes_over:
+            self._takes_over = False
+            self._alarm_ns = self._alarm_ns or now_ns + self.max_age_ns
         if self._alarm_ns is not None and now_ns >= self._alarm_ns:
             self._alarm_ns = None
             self.counts["silences"] += 1

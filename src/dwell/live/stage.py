@@ -11,7 +11,15 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 from dwell.errors import LiveError
 
-__all__ = ["Actuator", "Message", "Stage", "Stateful", "load_actuator", "load_stage"]
+__all__ = [
+    "Actuator",
+    "Message",
+    "Stage",
+    "Stateful",
+    "load_actuator",
+    "load_function",
+    "load_stage",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +142,14 @@ def load_actuator(name: str, where: str) -> Actuator:
     if inspect.isfunction(found) or inspect.ismethod(found):
         return _Apply(found)
     raise LiveError(f"{where}: {name} is no actuator: it has no method apply(command)")
+
+
+def load_function(name: str, where: str) -> Callable[[], float]:
+    """Import a function that returns a number, or an object that is called like one."""
+    found = _made(name, where)
+    if not callable(found):
+        raise LiveError(f"{where}: {name} cannot be called")
+    return cast("Callable[[], float]", found)
 
 
 def _made(name: str, where: str) -> object:

@@ -554,7 +554,10 @@ class Worker:
             self._framed_ns = self._now_ns
         if self._framed_ns is not None and self._now_ns - self._framed_ns > limit_ns:
             silent_s = (self._now_ns - self._framed_ns) / 1e9
-            return True, self.trouble or f"{where}: wait() has brought no frame for {silent_s:.0f} s"
+            return (
+                True,
+                self.trouble or f"{where}: wait() has brought no frame for {silent_s:.0f} s",
+            )
         return True, self.trouble
 
     def wake(self, now_ns: int) -> int:

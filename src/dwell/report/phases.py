@@ -61,8 +61,7 @@ def disturbed(scenario: Iterable[Item], tiers: Mapping[str, str]) -> list[Distur
     tiers : mapping of str to str
         Of the nodes.
     """
-    found: dict[tuple[float, float, str], list[str]] = {}
-    kinds: dict[str, str] = {}
+    found: dict[tuple[float, float, str, str], list[str]] = {}
     for item in scenario:
         if item.get("episodes") is not None:
             continue
@@ -71,14 +70,14 @@ def disturbed(scenario: Iterable[Item], tiers: Mapping[str, str]) -> list[Distur
         end_s = begin_s + (math.inf if length_s is None else float(length_s))
         link = item.get("link")
         what = _on_node(item) if link is None else _on_link(item)
-        kinds[what] = NETWORK if link is not None else _stress(item, tiers)
+        kind = _stress(item, tiers) if link is None else NETWORK
         who = str(item["node"]) if link is None else "–".join(sorted(str(link).split("->")))
-        mine = found.setdefault((round(begin_s, DIGITS), round(end_s, DIGITS), what), [])
+        mine = found.setdefault((round(begin_s, DIGITS), round(end_s, DIGITS), kind, what), [])
         if who not in mine:
             mine.append(who)
     return [
-        Disturbed(begin_s, end_s, f"{', '.join(who)}: {what}", kinds[what])
-        for (begin_s, end_s, what), who in sorted(found.items())
+        Disturbed(begin_s, end_s, f"{', '.join(who)}: {what}", kind)
+        for (begin_s, end_s, kind, what), who in sorted(found.items())
     ]
 
 
