@@ -1,4 +1,4 @@
-"""The controller of a live cell on the in-memory network: windows, orders, people, and its absence."""
+"""A live cell's controller on the in-memory network: windows, orders, people, its absence."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_without_answers_the_controller_knows_where_the_cell_is(problem: Problem
     world = alternating(problem)
     world.run(3_000)
     world.network.cut("stamper@R1", "*", key="dwell/*/accepted")
-    world.network.cut("agent@E", "*", key="dwell/*/carried")
+    world.network.cut("agent@E", "*", key="dwell/*/gathered")
     world.run(6_000)
     cell = cell_of(world)
     assert cell.held is not None

@@ -38,7 +38,7 @@ def test_a_message_goes_only_to_the_node_that_needs_it(problem: Problem) -> None
 def test_a_shadow_is_joined_once_by_every_task_of_its_own(
     problem: Problem, active: str, other: str
 ) -> None:
-    """Each task behind the parting gets one message a flow, from the shadow if that has the source."""
+    """Behind the parting a task gets one message a flow, from the shadow if it has the source."""
     routes, pipeline = Routes(problem), problem.pipeline
     marked = stamp(active, other)
     apart = pipeline.diverging(problem.candidates[active], problem.candidates[other])
@@ -72,7 +72,7 @@ def test_inputs_are_forked_to_where_a_state_goes(problem: Problem) -> None:
 
 
 def test_an_unknown_candidate_says_that_cell_files_differ(problem: Problem) -> None:
-    with pytest.raises(LiveError, match="'NEW', which is no candidate here .*cell files differ"):
+    with pytest.raises(LiveError, match=r"'NEW', which is no candidate here .*cell files differ"):
         Routes(problem).destinations("sensing", stamp("NEW"))
     with pytest.raises(LiveError, match="cell files differ"):
         Routes(problem).destinations("sensing", stamp("LOC", "NEW"))
