@@ -27,6 +27,11 @@ BENCHMARKS = {
     "import": ("importing", "measure"),
     "link": ("link", "measure"),
     "transport": ("transport", "measure"),
+    "order": ("live", "decision"),
+    "moves": ("live", "moves"),
+    "lanes": ("live", "lanes"),
+    "share": ("live", "share"),
+    "live-fleet": ("fleet_live", "measure"),
 }
 
 

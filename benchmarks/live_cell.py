@@ -19,15 +19,21 @@ import dwell
 from benchmarks.timing import ROOT
 from dwell.demo.stageplay import Stageplay, on_this_machine
 from dwell.errors import LiveError
+from dwell.live.messages import Header, decode
 from dwell.live.stage import Message
+from dwell.live.transport.protocol import Sample
 from dwell.live.visiting import Visitor
+from dwell.live.worker import Worker
 from dwell.model import Problem
 
-__all__ = ["Applied", "LightCell", "document"]
+__all__ = ["ARRIVED", "NUMBER", "Applied", "LightCell", "document", "problem_of"]
 
 #: Where the actuator writes, and what: cycle, release, and the instant of the call.
 OBSERVED = "DWELL_BENCH_OBSERVED"
 RECORD = struct.Struct("<qqq")
+#: Where `Counting` writes the numbers of cycles.
+ARRIVED = "arrived"
+NUMBER = struct.Struct("<q")
 NODES = ("R1", "E", "R2")
 CANDIDATES = {
     "LOC": {"perception": "R1", "planning": "R2"},
@@ -44,6 +50,21 @@ class Passing:
     def process(self, inputs: Mapping[str, Message]) -> Message:
         """Return eight bytes."""
         return Message(bytes(8))
+
+
+class Counting(Passing):
+    """The same in a worker that writes down what arrives, before it takes the newest of it."""
+
+    def __init__(self) -> None:
+        path = Path(os.environ[OBSERVED]).with_name(ARRIVED)
+        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        take = Worker._input
+
+        def write(worker: Worker, sample: Sample, kind: str, now_ns: int) -> None:
+            os.write(file, NUMBER.pack(decode(sample.header, Header).stamp.cycle))
+            take(worker, sample, kind, now_ns)
+
+        Worker._input = write  # type: ignore[method-assign, assignment]
 
 
 class Actuator:
@@ -162,7 +183,8 @@ class LightCell(Stageplay):
     def __init__(self, found: dict[str, Any], folder: Path, *, links: bool = False) -> None:
         problem = problem_of(found, folder, links=links)
         self._observed = folder / "observed"
-        environment = {OBSERVED: str(self._observed), "PYTHONPATH": str(ROOT)}
+        paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {OBSERVED: str(self._observed), "PYTHONPATH": os.pathsep.join(paths)}
         super().__init__(problem, folder, {}, environment=environment)
 
     def __enter__(self) -> LightCell:
@@ -198,6 +220,10 @@ class LightCell(Stageplay):
             return self.visitor.ask("status", patience_s=0.5)
         except LiveError:
             return {}
+
+    def wait_until_at(self, placement: str) -> None:
+        """Wait until the controller says that the cell is there."""
+        self.wait_for(placement, lambda: self.said().get("placement") == placement)
 
     def wait_for(self, what: str, event: Callable[[], bool], patience_s: float = START_S) -> None:
         """Wait until something holds.

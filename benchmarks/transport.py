@@ -1,7 +1,8 @@
-"""One-way latency between two processes: raw TCP, bare Zenoh, and the transport of a live cell.
+"""One-way latency between two processes: raw TCP, bare Zenoh, a live cell's transport and workers.
 
 The receiver notes the instant at which it holds the payload as bytes, and sends it back; both
-processes read one clock. Each kind has a process of its own that answers; they take turns.
+processes read one clock. Each kind has a process of its own that answers; they take turns. Between
+workers it is the time from the end of a stage to the call of the next (see `hop`).
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from statistics import median
 from typing import Any
 
 from benchmarks.figures import Figure, Goal, Section
+from benchmarks.hop import PAUSE_S, SIZES, hops
 from benchmarks.timing import ROOT
 from dwell.live.transport.protocol import Sample
 from dwell.live.transport.zenoh import ZenohTransport
@@ -27,9 +30,6 @@ from dwell.live.wiring import SESSIONS, Entry, Locator, Role
 
 __all__ = ["measure"]
 
-#: Bytes, and messages of a burst of that size.
-SIZES = {1_000: 100, 100_000: 100, 1_000_000: 30}
-PAUSE_S = 0.003
 #: What each message begins with, and each answer is: a number and an instant.
 MARK = struct.Struct("<qq")
 HEADER = bytes(300)
@@ -37,6 +37,7 @@ HERE, THERE, NEAR = "here@R1", "there@E", "near@R1"
 
 Put = Callable[[bytes], None]
 Arrived = Callable[[bytes], None]
+Burst = Callable[[int, int], float]
 
 
 def measure(quick: bool) -> Section:
@@ -48,12 +49,18 @@ def measure(quick: bool) -> Section:
         kinds = {
             name: stack.enter_context(_partner(name)) for name in ("tcp", "zenoh", "ours", "shared")
         }
-        names = list(kinds)
+        workers = stack.enter_context(hops())
+        bursts: dict[str, Burst] = {
+            **{name: kind.burst for name, kind in kinds.items()},
+            "far": partial(workers.burst, "THERE"),
+            "near": partial(workers.burst, "HERE"),
+        }
+        names = list(bursts)
         for turn in range(-1, rounds):
             for size, count in SIZES.items():
                 begin = turn % len(names)
                 for name in names[begin:] + names[:begin]:
-                    latency_ms = kinds[name].burst(size, count)
+                    latency_ms = bursts[name](size, count)
                     if turn >= 0:  # a round that does not count goes ahead
                         found.setdefault((name, size), []).append(latency_ms)
     labels = {
@@ -61,27 +68,28 @@ def measure(quick: bool) -> Section:
         "zenoh": "bare Zenoh",
         "ours": "ours, to another node",
         "shared": "ours, on one node",
+        "far": "stage to stage, another node",
+        "near": "stage to stage, one node",
     }
     figures = [
         Figure(f"{label}, {_text(size)}", found[name, size], "ms")
         for size in SIZES
         for name, label in labels.items()
     ]
-    figures += [
-        Figure(
-            f"ours over bare Zenoh, {_text(size)}",
-            [a - b for a, b in zip(found["ours", size], found["zenoh", size], strict=True)],
-            "ms",
-            Goal(high=0.15) if size == 100_000 else None,
-        )
-        for size in SIZES
-    ]
+    for name in ("ours", "far", "near"):
+        for size in SIZES:
+            pairs = zip(found[name, size], found["zenoh", size], strict=True)
+            goal = Goal(high=0.15) if size == 100_000 else None
+            what = f"{labels[name]}, over bare Zenoh, {_text(size)}"
+            figures.append(Figure(what, [one - other for one, other in pairs], "ms", goal))
     return Section(
         "One-way latency between two processes on loopback, median of a burst",
         figures,
         [
             f"elapsed time, on all cores; {rounds} rounds in turns, pauses of {PAUSE_S * 1e3:g} ms",
-            "ours carries a header of 300 bytes; on one node from 100 kB through shared memory",
+            "ours: our transport with a header of 300 bytes; on one node 100 kB go through shared "
+            "memory",
+            "stage to stage: everything between the end of a stage and the call of the next",
         ],
     )
 

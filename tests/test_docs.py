@@ -19,10 +19,14 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 EXECUTED = (
     "README.md",
     "docs/estimators.md",
+    "docs/live-tutorial.md",
     "docs/profiling.md",
     "docs/studies.md",
     "docs/tutorial.md",
 )
+
+# These go on until they are told to end, or need those that do; tests/cli/test_live.py runs them.
+LASTING = ("agent", "controller", "demo", "live")
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
@@ -74,7 +78,7 @@ def test_examples_run(name: str, folder: Path, capsys: pytest.CaptureFixture[str
             count += 1
         elif language == "sh":
             for words in commands(text):
-                if words[0] == "dwell" and words[1] != "demo":
+                if words[0] == "dwell" and words[1] not in LASTING:
                     result = CliRunner().invoke(app, words[1:])
                     assert result.exit_code == 0, result.output
                     count += 1

@@ -29,7 +29,7 @@ P_NS = PERIOD_MS * 1_000_000
 GUARD_CYCLES = 3
 MAX_AGE_MS = 120
 MIN_DWELL = 2
-WINDOW_CYCLES = 5
+WINDOW_CYCLES = 3
 #: A window with lost cycles closes after the guard has looked: an order that comes of it, and that
 #: might be for what has just died, finds another term.
 GRACE_MS = GUARD_CYCLES * PERIOD_MS
@@ -255,8 +255,6 @@ class RealCell(Stageplay):
         shutil.copy(Path(real_stages.__file__), folder / "real_stages.py")
         self.observed = Observed(folder / "observed")
         self.visitor: Visitor | None = None
-        #: Whether the last fault made the cell move.
-        self.moved = False
 
     def __enter__(self) -> RealCell:
         super().__enter__()
@@ -491,9 +489,9 @@ FAULTS = {fault.name: fault for fault in _faults()}
 
 
 def moves(fault: Fault) -> bool:
-    """Whether the guard has to move the cell, after which it needs time to be healthy again."""
+    """Whether the guard has to move the cell, for which it should have been healthy before."""
     if fault.how == "cut":
-        return not {"R2->E", "R2->R1"} & {fault.whom[0]} or len(fault.whom) > 1
+        return True
     relocatable = any(who.startswith(("perception", "planning", "*E")) for who in fault.whom)
     return fault.bound is not None and relocatable
 
@@ -565,7 +563,7 @@ def strike(
         If an event that it waits for does not come.
     """
     cell.wait_for("the whole cell at home", cell.at_home, 30.0)
-    if cell.moved:
+    if moves(fault):
         cell.wait_for("health", cell.healthy, 30.0)
     last = cell.observed.last()
     assert last is not None
@@ -586,9 +584,7 @@ def strike(
     back_ns = time.monotonic_ns()
     # What is on its way when the cell is back is seen, too.
     cell.wait_for("five more cycles", lambda: _few(cell, back_ns, 5), 5.0)
-    found = _weigh(cell, fault, stalls, seed, phase, (begin_ns, end_ns, back_ns))
-    cell.moved = " " in found.moved
-    return found
+    return _weigh(cell, fault, stalls, seed, phase, (begin_ns, end_ns, back_ns))
 
 
 def _act(cell: RealCell, fault: Fault, names: list[str], at_ns: int) -> int:

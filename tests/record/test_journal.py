@@ -138,6 +138,15 @@ def test_sealing_writes_what_a_run_has(tmp_path: Path) -> None:
     assert_holds(seal_run(tmp_path / "run"), 3)
 
 
+def test_more_can_be_said_of_a_run_that_is_sealed(tmp_path: Path) -> None:
+    write(tmp_path / "run", 3)
+    before = seal_run(tmp_path / "run", note="over").meta
+    run = seal_run(tmp_path / "run", played=[])
+    assert_holds(run, 3)
+    assert run.meta == {**before, "played": []}
+    assert open_run(tmp_path / "run").meta == run.meta
+
+
 def test_a_kill_while_sealing_leaves_the_journal_or_the_tables(tmp_path: Path) -> None:
     write(tmp_path / "run", 2)
     kept = (tmp_path / "run" / JOURNAL).read_bytes()

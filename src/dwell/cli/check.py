@@ -17,8 +17,8 @@ from dwell.model import Problem
 __all__ = ["check_cell", "find_warnings"]
 
 
-def check_cell(cell: Path, traces: Path | None, *, as_json: bool) -> bool:
-    """Check a cell and print what was found.
+def check_cell(cell: Path, traces: Path | None, *, node: str | None = None, as_json: bool) -> bool:
+    """Check a cell, or whether this computer can be one of its nodes, and print what was found.
 
     Returns
     -------
@@ -34,6 +34,10 @@ def check_cell(cell: Path, traces: Path | None, *, as_json: bool) -> bool:
         else:
             typer.echo(str(error), err=True)
         return False
+    if node is not None:
+        from dwell.cli.check_node import check_node
+
+        return check_node(problem, cell, node, as_json=as_json)
     profile = Profile(problem)
     warnings = tuple(find_warnings(problem, profile))
     if as_json:

@@ -90,7 +90,18 @@ def options(
 
 
 @app.command()
-def check(cell: Cell, traces: Traces = None, as_json: Json = False) -> None:
+def check(
+    cell: Cell,
+    traces: Traces = None,
+    node: Annotated[
+        str | None,
+        typer.Option(
+            help="Check instead that this computer can be that node of the live cell: import and "
+            "make its stages and actuators."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
     """Find every fault in a cell, or say what it amounts to.
 
     Faults go to stderr, one a line as file:line: path: message, and the exit code is 2. Warnings
@@ -98,7 +109,7 @@ def check(cell: Cell, traces: Traces = None, as_json: Json = False) -> None:
     """
     from dwell.cli.check import check_cell
 
-    if not check_cell(cell, traces, as_json=as_json):
+    if not check_cell(cell, traces, node=node, as_json=as_json):
         raise typer.Exit(WRONG)
 
 

@@ -19,7 +19,7 @@ import typer
 
 import dwell
 from dwell.cli.live_view import Look, View, live_view
-from dwell.cli.output import aligned, print_json, write_file
+from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.demo.error_sampler import ErrorSampler
 from dwell.demo.stageplay import Change, Stageplay, changes_of, on_this_machine
 from dwell.demo.world import World
@@ -80,7 +80,9 @@ def play(
         except KeyboardInterrupt:
             interrupted = True
             typer.echo("interrupted; ending the cell", err=True)
-        cell.stop_controller()
+        with working("ending the cell"):
+            cell.stop_controller()
+            cell.close()
     folder = _run_folder(out)
     if folder is None and interrupted:
         raise typer.Exit(INTERRUPTED)
@@ -190,11 +192,14 @@ def _come_up(visitor: Visitor, cell: Stageplay) -> None:
     """Wait until everybody is there."""
     until = time.monotonic() + START_S
     awaited = {who for node in cell.problem.fabric.nodes for who in cell.expected(node)}
-    missing: Mapping[str, str] = dict.fromkeys(awaited, "has not been heard")
+    missing: Mapping[str, str] = {"the controller": "has not answered"}
     while missing:
         if time.monotonic() > until:
-            found = "; ".join(f"{who}: {why}" for who, why in sorted(missing.items()))
-            raise LiveError(f"after {START_S:.0f} s the cell is not complete: {found}")
+            found = "; ".join(f"{who} {why}" for who, why in sorted(missing.items()))
+            raise LiveError(
+                f"after {START_S:.0f} s the cell is not complete: {found}; see the logs in "
+                f"{cell.folder}"
+            )
         try:
             heard = visitor.ask("status", patience_s=1.0)["processes"]
         except LiveError:
@@ -212,7 +217,8 @@ def _watch_from_start(
 ) -> None:
     """Wait until everybody is there, and play the scenario."""
     with Visitor(cell.problem) as visitor:
-        _come_up(visitor, cell)
+        with working("starting the cell"):
+            _come_up(visitor, cell)
         now_ns = time.monotonic_ns()
         origin_ns = visitor.ask("status").get("origin_ns") or now_ns
         begin_ns = max(int(origin_ns), now_ns - round(MOST_BEFORE_S * 1e9))

@@ -28,7 +28,7 @@ TEND_NS = 1_000_000_000
 GAUGE_S = 2.0
 #: Messages that the detour carries on together at most; more within that time are dropped.
 MOST_CARRIED = 1_000
-#: Periods between two beats of an agent.
+#: Periods between two beats of an agent, and between two of anybody that the controller is told of.
 AGENT_BEAT = 5
 NEVER_NS = 1 << 62
 
@@ -128,6 +128,11 @@ class Agent:
         self._look_ns = self._load_ns = self._tend_ns = 0
         self._carried: list[tuple[str, bytes]] = []
         self._carry_ns = NEVER_NS
+        self._gathered: list[tuple[str, bytes]] = []
+        self._beats: dict[str, bytes] = {}
+        self._gather_ns = self._beats_ns = 0
+        self._beat_prefix = place.keys.relay(place.keys.beat("", "").removesuffix("/"))
+        self._relay_prefix = f"{place.keys.root}/relay/"
         self._spent: dict[str, int] = {"own": 0, "shadow": 0}
 
     def subscriptions(self) -> Iterable[str]:
@@ -136,16 +141,23 @@ class Agent:
         if self._relays:
             yield self.place.keys.relay(f"{self.place.keys.root}/**")
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Sample, now_ns: int) -> int | None:
         """Take a message in; carry it on where this is the detour."""
         if self.pulse.hears(sample):
             self.pulse.receive(sample, now_ns)
-            return
-        keys = self.place.keys
-        prefix = f"{keys.root}/relay/"
-        if self._relays and sample.key.startswith(prefix) and len(self._carried) < MOST_CARRIED:
-            self._carried.append((sample.key.removeprefix(prefix), sample.payload))
+            return None
+        if not (self._relays and sample.key.startswith(self._relay_prefix)):
+            return None
+        key = sample.key.removeprefix(self._relay_prefix)
+        if len(self._carried) < MOST_CARRIED:
+            self._carried.append((key, sample.payload))
             self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
+        if sample.key.startswith(self._beat_prefix):
+            if key in self._beats or len(self._beats) < MOST_CARRIED // 2:
+                self._beats[key] = sample.payload
+        elif len(self._gathered) < MOST_CARRIED // 2:
+            self._gathered.append((key, sample.payload))
+        return self._carry_ns
 
     def _state(self) -> tuple[bool, str]:
         trouble = "" if self._accelerator is None else self._accelerator.trouble()
@@ -166,7 +178,23 @@ class Agent:
             carried, self._carried = self._carried, []
             self._carry_ns = NEVER_NS
             self.place.transport.put(self.place.keys.carried(), encode(Carried(tuple(carried))))
-        return min(self.pulse.wake(now_ns), self._look_ns, self._load_ns, self._carry_ns)
+        wakes = [self.pulse.wake(now_ns), self._look_ns, self._load_ns, self._carry_ns]
+        if self._relays:
+            if now_ns >= self._gather_ns:
+                self._tell(now_ns)
+                self._gather_ns = now_ns + self.place.period_ns
+            wakes.append(self._gather_ns)
+        return min(wakes)
+
+    def _tell(self, now_ns: int) -> None:
+        """Tell the controller what came over the detour: of beats the last, and now and then."""
+        told, self._gathered = self._gathered, []
+        if now_ns >= self._beats_ns:
+            told += self._beats.items()
+            self._beats = {}
+            self._beats_ns = now_ns + AGENT_BEAT * self.place.period_ns
+        if told:
+            self.place.transport.put(self.place.keys.gathered(), encode(Carried(tuple(told))))
 
     def _report(self, now_ns: int) -> None:
         place = self.place

@@ -6,7 +6,7 @@ The decisions are those of `dwell.control.Controller`, the object that the simul
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeAlias
 
@@ -38,6 +38,8 @@ ASK_NS = 250_000_000
 RESEND_NS = 40_000_000
 #: Time after which a migration that does not come about is given up.
 PATIENCE_NS = 2_000_000_000
+#: Periods between two beats: nobody's decision hangs on them.
+BEAT = 5
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
 
@@ -90,9 +92,11 @@ class Cell:
         self._recorder = recorder
         self.offsets = place.offsets()
         self.windows: LiveWindows | None = None
-        # Of the others it hears over the detour.
-        direct = [(node, f"{kind}@{node}") for kind, node in self._nearest()]
-        self.pulse = Pulse(place, lambda: (True, ""), hears=direct)
+        # Of the others the relay's agent tells it now and then. What beats say of the clocks is
+        # what they have heard themselves: it is as good when it comes late, by way of others.
+        agent = place.relay, f"agent@{place.relay}"
+        self.pulse = Pulse(place, lambda: (True, ""), hears=[agent], every=BEAT)
+        self._gathered = place.keys.gathered()
         self.held: Accepted | None = None
         self.refused = ""
         self.pinned = ""
@@ -110,15 +114,24 @@ class Cell:
         keys = self.place.keys
         yield from self.pulse.subscriptions()
         yield from (keys.done("*"), keys.ended(), keys.accepted(), keys.load("*"))
-        yield from (keys.carried(), keys.stamped())
+        yield from (keys.gathered(), keys.stamped())
         yield keys.restored()
         yield keys.ask()
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
-        """Take a message in."""
-        if sample.key == self.place.keys.carried():
+    def receive(self, sample: Sample, now_ns: int) -> int | None:
+        """Take a message in; returns when a window closes, or an order is sent again."""
+        self._take(sample, now_ns)
+        windows, move = self.windows, self._move
+        due_ns = None if windows is None else windows.due_ns(now_ns)
+        if move is None:
+            return due_ns
+        again_ns = move.sent_ns + RESEND_NS
+        return again_ns if due_ns is None else min(due_ns, again_ns)
+
+    def _take(self, sample: Sample, now_ns: int) -> None:
+        if sample.key == self._gathered:
             for one in self.place.around(sample):
-                self.receive(one, now_ns)
+                self._take(one, now_ns)
             return
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
@@ -143,15 +156,6 @@ class Cell:
                     self._asked(decode(sample.payload, Ask), now_ns)
         except LiveError as error:
             self.place.complain(error)
-
-    def _nearest(self) -> Iterator[tuple[str, str]]:
-        """Processes that this one is connected to: the ends of a cycle."""
-        problem = self.place.problem
-        yield "stamper", problem.stamper_node
-        yield "agent", self.place.relay
-        for task in problem.pipeline.tasks.values():
-            if not problem.pipeline.outputs(task.name):
-                yield from ((f"sink.{task.name}", node) for node in task.on)
 
     def _compare_clocks(self, beat: Beat, now_ns: int, *, direct: bool) -> None:
         """Learn what a beat tells of the clocks; over the detour, of others than this node's."""
@@ -265,6 +269,7 @@ class Cell:
 
     def _push(self, move: _Move, now_ns: int) -> None:
         """Send what the present phase of a migration asks for."""
+        move.sent_ns = now_ns
         if move.phase == "state":
             return
         if move.order is None:
@@ -274,7 +279,6 @@ class Cell:
             # An order that was refused for now is asked for anew; one without answer, again.
             move.order = self._order(move.order.placement, move.forks)
             self.refused = ""
-        move.sent_ns = now_ns
         self._send(move.order)
 
     def _ask_for_states(self, move: _Move, held: Accepted) -> None:
@@ -416,6 +420,8 @@ class Cell:
             case "pin":
                 if ask.about not in problem.candidates:
                     return f"no candidate {ask.about!r}; there are {', '.join(problem.candidates)}"
+                if needed := self.drained.intersection(problem.candidates[ask.about].values()):
+                    return f"{ask.about} needs {', '.join(sorted(needed))}, which is drained"
                 self.pinned = ask.about
             case "unpin":
                 self.pinned = ""
@@ -423,12 +429,17 @@ class Cell:
                 if refused := self._drain(ask.about):
                     return refused
             case "undrain":
+                if ask.about not in problem.fabric.nodes:
+                    return f"no node {ask.about!r}; there are {', '.join(problem.fabric.nodes)}"
                 self.drained.discard(ask.about)
             case _:
                 return f"unknown question {ask.what!r}"
         held = self.held
-        if held is not None and (target := self._allowed(held.placement)) != held.placement:
-            self._begin(target, now_ns)
+        under_way = None if self._move is None else self._move.name
+        if held is not None:
+            target = self._allowed(held.placement)
+            if target not in (held.placement, under_way):
+                self._begin(target, now_ns)
         return ""
 
     def _drain(self, node: str) -> str:
@@ -438,6 +449,8 @@ class Cell:
         drained = {*self.drained, node}
         if all(drained.intersection(p.values()) for p in problem.candidates.values()):
             return f"every candidate needs {node}; nothing could run"
+        if self.pinned and node in problem.candidates[self.pinned].values():
+            return f"the cell is pinned to {self.pinned}, which needs {node}; unpin it first"
         self.drained = drained
         return ""
 

@@ -68,7 +68,10 @@ class Hosted:
         if self.stopped.is_set():
             return
         with self.lock:
-            self.role.receive(sample, self.clock())
+            wanted_ns = self.role.receive(sample, self.clock())
+            sooner = wanted_ns is not None and wanted_ns < self._due_ns
+        if sooner:
+            self._hurry.set()
         if self._heard is not None and self._heard():
             self.news.release()
 
@@ -81,7 +84,7 @@ class Hosted:
         try:
             while not self.stopped.is_set():
                 with self.lock:
-                    due_ns = self.role.wake(self.clock())
+                    due_ns = self._due_ns = self.role.wake(self.clock())
                 wait_s = min((due_ns - self.clock()) / 1e9, LONGEST_SLEEP_S)
                 if wait_s > 0:
                     self._hurry.wait(wait_s)

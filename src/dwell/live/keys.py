@@ -90,3 +90,7 @@ class Keys:
     def carried(self) -> str:
         """All copies of a while, together."""
         return f"{self.root}/carried"
+
+    def gathered(self) -> str:
+        """The same for the controller, which is in less of a hurry."""
+        return f"{self.root}/gathered"

@@ -42,8 +42,8 @@ class Role(Protocol):
         """Key expressions that it wants to hear."""
         ...
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
-        """Take a message in."""
+    def receive(self, sample: Sample, now_ns: int) -> int | None:
+        """Take a message in; returns an instant at which something is due since, if that is so."""
         ...
 
     def wake(self, now_ns: int) -> int:
@@ -195,6 +195,8 @@ class Pulse:
         self._key = keys.beat(place.node, place.who)
         direct = keys.beat("", "").removesuffix("/")
         self._prefix = direct, keys.detour(direct)
+        # Beats as they came directly: their copies say nothing new, and need not be read.
+        self._came: dict[str, bytes] = {}
 
     def subscriptions(self) -> tuple[str, ...]:
         """Key expressions of beats."""
@@ -204,6 +206,8 @@ class Pulse:
     def receive(self, sample: Sample, now_ns: int) -> Beat | None:
         """Take a beat in; None where it is none, or no news."""
         if not sample.key.startswith(self._prefix):
+            return None
+        if self._is_copy(sample):
             return None
         try:
             beat = decode(sample.payload, Beat)
@@ -222,6 +226,16 @@ class Pulse:
         if direct:
             self._look_for_rival(beat)
         return None
+
+    def _is_copy(self, sample: Sample) -> bool:
+        """Whether a beat is the copy of the last that came directly."""
+        direct, detour = self._prefix
+        if sample.key.startswith(detour):
+            return self._came.get(sample.key[len(detour) :]) == sample.payload
+        name = sample.key[len(direct) :]
+        if name in self._came or len(self._came) < MAX_STRANGERS:
+            self._came[name] = sample.payload
+        return False
 
     def _differs(self, beat: Beat) -> str:
         """Return why a beat is not heard, or nothing."""

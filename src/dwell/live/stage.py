@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 import inspect
 from collections.abc import Callable, Mapping
@@ -126,8 +127,8 @@ def load_stage(name: str, where: str) -> Stage:
     found = _made(name, where)
     if callable(getattr(found, "process", None)):
         return cast("Stage", found)
-    if inspect.isfunction(found) or inspect.ismethod(found):
-        return _Function(found)
+    if _is_function(found):
+        return _Function(cast("Callable[[Mapping[str, Message]], Message]", found))
     raise LiveError(f"{where}: {name} is no stage: it has no method process(inputs)")
 
 
@@ -139,17 +140,24 @@ def load_actuator(name: str, where: str) -> Actuator:
             if not callable(getattr(found, method, None)):
                 raise LiveError(f"{where}: {name} has no method {method}()")
         return cast("Actuator", found)
-    if inspect.isfunction(found) or inspect.ismethod(found):
-        return _Apply(found)
+    if _is_function(found):
+        return _Apply(cast("Callable[[Message], None]", found))
     raise LiveError(f"{where}: {name} is no actuator: it has no method apply(command)")
 
 
 def load_function(name: str, where: str) -> Callable[[], float]:
     """Import a function that returns a number, or an object that is called like one."""
+    if ":" not in name:
+        raise LiveError(f"{where}: {name!r} is not of the form package.module:function")
     found = _made(name, where)
     if not callable(found):
         raise LiveError(f"{where}: {name} cannot be called")
     return cast("Callable[[], float]", found)
+
+
+def _is_function(found: object) -> bool:
+    kinds = (inspect.isfunction, inspect.ismethod, inspect.isbuiltin)
+    return any(kind(found) for kind in kinds) or isinstance(found, functools.partial)
 
 
 def _made(name: str, where: str) -> object:

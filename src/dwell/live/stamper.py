@@ -145,13 +145,15 @@ class Stamper:
                 direct = "/detour/" not in sample.key
                 self._heard(beat, now_ns, direct)
             return
+        word = sample.key.removeprefix(self.place.keys.root + "/").removeprefix("detour/")
         try:
-            if sample.key == self.place.keys.order():
-                self._order(decode(sample.payload, Order), now_ns)
-            elif sample.key == self.place.keys.frame():
-                self._frame(now_ns)
-            else:
-                self._completed(decode(sample.payload, Completion), now_ns)
+            match word.partition("/")[0]:
+                case "order":
+                    self._order(decode(sample.payload, Order), now_ns)
+                case "frame":
+                    self._frame(now_ns)
+                case "done" | "ended":
+                    self._completed(decode(sample.payload, Completion), now_ns)
         except LiveError as error:
             self.place.complain(error)
 

@@ -389,6 +389,8 @@ def _calls(problem: Problem, one: Role, other: Role, relay: str) -> bool:
             return other.kind == "agent" or same_node or one.node == relay
         case "sink":  # takes the commands of its task's workers
             return other.kind == "controller" or (other.works and other.task == one.task)
+        case "standby":  # works only while that one is silent
+            return other.kind == "worker" and same_node and other.task == one.task
         case "controller":  # of completions, loads, shadows that stopped, states that moved
             if not other.works:
                 return other.kind == "agent"

@@ -297,7 +297,8 @@ def _dataclass(part: Any) -> Document:
 def fingerprint(problem: Problem) -> str:
     """Return a short digest of what all nodes of a live cell have to agree on.
 
-    Left out is what each node may say for itself: the code it runs, and how it reaches others.
+    Left out is what each node may say for itself: the code it runs, and how it reaches others. The
+    order of nodes and tasks is not left out: ports are given out by it.
     """
     document = to_document(problem)
     live = {**document.get("live", {})}
@@ -306,5 +307,5 @@ def fingerprint(problem: Problem) -> str:
     document["live"] = live
     for task in document["tasks"].values():
         task.pop("run", None)
-    text = json.dumps(document, sort_keys=True)
+    text = json.dumps(document)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

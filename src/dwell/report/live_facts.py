@@ -52,23 +52,17 @@ def _unheard(run: Run) -> Iterator[str]:
         )
     away = int((cycles["outcome"].cast(str) == "done").sum()) - int(cycles["actuated"].sum())
     if away > 0:
-        yield (
-            f"{write_number(away, 0)} commands arrived and were not applied: too old, or behind a "
-            "later one."
-        )
+        which = "1 command arrived and was" if away == 1 else f"{away} commands arrived and were"
+        yield f"{which} not applied: too old, or behind a later one."
 
 
 def _lead(run: Run) -> Iterator[str]:
-    windows = run.windows
-    after = windows.filter((windows["lead"] > 0) & (windows["window"] > windows["window"][0]))
     cycles = int(run.cycles["lead"].sum())
     if cycles:
-        where = (
-            f", {after['lead'].sum()} of them before a window after a move" if len(after) else ""
-        )
+        which = "1 cycle is" if cycles == 1 else f"{write_number(cycles, 0)} cycles are"
         yield (
-            f"{cycles} lead cycles belong to no window{where}: a window holds cycles of one "
-            "placement only."
+            f"{which} in no window (lead cycles): a window holds cycles of one placement, and "
+            "begins with the first one after a move."
         )
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
 
 from dwell.report.phases import phases
 from dwell.study.summary import latency_ms, order_statistic
@@ -67,16 +65,15 @@ def phase_rows(run: Run, facts: Facts) -> list[PhaseRow]:
     found = phases(facts.disturbed, float(released_s[-1]) + facts.period_ms / 1e3)
     if len(found) > MOST:
         return []
-    placed = cycles["placement"].cast(pl.String)
-    moved_s = released_s[1:][(placed[1:] != placed[:-1]).to_numpy()]
-    guard_s = _guarded(run, dict(zip(cycles["cycle"], released_s.tolist(), strict=True)))
+    moved_s = _moves(run)
+    guard_s = _guarded(run, moved_s)
     rows = []
     for phase in found:
         inside = (phase.begin_s <= released_s) & (released_s < phase.end_s)
         mine = cycles.filter(pl.Series(inside))
         if mine.is_empty():
             continue
-        moves = int(np.sum((phase.begin_s <= moved_s) & (moved_s < phase.end_s)))
+        moves = sum(phase.begin_s <= at_s < phase.end_s for at_s, _ in moved_s)
         guards = sum(phase.begin_s <= at_s < phase.end_s for at_s in guard_s)
         counts = mine["placement"].cast(pl.String).value_counts(sort=True)
         rms_mm, rms_px = (math.nan, math.nan)
@@ -101,14 +98,27 @@ def phase_rows(run: Run, facts: Facts) -> list[PhaseRow]:
     return rows
 
 
-def _guarded(run: Run, released_s: Mapping[int, float]) -> list[float]:
-    """When the guard moved the cell: noted under the window that follows."""
+def _moves(run: Run) -> list[tuple[float, str]]:
+    """When the first cycle on another placement was released, and on which."""
+    import polars as pl
+
+    cycles = run.cycles.select("release_ns", pl.col("placement").cast(pl.String))
+    changed = cycles.filter(pl.col("placement") != pl.col("placement").shift(1))
+    return [(at_ns / 1e9, placement) for at_ns, placement in changed.rows()]
+
+
+def _guarded(run: Run, moved_s: Sequence[tuple[float, str]]) -> list[float]:
+    """When it was the guard: it is noted under the window that follows the move."""
     import polars as pl
 
     decisions = run.decisions
-    moves = decisions.filter(
-        decisions["migrated"] & (decisions["reason"].cast(pl.String) == "guard")
-    )
+    guard = decisions["migrated"] & (decisions["reason"].cast(pl.String) == "guard")
     first = dict(zip(run.windows["window"], run.windows["first_cycle"], strict=True))
-    last_s = max(released_s.values())
-    return [released_s.get(first.get(window, -1), last_s) for window in moves["window"].to_list()]
+    released_ns = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
+    found = []
+    for window, target in decisions.filter(guard).select("window", "placement").rows():
+        # After the last window there is none that follows.
+        until_ns = released_ns.get(first.get(window, -1), math.inf)
+        mine = [at_s for at_s, name in moved_s if name == target and at_s * 1e9 <= until_ns + 1]
+        found += mine[-1:]
+    return found

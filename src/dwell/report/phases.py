@@ -61,7 +61,7 @@ def disturbed(scenario: Iterable[Item], tiers: Mapping[str, str]) -> list[Distur
     tiers : mapping of str to str
         Of the nodes.
     """
-    found: dict[tuple[float, float, str, str], list[str]] = {}
+    found: dict[tuple[float, float, str, str], tuple[float, float, list[str]]] = {}
     for item in scenario:
         if item.get("episodes") is not None:
             continue
@@ -72,12 +72,13 @@ def disturbed(scenario: Iterable[Item], tiers: Mapping[str, str]) -> list[Distur
         what = _on_node(item) if link is None else _on_link(item)
         kind = _stress(item, tiers) if link is None else NETWORK
         who = str(item["node"]) if link is None else "–".join(sorted(str(link).split("->")))
-        mine = found.setdefault((round(begin_s, DIGITS), round(end_s, DIGITS), kind, what), [])
+        together = round(begin_s, DIGITS), round(end_s, DIGITS), kind, what
+        *_, mine = found.setdefault(together, (begin_s, end_s, []))
         if who not in mine:
             mine.append(who)
     return [
         Disturbed(begin_s, end_s, f"{', '.join(who)}: {what}", kind)
-        for (begin_s, end_s, kind, what), who in sorted(found.items())
+        for (_, _, kind, what), (begin_s, end_s, who) in sorted(found.items())
     ]
 
 

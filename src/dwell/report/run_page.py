@@ -260,7 +260,8 @@ def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str
     rows: list[tuple[str, Sequence[Cell]]] = []
     for row in phases:
         placed = "<br>".join(
-            f"{_placed(palette, name)} {percent(share)}" for name, share in row.shares.items()
+            f'<span class="nowrap">{_placed(palette, name)} {percent(share)}</span>'
+            for name, share in row.shares.items()
         )
         cells = [
             Cell(escape(row.name)),
@@ -280,7 +281,7 @@ def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str
         rows.append(("", cells))
     head = [
         Cell("phase"),
-        Cell("from (s)", "num"),
+        Cell("time (s)", "num"),
         Cell("placed"),
         Cell(marked("V_D (%)"), "num"),
         Cell("L95 (ms)", "num"),

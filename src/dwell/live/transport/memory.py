@@ -46,7 +46,7 @@ class Participant(Protocol):
         """Key expressions that it wants to hear."""
         ...
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Sample, now_ns: int) -> int | None:
         """Take a message."""
         ...
 

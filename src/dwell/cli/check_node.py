@@ -1,0 +1,152 @@
+"""`dwell check --node`: whether a node has what it needs to run its part of a live cell."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import typer
+
+from dwell.cli.output import aligned, print_json
+from dwell.errors import Fault, LiveError, ProblemError
+from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
+from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
+from dwell.model import Problem
+
+__all__ = ["check_node"]
+
+PACKAGES = {"zenoh": "eclipse-zenoh", "msgspec": "msgspec", "psutil": "psutil"}
+
+
+def check_node(problem: Problem, cell: Path, node: str, *, as_json: bool) -> bool:
+    """Import and make every stage and actuator of a node, and print what is missing.
+
+    Returns
+    -------
+    bool
+        Whether nothing is.
+    """
+    if node not in problem.fabric.nodes:
+        known = ", ".join(problem.fabric.nodes)
+        raise ProblemError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
+    # As the worker's process does: the user's stages lie beside their cell file.
+    sys.path.insert(0, str(cell.resolve().parent))
+    wiring, faults = _wiring(problem)
+    faults += [*_packages(), *_stages(problem, node), *_actuators(problem, node)]
+    if as_json:
+        found = [{"path": fault.path, "message": fault.message} for fault in faults]
+        processes = [] if wiring is None else [role.who for role in wiring.on(node)]
+        print_json({"node": node, "ready": not faults, "faults": found, "processes": processes})
+        return not faults
+    for fault in faults:
+        typer.echo(f"{cell}: node {node}: {fault}", err=True)
+    if wiring is not None and not faults:
+        typer.echo(_summary(problem, wiring, node))
+    return not faults
+
+
+def _packages() -> Iterator[Fault]:
+    for module, package in PACKAGES.items():
+        if importlib.util.find_spec(module) is None:
+            yield Fault("", f"{package} is not installed; pip install 'dwell[live]'")
+
+
+def _wiring(problem: Problem) -> tuple[Wiring | None, list[Fault]]:
+    """Return who listens where, or what is wrong with the hosts."""
+    try:
+        return wire(problem), []
+    except LiveError as error:
+        parts = (line.partition(": ") for line in str(error).splitlines())
+        return None, [
+            Fault(path, told) if told else Fault("live.hosts", path) for path, _, told in parts
+        ]
+
+
+def _stages(problem: Problem, node: str) -> Iterator[Fault]:
+    """Yield what keeps a stage of the node from running."""
+    pipeline = problem.pipeline
+    first = next(name for name in pipeline.tasks if not pipeline.inputs(name))
+    for name, task in pipeline.tasks.items():
+        if node not in task.on:
+            continue
+        where = f"tasks.{name}.run"
+        if task.run is None:
+            yield Fault(where, "missing; name its stage, as module:Name")
+            continue
+        try:
+            stage = load_stage(task.run, where)
+        except LiveError as error:
+            yield Fault(where, str(error).removeprefix(f"{where}: "))
+            continue
+        yield from _inputs(problem, name, stage, where)
+        frames = problem.live.release == "frames" and name == first
+        if frames and not callable(getattr(stage, "wait", None)):
+            yield Fault(where, f"{task.run} has no method wait(), and live.release is frames")
+        yield from _state(name, task.run, stage, task.state_bytes)
+
+
+def _inputs(problem: Problem, name: str, stage: Stage, where: str) -> Iterator[Fault]:
+    sources = {flow.source for flow in problem.pipeline.inputs(name)}
+    for source in getattr(stage, "inputs", {}):
+        if source not in sources:
+            known = ", ".join(sorted(sources)) or "nothing"
+            yield Fault(where, f"its `inputs` name {source!r}, but it gets {known}")
+
+
+def _state(name: str, run: str, stage: Stage, state_bytes: int) -> Iterator[Fault]:
+    """Yield where the cell file and the stage disagree on whether there is a state to move."""
+    where = f"tasks.{name}.state_bytes"
+    if state_bytes and not isinstance(stage, Stateful):
+        yield Fault(where, f"{state_bytes}, but {run} has no methods snapshot() and restore()")
+    if not state_bytes and isinstance(stage, Stateful):
+        yield Fault(where, f"0, but {run} has a state: say about how many bytes it takes")
+
+
+def _actuators(problem: Problem, node: str) -> Iterator[Fault]:
+    for name, task in problem.pipeline.tasks.items():
+        if problem.pipeline.outputs(name) or node not in task.on:
+            continue
+        where = f"live.actuators.{name}"
+        run = problem.live.actuators.get(name)
+        if run is None:
+            yield Fault(where, "missing; name what applies its commands, as module:Name")
+            continue
+        try:
+            load_actuator(run, where)
+        except LiveError as error:
+            yield Fault(where, str(error).removeprefix(f"{where}: "))
+
+
+def _summary(problem: Problem, wiring: Wiring, node: str) -> str:
+    """Return the node's processes, their ports, and who connects to them."""
+    host = problem.live.hosts[node]
+    here = [role.who for role in wiring.on(node)]
+    last = host.port + PORTS_PER_ROLE * len(here) - 1
+    node_of = {role.who: role.node for role in roles(problem)}
+    rows = [["process", "listens on", "reached from", "connects to"]]
+    for role in wiring.on(node):
+        entry = wiring.entry(role.who)
+        ports = ", ".join(sorted(str(end.port) for end in entry.listen.values())) or "-"
+        sources = _others(wiring, role, node_of, incoming=True)
+        targets = _others(wiring, role, node_of, incoming=False)
+        rows.append([role.who, ports, sources, targets])
+    return "\n".join(
+        (
+            f"{problem.name}: {node} has all that it needs",
+            f"{len(here)} processes; TCP ports {host.port} to {last} of {host.address}",
+            "",
+            aligned(rows[0], rows[1:]),
+        )
+    )
+
+
+def _others(wiring: Wiring, role: Role, node_of: dict[str, str], *, incoming: bool) -> str:
+    """Return the other nodes that a process is reached from, or connects to."""
+    found = {
+        node_of[one.source if incoming else one.target]
+        for one in wiring.wires
+        if role.who == (one.target if incoming else one.source)
+    }
+    return ", ".join(sorted(found - {role.node})) or "-"

@@ -1,0 +1,400 @@
+"""Live cells from the command line: real processes over Zenoh, begun by a camera's own frames."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+import dwell
+from dwell.cli.commands import app
+from dwell.errors import LiveError
+from dwell.live.leash import OWNER
+from dwell.live.visiting import Visitor
+from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.model.document import to_document
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "live"
+PATIENCE_S = 60.0
+CPU = min(os.sched_getaffinity(0))
+
+#: Stages that do what the file `mood` beside them says, and an accelerator's utilisation.
+MOODY = """
+from pathlib import Path
+import stages
+from dwell.live.stage import Message
+
+MOOD = Path(__file__).with_name("mood")
+
+def perceive(inputs):
+    mood = MOOD.read_text() if MOOD.exists() else ""
+    if mood == "raise":
+        raise ValueError("no light")
+    if mood == "text":
+        return "left"
+    return stages.perceive(inputs)
+
+class Perception:
+    def start(self):
+        print("the old code", flush=True)
+    def process(self, inputs):
+        return perceive(inputs)
+
+def busy():
+    return 0.875
+"""
+
+
+def invoke(*arguments: str | Path) -> tuple[int, str, str]:
+    """Run a command in this process."""
+    result = CliRunner().invoke(app, [str(word) for word in arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def free_ports(count: int) -> int:
+    """Return the first of so many ports that nobody has."""
+    for first in range(20_000 + os.getpid() % 1_000, 32_000, count):
+        with ExitStack() as stack, suppress(OSError):
+            for port in range(first, first + count):
+                stack.enter_context(socket.create_server(("127.0.0.1", port)))
+            return first
+    raise AssertionError("no ports")
+
+
+class RealCell:
+    """The example's cell with other ports, in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        shutil.copytree(EXAMPLE, folder / "cell", ignore=shutil.ignore_patterns("__pycache__"))
+        self.folder, self.file = folder, folder / "cell" / "cell.yaml"
+        self.mood = folder / "cell" / "mood"
+        self.module = folder / "cell" / "moody.py"
+        self.module.write_text(MOODY)
+        document = to_document(dwell.load(self.file))
+        document["tasks"]["perception"]["run"] = "moody:Perception"
+        document["live"] |= {"release": "frames", "max_age_ms": 400}
+        # Other work on this machine shall not look like a fault.
+        document["controller"] |= {"guard_cycles": 20, "policy": "LOC"}
+        nodes = list(document["nodes"])
+        first = free_ports(3 * 40)
+        for i, node in enumerate(nodes):
+            document["live"]["hosts"][node]["port"] = first + 40 * i
+        self.document = document
+        self.file.write_text(yaml.safe_dump(document, sort_keys=False))
+        self.problem = dwell.load(self.file)
+        assert PORTS_PER_ROLE * len(roles(self.problem)) < 3 * 40
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, *arguments: str | Path) -> subprocess.Popen[bytes]:
+        """Start a command; what it prints goes to a file."""
+        with (self.folder / f"{name}.log").open("ab") as log:
+            made = subprocess.Popen(
+                [sys.executable, "-m", "dwell", *map(str, arguments)],
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, OWNER: str(os.getpid()), "PYTHONPATH": str(ROOT / "src")},
+            )
+        self.processes[name] = made
+        return made
+
+    def agent(self, node: str, *more: str, cell: Path | None = None) -> None:
+        """Start a node."""
+        words = ("--node", node, "--cell", cell or self.file, "--state", self.state(node))
+        self.start(f"agent-{node}", "agent", *words, *more)
+
+    def controller(self) -> None:
+        """Start the controller."""
+        self.start("controller", "controller", "--cell", self.file, "--out", self.folder / "runs")
+
+    def end(self, name: str) -> int:
+        """End a command as systemd would."""
+        process = self.processes.pop(name)
+        process.send_signal(signal.SIGTERM)
+        return process.wait(timeout=PATIENCE_S)
+
+    def state(self, node: str) -> Path:
+        return self.folder / "state" / node
+
+    def log(self, node: str, who: str) -> str:
+        return (self.state(node) / f"{who}.log").read_text()
+
+    def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        """Ask for the status until something holds."""
+        limit_s = time.monotonic() + PATIENCE_S
+        found: dict[str, Any] = {}
+        with Visitor(self.problem) as visitor:
+            while time.monotonic() < limit_s:
+                try:
+                    found = visitor.ask("status", patience_s=1.0)
+                except LiveError:
+                    continue
+                if holds(found):
+                    return found
+                time.sleep(0.02)
+        logs = "\n".join(f"{p.name}: {p.read_text()}" for p in self.folder.glob("*.log"))
+        raise AssertionError(f"it has not come about: {json.dumps(found, indent=1)}\n{logs}")
+
+    def note(self, who: str) -> Callable[[dict[str, Any]], str]:
+        return lambda status: str(status["processes"].get(who, {}).get("note", ""))
+
+    def close(self) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGTERM)
+        for process in self.processes.values():
+            process.wait(timeout=PATIENCE_S)
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCell]:
+    made = RealCell(tmp_path_factory.mktemp("live"))
+    try:
+        made.controller()
+        made.agent("R2")
+        made.agent("E", "--accelerator", "moody:busy")
+        made.agent("R1", "--cpus-of", f"perception@*={CPU}", "--realtime", "camera@R1=1")
+        made.until(
+            lambda status: (
+                not status["silent"]
+                and all(one["ready"] for one in status["processes"].values())
+                and status["window"]
+            )
+        )
+        yield made
+    finally:
+        made.close()
+
+
+def test_frames_begin_the_cycles(cell: RealCell) -> None:
+    """Of a camera that brings 20 a second, in a cell whose stamper has no timer."""
+    before = cell.until(lambda status: status["window"])["window"]["number"]
+    cell.until(lambda status: status["window"]["number"] >= before + 2)
+    assert "turn" in cell.log("R2", "sink.control@R2")
+
+
+def test_status_says_who_is_there(cell: RealCell) -> None:
+    code, stdout, _ = invoke("live", "status", "--cell", cell.file)
+    assert code == 0
+    lines = stdout.splitlines()
+    assert lines[0] == "light-follower: LOC"
+    assert lines[1].startswith("mode control, term ")
+    assert lines[2].startswith("window ")
+    shown = {line.split()[0] for line in lines[3:]}
+    assert shown == {role.who for role in roles(cell.problem)} - {"controller@E"}
+
+
+def test_processes_are_placed_one_by_one(cell: RealCell) -> None:
+    def pid(who: str) -> int:
+        return int(json.loads((cell.state("R1") / f"{who}.pid").read_text())["pid"])
+
+    assert os.sched_getaffinity(pid("perception@R1")) == {CPU}
+    assert os.sched_getaffinity(pid("stamper@R1")) == os.sched_getaffinity(0)
+    real = os.sched_getscheduler(pid("camera@R1")) == os.SCHED_FIFO
+    # Who may not have the priority goes on without, and says so.
+    assert real or "real-time priority 1" in cell.log("R1", "camera@R1")
+
+
+def test_the_busier_of_cpu_and_accelerator_counts(cell: RealCell) -> None:
+    status = cell.until(lambda status: status["window"]["utilisation"]["E"] >= 0.87)
+    assert status["processes"]["agent@E"]["note"] == ""
+
+
+def test_a_stage_that_raises_is_named_and_the_loop_goes_on(cell: RealCell) -> None:
+    cell.mood.write_text("raise")
+    who = cell.note("perception@R1")
+    found = who(cell.until(lambda status: "no light" in who(status)))
+    assert found.startswith("perception on R1: cycle ")
+    assert found.endswith("process() raised ValueError: no light")
+    cell.mood.write_text("text")
+    found = who(cell.until(lambda status: "returned" in who(status)))
+    assert found.endswith("process() returned a str, not a Message")
+    cell.mood.unlink()
+    before = cell.until(lambda status: status["window"])["window"]["number"]
+    cell.until(lambda status: status["window"]["number"] > before)
+    assert "process() raised ValueError: no light" in cell.log("R1", "perception@R1")
+
+
+def test_a_pin_and_a_drain_move_the_cell(cell: RealCell) -> None:
+    def told(*words: str) -> tuple[int, str]:
+        code, stdout, stderr = invoke("live", *words, "--cell", cell.file)
+        return code, stdout + stderr
+
+    assert told("pin", "SO")[0] == 0
+    cell.until(lambda status: status["placement"] == "SO")
+    assert told("drain", "E") == (
+        1,
+        "error: refused: the cell is pinned to SO, which needs E; unpin it first\n",
+    )
+    assert told("pin", "LOC")[0] == 0
+    cell.until(lambda status: status["placement"] == "LOC")
+    assert told("drain", "E")[0] == 0
+    assert told("pin", "SO") == (1, "error: refused: SO needs E, which is drained\n")
+    assert told("drain", "R1") == (
+        1,
+        "error: refused: every candidate needs R1; nothing could run\n",
+    )
+    assert told("pin", "NO") == (
+        1,
+        "error: refused: no candidate 'NO'; there are LOC, SO, HYB\n",
+    )
+    assert told("undrain", "X") == (1, "error: refused: no node 'X'; there are R1, E, R2\n")
+
+
+def test_a_drained_node_gets_other_code(cell: RealCell) -> None:
+    """Goes on from the test before: E is drained."""
+    assert "the old code" in cell.log("E", "perception@E")
+    assert cell.end("agent-E") == 0
+    cell.until(lambda status: status["processes"]["agent@E"]["age_ms"] > 1_000)
+    # Windows go on without E.
+    before = cell.until(lambda status: status["window"])["window"]["number"]
+    cell.until(lambda status: status["window"]["number"] > before)
+    cell.module.write_text(MOODY.replace("the old code", "the new code"))
+    cell.agent("E")
+    cell.until(lambda status: status["processes"]["agent@E"]["age_ms"] < 1_000)
+    assert invoke("live", "undrain", "E", "--cell", cell.file)[0] == 0
+    assert invoke("live", "pin", "SO", "--cell", cell.file)[0] == 0
+    status = cell.until(lambda status: status["placement"] == "SO")
+    assert status["drained"] == []
+    assert "the new code" in cell.log("E", "perception@E")
+    assert "the old code" in cell.log("R1", "perception@R1")
+
+
+def test_a_second_agent_of_a_node_is_refused(cell: RealCell) -> None:
+    state = cell.folder / "state" / "second"
+    second = cell.start(
+        "second", "agent", "--node", "R2", "--cell", cell.file, "--state", state
+    )  # fmt: skip
+    assert second.wait(timeout=PATIENCE_S) == 1
+    told = (cell.folder / "second.log").read_text()
+    assert "agent@R2 cannot open its session 'control' on tcp/127.0.0.1:" in told
+    assert told.endswith("is there another agent for node R2 here?\n")
+    assert "Traceback" not in told
+
+
+def test_another_cell_file_is_named_by_status(cell: RealCell) -> None:
+    other = cell.file.with_name("other.yaml")
+    other.write_text(yaml.safe_dump({**cell.document, "deadline_ms": 40}, sort_keys=False))
+    cell.end("agent-E")
+    cell.agent("E", cell=other)
+    status = cell.until(lambda status: "agent@E" in status["strangers"])
+    assert "agent@E has another cell file (" in status["strangers"]["agent@E"]
+    _, stdout, _ = invoke("live", "status", "--cell", cell.file)
+    assert "copy one file to all nodes" in stdout
+    # Nobody hears it: the guard has moved to where E is not needed.
+    cell.until(lambda status: status["placement"] == "LOC" and status["guard_moves"])
+    cell.end("agent-E")
+
+
+def test_the_run_is_a_run(cell: RealCell) -> None:
+    assert cell.end("controller") == 0
+    (folder,) = (cell.folder / "runs").iterdir()
+    run = dwell.open_run(folder)
+    assert run.windows.height > 5
+    assert {"LOC", "SO"} <= set(run.windows["placement"])
+
+
+def test_nobody_answers(cell: RealCell) -> None:
+    code, _, stderr = invoke("live", "status", "--cell", cell.file)
+    assert code == 1
+    assert stderr == (
+        "error: no controller of cell 'light-follower' answers; is `dwell controller` running on "
+        "E?\n"
+    )
+
+
+# ------------------------------------------------------------------------ before the start
+
+
+@pytest.mark.parametrize("node", ["R1", "E", "R2"])
+def test_a_node_that_has_all_it_needs(node: str) -> None:
+    code, stdout, stderr = invoke("check", "--node", node, EXAMPLE / "cell.yaml")
+    assert (code, stderr) == (0, "")
+    assert stdout.startswith(f"light-follower: {node} has all that it needs\n")
+    assert f"agent@{node}" in stdout
+
+
+def test_all_that_a_node_lacks_is_told_at_once(tmp_path: Path) -> None:
+    document = to_document(dwell.load(EXAMPLE / "cell.yaml"))
+    shutil.copy(EXAMPLE / "stages.py", tmp_path / "lacking_stages.py")
+    tasks = document["tasks"]
+    tasks["camera"]["run"] = "lacking_stages:Drive"
+    tasks["perception"]["run"] = "no_such_vision:Detect"
+    tasks["planning"]["run"] = "lacking_stages:Plna"
+    tasks["control"]["run"] = "lacking_stages:Plan"
+    document["live"] = {"hosts": {"R1": {"port": 7450}}, "release": "frames"}
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml.safe_dump(document, sort_keys=False))
+    code, stdout, stderr = invoke("check", "--node", "R1", file)
+    start = f"{file}: node R1: "
+    assert (code, stdout) == (2, "")
+    assert stderr.splitlines() == [
+        f"{start}live.hosts.E: missing; give its address and first port",
+        f"{start}live.hosts.R2: missing; give its address and first port",
+        f"{start}tasks.camera.run: lacking_stages:Drive is no stage: it has no method "
+        "process(inputs)",
+        f"{start}tasks.perception.run: importing no_such_vision failed (ModuleNotFoundError: No "
+        "module named 'no_such_vision')",
+    ]
+    code, stdout, _ = invoke("check", "--node", "R2", file, "--json")
+    found = {fault["path"]: fault["message"] for fault in json.loads(stdout)["faults"]}
+    assert code == 2
+    assert found["tasks.planning.run"] == "lacking_stages has no 'Plna'; did you mean 'Plan'?"
+    assert found["tasks.control.run"] == "its `inputs` name 'perception', but it gets planning"
+    assert found["tasks.control.state_bytes"].startswith("0, but lacking_stages:Plan has a state")
+    assert found["live.actuators.control"].startswith("missing; ")
+
+
+def test_frames_need_a_method_that_waits_for_them(tmp_path: Path) -> None:
+    document = to_document(dwell.load(EXAMPLE / "cell.yaml"))
+    document["tasks"]["camera"]["run"] = "waiting_stages:perceive"
+    document["live"]["release"] = "frames"
+    shutil.copy(EXAMPLE / "stages.py", tmp_path / "waiting_stages.py")
+    shutil.copy(EXAMPLE / "stages.py", tmp_path / "stages.py")
+    file = tmp_path / "cell.yaml"
+    file.write_text(yaml.safe_dump(document, sort_keys=False))
+    _, _, stderr = invoke("check", "--node", "R1", file)
+    assert "waiting_stages:perceive has no method wait(), and live.release is frames" in stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("check", "--node", "X"), "no node 'X' in cell 'light-follower'; there are R1, E, R2"),
+        (("agent", "--node", "X", "--cell"), "no node 'X' in cell 'light-follower'"),
+        (
+            ("agent", "--node", "R1", "--realtime", "nobody@R1=3", "--cell"),
+            "--realtime: 'nobody@R1=3' is for no process of the node: agent@R1, camera@R1, ",
+        ),
+        (
+            ("agent", "--node", "R1", "--realtime", "camera@R1=100", "--cell"),
+            "--realtime: '100' is no priority from 1 to 99",
+        ),
+        (
+            ("agent", "--node", "R1", "--cpus-of", "camera@R1=x", "--cell"),
+            "--cpus-of: 'x' is no list of CPUs, as 0,2-3",
+        ),
+        (
+            ("agent", "--node", "R1", "--accelerator", "no_such:thing", "--cell"),
+            "--accelerator: importing no_such failed",
+        ),
+    ],
+)
+def test_mistakes_are_told_before_anything_starts(arguments: tuple[str, ...], words: str) -> None:
+    code, _, stderr = invoke(*arguments, EXAMPLE / "cell.yaml")
+    assert code in (1, 2)
+    assert words in " ".join(stderr.replace("│", "").split())

@@ -1,0 +1,242 @@
+"""The live demo: what it shows while it runs, what it writes into its run, how it ends."""
+
+from __future__ import annotations
+
+import importlib.resources
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from rich.console import Console
+
+import dwell
+from dwell.cli import live_demo
+from dwell.cli.live_view import Lines, Look, Screen
+from dwell.demo.stageplay import Change, changes_of
+from dwell.errors import LiveError
+from dwell.model import Problem
+from dwell.model.document import to_document
+from dwell.report.phases import Disturbed, disturbed
+from tests.report.live_runs import PERIOD_NS, live_run
+
+SECONDS = 116.0
+#: Far more than any of it takes, on a machine that has a lot else to do.
+PATIENCE_S = 60.0
+TWO_CPUS = pytest.mark.skipif(
+    len(os.sched_getaffinity(0)) < 2, reason="robots and edge need a CPU each"
+)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    file = importlib.resources.files("dwell.demo") / "cell.yaml"
+    with importlib.resources.as_file(file) as path:
+        return dwell.load(path)
+
+
+@pytest.fixture
+def plan(problem: Problem) -> list[Disturbed]:
+    tiers = {name: node.tier for name, node in problem.fabric.nodes.items()}
+    return disturbed(to_document(problem)["scenarios"]["demo"], tiers)
+
+
+def status(window: int, **more: Any) -> dict[str, Any]:
+    return {
+        "placement": "LOC",
+        "fallback": False,
+        "migrations": 3,
+        "guard_moves": 0,
+        "window": {
+            "number": window,
+            "l95_ms": 31.25,
+            "violation_rate": 0.025,
+            "estimates": {"LOC": 1.0, "SO": 1.25, "HYB": None},
+            "utilisation": {"R1": 0.6, "E": 0.3, "R2": 1.02},
+            "reason": "hold",
+        },
+        **more,
+    }
+
+
+class Terminal:
+    """A screen drawn on paper of a given size."""
+
+    def __init__(self, problem: Problem, plan: list[Disturbed], columns: int) -> None:
+        self.console = Console(
+            file=io.StringIO(), width=columns, force_terminal=True, color_system=None
+        )
+        self.screen = Screen(problem, SECONDS, plan, self.console, lambda _: None)
+
+    def lines(self) -> list[str]:
+        with self.console.capture() as capture:
+            self.console.print(self.screen.drawn())
+        return capture.get().splitlines()
+
+
+def look(at_s: float, told: dict[str, Any], active: list[Disturbed], **more: float) -> Look:
+    answered_s = more.get("answered_s", at_s)
+    return Look(at_s, told, answered_s, 3.25, 5.5, active)
+
+
+@pytest.mark.parametrize(("columns", "width"), [(80, 80), (100, 100), (180, 100)])
+def test_it_fits_a_terminal_at_every_moment(
+    columns: int, width: int, problem: Problem, plan: list[Disturbed]
+) -> None:
+    terminal = Terminal(problem, plan, columns)
+    heights = set()
+    for second in range(0, 117, 3):
+        active = [one for one in plan if one.begin_s <= second < one.end_s]
+        placement = ("LOC", "SO", "HYB")[second % 3]
+        moved = status(second, placement=placement, fallback=second % 2 == 0)
+        terminal.screen.show(look(second, moved, active))
+        lines = terminal.lines()
+        assert {len(line) for line in lines} == {width}
+        heights.add(len(lines))
+    # It never jumps, and leaves room for a prompt.
+    assert len(heights) == 1
+    assert max(heights) < 23
+
+
+def test_it_shows_what_is_known_of_the_cell(problem: Problem, plan: list[Disturbed]) -> None:
+    terminal = Terminal(problem, plan, 80)
+    terminal.screen.show(look(10, {}, []))
+    assert "nothing disturbs it" in "\n".join(terminal.lines())
+    terminal.screen.show(look(20, status(4), plan[:1]))
+    terminal.screen.show(look(21, status(5, placement="SO", guard_moves=1, fallback=True), []))
+    text = "\n".join(terminal.lines())
+    for part in ("31.2 ms", "2.5 %", "3.2 mm", "3 migrations, 1 by the guard", "R1 ", " 60 %"):
+        assert part in text, part
+    assert "at 21 s by the guard: LOC → SO" in text
+    assert "perception E" in text
+    assert "▒" in text
+    terminal.screen.show(look(30, status(5), [], answered_s=21))
+    assert "no answer from the controller for 9 s" in "\n".join(terminal.lines())
+
+
+def test_logs_get_a_line_whenever_something_has_changed(
+    plan: list[Disturbed], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = Lines()
+    for second in range(10):
+        active = plan[:1] if second >= 5 else []
+        lines.show(look(second, status(second, placement="LOC" if second < 7 else "SO"), active))
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split()[0] for line in told] == ["0.0", "5.0", "7.0"]
+    assert "robot stress (R1: 2 busy threads)" in told[1]
+
+
+def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path) -> None:
+    folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
+    told = live_demo._Told(problem, "demo", 5)
+    first = changes_of(problem, "demo")[0]
+    told.begun_ns[id(first.item)] = 20 * PERIOD_NS
+    run = told.note(folder)
+    assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
+    # Interrupted: it was on until the end.
+    (played,) = run.meta["played"]
+    assert played["node"] == "R1"
+    assert played["at_s"] == pytest.approx(10 * PERIOD_NS / 1e9, abs=1e-3)
+    assert played["for_s"] == pytest.approx(51 * PERIOD_NS / 1e9, abs=1e-3)
+    assert "tracking" not in run.meta
+
+
+def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:
+    told = live_demo._Told(problem, "demo", 1)
+    changes: list[Change] = changes_of(problem, "demo")
+    seen = []
+    for change in changes:
+        told.changed(change)
+        seen.append(tuple(one.kind for one in told.active()))
+    assert list(dict.fromkeys(seen)) == [
+        ("robot stress",), (), ("network impairment",), ("edge stress",),
+    ]  # fmt: skip
+    assert told.active() == []
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(LiveError, match="is not a demo's"):
+        live_demo._make(tmp_path)
+    live_demo._make(tmp_path / "out")
+    (tmp_path / "out" / "runs").mkdir()
+    live_demo._make(tmp_path / "out")
+    assert not (tmp_path / "out" / "runs").exists()
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A demo that has begun to play."""
+    one = subprocess.Popen(
+        [sys.executable, "-m", "dwell", "live", "demo", "--out", str(tmp_path / "out"), "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert one.stderr is not None
+    try:
+        assert "nothing disturbs it" in one.stderr.readline()
+        yield one
+    finally:
+        one.kill()
+        one.communicate()
+
+
+def shared_by(processes: list[psutil.Process]) -> set[str]:
+    """Files of Zenoh's in shared memory that processes have mapped."""
+    found: set[str] = set()
+    for process in processes:
+        maps = Path(f"/proc/{process.pid}/maps").read_text()
+        found.update(line.split()[-1] for line in maps.splitlines() if line.endswith(".zenoh"))
+    return found
+
+
+@TWO_CPUS
+def test_interrupted_it_seals_its_run_and_ends_everything(
+    demo: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    of_it = psutil.Process(demo.pid).children(recursive=True)
+    assert len(of_it) > 15
+    demo.send_signal(signal.SIGINT)
+    told, said = demo.communicate(timeout=PATIENCE_S)
+    assert demo.returncode == 130
+    assert "Traceback" not in said
+    found = json.loads(told)
+    assert found["interrupted"]
+    run = dwell.open_run(found["run"])
+    assert run.meta["recovered"]["sealed"]
+    assert run.meta["scenario"] == "demo"
+    # Nothing had been played, and no window may have closed.
+    assert run.meta.get("played", []) == []
+    # Everything had ended before it told so.
+    assert not [process for process in of_it if process.is_running()]
+
+
+@TWO_CPUS
+def test_killed_it_leaves_no_process_port_or_shared_memory(demo: subprocess.Popen[str]) -> None:
+    of_it = psutil.Process(demo.pid).children(recursive=True)
+    shared = shared_by(of_it)
+    ports = {
+        entry.laddr.port
+        for process in of_it
+        for entry in process.net_connections("tcp")
+        if entry.status == psutil.CONN_LISTEN
+    }
+    assert shared
+    assert ports
+    demo.kill()
+    _, alive = psutil.wait_procs(of_it, timeout=PATIENCE_S)
+    assert alive == []
+    assert not [name for name in shared if Path(name).exists()]
+    for port in ports:
+        with socket.socket() as one:
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            one.bind(("127.0.0.1", port))

@@ -1,0 +1,128 @@
+"""Rule 13 on the in-memory network: advice, and what people ask of a controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+import dwell
+from dwell.live.cell import Cell
+from dwell.live.keys import Keys
+from dwell.live.messages import Ask, encode
+from dwell.live.transport.protocol import Sample
+from dwell.live.wiring import roles
+from dwell.model import Problem
+from tests.live.small_world import World
+
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    cell = dwell.load("examples/canonical.yaml")
+    return replace(cell, controller=replace(cell.controller, fallbacks=("LOC",), initial="SO"))
+
+
+def ask(world: World, what: str, about: str = "") -> str:
+    """Ask as a person does; returns the refusal."""
+    cell = controller(world)
+    sample = Sample(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
+    before = cell._do(Ask("me", what, about), world.network.now_ns)
+    cell.receive(sample, world.network.now_ns)
+    return before
+
+
+def controller(world: World) -> Cell:
+    return next(role for role in world.roles.values() if isinstance(role, Cell))
+
+
+def require_unbroken(cycles: Iterable[int], world: World) -> None:
+    """No cycle is missing, twice, or out of order."""
+    assert all(later == earlier + 1 for earlier, later in pairwise(cycles))
+    assert world.cycles[-1] >= world.stamper.cycle - 2
+
+
+def test_advice_is_recorded_and_not_followed(problem: Problem) -> None:
+    # LOC is slower than the cell file says of SO, and how busy this machine is does not count.
+    weights = replace(problem.objective.weights, robot=0.0, edge=0.0)
+    moving = replace(
+        problem,
+        controller=replace(problem.controller, initial="LOC"),
+        objective=replace(problem.objective, weights=weights),
+    )
+    advised = replace(moving, live=replace(problem.live, mode="advise"))
+    exec_ms = {**EXEC_MS, "perception": 28.0}
+    moved, stayed = (World(cell, exec_ms=exec_ms, policy="dtp") for cell in (moving, advised))
+    for world in (moved, stayed):
+        world.run(15_000)
+    assert moved.stamper.moves
+    assert not stayed.stamper.moves
+    rows = stayed.recorder.rows["decisions"]
+    assert len(rows) >= 3
+    names = controller(stayed).controller.log.columns(tuple(problem.candidates))
+    assert {dict(zip(names, row, strict=False))["placement"] for row in rows} - {"LOC"}
+
+
+def test_a_pin_holds_against_the_policy_even_where_it_only_advises(problem: Problem) -> None:
+    advised = replace(problem, live=replace(problem.live, mode="advise"))
+    world = World(advised, exec_ms=EXEC_MS, policy="dtp")
+    world.run(2_000)
+    assert not ask(world, "pin", "HYB")
+    world.run(8_000)
+    assert world.stamper.placement == "HYB"
+    assert controller(world).status(world.network.now_ns)["pinned"] == "HYB"
+    require_unbroken(world.cycles, world)
+
+
+def test_code_is_changed_by_draining_at_no_cycle_lost(problem: Problem) -> None:
+    world = World(problem, exec_ms=EXEC_MS, policy="SO")
+    world.run(2_000)
+    assert world.stamper.placement == "SO"
+    assert not ask(world, "drain", "E")
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    workers = [role.who for role in roles(world.problem) if role.node == "E" and role.works]
+    assert workers
+    for who in workers:
+        world.kill(who)
+    world.run(3_000)
+    for who in workers:
+        world.start(who)
+    world.run(1_000)
+    assert not ask(world, "undrain", "E")
+    assert not ask(world, "pin", "SO")
+    world.run(2_000)
+    assert world.stamper.placement == "SO"
+    assert not any(reason == "guard" for _, _, reason in world.stamper.moves)
+    require_unbroken(world.cycles, world)
+
+
+@pytest.mark.parametrize(
+    ("questions", "refused"),
+    [
+        ([("pin", "NO")], "no candidate 'NO'; there are LOC, SO, HYB"),
+        ([("drain", "X")], "no node 'X'; there are R1, E, R2"),
+        ([("undrain", "X")], "no node 'X'; there are R1, E, R2"),
+        ([("drain", "R1")], "every candidate needs R1; nothing could run"),
+        (
+            [("pin", "SO"), ("drain", "E")],
+            "the cell is pinned to SO, which needs E; unpin it first",
+        ),
+        ([("drain", "E"), ("pin", "SO")], "SO needs E, which is drained"),
+        ([("dance", "")], "unknown question 'dance'"),
+    ],
+)
+def test_what_cannot_be_is_refused(
+    problem: Problem, questions: list[tuple[str, str]], refused: str
+) -> None:
+    world = World(problem, exec_ms=EXEC_MS, policy="SO")
+    world.run(1_000)
+    *before, last = questions
+    for question in before:
+        assert not ask(world, *question)
+    assert ask(world, *last) == refused
+    world.run(1_000)
+    require_unbroken(world.cycles, world)

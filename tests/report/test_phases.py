@@ -1,0 +1,75 @@
+"""Phases of a run, from what was done to it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.report.phases import CALM, Disturbed, disturbed, phases
+
+TIERS = {"R1": "robot", "E": "edge"}
+SCENARIO: list[dict[str, Any]] = [
+    {"node": "R1", "stress_threads": 2, "at_s": 6.0, "for_s": 22.0},
+    {"link": "R1->E", "add_delay_ms": {"normal": {"mean": 25.0, "std": 5.0}}, "loss": 0.02,
+     "at_s": 42.01, "for_s": 22.0},
+    {"link": "E->R1", "add_delay_ms": {"normal": {"mean": 25.0, "std": 5.0}}, "loss": 0.02,
+     "at_s": 42.04, "for_s": 22.0},
+    {"node": "E", "stress_threads": 2, "at_s": 78.0},
+]  # fmt: skip
+
+
+def test_both_ways_of_a_link_are_one_disturbance() -> None:
+    assert [(one.kind, one.what) for one in disturbed(SCENARIO, TIERS)] == [
+        ("robot stress", "R1: 2 busy threads"),
+        ("network impairment", "E–R1: +25 ms, loss 2 %"),
+        ("edge stress", "E: 2 busy threads"),
+    ]
+
+
+def test_what_is_down_or_has_a_rate_is_told_so() -> None:
+    items: list[dict[str, Any]] = [
+        {"node": "E", "down": True},
+        {"link": "R1->E", "rate_mbps": 5.0},
+        {"link": "R1->E"},
+    ]
+    told = {(one.kind, one.what) for one in disturbed(items, TIERS)}
+    assert ("edge outage", "E: down") in told
+    assert ("network impairment", "E–R1: 5 Mbit/s") in told
+
+
+def test_episodes_are_left_out() -> None:
+    assert disturbed([{"node": "E", "stress_threads": 1, "episodes": {}}], TIERS) == []
+
+
+def test_phases_begin_and_end_with_what_is_on() -> None:
+    found = phases(disturbed(SCENARIO, TIERS), 116.0)
+    assert [phase.name for phase in found] == [
+        CALM, "robot stress", CALM, "network impairment", CALM, "edge stress",
+    ]  # fmt: skip
+    assert found[-1].end_s == 116.0
+    assert found[1].begin_s == 6.0
+
+
+events = st.lists(
+    st.builds(
+        lambda begin, length, kind: Disturbed(begin, begin + length, kind, kind),
+        st.floats(0, 100),
+        st.one_of(st.just(math.inf), st.floats(0.1, 50)),
+        st.sampled_from(("robot stress", "edge stress")),
+    ),
+    max_size=6,
+)
+
+
+@given(events, st.floats(1, 120))
+def test_phases_cover_the_run_without_gaps(happened: list[Disturbed], end_s: float) -> None:
+    found = phases(happened, end_s)
+    assert found[0].begin_s == 0.0
+    assert found[-1].end_s == end_s
+    for before, after in itertools.pairwise(found):
+        assert before.end_s == after.begin_s
+        assert before.name != after.name
