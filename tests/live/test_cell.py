@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -94,9 +95,7 @@ def test_windows_begin_with_the_first_cycle_of_a_new_placement(problem: Problem)
     windows = columns(world, "windows", "window", "first_cycle", "placement", "mixed", "lead")
     assert len(windows) >= 8
     assert not any(mixed for *_, mixed, _ in windows)
-    for (_, first, before, _, _), (_, following, after, _, lead) in zip(
-        windows, windows[1:], strict=False
-    ):
+    for (_, first, before, _, _), (_, following, after, _, lead) in itertools.pairwise(windows):
         assert following == first + problem.window_cycles + lead
         assert before != after
         # The order travels: the close is at the release of a cycle that has the old stamp.
