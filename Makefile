@@ -12,7 +12,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench lock clean
+.PHONY: help env demo test check bench faults lock clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-6s %s\n", $$1, $$2}' Makefile
@@ -52,6 +52,9 @@ check: env ## Lint, formatting, types and the borders between packages
 
 bench: env ## Run the benchmarks
 	$(BIN)/python -m benchmarks $(ARGS)
+
+faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on where it was stopped
+	$(BIN)/python -m tests.live.faults $(ARGS)
 
 lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
 	$(COMPILE) --group uv --output-file requirements/uv.txt

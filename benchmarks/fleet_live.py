@@ -313,7 +313,8 @@ def _play(cells: list[_Cell], seconds: float) -> None:
     end_ns = begin_ns + round(seconds * 1e9)
     due: list[tuple[int, int, str, _Cell, Any]] = []
     for i, cell in enumerate(cells):
-        phase_ns = begin_ns + PERIOD_NS * i // len(cells)
+        # Cells begin when they like: their windows close all over the time that one takes.
+        phase_ns = begin_ns + (WINDOW * PERIOD_NS + PERIOD_NS) * i // len(cells)
         heapq.heappush(due, (phase_ns, next(number), "release", cell, None))
         heapq.heappush(due, (phase_ns + LOAD_NS * i // len(cells), next(number), "load", cell, 0))
     while due:

@@ -76,8 +76,8 @@ def decision(quick: bool) -> Section:
             cell.wait_until_at(target)
         cell.stop_controller()
         run = open_run(next((cell.folder / "runs").iterdir()))
-    origin_ns = run.meta["origin_ns"]
-    rows = run.cycles.select("release_ns", "placement").rows()
+        origin_ns = run.meta["origin_ns"]
+        rows = run.cycles.select("release_ns", "placement").rows()
     starts = [
         (origin_ns + release_ns, placement)
         for (_, before), (release_ns, placement) in pairwise(rows)

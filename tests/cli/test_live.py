@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -308,13 +309,11 @@ def test_the_run_is_a_run(cell: RealCell) -> None:
     assert {"LOC", "SO"} <= set(run.windows["placement"])
 
 
-def test_nobody_answers(cell: RealCell) -> None:
-    code, _, stderr = invoke("live", "status", "--cell", cell.file)
-    assert code == 1
-    assert stderr == (
-        "error: no controller of cell 'light-follower' answers; is `dwell controller` running on "
-        "E?\n"
-    )
+def test_nobody_answers(tmp_path: Path) -> None:
+    made = RealCell(tmp_path)
+    words = "no controller of cell 'light-follower' answers; is `dwell controller` running on E?"
+    with Visitor(made.problem) as visitor, pytest.raises(LiveError, match=re.escape(words)):
+        visitor.ask("status", patience_s=0.2)
 
 
 # ------------------------------------------------------------------------ before the start

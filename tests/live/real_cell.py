@@ -387,6 +387,7 @@ class RealCell(Stageplay):
             for before, later in pairwise(windows)
             if later - before < MIN_DWELL + 1
         ]
+        self.observed.look()
         applied = {seen.cycle for seen in self.observed.applied}
         told = run.cycles.filter(run.cycles["actuated"].cast(bool, strict=False))
         unknown = set(told["number"].to_list()) - applied

@@ -285,8 +285,10 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     cell = replace(cell, controller=replace(cell.controller, fallbacks=()))
     world = World(cell, exec_ms=EXEC_MS)
     world.run(1_000)
+    assert not world.worker(f"{who}.1").active
     world.network.freeze(who)
     world.run(1_000)
+    assert world.worker(f"{who}.1").active
     assert world.stamper.placement == "LOC"
     assert longest_gap(world.cycles, world.stamper.cycle - 2) <= 4
     world.network.thaw(who)

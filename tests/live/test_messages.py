@@ -125,7 +125,7 @@ def values_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[list[Any]]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_any_bytes_are_decoded_or_refused(kind: type[msgspec.Struct], data: st.DataObject) -> None:
     raw = data.draw(st.one_of(st.binary(max_size=300), values_of(kind).map(msgspec.msgpack.encode)))
@@ -221,7 +221,7 @@ def sample(data: st.DataObject, key: str) -> Sample:
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
 def test_no_role_falls_over_what_nobody_meant(world: World, data: st.DataObject) -> None:

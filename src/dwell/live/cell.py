@@ -361,7 +361,7 @@ class Cell:
             self._recorder.append(windows.rows())
             return
         wanted = self.controller.close(closed, proven=held.proven or None)
-        self._recorder.append(windows.rows(), origin_ns=windows.origin_ns)
+        rows = windows.rows()
         self._window = self._shown(last.number, last.cycles[0].placement, closed)
         target = self._allowed(wanted)
         if self.place.problem.live.mode == "advise" and not self.pinned:
@@ -370,6 +370,8 @@ class Cell:
             self.controller.resume(held.placement, fallback=held.fallback)
         if target != held.placement:
             self._begin(target, now_ns)
+        # Written last: no order waits for a disk.
+        self._recorder.append(rows, origin_ns=windows.origin_ns)
 
     def _allowed(self, wanted: str) -> str:
         """Return what people let the policy have."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -144,6 +145,8 @@ def run_controller(
     if len(set(names)) < len(names):
         raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
     name = name or f"controller-{os.getpid()}"
+    # Cells take turns: none waits for long while others close their windows.
+    sys.setswitchinterval(0.0005)
     recorders = []
     with ExitStack() as stack:
         threads = []
