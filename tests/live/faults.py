@@ -35,6 +35,8 @@ from tests.live.real_cell import (
 
 #: Faults that one cell goes through before another is started.
 A_CELL = 60
+#: Periods that what is frozen or cut stays so: shorter and longer than a session's lease.
+LASTS = 12, 60
 Z = 1.96
 
 
@@ -97,7 +99,7 @@ def _one_cell(
             fault = min(mine, key=lambda one: done[one.name])
             phase = planned[fault.name][done[fault.name]]
             done[fault.name] += 1
-            lasts = random.Random(f"{seed} {fault.name} {phase}").randint(12, 25)
+            lasts = random.Random(f"{seed} {fault.name} {phase}").randint(*LASTS)
             stalls.stalls.clear()
             broken = False
             try:
@@ -130,9 +132,9 @@ def _line(outcome: Outcome) -> str:
 
 
 def wilson(hits: int, count: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson 1927); without a hit, 3 of `count` at most."""
+    """95 % interval of a share (Wilson 1927); without a hit the exact bound, 3 / n for many."""
     if hits == 0:
-        return 0.0, min(3 / count, 1.0)
+        return 0.0, 1 - 0.05 ** (1 / count)
     share, square = hits / count, Z**2
     centre = (share + square / (2 * count)) / (1 + square / count)
     half = Z / (1 + square / count) * (share * (1 - share) / count + square / (4 * count**2)) ** 0.5
