@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
@@ -374,8 +375,9 @@ def spread(
 
 def _finite(parts: Sequence[Floats]) -> Floats:
     joined = np.concatenate([*parts, np.zeros(0)])
-    found: Floats = joined[np.isfinite(joined)]
-    return found
+    # Numbers so small that arithmetic on them loses digits are as good as none.
+    found: Floats = np.where(np.abs(joined) < sys.float_info.min * 1e8, 0.0, joined)
+    return found[np.isfinite(found)]
 
 
 def _is_squeezed(panel: Panel, shown: Floats) -> bool:
