@@ -316,6 +316,22 @@ def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
     assert [count for _, count in world.arm.counts] == [cycle + 1 for cycle in world.cycles]
 
 
+@pytest.mark.parametrize("state_bytes", [100, 100_000])
+@pytest.mark.parametrize(("here", "there"), [("LOC", "SO"), ("SO", "LOC")])
+def test_rule_8_a_state_finds_its_way_beside_images(
+    problem: Problem, here: str, there: str, state_bytes: int
+) -> None:
+    tasks = dict(problem.pipeline.tasks)
+    tasks["perception"] = replace(tasks["perception"], state_bytes=state_bytes)
+    cell = on(replace(problem, pipeline=replace(problem.pipeline, tasks=tasks)), here)
+    world = World(cell, exec_ms=EXEC_MS, stages={"perception": Counting}, policy=here)
+    world.run(2_000)
+    world.pin(there)
+    world.run(3_000)
+    assert world.stamper.placement == there
+    assert [count for _, count in world.arm.counts] == [cycle + 1 for cycle in world.cycles]
+
+
 def test_rule_8_a_checkpoint_survives_its_node(problem: Problem) -> None:
     world = counting(problem, "SO")
     world.run(3_000)

@@ -27,6 +27,7 @@ __all__ = [
     "Session",
     "Wire",
     "Wiring",
+    "lane_of",
     "roles",
     "session_of",
     "wire",
@@ -305,6 +306,11 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     return wiring
 
 
+def lane_of(declared_bytes: int) -> Lane:
+    """Lane of what a cell file declares that many bytes for: a flow, or a task's state."""
+    return "images" if declared_bytes >= IMAGE_BYTES else "control"
+
+
 def session_of(entry: Entry, lane: Lane, key: str) -> Session:
     """Session that a process sends a message in.
 
@@ -357,10 +363,10 @@ def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, f
                 session = _session(flow, one, other)
                 found[session, frozenset((one.who, other.who))] = None
     for task in problem.pipeline.tasks.values():
-        large = task.state_bytes >= IMAGE_BYTES
+        state = lane_of(task.state_bytes)
         for one, other in combinations(_workers(everybody, task.name), 2):
             if one.node != other.node:
-                found["images" if large else "control", frozenset((one.who, other.who))] = None
+                found[state, frozenset((one.who, other.who))] = None
     return list(found)
 
 
@@ -369,7 +375,7 @@ def _workers(everybody: Iterable[Role], task: str) -> list[Role]:
 
 
 def _session(flow: Flow, one: Role, other: Role) -> Session:
-    if flow.payload_bytes < IMAGE_BYTES:
+    if lane_of(flow.payload_bytes) == "control":
         return "control"
     return "local" if one.node == other.node else "images"
 

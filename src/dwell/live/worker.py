@@ -25,11 +25,10 @@ from dwell.live.role import Place, Pulse
 from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import Message, Stage, Stateful
 from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.wiring import lane_of
 
-__all__ = ["IMAGE_BYTES", "Job", "Worker"]
+__all__ = ["Job", "Worker"]
 
-#: Flows that declare at least so many bytes travel in the lane of images.
-IMAGE_BYTES = 16_384
 #: Cycles that may wait for the rest of their inputs.
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
@@ -197,9 +196,9 @@ class Worker:
         self._depth = problem.pipeline.tasks[task].depth
         self._joins = {MAIN: _Joins(sources), SHADOW: _Joins(sources)}
         self._lanes: dict[str, Lane] = {
-            flow.target: "images" if flow.payload_bytes >= IMAGE_BYTES else "control"
-            for flow in problem.pipeline.outputs(task)
+            flow.target: lane_of(flow.payload_bytes) for flow in problem.pipeline.outputs(task)
         }
+        self._state_lane = lane_of(problem.pipeline.tasks[task].state_bytes)
         self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
@@ -366,7 +365,7 @@ class Worker:
             self._failed(f"snapshot() failed ({type(error).__name__}: {error})")
             return
         header = encode(State(run, cycle, self.task, place.node, number))
-        place.transport.put(place.keys.state(self.task, to), data, header, lane="images")
+        place.transport.put(place.keys.state(self.task, to), data, header, lane=self._state_lane)
 
     def _take_over(self, state: State, data: bytes) -> str:
         """Restore a state; returns what went wrong, or nothing."""
