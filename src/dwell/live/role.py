@@ -276,6 +276,12 @@ class Pulse:
             self.place.complain(LiveError(told))
         self._rivals[beat.who] = count
 
+    def compare_clocks(self, sample: Sample, now_ns: int, offsets: Offsets) -> None:
+        """Take a beat in, and what it tells of the clocks if it came directly."""
+        beat = self.receive(sample, now_ns)
+        if beat is not None and "/detour/" not in sample.key:
+            offsets.hear(beat, now_ns)
+
     def hears(self, sample: Sample) -> bool:
         """Whether a message is a beat."""
         return sample.key.startswith(self._prefix)

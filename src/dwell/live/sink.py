@@ -73,9 +73,7 @@ class Sink:
     def receive(self, sample: Sample, now_ns: int) -> None:
         """Take a command or a beat in."""
         if self.pulse.hears(sample):
-            beat = self.pulse.receive(sample, now_ns)
-            if beat is not None and "/detour/" not in sample.key:
-                self.offsets.hear(beat, now_ns)
+            self.pulse.compare_clocks(sample, now_ns, self.offsets)
             return
         header = self.place.header(sample)
         if header is None or header.source != self.task:

@@ -250,9 +250,7 @@ class Worker:
     def receive(self, sample: Sample, now_ns: int) -> None:
         """Take a message in."""
         if self.pulse.hears(sample):
-            beat = self.pulse.receive(sample, now_ns)
-            if beat is not None and "/detour/" not in sample.key:
-                self.offsets.hear(beat, now_ns)
+            self.pulse.compare_clocks(sample, now_ns, self.offsets)
             return
         kind = sample.key.rpartition("/")[2]
         if kind in (MAIN, SHADOW) and "/in/" in sample.key:
