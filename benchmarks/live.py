@@ -23,12 +23,12 @@ import psutil
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import ARRIVED, NUMBER, LightCell, document
 from dwell.demo.link import Forward, LinkProcess
-from dwell.demo.link_conditions import Conditions
 from dwell.live.transport.protocol import Lane, Sample
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import Entry, Locator, Role, Session
 from dwell.model import Constant
 from dwell.record import open_run
+from dwell.testbed.conditions import Conditions
 
 __all__ = ["decision", "lanes", "moves", "share"]
 

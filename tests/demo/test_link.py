@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from dwell.demo.link import Forward, LinkProcess
-from dwell.demo.link_conditions import CUTS, Conditions, Cut
 from dwell.errors import LiveError
 from dwell.model import Constant, Normal, Trace, TraceTable, Uniform
+from dwell.testbed.conditions import CUTS, Conditions, Cut
 from tests.demo.link_wire import (
     DECLARE,
     INIT,

@@ -14,8 +14,8 @@ import pytest
 import zenoh
 
 from dwell.demo.link import Forward, LinkProcess
-from dwell.demo.link_conditions import CUTS, Cut
 from dwell.model import Constant
+from dwell.testbed.conditions import CUTS, Cut
 from tests.demo.link_sender import IMAGE_BYTES, session
 from tests.demo.link_wire import PATIENCE_S, wait_until
 

@@ -25,9 +25,9 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self, cast
 
-from dwell.demo.child import Child, Json
-from dwell.demo.link_conditions import Conditions, Cut, Scheduling, to_json
 from dwell.errors import LiveError
+from dwell.testbed.child import Child, Json
+from dwell.testbed.conditions import Conditions, Cut, Scheduling, to_json
 
 __all__ = ["Forward", "LinkProcess", "Traffic"]
 

@@ -24,10 +24,10 @@ from typing import Protocol, TypeAlias, TypedDict, cast
 
 import numpy as np
 
-from dwell.demo.child import PARENT_CHECK_S, Json, Parent
 from dwell.demo.link_batches import LENGTH_BYTES, Sifter, is_session
-from dwell.demo.link_conditions import Conditions, Scheduling, changed, delays_ns
 from dwell.errors import DwellError, LiveError
+from dwell.testbed.child import PARENT_CHECK_S, Json, Parent
+from dwell.testbed.conditions import Conditions, Scheduling, changed, delays_ns
 
 __all__ = ["main"]
 

@@ -21,9 +21,7 @@ from typing import Any
 
 import yaml
 
-from dwell.demo.burner import Burner
 from dwell.demo.link import Forward, LinkProcess
-from dwell.demo.link_conditions import Conditions
 from dwell.errors import LiveError
 from dwell.live.leash import OWNER
 from dwell.live.transport.orphans import remove_orphans
@@ -38,6 +36,8 @@ from dwell.model import (
     Problem,
 )
 from dwell.model.document import to_document
+from dwell.testbed.burner import Burner
+from dwell.testbed.conditions import Conditions
 
 __all__ = ["Change", "Stageplay", "changes_of", "on_this_machine"]
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from dwell.demo.link_conditions import Conditions, changed, delays_ns, to_json
 from dwell.errors import LiveError, ProblemError
 from dwell.model import (
     AR1,
@@ -24,6 +23,7 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
+from dwell.testbed.conditions import Conditions, changed, delays_ns, to_json
 
 PROCESSES = [
     Constant(3.0),

@@ -19,8 +19,8 @@ from itertools import count
 from types import TracebackType
 from typing import NoReturn, Self, cast
 
-from dwell.demo.child import PARENT_CHECK_S, Child, Parent
 from dwell.errors import LiveError
+from dwell.testbed.child import PARENT_CHECK_S, Child, Parent
 
 __all__ = ["Burner"]
 
@@ -48,7 +48,7 @@ class Burner:
         #: Ids of the threads as of the last answer: each is a process.
         self.pids: tuple[int, ...] = ()
         self._cpus = sorted(cpus)
-        self._child = Child("dwell.demo.burner", f"burner on {','.join(map(str, self._cpus))}")
+        self._child = Child("dwell.testbed.burner", f"burner on {','.join(map(str, self._cpus))}")
 
     @property
     def pid(self) -> int:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from dwell.demo.burner import Burner
 from dwell.errors import LiveError, ProblemError
+from dwell.testbed.burner import Burner
 from tests.demo.link_wire import PATIENCE_S, wait_until
 
 CPU = max(os.sched_getaffinity(0))
@@ -81,7 +81,7 @@ def test_all_threads_end_with_the_burner() -> None:
 
 PARENT = f"""
 import sys
-from dwell.demo.burner import Burner
+from dwell.testbed.burner import Burner
 burner = Burner([{CPU}])
 burner.start(2)
 print(burner.pid, *burner.pids, flush=True)
