@@ -24,7 +24,6 @@ from dwell.io.entries import (
 from dwell.io.faults import Faults
 from dwell.io.traces import Source, Tables
 from dwell.model import (
-    AR1,
     Bursts,
     Caps,
     Constant,
@@ -33,19 +32,15 @@ from dwell.model import (
     Endpoint,
     Episodes,
     Execution,
-    Exponential,
     Fabric,
     Flow,
-    Gamma,
     Host,
     Link,
     LinkDisturbance,
     LiveSettings,
-    LogNormal,
     MovingTarget,
     Node,
     NodeDisturbance,
-    Normal,
     Objective,
     Pipeline,
     Placement,
@@ -56,23 +51,14 @@ from dwell.model import (
     Targets,
     Task,
     Trace,
-    Uniform,
     Weights,
 )
 from dwell.model.bounds import require
 from dwell.model.meaning import Parts, find_faults
 from dwell.model.problem import POLICIES
+from dwell.model.process import DRAWN
 
 __all__ = ["Assembly"]
-
-NAMED: Mapping[str, type[Process]] = {
-    "uniform": Uniform,
-    "normal": Normal,
-    "lognormal": LogNormal,
-    "gamma": Gamma,
-    "exponential": Exponential,
-    "ar1": AR1,
-}
 
 # Keys of a disturbance that belong to one kind of it.
 NODE_KEYS = ("stress_threads",)
@@ -182,7 +168,7 @@ class Assembly:
         if entry.trace is not None:
             table = self.tables.get(Source.of(entry.trace))
             return Trace(table, entry.trace.column) if table is not None else STAND_IN
-        for name, kind in NAMED.items():
+        for name, kind in DRAWN.items():
             values: Entry | None = getattr(entry, name)
             if values is not None:
                 arguments = values.model_dump(exclude_none=True)

@@ -15,17 +15,7 @@ from dwell.model.fabric import Bursts, Link, Node
 from dwell.model.live import LiveSettings
 from dwell.model.pipeline import Execution, Task
 from dwell.model.problem import ControllerSettings, Problem
-from dwell.model.process import (
-    AR1,
-    Constant,
-    Exponential,
-    Gamma,
-    LogNormal,
-    Normal,
-    Process,
-    Trace,
-    Uniform,
-)
+from dwell.model.process import DRAWN, Constant, Process, Trace
 from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
 from dwell.model.servo import Servo
 
@@ -36,14 +26,7 @@ VERSION = 1
 
 Document: TypeAlias = dict[str, Any]
 
-NAMES: dict[type, str] = {
-    Uniform: "uniform",
-    Normal: "normal",
-    LogNormal: "lognormal",
-    Gamma: "gamma",
-    Exponential: "exponential",
-    AR1: "ar1",
-}
+NAMES: dict[type, str] = {kind: name for name, kind in DRAWN.items()}
 
 
 def to_document(problem: Problem) -> Document:

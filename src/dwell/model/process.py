@@ -8,6 +8,7 @@ in order) is the simulator's business.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
@@ -19,6 +20,7 @@ from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, require
 
 __all__ = [
     "AR1",
+    "DRAWN",
     "Constant",
     "Exponential",
     "Gamma",
@@ -399,3 +401,14 @@ class Trace:
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` recorded values independently."""
         return self.values[rng.integers(self.table.rows, size=size)]
+
+
+#: The cell file's words for the processes that are drawn by their parameters, the fields' names.
+DRAWN: Mapping[str, type[Process]] = {
+    "uniform": Uniform,
+    "normal": Normal,
+    "lognormal": LogNormal,
+    "gamma": Gamma,
+    "exponential": Exponential,
+    "ar1": AR1,
+}

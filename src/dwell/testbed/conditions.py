@@ -13,15 +13,12 @@ from dwell.errors import LiveError
 from dwell.model import bounds
 from dwell.model.process import (
     AR1,
+    DRAWN,
     Constant,
-    Exponential,
-    Gamma,
     LogNormal,
-    Normal,
     Process,
     Trace,
     TraceTable,
-    Uniform,
 )
 
 __all__ = ["CUTS", "Conditions", "Cut", "Scheduling", "changed", "delays_ns", "to_json"]
@@ -32,15 +29,7 @@ CUTS: tuple[Cut, ...] = ("drop", "hold")
 #: How a link's process gets the CPU: by real-time priority, with short time slices, as any other.
 Scheduling: TypeAlias = Literal["fifo", "short slices", "usual"]
 
-NAMED: dict[str, type[Process]] = {
-    "constant": Constant,
-    "uniform": Uniform,
-    "normal": Normal,
-    "lognormal": LogNormal,
-    "gamma": Gamma,
-    "exponential": Exponential,
-    "ar1": AR1,
-}
+NAMED: Mapping[str, type[Process]] = {"constant": Constant, **DRAWN}
 NAMES = {kind: name for name, kind in NAMED.items()}
 # Drawn at a time: a draw of one costs a hundred times as much a value.
 BLOCK = 256
