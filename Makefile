@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv
 # The folders that hold Python.
-CODE := $(shell find src tests examples benchmarks -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
+CODE := $(shell find src tests examples benchmarks docs -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
 
 # uv installs exactly what a lock file says; `sync` also removes what it does not say.
 SYNC := $(UV) pip sync --quiet --python $(BIN)/python --require-hashes

@@ -1,0 +1,178 @@
+"""Cycle numbers and the sink's gate (rules 1, 7) as a model: `python -m docs.protocol.gate`.
+
+A stamper that numbers cycles, and a sink before an actuator; both die and start again. What was
+stamped once may reach the sink as a command at any time later, any number of times, or never.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+from docs.protocol.checker import Rules, Step, report
+
+__all__ = ["RULES", "Limits", "State", "good", "initial", "successors"]
+
+#: What can be left out.
+RULES = {
+    "reservation": "numbers are reserved before they are used, and left out after a restart",
+    "order": "a command that is not newer than the newest one is dropped",
+    "memory": "a sink that starts again knows the newest command",
+    "before": "a command is remembered before it is applied, not after",
+    "age": "a command that is too old is dropped",
+    "run": "a stamper whose book is gone begins a later run",
+}
+
+#: Run and cycle.
+Number: TypeAlias = tuple[int, int]
+NONE: Number = (0, -1)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How much may happen.
+
+    Parameters
+    ----------
+    cycles : int
+        Numbers that are used.
+    crashes : int
+        Processes that die and start again.
+    losses : int
+        Times that the stamper's book is gone, too.
+    block : int
+        Numbers that are reserved at a time.
+    fresh : int
+        Cycles after whose release a command is too old.
+    """
+
+    cycles: int = 7
+    crashes: int = 3
+    losses: int = 1
+    block: int = 2
+    fresh: int = 3
+
+
+ALL, LIMITS = Rules(), Limits()
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Everything.
+
+    Parameters
+    ----------
+    run, cycle, reserved : int
+        The stamper's; the book has the run and the reservation.
+    stamped : tuple of tuple
+        Numbers in the order of their use.
+    newest : tuple
+        What the sink takes for the newest command.
+    book : tuple
+        What it has remembered.
+    under_way : tuple
+        Command that has passed the gate and is not yet applied (or remembered).
+    actuated : tuple
+        What the actuator has done last.
+    crashes, losses : int
+        How many there have been.
+    """
+
+    run: int = 1
+    cycle: int = 0
+    reserved: int = 0
+    stamped: tuple[Number, ...] = ()
+    newest: Number = NONE
+    book: Number = NONE
+    under_way: Number = NONE
+    actuated: Number = NONE
+    crashes: int = 0
+    losses: int = 0
+
+
+def initial() -> State:
+    """Return the state in which a cell begins."""
+    return State()
+
+
+def good(state: State) -> bool:
+    """Whether the actuator has done what was stamped last, or no further cycle may come."""
+    over = len(state.stamped) == LIMITS.cycles
+    return over or (bool(state.stamped) and state.actuated == state.stamped[-1])
+
+
+def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Iterator[Step[State]]:
+    """Return everything that may happen next."""
+    yield from _faults(state, rules, limits)
+    yield from _stamp(state, limits)
+    if state.under_way == NONE:
+        for number in set(state.stamped):
+            if _passes(state, rules, limits, number):
+                seen = replace(state, under_way=number, newest=number)
+                if rules.holds("before"):
+                    seen = replace(seen, book=number)
+                yield Step(f"the gate lets {number} through", seen)
+    else:
+        yield _apply(state, rules, limits)
+
+
+def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
+    if state.crashes == limits.crashes:
+        return
+    once = replace(state, crashes=state.crashes + 1)
+    # Without the reservation the book has the newest number only now and then.
+    behind = max(state.cycle - 1, 0)
+    cycle = state.reserved if rules.holds("reservation") else behind
+    yield Step("the stamper starts again", replace(once, cycle=cycle), fault=True)
+    if state.losses < limits.losses:
+        run = state.run + 1 if rules.holds("run") else state.run
+        fresh = replace(once, run=run, cycle=0, reserved=0, losses=state.losses + 1)
+        yield Step("the stamper starts again without its book", fresh, fault=True)
+    known = state.book if rules.holds("memory") else NONE
+    reborn = replace(once, newest=known, under_way=NONE)
+    yield Step("the sink starts again", reborn, fault=True)
+    if state.under_way != NONE and not rules.holds("before"):
+        applied = replace(reborn, actuated=state.under_way)
+        yield Step("the sink applies, and starts again", applied, fault=True)
+
+
+def _stamp(state: State, limits: Limits) -> Iterator[Step[State]]:
+    if len(state.stamped) == limits.cycles:
+        return
+    reserved = state.reserved
+    if state.cycle >= reserved:
+        reserved = state.cycle + limits.block
+    number = state.run, state.cycle
+    wrong = "a number is used twice" if number in state.stamped else ""
+    after = replace(
+        state, cycle=state.cycle + 1, reserved=reserved, stamped=(*state.stamped, number)
+    )
+    yield Step(f"{number} is stamped", after, wrong=wrong)
+
+
+def _passes(state: State, rules: Rules, limits: Limits, number: Number) -> bool:
+    if rules.holds("order") and number <= state.newest:
+        return False
+    return not rules.holds("age") or not _old(state, limits, number)
+
+
+def _old(state: State, limits: Limits, number: Number) -> bool:
+    return len(state.stamped) - state.stamped.index(number) > limits.fresh
+
+
+def _apply(state: State, rules: Rules, limits: Limits) -> Step[State]:
+    number = state.under_way
+    wrong = ""
+    if number == state.actuated:
+        wrong = "a command is applied twice"
+    elif number < state.actuated:
+        wrong = "a command is applied after a later one"
+    elif not rules.holds("age") and _old(state, limits, number):
+        wrong = "an old command is applied"
+    after = replace(state, under_way=NONE, book=max(state.book, number), actuated=number)
+    return Step(f"{number} is applied", after, wrong=wrong)
+
+
+if __name__ == "__main__":
+    report(initial(), successors, good, RULES)

@@ -1,0 +1,231 @@
+"""Orders, terms, guard and return (rules 2, 5, 6) as a model: `python -m docs.protocol.orders`.
+
+One stamper, two controllers that may both think that they are in charge, and a network that loses,
+delays, repeats and reorders whatever is said: a message that was sent once may arrive at any time
+later, any number of times, or never. Time is left out: the guard may fire, a lease may run out and
+a process may die and come back whenever there are faults left to spend. Each rule can be left out
+of the model, and the checker then has to find out what it is there for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+from docs.protocol.checker import Rules, Step, report
+
+__all__ = ["RULES", "Limits", "State", "good", "initial", "successors"]
+
+#: Candidates: the guard's only fallback, where the controllers would like to be, a third one.
+FALLBACK, WANTED, OTHER = "LOC", "SO", "HYB"
+CONTROLLERS = "A", "B"
+
+Item = TypeVar("Item")
+
+#: What can be left out.
+RULES = {
+    "term": "an order is accepted in the term that it was computed on only",
+    "proof": "a fallback is left only after enough probes",
+    "new term": "every change of the placement begins a term",
+    "fresh proof": "a proof counts for the stay on the fallback that it was made in",
+    "charge": "a second controller is refused while the first one is in charge",
+    "book": "a stamper that starts again knows its term and placement",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How much may happen.
+
+    Parameters
+    ----------
+    fires : int
+        Times that the guard moves the cell.
+    crashes : int
+        Processes that die and start again.
+    lapses : int
+        Times that a lease runs out although its controller lives.
+    whims : int
+        Orders to another placement than the one that is wanted otherwise.
+    """
+
+    fires: int = 2
+    crashes: int = 1
+    lapses: int = 1
+    whims: int = 0
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Order:
+    """An order on its way; `fires` is how often the guard had moved when it was sent."""
+
+    controller: str
+    term: int
+    placement: str
+    fires: int
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Told:
+    """What the stamper has said of itself at some time, in answers and stamps."""
+
+    term: int
+    placement: str
+    fallback: bool
+
+
+ALL, LIMITS = Rules(), Limits()
+NOTHING = Told(0, "", False)
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Everything.
+
+    Parameters
+    ----------
+    now : Told
+        Term and placement of the stamper.
+    charge : str
+        Controller that is in charge.
+    probed : frozenset of int
+        Terms in which a probe has come through; word of it may arrive at any time.
+    proof : frozenset of int
+        Terms of the probes that the stamper has heard of.
+    told : frozenset of Told
+        What has been said; may arrive at any time.
+    orders : frozenset of Order
+        What has been ordered; may arrive at any time.
+    views : tuple of Told
+        What each controller knows: nothing before it has heard anything.
+    fires, crashes, lapses, whims : int
+        How many there have been.
+    done : frozenset of Order
+        Orders that have taken effect, as an omniscient observer knows.
+    """
+
+    now: Told = Told(1, WANTED, False)
+    charge: str = ""
+    probed: frozenset[int] = frozenset()
+    proof: frozenset[int] = frozenset()
+    told: frozenset[Told] = frozenset({Told(1, WANTED, False)})
+    orders: frozenset[Order] = frozenset()
+    views: tuple[Told, ...] = (NOTHING, NOTHING)
+    fires: int = 0
+    crashes: int = 0
+    lapses: int = 0
+    whims: int = 0
+    done: frozenset[Order] = frozenset()
+
+
+def initial() -> State:
+    """Return the state in which a cell begins."""
+    return State()
+
+
+def good(state: State) -> bool:
+    """Whether the cell is where its controllers want it, by an order."""
+    return state.now.placement == WANTED and not state.now.fallback
+
+
+def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Iterator[Step[State]]:
+    """Return everything that may happen next."""
+    yield from _faults(state, rules, limits)
+    yield from _stamper(state, rules)
+    for index, name in enumerate(CONTROLLERS):
+        yield from _controller(state, limits, index, name)
+
+
+def _moved(state: State, rules: Rules, placement: str, *, fallback: bool) -> State:
+    term = state.now.term + 1 if rules.holds("new term") else state.now.term
+    now = Told(term, placement, fallback)
+    proof = frozenset[int]() if rules.holds("fresh proof") else state.proof
+    return replace(state, now=now, told=state.told | {now}, proof=proof)
+
+
+def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
+    if state.fires < limits.fires and state.now.placement != FALLBACK:
+        fired = _moved(state, rules, FALLBACK, fallback=True)
+        yield Step("the guard moves the cell", replace(fired, fires=state.fires + 1), fault=True)
+    if state.crashes < limits.crashes:
+        once = replace(state, crashes=state.crashes + 1)
+        reborn = replace(once, charge="", proof=frozenset())
+        if not rules.holds("book"):
+            first = Told(1, WANTED, False)
+            reborn = replace(reborn, now=first)
+        yield Step("the stamper starts again", reborn, fault=True)
+        for index, name in enumerate(CONTROLLERS):
+            again = replace(once, views=_set(once.views, index, NOTHING))
+            yield Step(f"controller {name} starts again", again, fault=True)
+    if state.lapses < limits.lapses and state.charge:
+        lapsed = replace(state, charge="", lapses=state.lapses + 1)
+        yield Step(f"the lease of {state.charge} runs out", lapsed, fault=True)
+
+
+def _set(values: tuple[Item, ...], index: int, value: Item) -> tuple[Item, ...]:
+    return (*values[:index], value, *values[index + 1 :])
+
+
+# -------------------------------------------------------------------------------- stamper
+
+
+def _stamper(state: State, rules: Rules) -> Iterator[Step[State]]:
+    term = state.now.term
+    if state.now.fallback and term not in state.probed:
+        yield Step("a probe comes through", replace(state, probed=state.probed | {term}))
+    for probed in state.probed - state.proof:
+        if state.now.fallback and (probed == term or not rules.holds("fresh proof")):
+            heard = replace(state, proof=state.proof | {probed})
+            yield Step(f"a probe of term {probed} is heard of", heard)
+    for order in state.orders:
+        yield _arrives(state, rules, order)
+
+
+def _arrives(state: State, rules: Rules, order: Order) -> Step[State]:
+    """The stamper takes an order in, for the first time or again."""
+    label = f"the order of {order.controller} in term {order.term} to {order.placement} arrives"
+    if state.charge not in ("", order.controller) and rules.holds("charge"):
+        return Step(label, state)
+    charged = replace(state, charge=order.controller)
+    here = order.placement == state.now.placement and not state.now.fallback
+    stale = order.term != state.now.term and rules.holds("term")
+    unproven = state.now.fallback and not state.proof and rules.holds("proof")
+    if here or stale or unproven:
+        return Step(label, charged)
+    wrong = ""
+    if order.fires < state.fires:
+        wrong = "an order from before the guard's move takes effect after it"
+    elif order in state.done:
+        wrong = "an order takes effect twice"
+    elif state.now.fallback and state.now.term not in state.probed:
+        wrong = "the fallback is left without a proof"
+    moved = _moved(charged, rules, order.placement, fallback=False)
+    return Step(label, replace(moved, done=state.done | {order}), wrong=wrong)
+
+
+# ----------------------------------------------------------------------------- controllers
+
+
+def _controller(state: State, limits: Limits, index: int, name: str) -> Iterator[Step[State]]:
+    view = state.views[index]
+    for placement in (WANTED, OTHER):
+        whim = placement != WANTED
+        order = Order(name, view.term, placement, state.fires)
+        here = placement == view.placement and not view.fallback
+        if not view.term or here or order in state.orders:
+            continue
+        if whim and state.whims == limits.whims:
+            continue
+        yield Step(
+            f"{name} orders {placement} in term {view.term}",
+            replace(state, orders=state.orders | {order}, whims=state.whims + whim),
+        )
+    for told in state.told:
+        if told.term > view.term:
+            heard = replace(state, views=_set(state.views, index, told))
+            yield Step(f"{name} hears of term {told.term}", heard)
+
+
+if __name__ == "__main__":
+    report(initial(), successors, good, RULES)
