@@ -18,6 +18,7 @@ __all__ = [
     "RunError",
     "SimulationError",
     "TraceError",
+    "TrustError",
 ]
 
 
@@ -112,3 +113,7 @@ class MeasurementError(DwellError, RuntimeError):
 
 class LiveError(DwellError, RuntimeError):
     """The live runtime cannot do what it was asked to."""
+
+
+class TrustError(DwellError, ValueError):
+    """A key, a certificate or a list of them is missing, not valid, or not who it should be."""

@@ -1,0 +1,189 @@
+"""Roster: the subjects of a cell, as its authority has signed them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+import re
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from dwell.errors import TrustError
+
+__all__ = ["ROLES", "Role", "Roster", "Subject", "write_private"]
+
+#: A `node` runs an agent and what it starts; the `controller` orders; an `operator` asks for pins
+#: and drains; an `observer` reads.
+Role: TypeAlias = Literal["node", "controller", "operator", "observer"]
+ROLES: tuple[Role, ...] = ("node", "controller", "operator", "observer")
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,47}")
+KEY_BYTES = 32
+VERSION = 1
+MAX_BYTES = 1 << 20
+DOMAIN = b"dwell roster 1\0"
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """Somebody with a certificate.
+
+    Parameters
+    ----------
+    name : str
+        A node's name, or another one.
+    role : {"node", "controller", "operator", "observer"}
+    generation : int
+        Counts its certificates from 1: the name in a certificate has it, so that one that was
+        revoked is not taken for the one that followed.
+    serial : int
+        Of its certificate.
+    public_key : str
+        Ed25519, base64.
+    expires : str
+        Day, ISO 8601.
+    """
+
+    name: str
+    role: Role
+    generation: int
+    serial: int
+    public_key: str
+    expires: str
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not NAME.fullmatch(self.name):
+            raise TrustError(
+                f"{self.name!r} is no name of a subject; write letters, digits, - and _, "
+                "beginning with a letter, 48 at most"
+            )
+        if self.role not in ROLES:
+            raise TrustError(f"{self.name}: no role {self.role!r}; there are {', '.join(ROLES)}")
+        if type(self.generation) is not int or self.generation < 1:
+            raise TrustError(f"{self.name}: generation is {self.generation!r}, not 1 or more")
+        if type(self.serial) is not int or self.serial < 1:
+            raise TrustError(f"{self.name}: serial is {self.serial!r}, not 1 or more")
+
+    @property
+    def common_name(self) -> str:
+        """Name in its certificate."""
+        return f"{self.name}.{self.generation}"
+
+    @property
+    def key(self) -> Ed25519PublicKey:
+        """What verifies its signatures.
+
+        Raises
+        ------
+        TrustError
+            If it is not a key.
+        """
+        try:
+            data = base64.b64decode(self.public_key, validate=True)
+            return Ed25519PublicKey.from_public_bytes(data)
+        except (binascii.Error, ValueError, TypeError):
+            raise TrustError(f"{self.name}: public_key is no Ed25519 key in base64") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Roster:
+    """Subjects of a cell.
+
+    Parameters
+    ----------
+    cell : str
+        Name of the cell.
+    number : int
+        Grows with every change.
+    subjects : mapping of str to Subject
+        Those that are in force, by name.
+    revoked : tuple of int
+        Serial numbers of certificates that are not.
+    """
+
+    cell: str
+    number: int
+    subjects: Mapping[str, Subject]
+    revoked: tuple[int, ...] = ()
+
+    def of_role(self, role: Role) -> list[Subject]:
+        """Return the subjects of a role."""
+        return [subject for subject in self.subjects.values() if subject.role == role]
+
+    def signed(self, key: Ed25519PrivateKey) -> str:
+        """Return it as JSON, signed by the authority."""
+        document = self._document()
+        signature = key.sign(DOMAIN + _canonical(document))
+        document["signature"] = base64.b64encode(signature).decode()
+        return json.dumps(document, indent=1) + "\n"
+
+    def _document(self) -> dict[str, Any]:
+        return {
+            "dwell": VERSION,
+            "cell": self.cell,
+            "number": self.number,
+            "subjects": [asdict(subject) for subject in self.subjects.values()],
+            "revoked": list(self.revoked),
+        }
+
+    @classmethod
+    def read(cls, path: Path, authority: Ed25519PublicKey) -> Roster:
+        """Read a roster and check who has signed it.
+
+        Raises
+        ------
+        TrustError
+            If it is missing, not a roster, or not signed by the authority.
+        """
+        try:
+            if path.stat().st_size > MAX_BYTES:
+                raise TrustError(f"{path}: {path.stat().st_size} bytes are too many for a roster")
+            document = json.loads(path.read_text(encoding="utf-8"))
+            signature = base64.b64decode(document.pop("signature"), validate=True)
+            authority.verify(signature, DOMAIN + _canonical(document))
+            if document["dwell"] != VERSION:
+                raise TrustError(f"{path}: a roster of version {document['dwell']}, not {VERSION}")
+            subjects = [Subject(**entry) for entry in document["subjects"]]
+            cell, number, revoked = (document[key] for key in ("cell", "number", "revoked"))
+        except OSError as error:
+            raise TrustError(f"{path}: cannot be read ({error.strerror})") from None
+        except InvalidSignature:
+            raise TrustError(f"{path}: was not signed by the authority of ca.pem") from None
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            if isinstance(error, TrustError):
+                raise
+            raise TrustError(f"{path}: is no roster ({type(error).__name__}: {error})") from None
+        return cls(cell, number, {subject.name: subject for subject in subjects}, tuple(revoked))
+
+
+def _canonical(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, sort_keys=True, separators=(",", ":")).encode("ascii")
+
+
+def write_private(path: Path, data: bytes | str) -> None:
+    """Write a file that only its owner can read, as a whole or not at all.
+
+    Raises
+    ------
+    TrustError
+        If it cannot be written.
+    """
+    content = data.encode() if isinstance(data, str) else data
+    try:
+        # mkstemp makes files with mode 0600.
+        descriptor, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(draft).replace(path)
+    except OSError as error:
+        raise TrustError(f"{path}: cannot be written ({error.strerror})") from None
