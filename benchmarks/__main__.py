@@ -26,10 +26,11 @@ BENCHMARKS = {
     "first-use": ("first_use", "measure"),
     "import": ("importing", "measure"),
     "link": ("link", "measure"),
+    "testbed-link": ("testbed_link", "measure"),
     "transport": ("transport", "measure"),
     "order": ("live", "decision"),
     "moves": ("live", "moves"),
-    "lanes": ("live", "lanes"),
+    "lanes": ("lanes", "measure"),
     "share": ("live", "share"),
     "live-fleet": ("fleet_live", "measure"),
 }

@@ -1,4 +1,4 @@
-"""What a live cell of real processes takes and does: orders, moves, lanes, and its share of a core.
+"""What a live cell of real processes takes and does: orders, moves, and its share of a core.
 
 All processes run on this machine and read one clock; links between nodes are emulated.
 """
@@ -8,38 +8,28 @@ from __future__ import annotations
 import os
 import random
 import tempfile
-import threading
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from statistics import mean, median
+from statistics import mean
 from typing import Any
 
 import psutil
 
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import ARRIVED, NUMBER, LightCell, document
-from dwell.demo.link import Forward, LinkProcess
-from dwell.live.transport.protocol import Lane, Sample
-from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import Entry, Locator, Role, Session
-from dwell.model import Constant
 from dwell.record import open_run
-from dwell.testbed.conditions import Conditions
 
-__all__ = ["decision", "lanes", "moves", "share"]
+__all__ = ["decision", "moves", "share"]
 
 PERIOD_MS = 40.0
 DELAY_MS = 5.0
 #: Controllers of one cell at 25 Hz are meant to take less of a core.
 CONTROLLER_SHARE = 2.0
 MOVES = 21
-RATE_MBPS = 20.0
-IMAGE_BYTES, IMAGE_HZ = 100_000, 30
-SMALL_BYTES, SMALL_HZ = 1_000, 100
 
 
 def _everywhere() -> None:
@@ -226,111 +216,3 @@ def _kind(who: str, cell: LightCell) -> str:
         return "sink"
     placed = cell.problem.candidates[cell.problem.initial][name]
     return "worker" if placed == node else "worker without cycles"
-
-
-# ---------------------------------------------------------------------------------- lanes
-
-
-def lanes(quick: bool) -> Section:
-    """Small messages beside images that would fill the link by themselves."""
-    runs, seconds = (1, 4.0) if quick else (3, 8.0)
-    _everywhere()
-    found: dict[tuple[str, str], list[float]] = {}
-    cases: Mapping[str, tuple[tuple[Session, ...], bool]] = {
-        "alone": (("control", "images"), False),
-        "beside images": (("control", "images"), True),
-        "in one session with images": (("control",), True),
-    }
-    for turn in range(runs):
-        for case, (sessions, images) in cases.items():
-            for what, value in _laned(sessions, seconds, images, turn).items():
-                found.setdefault((case, what), []).append(value)
-    goals = {("beside images", "delivered"): Goal(low=100)}
-    units = {"p50": "ms", "p95": "ms", "delivered": "%", "images delivered": "%"}
-    return Section(
-        f"{SMALL_HZ} small messages a second on a link of {RATE_MBPS:g} Mbit/s",
-        [
-            Figure(f"{case}: {what}", values, units[what], goals.get((case, what)))
-            for (case, what), values in found.items()
-        ],
-        [
-            f"images of {IMAGE_BYTES // 1000} kB, {IMAGE_HZ} a second: "
-            f"{8e-6 * IMAGE_BYTES * IMAGE_HZ:g} Mbit/s",
-            "the link's own queue of 64 kB takes 26 ms to drain; two sessions is what a cell has",
-        ],
-    )
-
-
-def _laned(
-    sessions: tuple[Session, ...], seconds: float, images: bool, seed: int
-) -> dict[str, float]:
-    """One-way latency of small messages, and what arrived."""
-    conditions = Conditions(delay_ms=Constant(1.0), rate_mbps=RATE_MBPS)
-    ports = {name: 29_500 + number for number, name in enumerate(sessions)}
-    listen = {name: Locator("127.0.0.1", port) for name, port in ports.items()}
-    forwards = [Forward("A", "127.0.0.1", port) for port in ports.values()]
-    both = {("A", "B"): conditions, ("B", "A"): conditions}
-    with LinkProcess(("A", "B"), forwards, both, seed=seed) as link:
-        receiver = ZenohTransport(Entry(Role("there@B", "B", "worker"), listen, {}))
-        ends = {
-            name: (Locator("127.0.0.1", port),)
-            for name, port in zip(sessions, link.ports, strict=True)
-        }
-        sender = ZenohTransport(Entry(Role("here@A", "A", "worker"), {}, ends))
-        ages_ms: dict[Lane, list[float]] = {"control": [], "images": []}
-
-        def arrived(sample: Sample) -> None:
-            lane: Lane = "images" if "/image/" in sample.key else "control"
-            sent_ns = int.from_bytes(sample.payload[:8], "little")
-            ages_ms[lane].append((time.monotonic_ns() - sent_ns) / 1e6)
-
-        receiver.subscribe("dwell/bench/in/**", arrived)
-        try:
-            while any(count == 0 for count in sender.peers.values()):
-                time.sleep(0.01)
-            time.sleep(0.5)
-            stopped = threading.Event()
-            begin = time.monotonic() + 0.2
-            streams: list[tuple[str, Lane, int, int]] = [
-                ("small", "control", SMALL_BYTES, SMALL_HZ)
-            ]
-            if images:
-                streams.append(("image", "images", IMAGE_BYTES, IMAGE_HZ))
-            threads = [
-                threading.Thread(target=_stream, args=(sender, *each, begin, seconds, stopped))
-                for each in streams
-            ]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-            time.sleep(0.5)
-        finally:
-            sender.close()
-            receiver.close()
-    small = sorted(ages_ms["control"])
-    told = {
-        "p50": median(small),
-        "p95": small[int(0.95 * len(small))],
-        "delivered": 100 * len(small) / (SMALL_HZ * seconds),
-    }
-    if images:
-        told["images delivered"] = 100 * len(ages_ms["images"]) / (IMAGE_HZ * seconds)
-    return told
-
-
-def _stream(
-    sender: ZenohTransport,
-    name: str,
-    lane: Lane,
-    size: int,
-    hertz: int,
-    begin: float,
-    seconds: float,
-    stopped: threading.Event,
-) -> None:
-    padding = bytes(size - 8)
-    for number in range(int(hertz * seconds)):
-        stopped.wait(max(begin + number / hertz - time.monotonic(), 0.0))
-        now = time.monotonic_ns().to_bytes(8, "little")
-        sender.put(f"dwell/bench/in/{name}/B/main", now + padding, lane=lane)

@@ -312,6 +312,8 @@ class _Maker:
         return Node(
             name,
             rng.choice(["robot", "edge", "cloud"]),
+            # Fractions that floating point has exactly: the naive simulator computes with those.
+            background=rng.choice([0.0, 0.0, 0.0, 0.0625, 0.125, 0.25]),
             cores=rng.choice([1, 1, 2, 2, 3, 4]),
             scheduler=rng.choice(self.schedulers),
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
@@ -325,7 +327,8 @@ class _Maker:
             return None
         # Some ten of the quota's periods a cycle: the naive simulator looks at each.
         period_ms = max(1.0, min(1000.0, round(self.period * rng.choice([0.03, 0.1, 0.5]))))
-        return Quota(rng.choice([0.3, 0.5, 1, 1.7, 2.5]), period_ms)
+        slack_ms = rng.choice([0.0, 0.0, 0.25, 1.0, 4.0])
+        return Quota(rng.choice([0.3, 0.5, 1, 1.7, 2.5]), period_ms, slack_ms)
 
     def task(self, name: str, load: float, *, source: bool) -> Task:
         rng = self.rng

@@ -41,6 +41,8 @@ __all__ = [
     "transmission_ns",
 ]
 
+#: Of the changes of one instant, the place of what quotas do then.
+LAST_CHANGE = 900_000
 COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, GUARD, RELEASE = range(1, 11)
 # Cells: the jobs of a cycle itself, and those of its shadow.
 ITSELF, SHADOW = 0, 1
@@ -94,8 +96,8 @@ class JobResult:
 class Usage:
     """What a node's CPU has done since time 0, core-nanoseconds.
 
-    `busy` is the integral of min(c, K' + s); `own` and `shadow` are the work that the jobs of the
-    cycles, and those of their shadows, have received.
+    `busy` is the integral of min(c, K' + s + b); `own` and `shadow` are the work that the jobs of
+    the cycles, and those of their shadows, have received.
     """
 
     busy: Fraction
@@ -307,16 +309,47 @@ class NodeState:
         self.busy = Fraction(0)
         self.work = {ITSELF: Fraction(0), SHADOW: Fraction(0)}
         self.since = 0
-        self.period = self.quota = self.left = 0
+        self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
-            self.quota = self.left = round(node.quota.cpu * self.period)
+            cpu = Fraction(node.quota.cpu)
+            if node.background:
+                cpu = min(cpu, Fraction(node.cores)) - Fraction(node.background)
+            self.quota = self.left = max(round(cpu * self.period), 1)
+            self.slack = nanoseconds(node.quota.slack_ms)
+            if self.slack:
+                self.pool, self.left = self.quota, 0
         self.empty_at: int | None = None
 
     @property
     def stopped(self) -> bool:
         """Whether the quota is used up."""
         return self.quota > 0 and self.left <= 0
+
+    def renew(self) -> None:
+        """Begin a period of the quota; its pool is full before anything else happens then."""
+        if self.slack:
+            self.draw()
+        else:
+            self.left = self.quota
+
+    @property
+    def thirsty(self) -> bool:
+        """Whether something runs that has used up what was drawn, and the pool is not empty."""
+        busy = not self.down and self.threads + self.foreign > 0
+        return bool(self.slack) and busy and self.left <= 0 and self.pool > 0
+
+    def draw(self) -> None:
+        """Draw on the pool; only after all changes of this instant."""
+        if self.thirsty:
+            self.left, self.pool = self.left + self.pool, 0
+
+    def give_back(self) -> None:
+        """Give back what an idle node has beyond the slack."""
+        idle = self.down or self.threads + self.foreign == 0
+        if self.slack and idle and self.left > self.slack:
+            self.pool = min(self.pool + self.left - self.slack, self.quota)
+            self.left = self.slack
 
     @property
     def rate(self) -> int:
@@ -343,9 +376,19 @@ class NodeState:
         if self.stopped:
             return Fraction(0)
         c, s = self.node.cores, self.foreign
+        # Under a quota the background takes from the bucket, elsewhere from the cores.
+        left = c - (Fraction(0) if self.quota else Fraction(self.node.background))
         if self.node.scheduler == "fair":
-            return min(Fraction(1), Fraction(c, max(1, self.threads + s)))
-        return Fraction(c, c + s)
+            return min(Fraction(1), left / max(1, self.threads + s))
+        return left / (c + s)
+
+    @property
+    def behind(self) -> Fraction:
+        """Cores that the background has."""
+        background = Fraction(self.node.background)
+        if self.down or self.quota:
+            return background * (not self.down)
+        return min(background, Fraction(self.node.cores - self.rate))
 
     def advance(self, now: int) -> None:
         """Let the time since the last change pass."""
@@ -362,8 +405,10 @@ class NodeState:
         for jobs in self.served.values():
             for job in jobs:
                 job.left -= elapsed * (job.cores > 0)
-        self.busy += rate * elapsed
+        self.busy += (rate + self.behind) * elapsed
         self.left -= rate * elapsed
+        if self.slack and now // self.period > self.periods:
+            self.periods, self.pool = now // self.period, self.quota
 
     @property
     def usage(self) -> Usage:
@@ -529,6 +574,7 @@ class Simulation:
             action()
             for node in self.nodes.values():
                 node.give_out()
+                node.give_back()
                 self.plan(node)
 
         order = (((kind * 10 + cell) * 10**9 + cycle + 1) * 10**6 + task + 1) * 10**6 + flow
@@ -558,17 +604,16 @@ class Simulation:
                 if due is not None:
                     self.foresee(job, due)
         empty_at = now + -(-node.left // node.rate) if node.quota and node.rate else None
+        if node.thirsty:
+            empty_at = now
         if empty_at != node.empty_at:
             node.empty_at = empty_at
             if empty_at is not None:
                 # Nothing else happens then; every event looks anew at who runs, and how fast.
-                self.at(empty_at, DISTURBANCE, -1, 0, lambda: None)
+                self.at(empty_at, DISTURBANCE, -1, LAST_CHANGE, node.draw)
 
     def renewer(self, node: NodeState) -> Callable[[], None]:
-        def renew() -> None:
-            node.left = node.quota
-
-        return renew
+        return node.renew
 
     def foresee(self, job: Job, due: int) -> None:
         self.at(
@@ -593,7 +638,7 @@ class Simulation:
             self.at(change.at_ns, DISTURBANCE, -1, i, self.changer(change), fixed=True)
         for node in self.nodes.values():
             for begin in range(node.period, self.end + 1, node.period) if node.quota else ():
-                self.at(begin, DISTURBANCE, -1, 0, self.renewer(node), fixed=True)
+                self.at(begin, DISTURBANCE, -1, LAST_CHANGE, self.renewer(node), fixed=True)
         for k in range(self.number):
             self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
         if self.guard is not None:

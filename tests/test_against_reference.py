@@ -174,6 +174,7 @@ def make_guarded(
         case.problem.controller,
         fallbacks=tuple(rng.sample(names, rng.randint(1, len(names)))),
         guard_cycles=rng.choice([2, 2, 3, 4]),
+        probe_cycles=2,
     )
     problem = replace(case.problem, controller=settings)
     windows = rng.randint(6, 14)
@@ -576,19 +577,18 @@ def test_orders_equal_to_the_microsecond_with_processor_sharing() -> None:
 
 
 @pytest.fixture
-def _eager_return(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let few probes prove a placement, and few cycles make health."""
-    monkeypatch.setattr(control_guard, "PROBE_CYCLES", 2)
+def _early_health(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let few cycles make health."""
     monkeypatch.setattr(control_guard, "HEALTH_WINDOWS", 2)
 
 
-@pytest.mark.usefixtures("_eager_return")
+@pytest.mark.usefixtures("_early_health")
 @pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
 def test_the_guard_equal_to_the_nanosecond_without_processor_sharing(whole_ms: bool) -> None:
     compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, guarded=True)
 
 
-@pytest.mark.usefixtures("_eager_return")
+@pytest.mark.usefixtures("_early_health")
 def test_the_guard_equal_to_the_microsecond_with_processor_sharing() -> None:
     compare(EVERY, FAIR_TOLERANCE_NS, orders=True, guarded=True)
 

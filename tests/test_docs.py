@@ -23,6 +23,7 @@ EXECUTED = (
     "docs/profiling.md",
     "docs/studies.md",
     "docs/tutorial.md",
+    "docs/validation.md",
 )
 
 # These go on until they are told to end, or need those that do; tests/cli/test_live.py runs them.

@@ -142,6 +142,17 @@ def test_check_prints_every_fault_with_its_line(cell: Path) -> None:
             "E: {exec_ms: 37.5}}}\ncontroller: {guard_cycles: 3, fallbacks: [LOC]}",
             ("controller.guard_cycles: 3 is tight for OFF", "40.5 ms", "40.0 ms"),
         ),
+        (
+            "E: {exec_ms: 2}}}",
+            "E: {exec_ms: 2}}}\ncontroller: {fallbacks: [LOC], close_grace_ms: 59}\n"
+            "live: {hosts: {R: {port: 7000}}}",
+            ("controller.close_grace_ms: 59 is less", "= 60 ms", "7 cycles", "instead of 4"),
+        ),
+        (
+            "E: {exec_ms: 2}}}",
+            "E: {exec_ms: 2, workers: 2}}}\nlive: {hosts: {R: {port: 7000}}}",
+            ("tasks.plan.on.E.workers: 2 is for the simulator", "one job at a time"),
+        ),
     ],
 )
 def test_check_warns(cell: Path, old: str, new: str, words: tuple[str, ...]) -> None:

@@ -243,6 +243,9 @@ def test_a_pin_and_a_drain_move_the_cell(cell: RealCell) -> None:
     )
     assert told("pin", "LOC")[0] == 0
     cell.until(lambda status: status["placement"] == "LOC")
+    assert cell.until(lambda status: status["pinned"] == "LOC")
+    assert told("unpin")[0] == 0
+    cell.until(lambda status: status["pinned"] is None)
     assert told("drain", "E")[0] == 0
     assert told("pin", "SO") == (1, "error: refused: SO needs E, which is drained\n")
     assert told("drain", "R1") == (

@@ -21,11 +21,12 @@ from rich.console import Console
 import dwell
 from dwell.cli import live_demo
 from dwell.cli.live_view import Lines, Look, Screen
-from dwell.demo.stageplay import Change, changes_of
 from dwell.errors import LiveError
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.report.phases import Disturbed, disturbed
+from dwell.testbed.playing import make_folder
+from dwell.testbed.timeline import Change, changes_of
 from tests.report.live_runs import PERIOD_NS, live_run
 
 SECONDS = 116.0
@@ -139,7 +140,7 @@ def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path
     told = live_demo._Told(problem, "demo", 5)
     first = changes_of(problem, "demo")[0]
     told.begun_ns[id(first.item)] = 20 * PERIOD_NS
-    run = told.note(folder)
+    run = told.note(folder, **told.tracking(folder))
     assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
     # Interrupted: it was on until the end.
     (played,) = run.meta["played"]
@@ -155,20 +156,20 @@ def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:
     seen = []
     for change in changes:
         told.changed(change)
-        seen.append(tuple(one.kind for one in told.active()))
+        seen.append(tuple(one.kind for one in told.on()))
     assert list(dict.fromkeys(seen)) == [
         ("robot stress",), (), ("network impairment",), ("edge stress",),
     ]  # fmt: skip
-    assert told.active() == []
+    assert told.on() == []
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(LiveError, match="is not a demo's"):
-        live_demo._make(tmp_path)
-    live_demo._make(tmp_path / "out")
+        make_folder(tmp_path, live_demo.MARK, "a demo's")
+    make_folder(tmp_path / "out", live_demo.MARK, "a demo's")
     (tmp_path / "out" / "runs").mkdir()
-    live_demo._make(tmp_path / "out")
+    make_folder(tmp_path / "out", live_demo.MARK, "a demo's")
     assert not (tmp_path / "out" / "runs").exists()
 
 

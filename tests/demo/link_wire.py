@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from dwell.demo.link import Forward, LinkProcess
+from dwell.demo.link_rate import Sharing
 
 # Longer than a machine under load ever takes: what does not come until then does not come.
 PATIENCE_S = 20.0
@@ -106,13 +107,13 @@ class End:
 class Wire:
     """A link from A, which dials, to B, which listens here."""
 
-    def __init__(self, seed: int = 5) -> None:
+    def __init__(self, seed: int = 5, *, sharing: Sharing = "fifo") -> None:
         self._stack = ExitStack()
         self._sockets: list[socket.socket] = []
         self._server = self._stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         self._server.settimeout(PATIENCE_S)
         forward = Forward("A", "127.0.0.1", self._server.getsockname()[1])
-        self.link = LinkProcess(("A", "B"), [forward], seed=seed)
+        self.link = LinkProcess(("A", "B"), [forward], seed=seed, sharing=sharing)
 
     def __enter__(self) -> Self:
         self._stack.enter_context(self.link)

@@ -10,6 +10,7 @@ import socket
 import statistics
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import fields
@@ -195,6 +196,23 @@ def test_a_full_queue_pushes_back_and_starves_nobody(wire: Wire) -> None:
     wire.link.set("A", "B", rate_mbps=1e9)
     whole = taken // len(framed(data(1, 60_000)))
     assert b.receive(whole) == data(1, 60_000) * whole
+
+
+def test_with_a_queue_each_a_full_one_holds_up_nobody_else() -> None:
+    with Wire(sharing="fair") as wire:
+        a, b = wire.connect()
+        other_a, other_b = wire.connect()
+        # Ten images would take a minute and a half; other messages take half of the rate.
+        wire.link.set("A", "B", rate_mbps=0.1)
+        image = fragments(push(b"i" * 100_000), 49_000)
+        sending = threading.Thread(target=a.send, args=image * 10, daemon=True)
+        sending.start()
+        assert b.silent
+        other_a.send(LAST)
+        assert other_b.receive(1) == [LAST]
+        assert b.silent
+        wire.link.set("A", "B", rate_mbps=1e9)
+        assert b.receive(len(image) * 10) == image * 10
 
 
 @pytest.mark.parametrize("kind", CUTS)

@@ -333,6 +333,7 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("controller", "shadow_fraction"), -1, "controller.shadow_fraction", ("-1", "from 0 to 1")),
     (("controller", "half_life_windows"), 0, "controller.half_life_windows", ("0", "above 0")),
     (("controller", "migration"), "hot", "controller.migration", ("'hot'", "warm, cold")),
+    (("controller", "probe_cycles"), 0, "controller.probe_cycles", ("0", "from 1 to 1000000")),
     (("controller", "guard_cycles"), 1, "controller.guard_cycles", ("1", "from 2 to 1000000")),
     (("controller", "min_dwell"), -1, "controller.min_dwell", ("-1", "from 0 to 1000000")),
     (("controller", "min_improvement"), -0.1, "controller.min_improvement", ("-0.1", "from 0")),

@@ -644,6 +644,28 @@ def _few(cell: RealCell, since_ns: int, count: int) -> str:
     return "" if found >= count else f"{found} of {count} cycles actuated"
 
 
+def _unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
+    """Silences in which the actuator was not told in time that no command comes.
+
+    A sink that is dead or frozen itself tells it nothing; of that no more is asked than that it
+    never applies what has become old.
+    """
+    found = []
+    commands = [place for place, one in enumerate(seen) if one.what == APPLY]
+    for before, later in pairwise(commands):
+        gap_ms = (seen[later].at_ns - seen[before].at_ns) / 1e6
+        told = [one.at_ns for one in seen[before + 1 : later] if one.what in (HOLD, ZERO)]
+        if gap_ms <= limit_ms:
+            continue
+        waited_ms = (told[0] - seen[before].at_ns) / 1e6 if told else gap_ms
+        if waited_ms > limit_ms:
+            found.append(
+                f"no command for {gap_ms:.0f} ms after cycle {seen[before].cycle}, "
+                f"and no hold() within {limit_ms:.0f} ms"
+            )
+    return found
+
+
 def _weigh(
     cell: RealCell,
     fault: Fault,
@@ -673,6 +695,9 @@ def _weigh(
     if fault.how == "kill" and "stamper" in fault.name:
         found.lost = -1
     found.wrong = cell.observed.faults()
+    if not set(fault.whom) & {"sink.control@R2", "*R2"}:
+        during = [one for one in seen if one.at_ns >= begin_ns - P_NS]
+        found.wrong += _unsafe(during, MAX_AGE_MS + PERIOD_MS + found.stall_ms)
     if fault.bound is not None:
         for when, lost in (("by it", found.lost), ("after it", found.lost_after)):
             if lost > fault.bound:

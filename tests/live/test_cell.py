@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,8 +13,9 @@ import pytest
 import dwell
 from dwell.live.cell import Cell
 from dwell.live.keys import Keys
-from dwell.live.messages import Answer, Ask, decode, encode
+from dwell.live.messages import Answer, Ask, Order, decode, encode
 from dwell.live.transport.protocol import Sample
+from dwell.live.windows import Rows
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
@@ -108,6 +110,54 @@ def test_what_is_not_moved_has_no_lead(problem: Problem) -> None:
     assert {lead for (lead,) in columns(world, "windows", "lead")} == {0}
 
 
+def test_what_else_is_due_comes_between_an_order_and_its_record(problem: Problem) -> None:
+    world, events = alternating(problem), list[str]()
+    cell, recorder = cell_of(world), world.recorder
+    wake, send, append = cell.wake, cell._send, recorder.append
+
+    def woken(now_ns: int) -> int:
+        events.append("wake")
+        return wake(now_ns)
+
+    def sent(order: Order) -> None:
+        events.extend(["order"] if order.placement else [])
+        send(order)
+
+    def appended(rows: Rows, **meta: object) -> None:
+        events.extend(["record"] if rows["windows"] else [])
+        append(rows, **meta)
+
+    cell.wake, cell._send = woken, sent  # type: ignore[method-assign]
+    recorder.append = appended  # type: ignore[method-assign]
+    world.run(8_000)
+    orders = [place for place, event in enumerate(events) if event == "order"]
+    assert len(orders) >= 8
+    for place in orders[:-1]:
+        assert events[place - 1 : place + 3] == ["wake", "order", "wake", "record"]
+
+
+def test_what_is_remembered_is_none_of_the_garbage_collectors_business(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(8_000)
+    windows = cell_of(world).windows
+    assert windows is not None
+    remembered = windows._recorded
+    assert len(remembered) > 100
+    for cycle in remembered:
+        held = (cycle, cycle.reports, cycle.heard_ns, cycle.replaced, cycle.shifts)
+        assert not any(map(gc.is_tracked, held))
+        assert cycle.reports
+        assert cycle.shifts
+
+
+def test_decisions_that_are_recorded_are_not_kept(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(8_000)
+    decisions = cell_of(world).controller.log.decisions
+    assert len(decisions) > 8
+    assert not any(decisions[:-2])
+
+
 def test_a_lost_order_is_sent_again(problem: Problem) -> None:
     world = alternating(problem)
     world.network.impair(world.losing(0.6), CONTROLLER, "stamper@R1")
@@ -172,6 +222,46 @@ def test_a_pinned_cell_stays_and_an_unpinned_one_goes_on(problem: Problem) -> No
     assert not ask(world, "unpin")
     world.run(4_000)
     assert world.stamper.term > term
+
+
+def test_what_was_decided_and_not_done_is_no_migration(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(3_000)
+    world.kill("perception@E")
+    world.run(6_000)
+    rows = columns(world, "decisions", "incumbent", "placement", "migrated", "refused")
+    refused = [row for row in rows if row[3] is not None]
+    assert len(refused) >= 2
+    for incumbent, placement, migrated, why in refused:
+        assert (placement, migrated) == (incumbent, False)
+        assert why.startswith("SO: not ready: perception@E")
+    # What is told of as done has been done.
+    done = [placement for _, placement, migrated, _ in rows if migrated]
+    assert done == [to for _, to, _ in world.stamper.moves][: len(done)]
+    assert len(done) >= len(world.stamper.moves) - 1
+    assert len(rows) >= len(columns(world, "windows", "window")) - 1
+
+
+def test_what_a_person_does_not_allow_is_no_migration(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(2_000)
+    assert not ask(world, "pin", "HYB")
+    world.run(5_000)
+    rows = columns(world, "decisions", "window", "migrated", "refused")[-4:]
+    assert {migrated for _, migrated, _ in rows} == {False}
+    assert {why.partition(": ")[2] for _, _, why in rows if why} == {"pinned to HYB"}
+
+
+def test_an_order_that_nobody_answers_is_no_migration(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(2_000)
+    moves = len(world.stamper.moves)
+    world.network.cut(CONTROLLER, "stamper@R1", key="dwell/*/order")
+    world.run(6_000)
+    assert len(world.stamper.moves) == moves
+    rows = columns(world, "decisions", "migrated", "refused")
+    assert sum(migrated for migrated, _ in rows) == moves
+    assert {why.partition(": ")[2] for _, why in rows if why} == {"no answer"}
 
 
 def test_a_drained_node_is_left_and_not_returned_to(problem: Problem) -> None:

@@ -36,6 +36,25 @@ def longest_gap(cycles: list[int], last: int) -> int:
     return max(later - earlier - 1 for earlier, later in pairwise([*cycles, last]))
 
 
+def lost(world: World) -> int:
+    """Most consecutive cycles that were lost; the last two may be on their way."""
+    return longest_gap(world.cycles, world.stamper.cycle - 2)
+
+
+def running(problem: Problem, candidate: str, ms: float = 1_000) -> World:
+    """A cell that has run on a candidate for a while, with nobody who gives orders."""
+    world = World(on(problem, candidate), exec_ms=EXEC_MS)
+    world.run(ms)
+    return world
+
+
+def stateful(problem: Problem, task: str, state_bytes: int) -> Problem:
+    """The cell, with a task whose state has to move with it."""
+    tasks = dict(problem.pipeline.tasks)
+    tasks[task] = replace(tasks[task], state_bytes=state_bytes)
+    return replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
+
+
 def require_ordered(world: World) -> None:
     assert world.cycles == sorted(set(world.cycles)), "an actuation twice, or out of order"
 
@@ -91,65 +110,47 @@ SINGLE_FAULTS: dict[str, tuple[str, Fault]] = {
 @given(phase=st.floats(0, 1))
 def test_rule_5_bounds_what_a_single_fault_costs(problem: Problem, name: str, phase: float) -> None:
     candidate, fault = SINGLE_FAULTS[name]
-    world = World(on(problem, candidate), exec_ms=EXEC_MS)
     period_ms = problem.pipeline.period_ms
-    world.run((30 + phase) * period_ms)
+    world = running(problem, candidate, (30 + phase) * period_ms)
     assert world.stamper.placement == candidate
     assert len(world.cycles) >= 28
     fault(world)
     world.run(30 * period_ms)
     require_ordered(world)
-    # The last two cycles may be on their way.
-    lost = longest_gap(world.cycles, world.stamper.cycle - 2)
-    assert lost <= problem.controller.guard_cycles + 1
+    missing = lost(world)
+    assert missing <= problem.controller.guard_cycles + 1
     harmless = name.startswith("agent")
-    assert (world.stamper.placement == candidate) == (harmless or not lost)
+    assert (world.stamper.placement == candidate) == (harmless or not missing)
 
 
 def test_rule_5_holds_without_a_controller(problem: Problem) -> None:
-    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
-    world.run(3_000)
-    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    world = running(problem, "SO", 3_000)
+    assert lost(world) == 0
     assert world.stamper.placement == "SO"
 
 
 def test_rule_6_leaves_a_fallback_only_by_proof(problem: Problem) -> None:
-    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "SO")
     cuts = [world.network.cut("R1", "E"), world.network.cut("E", "R1")]
     world.run(500)
     assert world.stamper.placement == "LOC"
-    number = 0
-
-    def ask() -> str:
-        nonlocal number
-        number += 1
-        stamper = world.stamper
-        stamper.receive(
-            world.sample(Order(number, "me", stamper.run, stamper.term, "SO")),
-            world.network.now_ns,
-        )
-        assert stamper._answered is not None
-        return stamper._answered[2].refused
-
-    assert ask().startswith("not ready")
+    assert world.order("SO").startswith("not ready")
     for rule in cuts:
         world.network.heal(rule)
     world.run(500)
-    assert ask().startswith("not proven")
+    assert world.order("SO").startswith("not proven")
     probes = world.stamper.probation.needed
     world.run((probes - 5) * problem.pipeline.period_ms)
-    assert ask().startswith("not proven")
+    assert world.order("SO").startswith("not proven")
     world.run(10 * problem.pipeline.period_ms)
-    assert not ask()
+    assert not world.order("SO")
     world.run(500)
     assert world.stamper.placement == "SO"
     require_ordered(world)
 
 
 def test_rule_6_doubles_the_proof_after_a_relapse(problem: Problem) -> None:
-    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "SO")
     before = world.stamper.probation.needed
     world.network.freeze("perception@E")
     world.run(500)
@@ -166,8 +167,7 @@ def test_rule_6_doubles_the_proof_after_a_relapse(problem: Problem) -> None:
 
 
 def test_rule_1_numbers_grow_across_restarts_of_the_stamper(problem: Problem) -> None:
-    world = World(on(problem, "HYB"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "HYB")
     last = world.cycles[-1]
     world.kill("stamper@R1")
     world.run(200)
@@ -179,8 +179,7 @@ def test_rule_1_numbers_grow_across_restarts_of_the_stamper(problem: Problem) ->
 
 
 def test_rule_1_a_stamper_that_lost_its_book_begins_a_later_run(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     count = len(world.cycles)
     world.kill("stamper@R1")
     world.book.entry = None
@@ -191,8 +190,7 @@ def test_rule_1_a_stamper_that_lost_its_book_begins_a_later_run(problem: Problem
 
 
 def test_rule_2_orders_die_with_their_term(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     term = world.stamper.term
     assert not world.order("SO")
     assert world.order("HYB", term=term).startswith("stale term")
@@ -202,8 +200,7 @@ def test_rule_2_orders_die_with_their_term(problem: Problem) -> None:
 
 
 def test_rule_2_an_order_twice_is_one_order(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     order = Order(5, "me", world.stamper.run, world.stamper.term, "SO")
     for _ in range(3):
         world.stamper.receive(world.sample(order), world.network.now_ns)
@@ -213,8 +210,7 @@ def test_rule_2_an_order_twice_is_one_order(problem: Problem) -> None:
 
 
 def test_rule_2_a_second_controller_is_refused_by_name(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     assert not world.order("SO")
     refused = world.order("LOC", controller="other")
     assert refused == "another controller: me is in charge"
@@ -224,8 +220,7 @@ def test_rule_2_a_second_controller_is_refused_by_name(problem: Problem) -> None
 
 @pytest.mark.parametrize("candidate", ["LOC", "SO", "HYB"])
 def test_rule_7_a_restarted_sink_replays_nothing(problem: Problem, candidate: str) -> None:
-    world = World(on(problem, candidate), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, candidate)
     world.kill("sink.control@R2")
     world.run(60)
     world.start("sink.control@R2")
@@ -235,8 +230,7 @@ def test_rule_7_a_restarted_sink_replays_nothing(problem: Problem, candidate: st
 
 
 def test_rule_7_the_watchdog_speaks_when_no_command_comes(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     assert world.arm.silences == 0
     world.kill("control@R2")
     world.run(1_000)
@@ -244,8 +238,7 @@ def test_rule_7_the_watchdog_speaks_when_no_command_comes(problem: Problem) -> N
 
 
 def test_rule_7_a_sink_that_takes_over_is_impatient_at_once(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     world.kill("sink.control@R2")
     world.kill("control@R2")
     assert world.arm.silences == 0
@@ -255,8 +248,7 @@ def test_rule_7_a_sink_that_takes_over_is_impatient_at_once(problem: Problem) ->
 
 
 def test_rule_7_an_old_command_is_never_applied(problem: Problem) -> None:
-    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "SO")
     stalled = world.network.stall("E", "R2")
     world.run(70)
     world.network.heal(stalled)
@@ -290,18 +282,16 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     world.run(1_000)
     assert world.worker(f"{who}.1").active
     assert world.stamper.placement == "LOC"
-    assert longest_gap(world.cycles, world.stamper.cycle - 2) <= 4
+    assert lost(world) <= 4
     world.network.thaw(who)
     world.run(1_000)
-    assert longest_gap(world.cycles, world.stamper.cycle - 2) <= 4
+    assert lost(world) <= 4
     require_ordered(world)
 
 
 def counting(problem: Problem, candidate: str) -> World:
     """A world whose planning counts its cycles, and whose cell file says that it has a state."""
-    tasks = dict(problem.pipeline.tasks)
-    tasks["planning"] = replace(tasks["planning"], state_bytes=100)
-    cell = on(replace(problem, pipeline=replace(problem.pipeline, tasks=tasks)), candidate)
+    cell = on(stateful(problem, "planning", 100), candidate)
     return World(cell, exec_ms=EXEC_MS, stages={"planning": Counting}, policy=candidate)
 
 
@@ -311,7 +301,7 @@ def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
     world.pin("SO")
     world.run(2_000)
     assert world.stamper.placement == "SO"
-    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    assert lost(world) == 0
     # What the commands say is how many cycles the planner has seen: none is missing or twice.
     assert [count for _, count in world.arm.counts] == [cycle + 1 for cycle in world.cycles]
 
@@ -321,9 +311,7 @@ def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
 def test_rule_8_a_state_finds_its_way_beside_images(
     problem: Problem, here: str, there: str, state_bytes: int
 ) -> None:
-    tasks = dict(problem.pipeline.tasks)
-    tasks["perception"] = replace(tasks["perception"], state_bytes=state_bytes)
-    cell = on(replace(problem, pipeline=replace(problem.pipeline, tasks=tasks)), here)
+    cell = on(stateful(problem, "perception", state_bytes), here)
     world = World(cell, exec_ms=EXEC_MS, stages={"perception": Counting}, policy=here)
     world.run(2_000)
     world.pin(there)
@@ -345,18 +333,16 @@ def test_rule_8_a_checkpoint_survives_its_node(problem: Problem) -> None:
 
 
 def test_rule_9_a_frozen_peer_costs_others_nothing(problem: Problem) -> None:
-    world = World(on(problem, "LOC"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "LOC")
     freeze(*EDGE)(world)
     world.run(2_000)
-    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    assert lost(world) == 0
     assert world.stamper.placement == "LOC"
 
 
 def test_rule_4_the_detour_carries_completions(problem: Problem) -> None:
-    world = World(on(problem, "SO"), exec_ms=EXEC_MS)
-    world.run(1_000)
+    world = running(problem, "SO")
     world.network.cut("R2", "R1")
     world.run(2_000)
     assert world.stamper.placement == "SO"
-    assert longest_gap(world.cycles, world.stamper.cycle - 2) == 0
+    assert lost(world) == 0

@@ -1,4 +1,4 @@
-"""A role in a thread: it is woken when something is due, also what a message has made due."""
+"""Roles in a thread: each is woken when something is due, also what a message has made due."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from dwell.live.hosting import Hosted
+from dwell.live.hosting import Hosted, take_turns
 from dwell.live.transport.memory import MemoryTransport, Network
 from dwell.live.transport.protocol import Sample
 
@@ -55,3 +55,53 @@ def test_what_a_message_makes_due_is_done_at_once(
     hosted.stop()
     thread.join(10)
     assert not thread.is_alive()
+
+
+class Due:
+    """Is due at some instants; the clock stands where the last one was."""
+
+    def __init__(self, name: str, log: list[str], *due_ns: int) -> None:
+        self.name, self.log, self.due_ns = name, log, list(due_ns)
+
+    def subscriptions(self) -> tuple[str, ...]:
+        return ()
+
+    def receive(self, sample: Sample, now_ns: int) -> int | None:
+        return None
+
+    def wake(self, now_ns: int) -> int:
+        self.log.append(self.name)
+        return self.due_ns.pop(0) if self.due_ns else FAR_NS
+
+
+def test_roles_of_one_thread_take_turns_the_one_due_first_before_the_others() -> None:
+    network, hurry, stopped = Network(), threading.Event(), threading.Event()
+    log: list[str] = []
+
+    class Last(Due):
+        def wake(self, now_ns: int) -> int:
+            stopped.set()
+            return super().wake(now_ns)
+
+    roles = [Due("a", log, 30, 40), Due("b", log, 10, 20, 41), Last("c", log)]
+    all_hosted = [
+        Hosted(role, network.transport(role.name, "E"), lambda: 100, stopped=stopped, hurry=hurry)
+        for role in roles
+    ]
+    # All are late; the last one has never been due before the others are through.
+    all_hosted[2]._due_ns = 45
+    take_turns(all_hosted)
+    assert log == ["a", "b", "b", "b", "a", "a", "b", "c"]
+
+
+def test_a_role_that_fails_stops_all() -> None:
+    class Failing(Due):
+        def wake(self, now_ns: int) -> int:
+            raise ZeroDivisionError
+
+    stopped = threading.Event()
+    failing = Failing("a", [])
+    hosted = Hosted(failing, Network().transport("a", "E"), lambda: 100, stopped=stopped)
+    with pytest.raises(ZeroDivisionError):
+        take_turns([hosted])
+    assert stopped.is_set()

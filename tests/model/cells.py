@@ -235,6 +235,7 @@ def _controller(draw: st.DrawFn, nodes: list[str], candidates: list[str]) -> Con
         half_life_windows=draw(_reals(0, 1e6, exclude_min=True)),
         migration=draw(st.sampled_from(MIGRATIONS)),
         guard_cycles=draw(_whole(2, 1_000_000)),
+        probe_cycles=draw(_whole(1, 1_000_000)),
         fallbacks=tuple(draw(st.lists(some, max_size=2))),
         order_delay_ms=draw(times),
         order_lead_cycles=draw(_whole(0, 1_000_000)),

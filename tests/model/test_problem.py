@@ -132,6 +132,7 @@ PLACED = {"a": "R", "b": "R"}
         (lambda: Targets(0), "targets.latency_ms", "from 1e-9"),
         (lambda: Objective(Weights(cloud=1), Targets(1)), "targets.cloud", "missing"),
         (lambda: ControllerSettings(guard_cycles=1), "guard_cycles", "from 2"),
+        (lambda: ControllerSettings(probe_cycles=0), "probe_cycles", "from 1"),
         (lambda: ControllerSettings(estimator="x"), "estimator", "shadow, scaling, corrected"),
         (lambda: ControllerSettings(migration="hot"), "migration", "warm, cold"),
         (lambda: ControllerSettings(shadow_fraction=-0.1), "shadow_fraction", "from 0 to 1"),

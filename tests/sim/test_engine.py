@@ -580,6 +580,43 @@ def test_a_quota_stops_a_job_whose_bucket_is_empty(exec_ms: float, latency_ms: f
     assert set(run.cycles["latency_ns"].to_list()) == {round(latency_ms * MS)}
 
 
+def test_a_core_keeps_some_of_what_it_has_drawn() -> None:
+    # As above, but 1 ms outlasts the period: from the second job on 6 ms are there at its begin.
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(0.5, 10.0, slack_ms=1.0))],
+        [Task("work", {"R": Execution(Constant(8.0))})],
+        period_ms=20.0,
+        window_cycles=10,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    latency_ms = [ns / MS for ns in run.cycles["latency_ns"]]
+    assert latency_ms == [13.0, *[12.0] * 19]
+
+
+@pytest.mark.parametrize(
+    ("quota", "exec_ms", "latency_ms", "used"),
+    [
+        # 4 of the 5 ms in every period are left to the job.
+        (Quota(0.5, 10.0), 3.0, 3.0, 0.5),
+        (Quota(0.5, 10.0), 8.0, 14.0, 1.0),
+        # 0.9 of the core are left to it: busy while it runs, and for a tenth of the rest.
+        (None, 4.5, 5.0, 0.325),
+    ],
+)
+def test_the_background_takes_of_the_quota_or_of_the_cores(
+    quota: Quota | None, exec_ms: float, latency_ms: float, used: float
+) -> None:
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=quota, background=0.1)],
+        [Task("work", {"R": Execution(Constant(exec_ms))})],
+        period_ms=20.0,
+        window_cycles=10,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    assert set(run.cycles["latency_ns"].to_list()) == {round(latency_ms * MS)}
+    assert run.windows["u_R"].to_list() == pytest.approx([used] * 2)
+
+
 def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:
     run = dwell.simulate(canonical, policy=Script("SO", "LOC", "HYB"), seed=1, windows=6, jobs=True)
     placed = run.cycles.select("cycle", pl.col("placement").cast(str))

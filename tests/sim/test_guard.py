@@ -330,14 +330,13 @@ def test_the_run_ends_with_the_last_close_where_no_window_can_follow() -> None:
 
 
 @pytest.fixture
-def _three_probes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control_guard, "PROBE_CYCLES", 3)
+def _early_health(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_guard, "HEALTH_WINDOWS", 2)
 
 
-@pytest.mark.usefixtures("_three_probes")
+@pytest.mark.usefixtures("_early_health")
 def test_it_returns_by_an_order_once_probes_have_completed() -> None:
-    found = play(cell(), down={"E": [(42, 152)]}, windows=10)
+    found = play(cell(probe_cycles=3), down={"E": [(42, 152)]}, windows=10)
     # Moved at cycle 7; from the close at cycle 11 on OFF is wanted, and probes are sent. They are
     # lost until E is up again; those of cycles 15 to 18 complete before the close at cycle 19.
     assert placements(found) == [("OFF", 7), ("LOC", 12), ("OFF", 20)]
@@ -356,19 +355,19 @@ def test_it_returns_by_an_order_once_probes_have_completed() -> None:
     assert set(shadows["node"]) == {"E"}
 
 
-@pytest.mark.usefixtures("_three_probes")
+@pytest.mark.usefixtures("_early_health")
 def test_a_relapse_doubles_the_probes() -> None:
     twice = {"E": [(42, 100), (212, 260)]}
-    found = play(cell(), down=twice, windows=16)
+    found = play(cell(probe_cycles=3), down=twice, windows=16)
     assert moves(found) == [(1, "OFF", "LOC"), (5, "OFF", "LOC")]
     # Of the four probes of a window three are enough; then six are needed: a window more.
     held = [count for name, count in placements(found) if name == "LOC"]
     assert held == [8, 12]
 
 
-@pytest.mark.usefixtures("_three_probes")
+@pytest.mark.usefixtures("_early_health")
 def test_probes_need_the_time_of_an_order_to_begin() -> None:
-    found = play(cell(order_delay_ms=11.0), down={"E": [(42, 100)]}, windows=10)
+    found = play(cell(order_delay_ms=11.0, probe_cycles=3), down={"E": [(42, 100)]}, windows=10)
     # Wanted at 110 ms: cycles from 13 on, of which two complete before the close at 150 ms.
     assert found.windows["shadow_cycles"].to_list()[2:4] == [2, 4]
     assert placements(found) == [("OFF", 7), ("LOC", 14), ("OFF", 16)]

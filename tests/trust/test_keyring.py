@@ -134,6 +134,11 @@ def test_certificates_name_addresses_and_uses(authority: Authority) -> None:
     assert [str(ip) for ip in names.get_values_for_type(x509.IPAddress)] == ["127.0.0.1"]
     basic = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     assert not basic.ca
+    # One that is issued anew is reached where it was.
+    again = (authority.issue("R1") / "cert.pem").read_bytes()
+    renewed = x509.load_pem_x509_certificate(again)
+    kept = renewed.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert kept == names
 
 
 @pytest.mark.parametrize(
@@ -144,14 +149,17 @@ def test_certificates_name_addresses_and_uses(authority: Authority) -> None:
         ("R.1", "node", 10, "is no name of a subject"),
         ("ca", "node", 10, "the authority's own name"),
         ("R2", "king", 10, "no role 'king'; there are node, controller"),
+        ("R2", None, 10, "R2 is new; say its role"),
         ("R2", "node", 0, "days is 0; a certificate holds 1 to 3650 days"),
-        ("R1", "observer", 10, "R1 is a node; revoke it before it becomes a observer"),
+        ("R1", "observer", 10, "R1 has the role node; revoke it to make it observer"),
     ],
 )
-def test_bad_subjects(authority: Authority, name: str, role: str, days: int, refused: str) -> None:
+def test_bad_subjects(
+    authority: Authority, name: str, role: str | None, days: int, refused: str
+) -> None:
     before = sorted(authority.folder.rglob("*"))
     with pytest.raises(TrustError, match=refused):
-        authority.issue(name, role, days=days)  # type: ignore[arg-type]
+        authority.issue(name, role, days=days)
     assert sorted(authority.folder.rglob("*")) == before
 
 

@@ -12,12 +12,21 @@ from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, ProblemError
 from dwell.estimators import Profile
 from dwell.io import load
+from dwell.live.cautions import find_cautions
 from dwell.model import Problem
 
 __all__ = ["check_cell", "find_warnings"]
 
 
-def check_cell(cell: Path, traces: Path | None, *, node: str | None = None, as_json: bool) -> bool:
+def check_cell(
+    cell: Path,
+    traces: Path | None,
+    *,
+    node: str | None = None,
+    keys: Path | None = None,
+    insecure: bool = False,
+    as_json: bool,
+) -> bool:
     """Check a cell, or whether this computer can be one of its nodes, and print what was found.
 
     Returns
@@ -37,7 +46,7 @@ def check_cell(cell: Path, traces: Path | None, *, node: str | None = None, as_j
     if node is not None:
         from dwell.cli.check_node import check_node
 
-        return check_node(problem, cell, node, as_json=as_json)
+        return check_node(problem, cell, node, keys, insecure=insecure, as_json=as_json)
     profile = Profile(problem)
     warnings = tuple(find_warnings(problem, profile))
     if as_json:
@@ -55,6 +64,7 @@ def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
     yield from _overloads(problem, profile)
     yield from _over_caps(problem, profile)
     yield from _false_alarms(problem, profile)
+    yield from find_cautions(problem)
 
 
 def _overloads(problem: Problem, profile: Profile) -> Iterator[Fault]:

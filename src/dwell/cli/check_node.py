@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import typer
 
+from dwell.cli.live import environment
 from dwell.cli.output import aligned, print_json
-from dwell.errors import Fault, LiveError, ProblemError
+from dwell.errors import Fault, LiveError, ProblemError, TrustError
+from dwell.live.cautions import find_cautions
+from dwell.live.security import Security, exposed
 from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
@@ -20,7 +23,15 @@ __all__ = ["check_node"]
 PACKAGES = {"zenoh": "eclipse-zenoh", "msgspec": "msgspec", "psutil": "psutil"}
 
 
-def check_node(problem: Problem, cell: Path, node: str, *, as_json: bool) -> bool:
+def check_node(
+    problem: Problem,
+    cell: Path,
+    node: str,
+    keys: Path | None = None,
+    *,
+    insecure: bool = False,
+    as_json: bool,
+) -> bool:
     """Import and make every stage and actuator of a node, and print what is missing.
 
     Returns
@@ -34,14 +45,21 @@ def check_node(problem: Problem, cell: Path, node: str, *, as_json: bool) -> boo
     # As the worker's process does: the user's stages lie beside their cell file.
     sys.path.insert(0, str(cell.resolve().parent))
     wiring, faults = _wiring(problem)
-    faults += [*_packages(), *_stages(problem, node), *_actuators(problem, node)]
+    security, unsafe = _security(problem, node, environment(keys, insecure=insecure))
+    faults += [*unsafe, *_packages(), *_stages(problem, node), *_actuators(problem, node)]
+    warnings = [str(caution) for caution in find_cautions(problem)]
+    if security is not None:
+        warnings += [line.removeprefix("warning: ") for line in security.warnings()]
     if as_json:
         found = [{"path": fault.path, "message": fault.message} for fault in faults]
         processes = [] if wiring is None else [role.who for role in wiring.on(node)]
-        print_json({"node": node, "ready": not faults, "faults": found, "processes": processes})
+        told = {"node": node, "ready": not faults, "faults": found, "processes": processes}
+        print_json({**told, "warnings": warnings})
         return not faults
     for fault in faults:
         typer.echo(f"{cell}: node {node}: {fault}", err=True)
+    for warning in warnings:
+        typer.echo(f"{cell}: warning: {warning}", err=True)
     if wiring is not None and not faults:
         typer.echo(_summary(problem, wiring, node))
     return not faults
@@ -51,6 +69,18 @@ def _packages() -> Iterator[Fault]:
     for module, package in PACKAGES.items():
         if importlib.util.find_spec(module) is None:
             yield Fault("", f"{package} is not installed; pip install 'dwell[live]'")
+
+
+def _security(
+    problem: Problem, node: str, given: Mapping[str, str]
+) -> tuple[Security | None, list[Fault]]:
+    """Return what protects the node's processes, or why they must not start."""
+    try:
+        return Security.of(problem, Role(f"agent@{node}", node, "agent"), given), []
+    except TrustError as error:
+        return None, [Fault("", str(error))]
+    except LiveError:
+        return None, list(exposed(problem))
 
 
 def _wiring(problem: Problem) -> tuple[Wiring | None, list[Fault]]:

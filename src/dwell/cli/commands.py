@@ -9,8 +9,10 @@ import typer
 from typer.core import TyperGroup
 
 from dwell import __version__
+from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
 from dwell.cli.profile import profile
+from dwell.cli.testbed import testbed
 from dwell.errors import (
     DwellError,
     MetricError,
@@ -19,6 +21,7 @@ from dwell.errors import (
     ProblemError,
     ProfileError,
     RunError,
+    TrustError,
 )
 
 __all__ = ["app"]
@@ -26,7 +29,15 @@ __all__ = ["app"]
 FAILED, WRONG, INTERRUPTED = 1, 2, 130
 
 # A TraceError is a ProblemError.
-MISTAKES = (ProblemError, PolicyError, PlacementError, MetricError, ProfileError, RunError)
+MISTAKES = (
+    ProblemError,
+    PolicyError,
+    PlacementError,
+    MetricError,
+    ProfileError,
+    RunError,
+    TrustError,
+)
 
 
 class Commands(TyperGroup):
@@ -100,6 +111,14 @@ def check(
             "make its stages and actuators."
         ),
     ] = None,
+    keys: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", envvar="DWELL_KEYS", help="The node's keyring."),
+    ] = None,
+    insecure: Annotated[
+        bool,
+        typer.Option("--insecure", envvar="DWELL_INSECURE", help="The node is to do without keys."),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Find every fault in a cell, or say what it amounts to.
@@ -109,7 +128,7 @@ def check(
     """
     from dwell.cli.check import check_cell
 
-    if not check_cell(cell, traces, node=node, as_json=as_json):
+    if not check_cell(cell, traces, node=node, keys=keys, insecure=insecure, as_json=as_json):
         raise typer.Exit(WRONG)
 
 
@@ -223,7 +242,9 @@ def study(
 
 @app.command()
 def report(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a saved run.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of a saved run, or of a campaign.")
+    ],
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Page to write [default: RUN/report.html]."),
@@ -237,10 +258,45 @@ def report(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write a run's report: one HTML file that needs nothing else."""
+    """Write the report of a run, or of a campaign: one HTML file that needs nothing else."""
     from dwell.cli.report import report_run
 
     report_run(folder, out or folder / "report.html", trace, as_json=as_json)
+
+
+@app.command()
+def validate(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that were measured.")
+    ],
+    cell: Annotated[Path, typer.Option(metavar="CELL", help="Calibrated cell file (YAML).")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Where page and table go; validations/CELL if not given."
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=2, help="Simulations of every run.")] = 20,
+    calibrated_from: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN",
+            help="A run that the cell was calibrated from, besides those that the file "
+            "CELL.calibration.json beside it names; may be repeated.",
+        ),
+    ] = None,
+    traces: Traces = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="How many to use; one a CPU if not given.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
+    from dwell.cli.validate import Request, validate_runs
+
+    used = tuple(calibrated_from or ())
+    request = Request(tuple(runs), cell, out, seeds, traces, used, processes)
+    validate_runs(request, as_json=as_json)
 
 
 @app.command()
@@ -290,3 +346,5 @@ def demo(
 app.command()(agent)
 app.command()(controller)
 app.add_typer(live, name="live")
+app.add_typer(keys, name="keys")
+app.add_typer(testbed, name="testbed")

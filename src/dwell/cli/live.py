@@ -24,6 +24,22 @@ Cpus = Annotated[
     str | None,
     typer.Option(metavar="LIST", help="CPUs to use, as 0,2-3; those of this process if not given."),
 ]
+Keys = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        envvar="DWELL_KEYS",
+        help="Keyring: all connections are encrypted and authenticated with it.",
+    ),
+]
+Insecure = Annotated[
+    bool,
+    typer.Option(
+        "--insecure",
+        envvar="DWELL_INSECURE",
+        help="Without keys: leave this computer all the same, in a network that you trust.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 live = typer.Typer(
@@ -61,15 +77,20 @@ def agent(
             help="Returns the utilisation of the node's accelerator, from 0 to 1.",
         ),
     ] = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     import dwell
     from dwell.cli.process import command
+    from dwell.live.cautions import find_cautions
     from dwell.live.node import run_agent
     from dwell.live.stage import load_function
     from dwell.live.wiring import roles
 
     problem = dwell.load(cell)
+    for caution in find_cautions(problem):
+        _say(f"warning: {caution}")
     folder = state or _state_folder() / problem.name / node
     sys.path.insert(0, str(cell.resolve().parent))
     read = None if accelerator is None else load_function(accelerator, "--accelerator")
@@ -85,6 +106,7 @@ def agent(
         _until_told(),
         cpus=wanted,
         accelerator=read,
+        environment=environment(keys, insecure=insecure),
         say=_say,
     )
 
@@ -102,7 +124,16 @@ def controller(
     name: Annotated[
         str | None, typer.Option(help="Of this controller; its process id if not given.")
     ] = None,
+    jobs: Annotated[
+        bool,
+        typer.Option(
+            envvar="DWELL_JOBS",
+            help="Keep every job, and what each process takes of the CPUs, in the runs, too.",
+        ),
+    ] = False,
     cpus: Cpus = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
 ) -> None:
     """Decide where the stages of live cells run."""
     import dwell
@@ -112,47 +143,68 @@ def controller(
     if wanted is not None:
         os.sched_setaffinity(0, wanted)
     problems = [dwell.load(file) for file in cell]
-    folders = run_controller(problems, out, _until_told(), policy=policy, name=name, say=_say)
+    folders = run_controller(
+        *(problems, out, _until_told()),
+        policy=policy,
+        name=name,
+        jobs=jobs,
+        environment=environment(keys, insecure=insecure),
+        say=_say,
+    )
     for folder in folders:
         _say(f"run: {folder}")
 
 
 @live.command()
-def status(cell: Cell, as_json: AsJson = False) -> None:
+def status(
+    cell: Cell, keys: Keys = None, insecure: Insecure = False, as_json: AsJson = False
+) -> None:
     """Show how a cell is."""
-    _ask(cell, "status", "", as_json=as_json)
+    _ask(cell, "status", "", keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
 def pin(
     candidate: Annotated[str, typer.Argument(metavar="CANDIDATE")],
     cell: Cell,
+    keys: Keys = None,
+    insecure: Insecure = False,
     as_json: AsJson = False,
 ) -> None:
     """Have a cell stay on one candidate, whatever its policy would do."""
-    _ask(cell, "pin", candidate, as_json=as_json)
+    _ask(cell, "pin", candidate, keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
-def unpin(cell: Cell, as_json: AsJson = False) -> None:
+def unpin(
+    cell: Cell, keys: Keys = None, insecure: Insecure = False, as_json: AsJson = False
+) -> None:
     """Let the policy decide again."""
-    _ask(cell, "unpin", "", as_json=as_json)
+    _ask(cell, "unpin", "", keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
 def drain(
-    node: Annotated[str, typer.Argument(metavar="NODE")], cell: Cell, as_json: AsJson = False
+    node: Annotated[str, typer.Argument(metavar="NODE")],
+    cell: Cell,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: AsJson = False,
 ) -> None:
     """Have no stage run on a node, so that it can be stopped or its code changed."""
-    _ask(cell, "drain", node, as_json=as_json)
+    _ask(cell, "drain", node, keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
 def undrain(
-    node: Annotated[str, typer.Argument(metavar="NODE")], cell: Cell, as_json: AsJson = False
+    node: Annotated[str, typer.Argument(metavar="NODE")],
+    cell: Cell,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: AsJson = False,
 ) -> None:
     """Let stages run on a node again."""
-    _ask(cell, "undrain", node, as_json=as_json)
+    _ask(cell, "undrain", node, keys, insecure=insecure, as_json=as_json)
 
 
 @live.command()
@@ -172,17 +224,27 @@ def demo(
     play(out, scenario, seconds, policy, seed, as_json=as_json)
 
 
-def _ask(cell: Path, what: str, about: str, *, as_json: bool) -> None:
+def _ask(
+    cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
+) -> None:
     import dwell
     from dwell.live.visiting import Visitor
 
-    with Visitor(dwell.load(cell)) as visitor:
+    with Visitor(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
         found = visitor.ask(what, about)
     if as_json:
         print_json(found)
         return
     for line in told(found):
         typer.echo(line)
+
+
+def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
+    """Return this process's environment with what was said of its keys."""
+    from dwell.live.security import INSECURE, KEYS
+
+    said = {KEYS: str(keys.resolve())} if keys is not None else {}
+    return {**os.environ, **said, **({INSECURE: "1"} if insecure else {})}
 
 
 def told(status: dict[str, Any]) -> list[str]:

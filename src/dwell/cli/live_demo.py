@@ -5,15 +5,11 @@ from __future__ import annotations
 import importlib.resources
 import math
 import os
-import shutil
-import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
-from typing import Any, NoReturn
+from typing import Any
 
 import typer
 
@@ -21,25 +17,34 @@ import dwell
 from dwell.cli.live_view import Look, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.demo.error_sampler import ErrorSampler
-from dwell.demo.stageplay import Change, Stageplay, changes_of, on_this_machine
+from dwell.demo.stageplay import Stageplay, on_this_machine
 from dwell.demo.world import World
-from dwell.errors import DwellError, LiveError
+from dwell.errors import LiveError
 from dwell.live.visiting import Visitor
 from dwell.model import Problem
-from dwell.model.document import to_document
-from dwell.record import Run, open_run, seal_run
+from dwell.record import Run, open_run
 from dwell.report import run_html
 from dwell.report.facts import Facts
 from dwell.report.phase_rows import PhaseRow, phase_rows
 from dwell.report.phases import Disturbed, disturbed
 from dwell.report.wording import listed, percent, write_number
+from dwell.testbed.playing import (
+    LOOK_S,
+    Ask,
+    Played,
+    begun,
+    come_up,
+    interruptible,
+    longest_run,
+    make_folder,
+)
+from dwell.testbed.playing import play as play_changes
+from dwell.testbed.timeline import Change, changes_of
 
 __all__ = ["play"]
 
 #: A folder with this file is a demo's, and may be replaced by the next.
 MARK = ".dwell-live-demo"
-LOOK_S = 0.5
-START_S = 30.0
 #: What the cell did before everybody was there belongs to the run, up to so many seconds of it.
 MOST_BEFORE_S = 4.0
 #: The arm comes from its home, and first has to get to the tag.
@@ -70,11 +75,11 @@ def play(
     if policy is not None:
         problem = replace(problem, controller=replace(problem.controller, policy=policy))
     changes = changes_of(problem, scenario)
-    _make(out)
+    make_folder(out, MARK, "a demo's")
     problem = on_this_machine(problem)
     told = _Told(problem, scenario, seed)
     interrupted = False
-    with _interruptible(), Stageplay(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
+    with interruptible(), Stageplay(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
         try:
             _watch_from_start(cell, changes, seconds, told)
         except KeyboardInterrupt:
@@ -83,98 +88,41 @@ def play(
         with working("ending the cell"):
             cell.stop_controller()
             cell.close()
-    folder = _run_folder(out)
+    folder = longest_run(out / "runs")
     if folder is None and interrupted:
         raise typer.Exit(INTERRUPTED)
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    run = told.note(folder)
+    run = told.note(folder, **told.tracking(folder))
     _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """Have whoever ends this process, or closes its terminal, interrupt it as Ctrl-C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    numbers = (signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 @dataclass(slots=True)
-class _Told:
-    """What the demo knows of a run, and its controller does not.
+class _Told(Played):
+    """What the demo knows of a run, and its controller does not."""
 
-    Instants are of the machine's monotonic clock, which the nodes of the demo have, too.
-    """
-
-    problem: Problem
-    scenario: str
-    seed: int
-    begun_ns: dict[int, int] = field(default_factory=dict)
-    ended_ns: dict[int, int] = field(default_factory=dict)
     sampler: ErrorSampler | None = None
 
-    def changed(self, change: Change) -> None:
-        """Note that a change has been made."""
-        instants = self.begun_ns if change.begins else self.ended_ns
-        instants[id(change.item)] = time.monotonic_ns()
+    def planned(self) -> list[Disturbed]:
+        """Return what is to be played, as it is shown."""
+        return self._disturbed(self.plan())
 
-    def items(self) -> list[tuple[object, Mapping[str, Any]]]:
-        """Return the scenario's items, each as the cell file has it."""
-        written = to_document(self.problem)["scenarios"].get(self.scenario, [])
-        return list(zip(self.problem.scenario(self.scenario), written, strict=True))
-
-    def plan(self) -> list[Disturbed]:
-        """Return what is to be played."""
-        return self._disturbed([written for _, written in self.items()])
-
-    def active(self) -> list[Disturbed]:
-        """Return what is on now."""
-        on = self.begun_ns.keys() - self.ended_ns.keys()
-        return self._disturbed([written for item, written in self.items() if id(item) in on])
+    def on(self) -> list[Disturbed]:
+        """Return what is on now, as it is shown."""
+        return self._disturbed(self.active())
 
     def _disturbed(self, items: Sequence[Mapping[str, Any]]) -> list[Disturbed]:
         tiers = {name: node.tier for name, node in self.problem.fabric.nodes.items()}
         return disturbed(items, tiers)
 
-    def note(self, folder: Path) -> Run:
-        """Add it to the run, whose time begins with the first release."""
-        run = open_run(folder)
-        origin_ns, cycles = run.meta.get("origin_ns"), run.cycles
-        notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
-        if isinstance(origin_ns, int) and not cycles.is_empty():
-            end_ns = origin_ns + int(cycles["release_ns"][-1])
-            notes["played"] = [
-                {
-                    **written,
-                    "at_s": round((begun_ns - origin_ns) / 1e9, 3),
-                    "for_s": round((self.ended_ns.get(id(item), end_ns) - begun_ns) / 1e9, 3),
-                }
-                for item, written in self.items()
-                if (begun_ns := self.begun_ns.get(id(item))) is not None
-            ]
-            if self.sampler is not None:
-                notes["tracking"] = self.sampler.told(origin_ns)
-        return seal_run(folder, **notes)
-
-
-def _make(out: Path) -> None:
-    if (out / MARK).is_file():
-        shutil.rmtree(out)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise LiveError(f"{out} exists and is not a demo's; choose another folder with --out")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / MARK).touch()
+    def tracking(self, folder: Path) -> dict[str, object]:
+        """Return what is to be said of the run's tracking error."""
+        span = begun(open_run(folder))
+        if self.sampler is None or span is None:
+            return {}
+        return {"tracking": self.sampler.told(span[0])}
 
 
 def _cpus(problem: Problem) -> dict[str, int]:
@@ -188,52 +136,33 @@ def _cpus(problem: Problem) -> dict[str, int]:
     }
 
 
-def _come_up(visitor: Visitor, cell: Stageplay) -> None:
-    """Wait until everybody is there."""
-    until = time.monotonic() + START_S
-    awaited = {who for node in cell.problem.fabric.nodes for who in cell.expected(node)}
-    missing: Mapping[str, str] = {"the controller": "has not answered"}
-    while missing:
-        if time.monotonic() > until:
-            found = "; ".join(f"{who} {why}" for who, why in sorted(missing.items()))
-            raise LiveError(
-                f"after {START_S:.0f} s the cell is not complete: {found}; see the logs in "
-                f"{cell.folder}"
-            )
-        try:
-            heard = visitor.ask("status", patience_s=1.0)["processes"]
-        except LiveError:
-            continue
-        missing = {
-            who: heard[who]["note"] or "is not ready" if who in heard else "has not been heard"
-            for who in awaited
-            if who not in heard or not heard[who]["ready"]
-        }
-        time.sleep(0.1)
-
-
 def _watch_from_start(
     cell: Stageplay, changes: Sequence[Change], seconds: float, told: _Told
 ) -> None:
     """Wait until everybody is there, and play the scenario."""
+    awaited = [who for node in cell.problem.fabric.nodes for who in cell.expected(node)]
     with Visitor(cell.problem) as visitor:
+
+        def ask(patience_s: float) -> Mapping[str, Any]:
+            return visitor.ask("status", patience_s=patience_s)
+
         with working("starting the cell"):
-            _come_up(visitor, cell)
+            status = come_up(ask, awaited, cell.folder)
         now_ns = time.monotonic_ns()
-        origin_ns = visitor.ask("status").get("origin_ns") or now_ns
+        origin_ns = status.get("origin_ns") or now_ns
         begin_ns = max(int(origin_ns), now_ns - round(MOST_BEFORE_S * 1e9))
         world = World.open(cell.world, now_ns)
         told.sampler = ErrorSampler(world, begin_ns + round(SETTLED_S * 1e9))
         try:
-            with live_view(cell.problem, seconds, told.plan()) as view:
-                _watch(visitor, cell, changes, begin_ns, seconds, told, view)
+            with live_view(cell.problem, seconds, told.planned()) as view:
+                _watch(ask, cell, changes, begin_ns, seconds, told, view)
         finally:
             told.sampler.sample(time.monotonic_ns())
             world.close()
 
 
 def _watch(
-    visitor: Visitor,
+    ask: Ask,
     cell: Stageplay,
     changes: Sequence[Change],
     begin_ns: int,
@@ -242,41 +171,30 @@ def _watch(
     view: View,
 ) -> None:
     """Play the changes at their times, and show how the cell is."""
-    waiting = list(changes)
     status: Mapping[str, Any] = {}
     answered_s = 0.0
-    while (at_s := (time.monotonic_ns() - begin_ns) / 1e9) < seconds:
-        while waiting and waiting[0].at_s <= at_s:
-            change = waiting.pop(0)
-            cell.apply(change)
-            told.changed(change)
+
+    def now_s() -> float:
+        return (time.monotonic_ns() - begin_ns) / 1e9
+
+    def apply(change: Change) -> None:
+        cell.apply(change)
+        told.changed(change)
+
+    def look(at_s: float) -> None:
+        nonlocal status, answered_s
         try:
-            status = visitor.ask("status", patience_s=LOOK_S)
-            answered_s = (time.monotonic_ns() - begin_ns) / 1e9
+            status = ask(LOOK_S)
+            answered_s = now_s()
         except LiveError:
             pass  # the view shows for how long nobody has answered
         error = math.nan, math.nan
         if told.sampler is not None:
             told.sampler.sample(time.monotonic_ns())
             error = told.sampler.newest()
-        view.show(Look(at_s, status, answered_s, *error, told.active()))
-        # Looks do not drift, and what begins or ends in between does so in time.
-        following_s = (math.floor(at_s / LOOK_S) + 1) * LOOK_S
-        if waiting:
-            following_s = min(following_s, waiting[0].at_s)
-        time.sleep(max(following_s - (time.monotonic_ns() - begin_ns) / 1e9, 0.0))
+        view.show(Look(at_s, status, answered_s, *error, told.on()))
 
-
-def _run_folder(out: Path) -> Path | None:
-    """Return the longest of the runs that were written; None where there is none."""
-    found: list[tuple[int, Path]] = []
-    runs = out / "runs"
-    for folder in sorted(runs.iterdir()) if runs.is_dir() else ():
-        try:
-            found.append((int(open_run(folder).meta.get("windows", 0)), folder))
-        except DwellError:
-            continue
-    return max(found)[1] if found else None
+    play_changes(changes, seconds, now_s, apply, look)
 
 
 def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:

@@ -14,7 +14,15 @@ from typing import Any
 
 import typer
 
-__all__ = ["Progress", "aligned", "print_json", "progress", "working", "write_file"]
+__all__ = [
+    "Progress",
+    "aligned",
+    "json_text",
+    "print_json",
+    "progress",
+    "working",
+    "write_file",
+]
 
 #: Takes how many are done, and of how many.
 Progress = Callable[[int, int], None]
@@ -32,8 +40,13 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """Print JSON on stdout; what is no number or infinite becomes null."""
-    typer.echo(json.dumps(_plain(value), indent=2, allow_nan=False))
+    """Print JSON on stdout (see `json_text`)."""
+    typer.echo(json_text(value))
+
+
+def json_text(value: Mapping[str, Any]) -> str:
+    """Return JSON; what is no number or infinite becomes null."""
+    return json.dumps(_plain(value), indent=2, allow_nan=False)
 
 
 def _plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""`dwell report`: a saved run as a page, and its jobs as a trace."""
+"""`dwell report`: a saved run as a page, and its jobs as a trace; a campaign as a page."""
 
 from __future__ import annotations
 
@@ -8,20 +8,29 @@ from pathlib import Path
 import typer
 
 from dwell.cli.output import print_json, working, write_file
+from dwell.errors import RunError
 from dwell.record import open_run
 from dwell.report import run_html, trace_events
+from dwell.testbed.execution import is_campaign
 
 __all__ = ["report_run"]
 
 
 def report_run(folder: Path, page: Path, trace: Path | None, *, as_json: bool) -> None:
-    """Write the page of a run, and its trace where a file is named for it.
+    """Write the page of a run, and its trace where a file is named for it; or a campaign's page.
 
     Raises
     ------
     RunError
         If the folder is not a run, or a trace is asked for and the run kept no jobs.
     """
+    if is_campaign(folder):
+        if trace is not None:
+            raise RunError(f"{folder} is a campaign; name one of its runs for a trace")
+        from dwell.cli.campaign import report_campaign
+
+        report_campaign(folder, page, as_json=as_json)
+        return
     run = open_run(folder)
     with working("writing the report"):
         events = None if trace is None else trace_events(run)

@@ -1,7 +1,7 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
 from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
-from dwell.control.guard import PROBE_CYCLES, Guard, Presence, Probation, parts_of
+from dwell.control.guard import Guard, Presence, Probation, parts_of
 from dwell.control.shadows import shadow_stamps
 from dwell.control.windows import NEVER_NS, final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
@@ -9,7 +9,6 @@ from dwell.policies import MinimalPolicy
 
 __all__ = [
     "NEVER_NS",
-    "PROBE_CYCLES",
     "ClosedWindow",
     "Controller",
     "Estimator",

@@ -12,12 +12,10 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import TypeAlias
 
 from dwell.model import FrozenDict, Problem
-from dwell.model.bounds import GUARD_CYCLES, require
+from dwell.model.bounds import GUARD_CYCLES, PROBE_CYCLES, require
 
-__all__ = ["PROBE_CYCLES", "Guard", "Presence", "Probation", "parts_of"]
+__all__ = ["Guard", "Presence", "Probation", "parts_of"]
 
-#: Probes that must complete before a fallback is left for the first time (h).
-PROBE_CYCLES = 30
 #: However often a cell relapses, no more than this many times as many.
 MOST_DOUBLINGS = 5
 #: Windows' worth of completed cycles that make a cell healthy (see `Probation`).
@@ -334,10 +332,8 @@ class Probation:
         "wanted",
     )
 
-    def __init__(
-        self, probe_cycles: int = PROBE_CYCLES, *, health_cycles: int, patience_ns: int
-    ) -> None:
-        require(probe_cycles >= 1, "probe_cycles", probe_cycles, "at least 1")
+    def __init__(self, probe_cycles: int, *, health_cycles: int, patience_ns: int) -> None:
+        PROBE_CYCLES.check("probe_cycles", probe_cycles)
         require(health_cycles >= 1, "health_cycles", health_cycles, "at least 1")
         self.probe_cycles = self.needed = probe_cycles
         self.most = probe_cycles << MOST_DOUBLINGS
@@ -348,11 +344,11 @@ class Probation:
         self._fallen = self._returned = False
 
     @classmethod
-    def of(cls, problem: Problem, probe_cycles: int | None = None) -> Probation:
+    def of(cls, problem: Problem) -> Probation:
         """Make that of a cell: ten windows completed are a stretch of health."""
         settings = problem.controller
         return cls(
-            PROBE_CYCLES if probe_cycles is None else probe_cycles,
+            settings.probe_cycles,
             health_cycles=HEALTH_WINDOWS * problem.window_cycles,
             patience_ns=settings.guard_cycles * round(problem.pipeline.period_ms * 1e6),
         )

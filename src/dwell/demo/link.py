@@ -22,11 +22,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
+from dwell.demo.link_rate import Sharing
 from dwell.errors import LiveError
-from dwell.testbed.child import Child, Json
+from dwell.testbed.child import Child, Json, Started
 from dwell.testbed.conditions import Conditions, Cut, Scheduling, to_json
 
 __all__ = ["Forward", "LinkProcess", "Traffic"]
@@ -90,7 +90,7 @@ class Traffic:
     cpu_s: float
 
 
-class LinkProcess:
+class LinkProcess(Started):
     """The link between two nodes, as its parent sees it.
 
     Parameters
@@ -102,7 +102,9 @@ class LinkProcess:
     seed : int
         Of delays and losses.
     queue_bytes : int
-        See `QUEUE_BYTES`; of one direction.
+        See `QUEUE_BYTES`; of one direction, or with `fair` of each connection in it.
+    sharing : {"fifo", "fair"}
+        Whether connections wait for the rate in one queue, or each in its own.
     cpus : collection of int, optional
         Where it runs; anywhere if left out.
     """
@@ -115,6 +117,7 @@ class LinkProcess:
         *,
         seed: int = 0,
         queue_bytes: int = QUEUE_BYTES,
+        sharing: Sharing = "fifo",
         cpus: Collection[int] | None = None,
     ) -> None:
         self.nodes = nodes
@@ -131,6 +134,7 @@ class LinkProcess:
             ],
             "seed": seed,
             "queue_bytes": queue_bytes,
+            "sharing": sharing,
             "cpus": sorted(cpus) if cpus is not None else None,
         }
         #: Where to dial, by forward.
@@ -158,20 +162,6 @@ class LinkProcess:
     def stop(self) -> None:
         """End it, and with it the connections; safe to call twice."""
         self._child.stop()
-
-    def __enter__(self) -> Self:
-        """Start it."""
-        self.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End it."""
-        self.stop()
 
     # ------------------------------------------------------------------------- conditions
 

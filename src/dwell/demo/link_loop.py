@@ -1,126 +1,46 @@
-"""The process of a link: one thread that reads batches, and sends each at its instant.
-
-It waits with `select`, whose timeouts are exact to microseconds; those of `epoll` are rounded to
-milliseconds, so that `epoll` is only asked which of many connections are ready.
-"""
+"""The process of a link: one thread that reads batches, and sends each at its instant."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import gc
-import heapq
 import os
 import select
 import socket
-import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import count
-from typing import Protocol, TypeAlias, TypedDict, cast
-
-import numpy as np
+from typing import TypeAlias, TypedDict, cast
 
 from dwell.demo.link_batches import LENGTH_BYTES, Sifter, is_session
+from dwell.demo.link_rate import SEGMENT_BYTES, Fair, InOrder, Rate, Sharing
 from dwell.errors import DwellError, LiveError
-from dwell.testbed.child import PARENT_CHECK_S, Json, Parent
-from dwell.testbed.conditions import Conditions, Scheduling, changed, delays_ns
+from dwell.testbed.child import Json, Parent
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.draws import Draws
+from dwell.testbed.event_loop import Loop
+from dwell.testbed.orders import Orders, Set
+from dwell.testbed.punctuality import come_first
 
 __all__ = ["main"]
 
 LISTEN_ON = "127.0.0.1"
-READ_BYTES = 65_536
 # What one direction of one connection may have on its way: as TCP's window, at 25 ms and 1 Gbit/s.
 WINDOW_BYTES = 4 << 20
 # The kernel's own buffers, which a bottleneck must not have a lot of (Linux doubles them).
 SOCKET_BYTES = 131_072
-# Of Ethernet. With loopback's 64 kB, ten of which TCP takes for a modest beginning, a sender's
-# kernel would buffer megabytes in front of a slow link.
-SEGMENT_BYTES = 1448
-# Linux lets timers of ordinary processes be 50 µs late to save power.
-TIMER_SLACK = "/proc/self/timerslack_ns"
-# The shortest time slice that Linux grants; the shorter it is, the sooner a process gets the CPU.
-SLICE_NS = 100_000
-SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
-
-Action: TypeAlias = Callable[[int], None]
-
-
-class _Change(TypedDict):
-    source: str
-    changes: dict[str, object]
 
 
 class _Settings(TypedDict):
     nodes: list[str]
     forwards: list[tuple[str, str, int, int]]
-    sets: list[_Change]
+    sets: list[Set]
     seed: int
     queue_bytes: int
+    sharing: Sharing
     cpus: list[int] | None
-
-
-class _Watched(Protocol):
-    """What a descriptor belongs to."""
-
-    served_ns: int
-
-    def ready(self, events: int) -> None: ...
-
-
-class _Loop:
-    """Descriptors to watch, and actions to take at their instants."""
-
-    def __init__(self) -> None:
-        self._epoll = select.epoll()
-        self._watched: dict[int, _Watched] = {}
-        self._masks: dict[int, int] = {}
-        self._actions: list[tuple[int, int, Action]] = []
-        self._order = count()
-
-    def at(self, instant_ns: int, action: Action) -> None:
-        """Have something done at an instant."""
-        heapq.heappush(self._actions, (instant_ns, next(self._order), action))
-
-    def watch(self, descriptor: int, mask: int, owner: _Watched) -> None:
-        """Watch for the events of a mask; one that is 0 watches for nothing, errors included."""
-        before = self._masks.get(descriptor, 0)
-        if mask == before:
-            return
-        if mask == 0:
-            self._epoll.unregister(descriptor)
-            del self._masks[descriptor], self._watched[descriptor]
-            return
-        if before == 0:
-            self._epoll.register(descriptor, mask)
-        else:
-            self._epoll.modify(descriptor, mask)
-        self._masks[descriptor] = mask
-        self._watched[descriptor] = owner
-
-    def turn(self) -> None:
-        """Do what is due, wait for the next event or instant, and serve what is ready.
-
-        Who was served longest ago goes first, so that nobody starves at a full queue.
-        """
-        actions = self._actions
-        while actions and actions[0][0] <= time.monotonic_ns():
-            instant_ns, _, action = heapq.heappop(actions)
-            action(instant_ns)
-        wait_s = PARENT_CHECK_S
-        if actions:
-            wait_s = min(wait_s, max(0, actions[0][0] - time.monotonic_ns()) / 1e9)
-        select.select([self._epoll], [], [], wait_s)
-        events = self._epoll.poll(0)
-        if len(events) > 1:
-            events.sort(key=lambda event: self._watched[event[0]].served_ns)
-        for descriptor, mask in events:
-            owner = self._watched.get(descriptor)
-            if owner is not None:  # not closed by one before it
-                owner.ready(mask)
 
 
 @dataclass(slots=True)
@@ -161,57 +81,36 @@ class _Counts:
 class _Direction:
     """What all connections from one node to the other share."""
 
-    def __init__(self, loop: _Loop, seed: tuple[int, int], queue_bytes: int) -> None:
-        self.conditions = Conditions()
+    def __init__(
+        self, loop: Loop, seed: tuple[int, int], queue_bytes: int, sharing: Sharing
+    ) -> None:
         self.counts = _Counts()
         self.streams: set[_Stream] = set()
-        self.full = False
-        self._free_ns = 0
-        self._loop = loop
-        self._queue_bytes = queue_bytes
-        delays, added, losses = np.random.default_rng(seed).spawn(3)
-        self._rngs = {"delay_ms": delays, "add_delay_ms": added}
-        self._delays = {name: self._drawn(name) for name in self._rngs}
-        self._losses = losses
+        kind = Fair[_Stream] if sharing == "fair" else InOrder[_Stream]
+        self.rate: Rate[_Stream] = kind(loop, queue_bytes, self._room_changed)
+        self._draws = Draws(seed)
+        self.lose = self._draws.lose
+        self.draw_ns = self._draws.delay_ns
 
-    def _drawn(self, name: str) -> Iterator[int]:
-        return delays_ns(getattr(self.conditions, name), self._rngs[name])
+    @property
+    def conditions(self) -> Conditions:
+        """Those of now."""
+        return self._draws.conditions
 
     def apply(self, changes: dict[str, object]) -> None:
         """Change conditions."""
         before = self.conditions
-        self.conditions = changed(before, changes)
-        for name in self._rngs:
-            if getattr(before, name) != getattr(self.conditions, name):
-                self._delays[name] = self._drawn(name)
+        self._draws.apply(changes)
+        if before.rate_mbps != self.conditions.rate_mbps:
+            self.rate.change(self.conditions.rate_mbps, time.monotonic_ns())
         if before.cut != self.conditions.cut:
             for stream in list(self.streams):
                 stream.cut_changed()
 
-    def lose(self) -> bool:
-        """Decide whether the next message is lost."""
-        return self.conditions.loss > 0 and self._losses.random() < self.conditions.loss
-
-    def draw_ns(self) -> int:
-        """Draw a delay."""
-        return sum(map(next, self._delays.values()))
-
-    def serialise(self, size_bytes: int, now_ns: int) -> int:
-        """Put bytes behind those that wait at the rate; return when they have passed."""
-        ns_per_byte = 8e3 / self.conditions.rate_mbps
-        self._free_ns = max(now_ns, self._free_ns) + round(size_bytes * ns_per_byte)
-        resume_ns = self._free_ns - round(self._queue_bytes * ns_per_byte)
-        if resume_ns > now_ns and not self.full:
-            self.full = True
-            self._loop.at(resume_ns, self._resume)
-            for stream in self.streams:
-                stream.source.watch()
-        return self._free_ns
-
-    def _resume(self, _instant_ns: int) -> None:
-        self.full = False
-        for stream in self.streams:
-            stream.source.watch()
+    def _room_changed(self, stream: _Stream | None) -> None:
+        """Watch for what there is room for now."""
+        for each in self.streams if stream is None else (stream,):
+            each.source.watch()
 
 
 @dataclass(slots=True)
@@ -227,7 +126,7 @@ class _Departure:
 class _Stream:
     """One direction of one connection."""
 
-    def __init__(self, loop: _Loop, direction: _Direction, source: _Side, target: _Side) -> None:
+    def __init__(self, loop: Loop, direction: _Direction, source: _Side, target: _Side) -> None:
         self.source, self.target, self.direction = source, target, direction
         self.blocked = False
         self.ended = False
@@ -236,6 +135,8 @@ class _Stream:
         self._known: bool | None = None
         self._sifter = Sifter()
         self._buffer = bytearray()
+        # Of the buffer's beginning: bytes that have taken their share of the rate already.
+        self._paid = 0
         self._queue: deque[_Departure] = deque()
         self._waiting_bytes = 0
         self._last_ns = 0
@@ -248,14 +149,14 @@ class _Stream:
         """Whether there is room for more, and the link is whole."""
         cut = self.direction.conditions.cut
         passes = cut is None or (cut == "drop" and self._known is not False)
-        room = self._waiting_bytes < WINDOW_BYTES and not self.direction.full
+        room = self._waiting_bytes < WINDOW_BYTES and not self.direction.rate.full(self)
         return passes and room and not self.ended
 
     def read(self) -> None:
         """Read what there is, and put its batches on their way."""
         received = b""
         try:
-            received = self.source.socket.recv(READ_BYTES)
+            received = self.source.socket.recv(self.direction.rate.chunk_bytes)
         except BlockingIOError:
             return
         except OSError:  # reset: what was read before still goes on
@@ -263,14 +164,14 @@ class _Stream:
         now_ns = time.monotonic_ns()
         if not received:
             self.ended = True
-            self._take(None, now_ns)
+            self._take(None, now_ns, 0)
             return
         buffer = self._buffer
         buffer += received
         if self._known is None:
             self._known = is_session(buffer)
         if self._known is False:
-            self._take(bytes(buffer), now_ns)
+            self._take(bytes(buffer), now_ns, len(buffer))
             buffer.clear()
         begin = 0
         while self._known and len(buffer) >= begin + LENGTH_BYTES:
@@ -278,23 +179,39 @@ class _Stream:
             end = head + int.from_bytes(buffer[begin:head], "little")
             if end > len(buffer):
                 break
-            self._take(bytes(buffer[head:end]), now_ns)
+            self._take(bytes(buffer[head:end]), now_ns, max(end - max(begin, self._paid), 0))
             begin = end
         del buffer[:begin]
+        self._paid = max(self._paid - begin, 0)
+        if self._known and self.direction.conditions.cut is None:
+            self.direction.rate.put(self, len(buffer) - self._paid, now_ns)
+            self._paid = len(buffer)
 
-    def _take(self, batch: bytes | None, now_ns: int) -> None:
-        """Lose, hold or queue a batch, or the end of the stream."""
+    def _take(self, batch: bytes | None, now_ns: int, unpaid_bytes: int) -> None:
+        """Lose, hold or queue a batch, or the end of the stream.
+
+        Of a batch whose beginning came before, only the rest has yet to take its share of the rate.
+        """
         direction = self.direction
         if direction.conditions.cut is not None:
             self._hold(batch)
         elif batch is None:
-            self._queue_up(_Departure(now_ns, memoryview(b"")))
+            self._pass(_Departure(0, memoryview(b"")), now_ns, 0)
         elif not self._known:
             direction.counts.unknown_bytes += len(batch)
-            passed_ns = direction.serialise(len(batch), now_ns)
-            self._queue_up(_Departure(passed_ns + direction.draw_ns(), memoryview(batch)))
+            departure = _Departure(direction.draw_ns(), memoryview(batch))
+            self._pass(departure, now_ns, unpaid_bytes)
         else:
-            self._send_on(batch, now_ns)
+            self._send_on(batch, now_ns, unpaid_bytes)
+
+    def _pass(self, departure: _Departure, now_ns: int, size_bytes: int) -> None:
+        """Queue what is due so long after it has passed at the rate."""
+
+        def passed(at_ns: int) -> None:
+            departure.due_ns += at_ns
+            self._queue_up(departure)
+
+        self.direction.rate.put(self, size_bytes, now_ns, passed)
 
     def _hold(self, batch: bytes | None) -> None:
         if batch is None or not self._known:
@@ -310,12 +227,10 @@ class _Stream:
         elif sifted.batch:
             self._held.append(sifted.batch)
 
-    def _send_on(self, batch: bytes, now_ns: int) -> None:
+    def _send_on(self, batch: bytes, now_ns: int, unpaid_bytes: int) -> None:
         direction = self.direction
         sifted = self._sifter.sift(batch, direction.lose)
         direction.counts.dropped += sifted.lost
-        # A message that is lost takes its share of the rate, as in the simulator.
-        passed_ns = direction.serialise(LENGTH_BYTES + len(batch), now_ns)
         since_ns, chain = now_ns, sifted.chain
         if chain is None:
             delay_ns = direction.draw_ns()
@@ -325,9 +240,10 @@ class _Stream:
             delay_ns, since_ns = chain.delay_ns, chain.since_ns
         if sifted.batch:
             framed = len(sifted.batch).to_bytes(LENGTH_BYTES, "little") + sifted.batch
-            self._queue_up(
-                _Departure(passed_ns + delay_ns, memoryview(framed), sifted.data, since_ns)
-            )
+            departure = _Departure(delay_ns, memoryview(framed), sifted.data, since_ns)
+            self._pass(departure, now_ns, unpaid_bytes)
+        else:  # what is lost takes its share of the rate all the same, as in the simulator
+            direction.rate.put(self, unpaid_bytes, now_ns)
 
     def cut_changed(self) -> None:
         """Put what was held on its way, if the direction is whole again."""
@@ -335,7 +251,7 @@ class _Stream:
             held, self._held = self._held, []
             now_ns = time.monotonic_ns()
             for batch in held:
-                self._take(batch, now_ns)
+                self._take(batch, now_ns, LENGTH_BYTES + len(batch) if batch is not None else 0)
         self.source.watch()
 
     # ------------------------------------------------------------------------------ leaving
@@ -397,7 +313,7 @@ class _Stream:
 class _Side:
     """One of the two sockets of a connection."""
 
-    def __init__(self, loop: _Loop, connection: _Connection, sock: socket.socket) -> None:
+    def __init__(self, loop: Loop, connection: _Connection, sock: socket.socket) -> None:
         self.socket = sock
         self.connection = connection
         self.connected = True
@@ -506,6 +422,7 @@ class _Connection:
         for stream in self.streams.values():
             stream.done = True
             stream.direction.streams.discard(stream)
+            stream.direction.rate.leave(stream)
         for side in self._sides:
             side.close()
 
@@ -556,7 +473,7 @@ class _Listener:
 class _Link:
     """The two directions, and the ports."""
 
-    loop: _Loop
+    loop: Loop
     directions: dict[str, _Direction]
     listeners: list[_Listener] = field(default_factory=list)
     _when_whole: list[Callable[[], None]] = field(default_factory=list)
@@ -571,11 +488,23 @@ class _Link:
         (back,) = (item for name, item in self.directions.items() if name != source)
         return self.directions[source], back
 
+    def conditions_from(self, source: str) -> Conditions:
+        """Those of the direction from a node."""
+        return self.directions[source].conditions
+
+    def stats(self, *, reset: bool) -> Json:
+        """Return what has passed each direction."""
+        counted: Json = {name: item.counts.as_traffic() for name, item in self.directions.items()}
+        if reset:
+            for direction in self.directions.values():
+                direction.counts = _Counts()
+        return counted
+
     def when_whole(self, action: Callable[[], None]) -> None:
         """Have something done when nothing is cut any more."""
         self._when_whole.append(action)
 
-    def apply(self, sets: list[_Change]) -> None:
+    def apply(self, sets: Sequence[Set]) -> None:
         """Change conditions."""
         for item in sets:
             self.directions[item["source"]].apply(item["changes"])
@@ -585,43 +514,6 @@ class _Link:
             actions, self._when_whole = self._when_whole, []
             for action in actions:
                 action()
-
-
-class _Orders:
-    """Requests of the parent."""
-
-    served_ns = 0
-
-    def __init__(self, parent: Parent, link: _Link) -> None:
-        self._parent, self._link = parent, link
-        link.loop.watch(parent.fileno(), select.EPOLLIN, self)
-
-    def ready(self, _events: int) -> None:
-        """Carry out a request; an `EOFError` ends the process."""
-        request = self._parent.receive()
-        try:
-            self._parent.answer(self._answer(request))
-        except DwellError as error:
-            self._parent.answer({"error": str(error)})
-
-    def _answer(self, request: Json) -> Json:
-        link = self._link
-        if request["do"] == "stats":
-            counted = {name: item.counts.as_traffic() for name, item in link.directions.items()}
-            if request["reset"]:
-                for direction in link.directions.values():
-                    direction.counts = _Counts()
-            return {"stats": counted}
-        sets = cast("list[_Change]", request["sets"])
-        for item in sets:  # all faults before anything has changed
-            changed(link.directions[item["source"]].conditions, item["changes"])
-        at_ns = cast("int | None", request["at_ns"]) or 0
-        now_ns = time.monotonic_ns()
-        if at_ns <= now_ns:
-            link.apply(sets)
-            return {"at_ns": now_ns}
-        link.loop.at(at_ns, lambda _: link.apply(sets))
-        return {"at_ns": at_ns}
 
 
 def main() -> None:
@@ -634,42 +526,23 @@ def main() -> None:
         except (DwellError, OSError) as error:
             parent.answer({"error": str(error)})
             return
-        _Orders(parent, link)
+        Orders(parent, link)
         ports = [listener.port for listener in link.listeners]
-        parent.answer({"ports": ports, "scheduling": _come_first()})
+        parent.answer({"ports": ports, "scheduling": come_first()})
         gc.freeze()
         while parent.alive:
             link.loop.turn()
 
 
-def _come_first() -> Scheduling:
-    """Get the CPU as soon as something is due, as far as the system lets this process.
-
-    A real link does not wait for the CPU of a node that it connects; and foreign work is there to
-    slow nodes, not links. Real-time priority does it, where the process may have it. Anybody may
-    ask for short time slices (Linux 6.12), which halve the lateness beside busy threads.
-    """
-    with contextlib.suppress(OSError), open(TIMER_SLACK, "w") as slack:
-        slack.write("1")
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        return "fifo"
-    number = SCHED_SETATTR.get(os.uname().machine)
-    # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period.
-    usual = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, 0, 0, 0, SLICE_NS, 0, 0)
-    done = number is not None and ctypes.CDLL(None).syscall(number, 0, usual, 0) == 0
-    return "short slices" if done else "usual"
-
-
 def _link(settings: _Settings) -> _Link:
     if settings["cpus"] is not None:
         os.sched_setaffinity(0, settings["cpus"])
-    loop = _Loop()
-    seed, queue_bytes = settings["seed"], settings["queue_bytes"]
+    loop = Loop()
+    seed, queueing = settings["seed"], (settings["queue_bytes"], settings["sharing"])
     link = _Link(
         loop,
         {
-            name: _Direction(loop, (seed, index), queue_bytes)
+            name: _Direction(loop, (seed, index), *queueing)
             for index, name in enumerate(settings["nodes"])
         },
     )

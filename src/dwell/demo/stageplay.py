@@ -6,81 +6,29 @@ controller makes of it is the controller's.
 
 from __future__ import annotations
 
-import os
-import signal
 import socket
 import subprocess
-import sys
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from dwell.demo.link import Forward, LinkProcess
 from dwell.errors import LiveError
-from dwell.live.leash import OWNER
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import PORTS_PER_ROLE, roles, wire
-from dwell.model import (
-    Constant,
-    Endpoint,
-    Host,
-    Link,
-    LinkDisturbance,
-    NodeDisturbance,
-    Problem,
-)
-from dwell.model.document import to_document
+from dwell.model import Endpoint, Host, NodeDisturbance, Problem
+from dwell.model.scenario import Disturbance
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions
+from dwell.testbed.processes import Processes, expected
+from dwell.testbed.timeline import Change, link_changes, link_with, threads_on
 
-__all__ = ["Change", "Stageplay", "changes_of", "on_this_machine"]
+__all__ = ["Stageplay", "on_this_machine"]
 
 #: Where ports are looked for; below what the kernel gives out by itself.
 PORTS = range(10_000, 32_000, 500)
-STOP_S = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """Something that begins or ends in a scenario.
-
-    Parameters
-    ----------
-    at_s : float
-    item : Disturbance
-    begins : bool
-    """
-
-    at_s: float
-    item: NodeDisturbance | LinkDisturbance
-    begins: bool
-
-
-def changes_of(problem: Problem, scenario: str) -> list[Change]:
-    """Return what a scenario's disturbances do, in the order of time.
-
-    Raises
-    ------
-    LiveError
-        If it has something that links and CPUs of this machine cannot be made to do.
-    """
-    found = []
-    for item in problem.scenario(scenario):
-        if item.down or item.episodes is not None or item.ramp_s:
-            raise LiveError(
-                f"scenario {scenario!r}: what is down, comes in episodes or has a ramp is not "
-                "played here; use at_s and for_s"
-            )
-        found.append(Change(item.at_s, item, begins=True))
-        if item.at_s + item.for_s < float("inf"):
-            found.append(Change(item.at_s + item.for_s, item, begins=False))
-    return sorted(found, key=lambda change: change.at_s)
 
 
 def on_this_machine(problem: Problem) -> Problem:
@@ -159,20 +107,26 @@ class Stageplay:
     ) -> None:
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
         self.world = folder / "world"
-        own = {"DWELL_WORLD": str(self.world), OWNER: str(os.getpid())}
-        self.environment = {**own, **(environment or {})}
-        self.cell = folder / "cell.yaml"
         self.links: dict[frozenset[str], LinkProcess] = {}
         self.burners: dict[str, Burner] = {}
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes = Processes(
+            [problem],
+            folder,
+            environment={"DWELL_WORLD": str(self.world), **(environment or {})},
+            cpus=cpus,
+        )
+        self._on: list[Disturbance] = []
         self._stack = ExitStack()
+
+    @property
+    def processes(self) -> dict[str, subprocess.Popen[bytes]]:
+        """Agents and controller, by name."""
+        return self._processes.running
 
     def __enter__(self) -> Stageplay:
         """Start everything."""
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            text = yaml.safe_dump(to_document(self.problem), sort_keys=False)
-            self.cell.write_text(text, encoding="utf-8")
+            self._processes.write()
             self._start_links()
             for cpu in sorted(set(self.cpus.values())):
                 burner = Burner([cpu])
@@ -209,93 +163,46 @@ class Stageplay:
             self.links[pair] = link
 
     def _usual(self, one: str, other: str) -> dict[tuple[str, str], Conditions]:
-        links = self.problem.fabric.links
+        links = self.problem.fabric.links.values()
         return {
-            (link.source, link.target): Conditions(
-                delay_ms=link.delay_ms, rate_mbps=link.rate_mbps, loss=link.loss
-            )
-            for link in links.values()
+            (link.source, link.target): link_with(link, ())
+            for link in links
             if {link.source, link.target} == {one, other}
         }
 
     def expected(self, node: str) -> list[str]:
         """Return the processes of a node that its agent starts, and the agent."""
-        return [
-            role.who
-            for role in roles(self.problem)
-            if role.node == node and role.kind != "controller"
-        ]
+        return expected(self.problem, node)
 
     def start_agent(self, node: str) -> None:
         """Start a node's agent, or start it again."""
-        arguments = ["agent", "--node", node, "--state", str(self.folder / node)]
-        self._start(f"agent@{node}", [*arguments, *self._on_cpus(node)])
+        self._processes.start_agent(node)
 
     def start_controller(self) -> None:
         """Start the controller, or start it again."""
-        node = self.problem.controller_node
-        arguments = ["controller", "--out", str(self.folder / "runs")]
-        self._start(f"controller@{node}", [*arguments, *self._on_cpus(node)])
-
-    def _on_cpus(self, node: str) -> list[str]:
-        return ["--cpus", str(self.cpus[node])] if node in self.cpus else []
-
-    def _start(self, who: str, arguments: Sequence[str]) -> None:
-        command = [sys.executable, "-m", "dwell", *arguments, "--cell", str(self.cell)]
-        with (self.folder / f"{who}.log").open("ab") as log:
-            self.processes[who] = subprocess.Popen(  # noqa: S603 - our own command
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={**os.environ, **self.environment},
-                process_group=0,
-            )
+        self._processes.start_controllers()
 
     def apply(self, change: Change) -> None:
         """Have links and CPUs do what begins or ends."""
-        item = change.item
+        item, before = change.item, self._on
+        self._on = [other for other in before if other is not item]
+        if change.begins:
+            self._on.append(item)
         if isinstance(item, NodeDisturbance):
-            self.burners[item.node].set(item.stress_threads if change.begins else 0)
+            burner = self.burners[item.node]
+            nodes = [node for node, its in self.burners.items() if its is burner]
+            burner.set(sum(threads_on(node, self._on) for node in nodes))
             return
-        link = self.links[frozenset((item.source, item.target))]
         usual = self.problem.fabric.links[item.link]
-        if not change.begins:
-            disturbed: dict[str, Any] = {"rate_mbps": usual.rate_mbps, "loss": usual.loss}
-            disturbed["add_delay_ms"] = Constant(0.0)
-        else:
-            disturbed = dict(_disturbed(usual, item))
-        link.set(item.source, item.target, **disturbed)
+        link = self.links[frozenset((item.source, item.target))]
+        link.set(item.source, item.target, **link_changes(usual, before, self._on))
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
-        self._end([who for who in self.processes if who.startswith("controller@")], 30.0)
-
-    def _end(self, names: Sequence[str], patience_s: float) -> None:
-        running = [self.processes.pop(who) for who in names]
-        for process in running:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-        deadline = time.monotonic() + patience_s
-        for process in running:
-            try:
-                process.wait(max(deadline - time.monotonic(), 0.1))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        self._processes.stop_controllers()
 
     def close(self) -> None:
         """End every process, links and burners last."""
-        self.stop_controller()
-        self._end(list(self.processes), STOP_S)
+        self._processes.stop()
         self._stack.close()
         remove_orphans()
-
-
-def _disturbed(usual: Link, item: LinkDisturbance) -> Iterator[tuple[str, object]]:
-    if item.add_delay_ms is not None:
-        yield "add_delay_ms", item.add_delay_ms
-    if item.loss:
-        yield "loss", 1 - (1 - usual.loss) * (1 - item.loss)
-    if item.rate_mbps is not None:
-        yield "rate_mbps", min(usual.rate_mbps, item.rate_mbps)

@@ -231,10 +231,11 @@ def _stretch(execution: Execution, node: Node) -> float:
     """Factor by which a CPU job takes longer where the node has fewer cores than it has threads.
 
     Only a `fair` node shares its cores among threads; the others give the job the whole node.
+    What the background takes of the cores comes on top.
     """
     if node.scheduler != "fair":
-        return 1.0
-    return max(1.0, execution.threads / node.cores)
+        return node.cores / node.spare
+    return max(1.0, execution.threads / node.spare)
 
 
 def _throttled(times: Floats, execution: Execution, node: Node) -> Floats:
@@ -246,7 +247,7 @@ def _throttled(times: Floats, execution: Execution, node: Node) -> Floats:
     if quota is None:
         return times
     rate = min(execution.threads, node.cores)
-    full_ms = quota.cpu * quota.period_ms / rate
+    full_ms = node.budget_ms / rate
     if full_ms >= quota.period_ms:
         return times
     # A job that just fills its last bucket must not wait for another one by a rounding error.

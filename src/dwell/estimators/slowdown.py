@@ -1,8 +1,8 @@
 """How much foreign threads slow a job on the CPU, and how many explain a slowdown.
 
 The slowdown is over a job alone on its node, as the profile has it. On a `fair` node a job of k
-threads on c cores beside s foreign threads runs at min(1, c / (k + s)) of its speed; on the others
-at c / (c + s).
+threads beside s foreign threads runs at min(1, c / (k + s)) of its speed, c being the cores that
+the background leaves; on the others at c / (c + s) of what it has alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ def slowdown(node: Node, job_threads: int, foreign_threads: float) -> float:
     """Return the factor by which a job takes longer; at least 1."""
     if node.scheduler != "fair":
         return (node.cores + foreign_threads) / node.cores
-    return max(1.0, (job_threads + foreign_threads) / max(job_threads, node.cores))
+    return max(1.0, (job_threads + foreign_threads) / max(job_threads, node.spare))
 
 
 def explaining_threads(node: Node, job_threads: int, slowed: float) -> float:
@@ -25,4 +25,4 @@ def explaining_threads(node: Node, job_threads: int, slowed: float) -> float:
         return 0.0
     if node.scheduler != "fair":
         return (slowed - 1.0) * node.cores
-    return slowed * max(job_threads, node.cores) - job_threads
+    return slowed * max(job_threads, node.spare) - job_threads

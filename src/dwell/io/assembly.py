@@ -203,7 +203,8 @@ class Assembly:
                 scheduler=entry.scheduler,
                 accelerators=entry.accelerators,
                 bursts=bursts,
-                quota=Quota(quota.cpu, quota.period_ms) if quota else None,
+                quota=Quota(quota.cpu, quota.period_ms, quota.slack_ms or 0.0) if quota else None,
+                background=entry.background,
             ),
         )
 

@@ -296,6 +296,11 @@ class QuotaEntry(Entry):
     period_ms: Annotated[float, Number(bounds.QUOTA_PERIOD_MS)] = Field(
         description="Period after which the budget is filled again, ms."
     )
+    slack_ms: Annotated[float, Number(bounds.QUOTA_SLACK_MS)] | None = Field(
+        None,
+        description="Run time that is kept beyond the period when nothing runs, ms; default 0. "
+        "Linux keeps 1.",
+    )
 
 
 class BurstsEntry(Entry):
@@ -339,6 +344,10 @@ class NodeEntry(Entry):
         None, description="How many accelerators of each kind it has, as `{gpu: 1}`."
     )
     quota: QuotaEntry | None = Field(None, description="CPU bandwidth limit; none by default.")
+    background: Annotated[float, Number(bounds.BACKGROUND)] | None = Field(
+        None,
+        description="Cores that others than the jobs always take, in small pieces; default 0.",
+    )
     bursts: NodeBurstsEntry | None = Field(None, description="Foreign work, in every scenario.")
 
 
@@ -636,6 +645,11 @@ class ControllerEntry(Entry):
         None,
         description="Periods without a completion after which the guard moves to a fallback; "
         "default 3.",
+    )
+    probe_cycles: Annotated[int, Number(bounds.PROBE_CYCLES)] | None = Field(
+        None,
+        description="Cycles that must complete through another placement, too, before the guard's "
+        "is left for it; default 30.",
     )
     fallbacks: list[str] | None = Field(
         None, description="Candidates that the guard may move to, best first; none: no guard."

@@ -26,6 +26,7 @@ from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
     ARRIVAL,
     BASE,
+    BEHIND_NS,
     BUSY,
     CANDIDATE_0,
     CELL_MASK,
@@ -129,7 +130,7 @@ from dwell.kernels.layout import (
     Tables,
 )
 from dwell.kernels.links import lose, send, slot_row
-from dwell.kernels.nodes import admit, job_row, key_row, leave, mark, refill, set_speed, tick
+from dwell.kernels.nodes import admit, draw_quota, job_row, key_row, leave, mark, set_speed, tick
 
 __all__ = ["advance"]
 
@@ -174,7 +175,7 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
                 own += received
             elif whose == shadow:
                 extra += received
-        out[cell, row, 0, node] = float(s.servers[server, BUSY])
+        out[cell, row, 0, node] = s.servers[server, BUSY] + s.servers_f[server, BEHIND_NS]
         out[cell, row, 1, node] = own
         out[cell, row, 2, node] = extra
 
@@ -310,7 +311,7 @@ def _quota(s: Tables, server: int, now: int) -> None:
     if s.servers[server, QUOTA_T] == now:
         s.servers[server, QUOTA_T] = -1
         tick(s, server, now)
-        refill(s, server, now)
+        draw_quota(s, server, now)
         mark(s, server)
 
 

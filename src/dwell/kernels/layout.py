@@ -152,11 +152,13 @@ SOURCE, TARGET, N_FLOW = range(3)
     PERIOD,
     THROTTLED,
     QUOTA_T,
+    POOL_NS,
+    SLACK_NS,
     N_SERVER,
-) = range(22)
+) = range(24)
 
 # servers, float64
-VIRTUAL, SPEED, N_SERVER_F = range(3)
+VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, N_SERVER_F = range(6)
 
 # hops
 LINK, PAYLOAD, N_HOP = range(3)

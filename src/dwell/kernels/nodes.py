@@ -19,7 +19,9 @@ from dwell.kernels.heaps import (
     push_waiting,
 )
 from dwell.kernels.layout import (
+    BACKGROUND,
     BASE,
+    BEHIND_NS,
     BUSY,
     CELL_MASK,
     CELL_SHIFT,
@@ -45,6 +47,7 @@ from dwell.kernels.layout import (
     NEXT_T,
     PERIOD,
     PERIOD_NS,
+    POOL_NS,
     PRIORITY,
     QUOTA_NS,
     QUOTA_T,
@@ -53,6 +56,8 @@ from dwell.kernels.layout import (
     SCHEDULER,
     SERVER,
     SITE,
+    SLACK_NS,
+    SPARE,
     SPEED,
     STARTED,
     STRESS,
@@ -69,7 +74,6 @@ __all__ = [
     "job_row",
     "leave",
     "mark",
-    "refill",
     "schedule",
     "set_speed",
     "tick",
@@ -107,6 +111,11 @@ def _account(s: Tables, server: int, now: int) -> int:
     """Bring a server's busy time up to now; returns the time since it last was."""
     elapsed = now - s.servers[server, LAST]
     busy = s.servers[server, USED] + s.servers[server, STRESS]
+    background = s.servers_f[server, BACKGROUND]
+    if background > 0.0 and elapsed > 0 and s.servers[server, DOWN] == 0:
+        if s.servers[server, QUOTA_NS] == 0:
+            background = min(background, max(s.servers[server, CORES] - busy, 0))
+        s.servers_f[server, BEHIND_NS] += elapsed * background
     if elapsed > 0 and busy > 0 and s.servers[server, DOWN] == 0:
         spent = elapsed * min(busy, s.servers[server, CORES])
         if s.servers[server, THROTTLED] == 0:
@@ -121,14 +130,30 @@ def refill(s: Tables, server: int, now: int) -> None:
     """Open or shut a server by its quota; its clock must be up to date.
 
     While anything runs there is an event at every boundary of a period and wherever the quota is
-    used up, so nothing that was spent belongs to two periods.
+    used up, so nothing that was spent belongs to two periods. With a slack the quota fills a pool,
+    and what runs draws all of it whenever it has used up what it had.
     """
     period = now // s.servers[server, PERIOD_NS]
+    filled = LEFT_NS if s.servers[server, SLACK_NS] == 0 else POOL_NS
     if period > s.servers[server, PERIOD]:
         s.servers[server, PERIOD] = period
-        s.servers[server, LEFT_NS] = s.servers[server, QUOTA_NS]
+        s.servers[server, filled] = s.servers[server, QUOTA_NS]
     s.servers[server, THROTTLED] = 1 if s.servers[server, LEFT_NS] <= 0 else 0
     set_speed(s, server)
+
+
+@phase
+def draw_quota(s: Tables, server: int, now: int) -> None:
+    """Draw on the pool where what was drawn before is used up; its clock must be up to date.
+
+    Only after all changes of this instant: what ends now draws nothing.
+    """
+    refill(s, server, now)
+    busy = s.servers[server, USED] + s.servers[server, STRESS]
+    if s.servers[server, LEFT_NS] <= 0 and busy > 0 and s.servers[server, DOWN] == 0:
+        s.servers[server, LEFT_NS] += s.servers[server, POOL_NS]
+        s.servers[server, POOL_NS] = 0
+        refill(s, server, now)
 
 
 @phase
@@ -138,11 +163,19 @@ def _announce_quota(s: Tables, server: int, now: int) -> None:
     busy = s.servers[server, USED] + s.servers[server, STRESS]
     if busy == 0 or s.servers[server, DOWN] != 0:
         s.servers[server, QUOTA_T] = -1
+        # Beyond the slack, what was drawn goes back.
+        slack, quota = s.servers[server, SLACK_NS], s.servers[server, QUOTA_NS]
+        if slack > 0 and s.servers[server, LEFT_NS] > slack:
+            pool = s.servers[server, POOL_NS] + s.servers[server, LEFT_NS] - slack
+            s.servers[server, POOL_NS] = min(pool, quota)
+            s.servers[server, LEFT_NS] = slack
         return
     t = (s.servers[server, PERIOD] + 1) * s.servers[server, PERIOD_NS]
     if s.servers[server, THROTTLED] == 0:
         rate = min(busy, s.servers[server, CORES])
         t = min(t, now + (s.servers[server, LEFT_NS] + rate - 1) // rate)
+    elif s.servers[server, POOL_NS] > 0:
+        t = now
     if t != s.servers[server, QUOTA_T]:
         s.servers[server, QUOTA_T] = t
         # The item of a change of a node is 0; that of a server's quota is its row, from 1.
@@ -162,15 +195,16 @@ def tick(s: Tables, server: int, now: int) -> None:
 def set_speed(s: Tables, server: int) -> None:
     """Set the common speed after threads, stress or quota changed; the clock must be up to date.
 
-    fair: min(1, c / (K + s)); fifo and priority: c / (c + s); any: 0 while the quota is used up.
+    With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
+    c' / (c + s); any: 0 while the quota is used up.
     """
-    cores = s.servers[server, CORES]
+    spare = s.servers_f[server, SPARE]
     stress = s.servers[server, STRESS]
     if s.servers[server, SCHEDULER] == FAIR:
         load = s.servers[server, USED] + stress
-        s.servers_f[server, SPEED] = 1.0 if load <= cores else cores / load
+        s.servers_f[server, SPEED] = 1.0 if load <= spare else spare / load
     else:
-        s.servers_f[server, SPEED] = 1.0 if stress == 0 else cores / (cores + stress)
+        s.servers_f[server, SPEED] = spare / (s.servers[server, CORES] + stress)
     if s.servers[server, THROTTLED] != 0:
         s.servers_f[server, SPEED] = 0.0
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
+from dwell.live.group import ControlGroup
 from dwell.live.messages import Carried, Load, encode
 from dwell.live.role import Place, Pulse
 from dwell.live.supervision import Supervisor
@@ -40,14 +41,27 @@ class CpuCount:
     ----------
     cpus : iterable of int, optional
         Those that the node has; all that this process may use where None.
+    group : ControlGroup, optional
+        Counts only what the processes of a control group have used of any CPU.
     """
 
-    def __init__(self, cpus: Iterable[int] | None = None) -> None:
+    def __init__(
+        self, cpus: Iterable[int] | None = None, group: ControlGroup | None = None
+    ) -> None:
         own = psutil.Process().cpu_affinity() or list(range(psutil.cpu_count() or 1))
         self.cpus = tuple(own if cpus is None else cpus)
+        self._group = group
 
     def busy_ns(self) -> int:
-        """Since the machine was started, with the kernel's resolution of 10 ms."""
+        """Since the machine was started, with the kernel's resolution of 10 ms; a group's exactly.
+
+        Raises
+        ------
+        LiveError
+            If the group is gone.
+        """
+        if self._group is not None:
+            return self._group.used_ns()
         times = psutil.cpu_times(percpu=True)
         busy_s = 0.0
         for cpu in self.cpus:
@@ -133,6 +147,7 @@ class Agent:
         self._gather_ns = self._beats_ns = 0
         self._beat_prefix = place.keys.relay(place.keys.beat("", "").removesuffix("/"))
         self._relay_prefix = f"{place.keys.root}/relay/"
+        self._read: dict[str, int] = {}
         self._spent: dict[str, int] = {"own": 0, "shadow": 0}
 
     def subscriptions(self) -> Iterable[str]:
@@ -198,15 +213,16 @@ class Agent:
 
     def _report(self, now_ns: int) -> None:
         place = self.place
-        shadow = self._grown("shadow", lambda who: who.endswith(".shadow"))
-        own = self._grown("own", lambda who: not who.endswith(".shadow"))
+        processes = {who: round(s * 1e9) for who, s in self.supervisor.cpu_seconds().items()}
+        for who, cpu_ns in processes.items():
+            # One that was started again counts from 0 again.
+            before = self._read.get(who, 0)
+            grown = cpu_ns - before if cpu_ns >= before else cpu_ns
+            self._spent["shadow" if who.endswith(".shadow") else "own"] += grown
+        self._read |= processes
         busy_ns = self._cpu.busy_ns()
         used = -1.0 if self._accelerator is None else self._accelerator.value()
-        load = Load(place.node, place.life, now_ns, busy_ns, own, shadow, used)
+        spent = busy_ns, self._spent["own"], self._spent["shadow"]
+        each = *processes.items(), (place.who, time.process_time_ns())
+        load = Load(place.node, place.life, now_ns, *spent, used, each)
         place.put_twice(place.keys.load(place.node), encode(load))
-
-    def _grown(self, what: str, select: Callable[[str], bool]) -> int:
-        """CPU time of processes; it never falls, though processes die."""
-        spent = round(self.supervisor.cpu_seconds(select) * 1e9)
-        self._spent[what] = max(self._spent[what], spent)
-        return self._spent[what]

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, TypeAlias
 
-from dwell.control import ClosedWindow, Controller
+from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.messages import (
     Accepted,
@@ -22,13 +22,13 @@ from dwell.live.messages import (
     Order,
     Restored,
     Snapshot,
-    Stamp,
+    Stamped,
     decode,
     encode,
 )
 from dwell.live.role import REPEATED_NS, Place, Pulse
 from dwell.live.transport.protocol import Sample
-from dwell.live.windows import LiveWindows, Resume, Rows
+from dwell.live.windows import LiveWindow, LiveWindows, Resume, Rows
 from dwell.live.wiring import roles
 
 __all__ = ["Cell", "Recorder"]
@@ -71,6 +71,7 @@ class _Move:
     awaited: dict[int, str] = field(default_factory=dict)
     order: Order | None = None
     sent_ns: int = 0
+    refused: str = ""
 
 
 class Cell:
@@ -96,7 +97,7 @@ class Cell:
         # what they have heard themselves: it is as good when it comes late, by way of others.
         agent = place.relay, f"agent@{place.relay}"
         self.pulse = Pulse(place, lambda: (True, ""), hears=[agent], every=BEAT)
-        self._gathered = place.keys.gathered()
+        self._keys = place.keys
         self.held: Accepted | None = None
         self.refused = ""
         self.pinned = ""
@@ -106,6 +107,8 @@ class Cell:
         self._ask_ns = 0
         self.guard_moves = self.migrations = 0
         self._window: dict[str, Any] = {}
+        # Whether a window has closed that is not recorded.
+        self._unwritten = False
 
     # ------------------------------------------------------------------------ hearing
 
@@ -116,7 +119,7 @@ class Cell:
         yield from (keys.done("*"), keys.ended(), keys.accepted(), keys.load("*"))
         yield from (keys.gathered(), keys.stamped())
         yield keys.restored()
-        yield keys.ask()
+        yield from (keys.ask(), keys.look())
 
     def receive(self, sample: Sample, now_ns: int) -> int | None:
         """Take a message in; returns when a window closes, or an order is sent again."""
@@ -129,21 +132,22 @@ class Cell:
         return again_ns if due_ns is None else min(due_ns, again_ns)
 
     def _take(self, sample: Sample, now_ns: int) -> None:
-        if sample.key == self._gathered:
+        keys = self._keys
+        word = keys.word(sample.key)
+        if word == "gathered":
             for one in self.place.around(sample):
                 self._take(one, now_ns)
             return
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
             if beat is not None:
-                self._compare_clocks(beat, now_ns, direct="/detour/" not in sample.key)
+                self._compare_clocks(beat, now_ns, direct=keys.came_directly(sample.key))
             return
         windows = self.windows
-        word = sample.key.removeprefix(self.place.keys.root + "/").removeprefix("detour/")
         try:
-            match word.partition("/")[0]:
+            match word:
                 case "stamped":
-                    self._stamped(decode(sample.payload, Stamp), now_ns)
+                    self._stamped(decode(sample.payload, Stamped), now_ns)
                 case "done" | "ended" if windows is not None:
                     windows.completed(decode(sample.payload, Completion), now_ns)
                 case "load" if windows is not None:
@@ -154,6 +158,9 @@ class Cell:
                     self._restored(decode(sample.payload, Restored), now_ns)
                 case "ask":
                     self._asked(decode(sample.payload, Ask), now_ns)
+                case "look":
+                    looks = Ask(decode(sample.payload, Ask).number, "status")
+                    self._asked(looks, now_ns)
         except LiveError as error:
             self.place.complain(error)
 
@@ -165,10 +172,11 @@ class Cell:
             for heard in beat.heard:
                 self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
-    def _stamped(self, stamp: Stamp, now_ns: int) -> None:
+    def _stamped(self, stamp: Stamped, now_ns: int) -> None:
         held = self.held
         if self.windows is not None:
             self.windows.stamped(stamp, now_ns)
+            self.windows.measured(stamp.run, stamp.intervals)
         if held is None or stamp.run < held.run or (stamp.run, stamp.term) <= (held.run, held.term):
             return
         move = self._move
@@ -185,8 +193,11 @@ class Cell:
         held = self.held
         before = held.placement if held is not None else placement
         self.held = Accepted(0, self.name, "", run, term, placement, 0, by_guard)
+        self._unwritten = True
         if not by_guard:
             self._move = None
+            if self.windows is not None:
+                self.windows.carried_out()
             self.migrations += 1
             if placement != self.controller.incumbent:
                 # A person's choice, not the policy's.
@@ -195,7 +206,7 @@ class Cell:
             return
         self._move = None
         if self.windows is not None:
-            self.windows.refused()
+            self.windows.refused(f"the placement became {placement} meanwhile")
         self.guard_moves += 1
         self.controller.adopt(placement, left=before)
 
@@ -227,6 +238,7 @@ class Cell:
             return
         self.refused = answer.refused
         if answer.refused:
+            move.refused = answer.refused
             if not answer.refused.startswith(("not ready", "not proven")):
                 self._give_up()
         elif move.phase == "fork":
@@ -249,8 +261,8 @@ class Cell:
         fraction = self.controller.shadow_fraction
         return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
 
-    def _begin(self, name: str, now_ns: int) -> None:
-        """Begin a migration."""
+    def _begin(self, name: str, now_ns: int, *, decided: bool = False) -> None:
+        """Begin a migration, that the policy has decided or somebody asked for."""
         held = self.held
         if held is None:
             return
@@ -264,7 +276,7 @@ class Cell:
         self._move = _Move(name, now_ns, "fork" if forks else "order", forks)
         self.refused = ""
         if self.windows is not None:
-            self.windows.ordered()
+            self.windows.ordered(decided=decided)
         self._push(self._move, now_ns)
 
     def _push(self, move: _Move, now_ns: int) -> None:
@@ -299,6 +311,7 @@ class Cell:
         del move.awaited[restored.number]
         if restored.failed:
             self.place.complain(LiveError(restored.failed))
+            move.refused = restored.failed
             self._give_up()
         elif not move.awaited:
             move.phase, move.order = "order", None
@@ -311,8 +324,9 @@ class Cell:
         if held is None:
             return
         self.controller.resume(held.placement, fallback=held.fallback)
+        self._unwritten = True
         if self.windows is not None:
-            self.windows.refused()
+            self.windows.refused((move.refused if move is not None else "") or "no answer")
         if move is not None and move.forks:
             self._send(self._order(""))
 
@@ -322,11 +336,14 @@ class Cell:
         """Close the windows that are due, push a migration on, beat; returns what is due next."""
         windows = self.windows
         due_ns = None
+        unwritten = self._unwritten
         while windows is not None:
             due_ns = windows.due_ns(now_ns)
             if due_ns is None or due_ns > now_ns:
                 break
             self._close(windows, now_ns)
+        if unwritten:
+            self.write()
         move = self._move
         if move is not None:
             if now_ns - move.since_ns > PATIENCE_NS:
@@ -342,6 +359,9 @@ class Cell:
             wakes.append(due_ns)
         if self._move is not None:
             wakes.append(self._move.sent_ns + RESEND_NS)
+        if self._unwritten:
+            # At once, but after all that has been due before: no order waits for a disk.
+            wakes.append(now_ns)
         return min(wakes)
 
     def _hello(self) -> Order:
@@ -350,6 +370,8 @@ class Cell:
     def _close(self, windows: LiveWindows, now_ns: int) -> None:
         """Close a window and act on what the policy makes of it."""
         closed = windows.close(unix_ns=time.time_ns())
+        self._unwritten = True
+        windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
         held = self.held
         if self._move is not None:
             # The order before has not come about within a whole window.
@@ -358,20 +380,25 @@ class Cell:
         last = windows.last
         if held is None or last is None or 2 * last.heard < self.place.problem.window_cycles:
             self.controller.miss()
-            self._recorder.append(windows.rows())
             return
         wanted = self.controller.close(closed, proven=held.proven or None)
-        rows = windows.rows()
-        self._window = self._shown(last.number, last.cycles[0].placement, closed)
+        self._window = self._shown(last)
         target = self._allowed(wanted)
         if self.place.problem.live.mode == "advise" and not self.pinned:
             target = held.placement
         if target != wanted:
             self.controller.resume(held.placement, fallback=held.fallback)
+            if self.place.problem.live.mode == "control":
+                pinned = f"pinned to {self.pinned}" if self.pinned else ""
+                windows.overruled(pinned or f"{', '.join(sorted(self.drained))} drained")
         if target != held.placement:
-            self._begin(target, now_ns)
-        # Written last: no order waits for a disk.
-        self._recorder.append(rows, origin_ns=windows.origin_ns)
+            self._begin(target, now_ns, decided=target == wanted)
+
+    def write(self) -> None:
+        """Record the windows that have closed since the last time."""
+        self._unwritten = False
+        if self.windows is not None:
+            self._recorder.append(self.windows.rows(), origin_ns=self.windows.origin_ns)
 
     def _allowed(self, wanted: str) -> str:
         """Return what people let the policy have."""
@@ -390,15 +417,15 @@ class Cell:
         order = (*self.place.problem.controller.fallbacks, *candidates)
         return next((name for name in order if clear(name)), wanted)
 
-    def _shown(self, number: int, placement: str, closed: ClosedWindow) -> dict[str, Any]:
+    def _shown(self, last: LiveWindow) -> dict[str, Any]:
         """Return the last window as people look at it."""
         log, names = self.controller.log, tuple(self.place.problem.candidates)
         l95_ms, violation_rate, cost = log.seen[-1]
         decision = dict(zip(log.columns(names), log.decisions[-1], strict=False))
-        used = self.controller.utilisation(closed)[0].tolist()
+        used = last.used[0].tolist()
         return {
-            "number": number,
-            "placement": placement,
+            "number": last.number,
+            "placement": last.cycles[0].placement,
             "l95_ms": l95_ms,
             "violation_rate": violation_rate,
             "cost": cost,

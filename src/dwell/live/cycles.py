@@ -8,9 +8,9 @@ another node of which nothing is known is taken to have been lost.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +22,7 @@ from dwell.model import Problem
 __all__ = ["Ledger", "LiveCycle"]
 
 Ints: TypeAlias = NDArray[np.int64]
+Row: TypeAlias = tuple[object, ...]
 
 UNKNOWN = -1
 #: Shadow completions remembered of one cycle.
@@ -30,9 +31,18 @@ MAX_SHADOWS = 16
 SHADOW, REPLACED = "shadow", "replaced"
 
 
-@dataclass(eq=False, slots=True)
-class LiveCycle:
+class Shift(msgspec.Struct, frozen=True, gc=False):
+    """What takes a node's instants to the stamper's clock, and how far off that may be."""
+
+    by_ns: int
+    bound_ns: int
+
+
+class LiveCycle(msgspec.Struct, eq=False, gc=False):
     """One cycle of a live run.
+
+    A controller remembers tens of thousands. The garbage collector, which stops everything, need
+    not look at them: they are in no circle, and what they hold is none of its business either.
 
     Parameters
     ----------
@@ -50,9 +60,11 @@ class LiveCycle:
     ----------
     stamped_ns : int or None
         When its stamp was heard, on the controller's clock.
-    reports : dict of str to (Completion, int or None)
-        By sink, with the instant it was heard.
-    shadows : list of Completion
+    reports : dict of str to Completion
+        By sink.
+    heard_ns : dict of str to int
+        When they were heard, where that is known.
+    shadows : tuple of Completion
     replaced : dict of str to Completion
         By task where a newer cycle took its place.
     latency_ns : int
@@ -63,6 +75,8 @@ class LiveCycle:
         Of the error of its latency, by the clocks.
     interval_ns : int or None
         From its stamp to its last completion, as both arrived at the controller.
+    stamper_interval_ns : int or None
+        From its release to its last completion, by the stamper's clock alone.
     row : int
         In the record; -1 while it is in no closed window.
     close_ns : int or None
@@ -78,18 +92,20 @@ class LiveCycle:
     origin_ns: int
     heard: bool
     stamped_ns: int | None = None
-    reports: dict[str, tuple[Completion, int | None]] = field(default_factory=dict)
-    shadows: list[Completion] = field(default_factory=list)
-    replaced: dict[str, Completion] = field(default_factory=dict)
+    reports: dict[str, Completion] = {}
+    heard_ns: dict[str, int] = {}
+    shadows: tuple[Completion, ...] = ()
+    replaced: dict[str, Completion] = {}
     latency_ns: int = NEVER_NS
     parts_ns: tuple[int, int, int] | None = None
     bound_ns: int = 0
     interval_ns: int | None = None
+    stamper_interval_ns: int | None = None
     row: int = -1
     window: int | None = None
     close_ns: int | None = None
     outcome: str = ""
-    shifts: dict[str, tuple[int, int]] = field(default_factory=dict)
+    shifts: dict[str, Shift] = {}
 
     @classmethod
     def of(cls, stamp: Stamp, origin_ns: int) -> LiveCycle:
@@ -120,20 +136,22 @@ class LiveCycle:
         if completion.outcome == SHADOW:
             new = len(self.shadows) < MAX_SHADOWS and completion not in self.shadows
             if new:
-                self.shadows.append(completion)
+                self.shadows += (completion,)
             return new
         if completion.outcome == REPLACED:
             return self.replaced.setdefault(completion.sink, completion) is completion
         if completion.sink in self.reports:
             return False
-        self.reports[completion.sink] = completion, at_ns
+        self.reports[completion.sink] = completion
+        if at_ns is not None:
+            self.heard_ns[completion.sink] = at_ns
         return True
 
     @property
     def actuated(self) -> bool:
         """Whether all its commands were applied, as far as is known."""
         reports = self.reports.values()
-        return bool(reports) and all(done.outcome == "actuated" for done, _ in reports)
+        return bool(reports) and all(done.outcome == "actuated" for done in reports)
 
     def missed(self, deadline_ns: int) -> bool:
         """Whether it was later than D, or unfinished when its window closed."""
@@ -173,17 +191,26 @@ class Ledger:
         """Whether every sink has reported a cycle."""
         return len(cycle.reports) == len(self.sinks)
 
-    def settle(self, cycle: LiveCycle) -> None:
-        """Work out latency and parts of a cycle that is complete."""
+    def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
+        """Work out latency and parts of a cycle that is complete.
+
+        Parameters
+        ----------
+        cycle : LiveCycle
+        most_ns : int, optional
+            Leave it for later where the clocks' bound is above that; the bound may tighten.
+        """
         if cycle.latency_ns < NEVER_NS or not self.complete(cycle):
             return
         reports = cycle.reports.values()
-        ends = [(self._since_origin(cycle, done.node, done.done_ns), done) for done, _ in reports]
+        ends = [(self._since_origin(cycle, done.node, done.done_ns), done) for done in reports]
         done_ns, last = max(ends, key=lambda pair: pair[0])
-        heard_ns = [at_ns for _, at_ns in reports if at_ns is not None]
-        if cycle.stamped_ns is not None and len(heard_ns) == len(reports):
-            cycle.interval_ns = max(max(heard_ns) - cycle.stamped_ns, 0)
-        cycle.bound_ns = max(cycle.shifts[done.node][1] for done, _ in reports)
+        if cycle.stamped_ns is not None and len(cycle.heard_ns) == len(reports):
+            cycle.interval_ns = max(max(cycle.heard_ns.values()) - cycle.stamped_ns, 0)
+        cycle.bound_ns = max(cycle.shifts[done.node].bound_ns for done in reports)
+        if most_ns is not None and cycle.bound_ns > most_ns:
+            cycle.shifts.clear()
+            return
         if cycle.bound_ns < UNBOUNDED_NS:
             cycle.latency_ns = max(done_ns - cycle.at_ns, 0)
             cycle.parts_ns = self._split(cycle, last)
@@ -196,10 +223,11 @@ class Ledger:
 
         All instants of a cycle on a node are moved alike: clocks part by microseconds in that time.
         """
-        if node not in cycle.shifts:
+        shift = cycle.shifts.get(node)
+        if shift is None:
             found = self._offsets.to_reference(node, instant_ns)
-            cycle.shifts[node] = found.instant_ns - instant_ns, found.bound_ns
-        return instant_ns + cycle.shifts[node][0] - cycle.origin_ns
+            shift = cycle.shifts[node] = Shift(found.instant_ns - instant_ns, found.bound_ns)
+        return instant_ns + shift.by_ns - cycle.origin_ns
 
     def _split(self, cycle: LiveCycle, last: Completion) -> tuple[int, int, int] | None:
         """Part a latency into compute, queue and network along its critical path.
@@ -224,6 +252,41 @@ class Ledger:
         compute_ns = min(compute_ns, cycle.latency_ns)
         network_ns = min(max(network_ns, 0), cycle.latency_ns - compute_ns)
         return compute_ns, cycle.latency_ns - compute_ns - network_ns, network_ns
+
+    # --------------------------------------------------------------------------- jobs
+
+    def jobs(self, cycle: LiveCycle) -> list[Row]:
+        """Rows of ``jobs``: all that is known to have become ready for a cycle or its shadow."""
+        found: dict[tuple[bool, str, str], Hop] = {}
+        apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
+        own = (*cycle.replaced.values(), *cycle.reports.values())
+        told = [(hop, False) for done in own for hop in done.hops]
+        told += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
+        for hop, shadow in told:
+            if hop.task not in self._tasks or (shadow and hop.task in self.sinks):
+                continue
+            known = found.get((shadow, hop.task, hop.node))
+            if known is None or known.ended_ns == UNKNOWN:
+                found[shadow, hop.task, hop.node] = hop
+        order = sorted(found, key=lambda key: (key[0], self._tasks[key[1]]))
+        rows = [self._job_row(cycle, found[key], shadow=key[0]) for key in order]
+        return [row for row in rows if row is not None]
+
+    def _job_row(self, cycle: LiveCycle, hop: Hop, *, shadow: bool) -> Row | None:
+        ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
+        if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
+            return None
+        if not self._pipeline.inputs(hop.task):
+            # Its stamp may have been there before the cycle began.
+            offset_ns = round(self._pipeline.tasks[hop.task].offset_ms * 1e6)
+            ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
+        who = cycle.row, hop.task, hop.node, ready_ns
+        if hop.ended_ns == UNKNOWN:
+            return (*who, None, None, "replaced", shadow, None)
+        start_ns = max(self._since_origin(cycle, hop.node, hop.started_ns), ready_ns)
+        end_ns = max(self._since_origin(cycle, hop.node, hop.ended_ns), start_ns)
+        cpu_ns = None if hop.cpu_ns == UNKNOWN else hop.cpu_ns
+        return (*who, start_ns, end_ns, "done", shadow, cpu_ns)
 
     # ----------------------------------------------------------------------- evidence
 
@@ -250,7 +313,7 @@ class Ledger:
                     self._enter(of_shadows, row, cycle, report.hops, apart)
                     # What both went through, should the cycle itself not have come so far.
                     self._enter(known, row, cycle, report.hops, self._every - apart)
-            for report in (*cycle.replaced.values(), *(done for done, _ in cycle.reports.values())):
+            for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._enter(known, row, cycle, report.hops, self._every)
             if cycle.heard and not cycle.reports and not cycle.replaced:
                 self._blame(known, row, cycle)
@@ -284,7 +347,7 @@ class Ledger:
             if column is None or hop.task not in apart:
                 continue
             ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
-            if cycle.shifts[hop.node][1] >= UNBOUNDED_NS:
+            if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
                 continue
             shift_ns = ready_ns - hop.arrived_ns
             if hop.ended_ns != UNKNOWN:

@@ -72,8 +72,12 @@ class Keys:
         return f"{self.root}/restored"
 
     def ask(self) -> str:
-        """Questions of a person to the controller."""
+        """What a person asks of the controller."""
         return f"{self.root}/ask"
+
+    def look(self) -> str:
+        """Asks the controller how the cell is, and for nothing else."""
+        return f"{self.root}/look"
 
     def answer(self, number: str) -> str:
         """Answers to them; ``*`` for all."""
@@ -86,6 +90,14 @@ class Keys:
     def detour(self, key: str) -> str:
         """The copy as it arrives."""
         return f"{self.root}/detour/{key.removeprefix(self.root + '/')}"
+
+    def came_directly(self, key: str) -> bool:
+        """Whether a message did not come over the detour."""
+        return not key.startswith(f"{self.root}/detour/")
+
+    def word(self, key: str) -> str:
+        """First word of a key, whichever way its message came: what it is."""
+        return key.removeprefix(f"{self.root}/").removeprefix("detour/").partition("/")[0]
 
     def carried(self) -> str:
         """All copies of a while, together."""

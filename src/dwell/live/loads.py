@@ -1,9 +1,10 @@
-"""Loads: what the CPU counters of a node showed at any instant between two reports."""
+"""Loads: what CPU counters showed at any instant between two reports, of nodes and of processes."""
 
 from __future__ import annotations
 
 import bisect
 from collections import deque
+from collections.abc import Iterable
 from typing import TypeAlias
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from dwell.live.messages import Load
 
-__all__ = ["NodeLoad"]
+__all__ = ["NodeLoad", "ProcessLoads"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -71,3 +72,44 @@ class NodeLoad:
         while len(self._at_ns) > 2 and self._at_ns[1] < before_ns:
             self._at_ns.popleft()
             self._total.popleft()
+
+
+class ProcessLoads:
+    """CPU time that processes have taken, each over its node's own time."""
+
+    def __init__(self) -> None:
+        self._of: dict[tuple[str, str], tuple[deque[int], deque[int]]] = {}
+        self._read: dict[tuple[str, str], int] = {}
+
+    def report(self, node: str, at_ns: int, processes: Iterable[tuple[str, int]]) -> None:
+        """Take in what processes of a node have taken since each was started."""
+        for who, cpu_ns in processes:
+            key = node, who
+            at, total = self._of.setdefault(key, (deque(maxlen=KEPT), deque(maxlen=KEPT)))
+            if at and at_ns < at[-1]:
+                # Its node's clock began anew.
+                at.clear()
+                total.clear()
+            elif at and at_ns == at[-1]:
+                continue
+            before = self._read.get(key, 0)
+            # One that was started again counts from 0 again.
+            grown = cpu_ns - before if cpu_ns >= before else cpu_ns
+            at.append(at_ns)
+            total.append((total[-1] if total else 0) + grown)
+            self._read[key] = cpu_ns
+
+    def between(self, node: str, begin_ns: int, end_ns: int) -> dict[str, float]:
+        """CPU time, nanoseconds, of every process of a node between two instants of its clock.
+
+        In proportion between two reports; nothing before the first and after the last.
+        """
+        found = {}
+        for (where, who), (at, total) in self._of.items():
+            if where == node:
+                first, last = np.interp((begin_ns, end_ns), list(at), list(total))
+                found[who] = float(last - first)
+                while len(at) > 2 and at[1] < begin_ns:
+                    at.popleft()
+                    total.popleft()
+        return found

@@ -30,6 +30,7 @@ __all__ = [
     "Restored",
     "Snapshot",
     "Stamp",
+    "Stamped",
     "State",
     "decode",
     "encode",
@@ -74,6 +75,25 @@ class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
     shadow: Annotated[str, msgspec.Meta(max_length=120)] = ""
     forks: Forks = ()
 
+    @property
+    def fields(self) -> tuple[int, int, int, str, int, str, Forks]:
+        """All of it, in order."""
+        who = self.run, self.cycle, self.term, self.placement
+        return (*who, self.released_ns, self.shadow, self.forks)
+
+
+class Stamped(Stamp, array_like=True, frozen=True, gc=False):
+    """A stamp as the controller is told it.
+
+    Parameters
+    ----------
+    intervals : tuple of (int, int)
+        Earlier cycles of the run, and how long they took by the stamper's clock alone, ns (see
+        `dwell.live.intervals`). Each is told once.
+    """
+
+    intervals: Annotated[tuple[tuple[Count, Count], ...], msgspec.Meta(max_length=64)] = ()
+
 
 class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     """One job of a cycle, on the clock of the node it ran on.
@@ -89,6 +109,8 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     state_age : int
         Cycles that the restored state behind it lacked, where it was the first after a failover;
         -1 otherwise.
+    cpu_ns : int
+        CPU time that the stage took (see `Worker.run`); -1 where it was not called.
     """
 
     task: Name
@@ -98,6 +120,7 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     ended_ns: Instant
     inputs: Annotated[tuple[tuple[Name, Instant], ...], msgspec.Meta(max_length=64)] = ()
     state_age: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
+    cpu_ns: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
 
 
 class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -304,6 +327,8 @@ class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Core-nanoseconds of everything, of the cell's own jobs, and of its shadow workers.
     accelerator : float
         Utilisation of the node's accelerator, where a hook tells; -1 otherwise.
+    processes : tuple of (str, int)
+        CPU time of each of the cell's processes there, the agent's included, since it was started.
     """
 
     node: Name
@@ -313,6 +338,7 @@ class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
     own_ns: Count
     shadow_ns: Count
     accelerator: Annotated[float, msgspec.Meta(ge=-1.0, le=1e9)] = -1.0
+    processes: Annotated[tuple[tuple[Name, Count], ...], msgspec.Meta(max_length=1_000)] = ()
 
 
 class Snapshot(msgspec.Struct, array_like=True, frozen=True, gc=False):

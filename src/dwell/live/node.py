@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -15,14 +15,16 @@ from dwell.errors import LiveError
 from dwell.live.agent import Agent, CpuCount, Gauge
 from dwell.live.cell import Cell
 from dwell.live.files import make_folder
-from dwell.live.hosting import Hosted, clock_of
+from dwell.live.group import own_group
+from dwell.live.hosting import Hosted, clock_of, keep_collections_short, take_turns
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.role import Place
+from dwell.live.security import Security
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import Wiring, wire
+from dwell.live.wiring import wire
 from dwell.model import Problem
 
 __all__ = ["run_agent", "run_controller"]
@@ -37,6 +39,7 @@ def run_agent(
     *,
     cpus: Iterable[int] | None = None,
     accelerator: Callable[[], float] | None = None,
+    environment: Mapping[str, str] | None = None,
     say: Callable[[str], None] = print,
 ) -> None:
     """Keep a node's processes running until told to stop; then end them.
@@ -54,13 +57,19 @@ def run_agent(
         Those that the node may use.
     accelerator : callable, optional
         Returns the utilisation of the node's accelerator, a share from 0 to 1.
+    environment : mapping of str to str, optional
+        Of the node's processes, with the variables of `dwell.live.security`; this process's own if
+        left out.
     say : callable
         Takes lines for the log.
 
     Raises
     ------
     LiveError
-        If there is no such node, or its ports or its folder cannot be had.
+        If there is no such node, or its ports or its folder cannot be had, or it leaves this
+        computer without keys.
+    TrustError
+        If the keys are not the node's.
     """
     if node not in problem.fabric.nodes:
         known = ", ".join(problem.fabric.nodes)
@@ -69,16 +78,20 @@ def run_agent(
         _use_cpus(cpus)
     wiring = wire(problem)
     who = f"agent@{node}"
-    transport = _listening(wiring, who, node)
-    supervisor = Supervisor(make_folder(folder), say)
+    security = Security.of(problem, wiring.entry(who).role, environment)
+    security.remind(say, stopped)
+    transport = _listening(security, who, node)
+    supervisor = Supervisor(make_folder(folder), say, environment=environment)
     try:
         for role in wiring.on(node):
             if role.kind not in ("agent", "controller"):
                 supervisor.keep(role.who, command(role.who))
         place = Place(problem, who, node, transport, time.time_ns(), say=Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
-        agent = Agent(place, supervisor, CpuCount(), gauge)
-        Hosted(agent, transport, clock_of(problem), stopped=stopped).run()
+        agent = Agent(place, supervisor, _cpu_count(problem, node, say), gauge)
+        hosted = Hosted(agent, transport, clock_of(problem), stopped=stopped)
+        keep_collections_short()
+        hosted.run()
     finally:
         supervisor.stop()
         transport.close()
@@ -86,7 +99,20 @@ def run_agent(
         remove_orphans()
 
 
-def _listening(wiring: Wiring, who: str, node: str) -> ZenohTransport:
+def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCount:
+    """Count the node's CPUs; of a node with a quota, what its own control group uses of them."""
+    if problem.fabric.nodes[node].quota is None:
+        return CpuCount()
+    group = own_group()
+    if group is None:
+        say(
+            f"node {node} has a quota, but this agent is in no control group of its own: its "
+            "utilisation counts all that its CPUs do"
+        )
+    return CpuCount(group=group)
+
+
+def _listening(security: Security, who: str, node: str) -> ZenohTransport:
     """Open an agent's sessions.
 
     Raises
@@ -95,7 +121,7 @@ def _listening(wiring: Wiring, who: str, node: str) -> ZenohTransport:
         If its port is taken: an agent of this node is there already.
     """
     try:
-        return ZenohTransport(wiring.entry(who))
+        return security.transport(who)
     except LiveError as error:
         raise LiveError(f"{error}\nis there another agent for node {node} here?") from None
 
@@ -114,6 +140,8 @@ def run_controller(
     *,
     policy: str | None = None,
     name: str | None = None,
+    jobs: bool = False,
+    environment: Mapping[str, str] | None = None,
     say: Callable[[str], None] = print,
 ) -> list[Path]:
     """Control cells until told to stop.
@@ -128,6 +156,10 @@ def run_controller(
         Instead of the cells' own.
     name : str, optional
         Of this controller, among others that would like to be in charge.
+    jobs : bool
+        Whether the runs keep their jobs, and what each process took of the CPUs.
+    environment : mapping of str to str, optional
+        With the variables of `dwell.live.security`; this process's own if left out.
     say : callable
         Takes lines for the log.
 
@@ -139,7 +171,10 @@ def run_controller(
     Raises
     ------
     LiveError
-        If two cells have one name, or ports cannot be had.
+        If two cells have one name, or ports cannot be had, or a cell leaves this computer without
+        keys.
+    TrustError
+        If the keys are not the controller's.
     """
     names = [problem.name for problem in problems]
     if len(set(names)) < len(names):
@@ -149,29 +184,31 @@ def run_controller(
     sys.setswitchinterval(0.0005)
     recorders = []
     with ExitStack() as stack:
-        threads = []
+        hosted, hurry = [], threading.Event()
         for problem in problems:
             node = problem.controller_node
-            transport = ZenohTransport(wire(problem).entry(f"controller@{node}"))
+            role = wire(problem).entry(f"controller@{node}").role
+            security = Security.of(problem, role, environment)
+            security.remind(say, stopped)
+            transport = security.transport(f"controller@{node}")
             stack.callback(transport.close)
             place = Place(
                 *(problem, f"controller@{node}", node, transport, time.time_ns()), say=Log(say)
             )
             controller = Controller(problem, policy)
-            recorder = RunRecorder(out, problem, controller, say)
+            recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
             clock = clock_of(problem)
             cell = Cell(place, controller, recorder, name, clock())
-            hosted = Hosted(cell, transport, clock, stopped=stopped)
-            threads.append(threading.Thread(target=hosted.run, name=problem.name, daemon=True))
+            hosted.append(Hosted(cell, transport, clock, stopped=stopped, hurry=hurry))
             recorders.append((recorder, cell))
-        for thread in threads:
-            thread.start()
-        stopped.wait()
-        for thread in threads:
-            thread.join()
-        return [
-            folder
-            for recorder, cell in recorders
-            if (folder := recorder.finish(cell.windows.rows() if cell.windows else None))
-            is not None
-        ]
+        keep_collections_short()
+        try:
+            take_turns(hosted)
+        finally:
+            folders = [_finished(recorder, cell) for recorder, cell in recorders]
+        return [folder for folder in folders if folder is not None]
+
+
+def _finished(recorder: RunRecorder, cell: Cell) -> Path | None:
+    cell.write()
+    return recorder.finish(cell.windows.rows(last=True) if cell.windows else None)

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from dwell.live.messages import Beat
 
@@ -59,9 +59,8 @@ class Instant(NamedTuple):
     bound_ns: int
 
 
-class _Interval(NamedTuple):
-    low_ns: int | None
-    high_ns: int | None
+#: Lowest and highest, where they are known.
+_Interval: TypeAlias = tuple[int | None, int | None]
 
 
 class _Pair:
@@ -144,12 +143,16 @@ class _Pair:
     def at(self, t_ns: int) -> _Interval:
         """Return the interval at an instant of a's clock, past or to come."""
         low_ns, high_ns, span_ns = self.low_ns, self.high_ns, t_ns - self.t_ns
+        if span_ns == 0:
+            return low_ns, high_ns
         slowest, fastest = self.slowest, self.fastest
         if abs(span_ns) > MEMORY_NS:
             slowest, fastest = -MAX_DRIFT_PPB, MAX_DRIFT_PPB
-        return _Interval(
-            None if low_ns is None else low_ns - _grown(span_ns, -slowest, -fastest),
-            None if high_ns is None else high_ns + _grown(span_ns, fastest, slowest),
+        if span_ns < 0:
+            slowest, fastest = fastest, slowest
+        return (
+            None if low_ns is None else low_ns - (span_ns * -slowest // PPB + 1),
+            None if high_ns is None else high_ns + (span_ns * fastest // PPB + 1),
         )
 
 
@@ -290,21 +293,21 @@ class Offsets:
         if node < to:
             pair = self._pairs.get((node, to))
             if pair is None:
-                return _Interval(None, None)
+                return None, None
             low_ns, high_ns = pair.at(instant_ns)
-            return _Interval(
+            return (
                 None if low_ns is None else instant_ns + low_ns,
                 None if high_ns is None else instant_ns + high_ns,
             )
         pair = self._pairs.get((to, node))
         if pair is None or not pair.known:
-            return _Interval(None, None)
+            return None, None
         # Where we are on the other clock is what is asked for; the second guess is near enough.
         guess_ns = instant_ns - _any_of(pair.low_ns, pair.high_ns)
         guess_ns = instant_ns - _any_of(*pair.at(guess_ns))
         low_ns, high_ns = pair.at(guess_ns)
         unsure_ns = 0 if low_ns is None or high_ns is None else _parted(high_ns - low_ns)
-        return _Interval(
+        return (
             None if high_ns is None else instant_ns - high_ns - unsure_ns,
             None if low_ns is None else instant_ns - low_ns + unsure_ns,
         )

@@ -11,15 +11,15 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
-from dwell.live.hosting import Hosted, clock_of, work
+from dwell.live.hosting import Hosted, clock_of, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.messages import Header
 from dwell.live.role import Place, Pulse, Role
+from dwell.live.security import Security
 from dwell.live.sink import Sink
 from dwell.live.stage import Actuator, load_actuator, load_stage
 from dwell.live.stamper import Stamper
 from dwell.live.transport.protocol import Sample
-from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import Role as Named
 from dwell.live.wiring import wire
 from dwell.live.worker import Job, Worker
@@ -43,10 +43,12 @@ def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Eve
     Raises
     ------
     LiveError
-        If there is no such process, or it cannot listen.
+        If there is no such process, or it cannot listen, or must not.
+    TrustError
+        If the keys that it has been given are not its.
     """
     entry = wire(problem).entry(who)
-    transport = ZenohTransport(entry)
+    transport = Security.of(problem, entry.role).transport(who)
     place = Place(problem, who, entry.role.node, transport, time.time_ns(), say=Log(_print))
     try:
         _run(problem, entry.role, place, make_folder(folder), stopped)
@@ -74,7 +76,9 @@ def _run(
 
 def _host(role: Role, place: Place, stopped: threading.Event) -> None:
     """Run a role in this thread until the process is told to end."""
-    Hosted(role, place.transport, clock_of(place.problem), stopped=stopped).run()
+    hosted = Hosted(role, place.transport, clock_of(place.problem), stopped=stopped)
+    keep_collections_short()
+    hosted.run()
 
 
 def _actuator(problem: Problem, task: str) -> Actuator:
@@ -115,7 +119,13 @@ def _work(
         else:
             inflight.begin(_written(job))
 
-    work(worker, place.transport, stopped=stopped, note=note, clock=clock_of(problem))
+    work(
+        *(worker, place.transport),
+        stopped=stopped,
+        note=note,
+        clock=clock_of(problem),
+        ready=keep_collections_short,
+    )
 
 
 def _print(line: str) -> None:

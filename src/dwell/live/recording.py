@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dwell.control import Controller
 from dwell.errors import RunError
-from dwell.live.tables import columns_of
+from dwell.live.tables import columns_of, job_columns
 from dwell.live.windows import Resume, Rows
 from dwell.model import Problem
 from dwell.model.document import to_document
@@ -30,12 +30,20 @@ class RunRecorder:
     controller : Controller
     say : callable
         Takes lines for the log.
+    jobs : bool
+        Whether to keep the jobs, and what each process took of the CPUs, too.
     """
 
     def __init__(
-        self, out: Path, problem: Problem, controller: Controller, say: Callable[[str], None]
+        self,
+        out: Path,
+        problem: Problem,
+        controller: Controller,
+        say: Callable[[str], None],
+        *,
+        jobs: bool = False,
     ) -> None:
-        self.out, self.problem, self.controller = out, problem, controller
+        self.out, self.problem, self.controller, self.jobs = out, problem, controller, jobs
         self._say = say
         self._journal: Journal | None = None
 
@@ -43,13 +51,13 @@ class RunRecorder:
         """Begin to keep a run, or go on with it; returns where."""
         self.finish()
         folder = self._free(f"{self.problem.name}-{run}")
-        journal = Journal(
-            folder, run=str(run), meta=self._meta(), columns=columns_of(self.controller)
-        )
+        more = job_columns(self.problem) if self.jobs else {}
+        columns = {**columns_of(self.controller), **more}
+        journal = Journal(folder, run=str(run), meta=self._meta(), columns=columns)
         self._journal = journal
         self._say(f"{self.problem.name}: the run is kept in {folder}")
         window, cycle = journal.following("windows"), journal.following("cycles")
-        return Resume(window, cycle, journal.meta.get("origin_ns"))
+        return Resume(window, cycle, journal.meta.get("origin_ns"), self.jobs)
 
     def _free(self, name: str) -> Path:
         """Return the run's folder; a further one where a controller before has sealed it."""

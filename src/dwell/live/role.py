@@ -240,7 +240,8 @@ class Pulse:
     def _differs(self, beat: Beat) -> str:
         """Return why a beat is not heard, or nothing."""
         place = self.place
-        if beat.version and _series(beat.version) != _series(__version__):
+        same = beat.version in ("", __version__)
+        if not same and _series(beat.version) != _series(__version__):
             return (
                 f"{beat.who} runs Dwell {beat.version}, and {place.who} {__version__}; "
                 "install one version on all nodes"
@@ -279,7 +280,7 @@ class Pulse:
     def compare_clocks(self, sample: Sample, now_ns: int, offsets: Offsets) -> None:
         """Take a beat in, and what it tells of the clocks if it came directly."""
         beat = self.receive(sample, now_ns)
-        if beat is not None and "/detour/" not in sample.key:
+        if beat is not None and self.place.keys.came_directly(sample.key):
             offsets.hear(beat, now_ns)
 
     def hears(self, sample: Sample) -> bool:

@@ -9,6 +9,7 @@ from typing import Protocol
 from dwell.control import shadow_stamps
 from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
+from dwell.live.intervals import Intervals
 from dwell.live.messages import (
     Accepted,
     Beat,
@@ -16,6 +17,7 @@ from dwell.live.messages import (
     Header,
     Order,
     Stamp,
+    Stamped,
     decode,
     encode,
 )
@@ -113,6 +115,7 @@ class Stamper:
         self._sinks = frozenset(
             name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
         )
+        self.intervals = Intervals(place.who, self._sinks)
         self._partial: dict[int, set[str]] = {}
         self._probes: set[int] = set()
         self._fraction = 0.0
@@ -142,18 +145,20 @@ class Stamper:
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
             if beat is not None:
-                direct = "/detour/" not in sample.key
-                self._heard(beat, now_ns, direct)
+                self._heard(beat, now_ns, self.place.keys.came_directly(sample.key))
             return
-        word = sample.key.removeprefix(self.place.keys.root + "/").removeprefix("detour/")
         try:
-            match word.partition("/")[0]:
+            match word := self.place.keys.word(sample.key):
                 case "order":
                     self._order(decode(sample.payload, Order), now_ns)
                 case "frame":
                     self._frame(now_ns)
                 case "done" | "ended":
-                    self._completed(decode(sample.payload, Completion), now_ns)
+                    done = decode(sample.payload, Completion)
+                    self._completed(done, now_ns)
+                    if word == "done" and done.stamp.run == self.run:
+                        direct = self.place.keys.came_directly(sample.key)
+                        self.intervals.completed(done, now_ns, direct=direct)
         except LiveError as error:
             self.place.complain(error)
 
@@ -172,6 +177,7 @@ class Stamper:
         presence.heard(beat.node, now_ns)
         if direct:
             presence.heard(f"{beat.node}->{self.place.node}", now_ns)
+            self.intervals.hear(beat, now_ns)
         for heard in beat.heard:
             age_ns = max(beat.sent_ns - heard.at_ns, 0)
             presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
@@ -351,7 +357,8 @@ class Stamper:
             if len(self._probes) > MAX_PARTIAL:
                 self._probes.discard(min(self._probes))
         self._send(stamp, here=True, elsewhere=early is None)
-        self.place.transport.put(self.place.keys.stamped(), encode(stamp))
+        told = Stamped(*stamp.fields, self.intervals.news())
+        self.place.transport.put(self.place.keys.stamped(), encode(told))
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
             self._send(self._ahead, here=False, elsewhere=True)

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -94,6 +94,8 @@ class Supervisor:
         Takes a line for the log of the agent.
     warm_s, growth_bytes, log_bytes
         From when on, and from what on, memory that grows is reported; length of a log.
+    environment : mapping of str to str, optional
+        Of the processes; this one's own if left out.
     """
 
     def __init__(
@@ -104,12 +106,14 @@ class Supervisor:
         warm_s: float = WARM_S,
         growth_bytes: int = GROWTH_BYTES,
         log_bytes: int = LOG_BYTES,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.folder = folder
         self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
         self.children: list[Child] = []
         self._say = say
-        self._environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        given = os.environ if environment is None else environment
+        self._environment = {**given, "PYTHONUNBUFFERED": "1"}
 
     def keep(self, who: str, command: Sequence[str]) -> Child:
         """Have a process run from now on."""
@@ -219,11 +223,11 @@ class Supervisor:
             )
             self._say(child.growth)
 
-    def cpu_seconds(self, select: Callable[[str], bool]) -> float:
-        """CPU time of the processes whose names are selected, past ones included."""
-        total = 0.0
+    def cpu_seconds(self) -> dict[str, float]:
+        """CPU time of every process that runs, since it was started."""
+        found: dict[str, float] = {}
         for child in self.children:
-            if not select(child.who) or child.pid is None:
+            if child.pid is None:
                 continue
             try:
                 if child.watched is None or child.watched.pid != child.pid:
@@ -231,8 +235,8 @@ class Supervisor:
                 times = child.watched.cpu_times()
             except psutil.Error:
                 continue
-            total += times.user + times.system
-        return total
+            found[child.who] = times.user + times.system
+        return found
 
     def notes(self) -> str:
         """What went wrong last, of processes that keep dying or growing."""

@@ -11,7 +11,18 @@ heard               false where it is known by its neighbours only
 actuated            whether all its commands were applied
 interval_ns         from its stamp to its last completion, as both arrived at the controller: one
                     clock alone, but with what the two messages' ways differ by
+stamper_interval_ns from its release to the arrival of its last completion at the stamper, less half
+                    the best round trip to the sink's node: the stamper's clock alone, with what the
+                    completion was late; null where it came over the detour
 bound_ns            of the error of its latency, by the clocks; null where they were not compared
+==================  ================================================================================
+
+==================  ================================================================================
+column of           what it is
+decisions
+==================  ================================================================================
+refused             what was decided and not done, and why: migrated is false, placement the old
+                    one, and reason the policy's; null where what was decided was done
 ==================  ================================================================================
 
 ==================  ================================================================================
@@ -24,6 +35,12 @@ bound_ms            largest of its cycles'
 unproven            whether that is more than 20 % of D
 closed_unix_ns      time of day of its close
 ==================  ================================================================================
+
+On request there are two more tables. ``jobs`` has a row of every job that is known of: a cycle that
+never reached a sink tells of none, unless a newer one took its place on the way. Its columns are a
+simulated run's and ``cpu_ns``, the CPU time of the stage's ``process()``; a job that was replaced
+has no instants but that of its readiness. ``processes`` has what every process of the cell took of
+its node's CPU in every window, from the release of its first cycle to its close.
 """
 
 from __future__ import annotations
@@ -35,12 +52,21 @@ from typing import TYPE_CHECKING, TypeAlias
 from dwell.control import NEVER_NS, Controller
 from dwell.live.cycles import LiveCycle
 from dwell.live.offsets import UNBOUNDED_NS
+from dwell.model import Problem
 from dwell.record import OUTCOMES, Columns
 
 if TYPE_CHECKING:
     from dwell.live.windows import LiveWindow
 
-__all__ = ["Row", "columns_of", "cycle_row", "decision_rows", "sends_shadows", "window_row"]
+__all__ = [
+    "Row",
+    "columns_of",
+    "cycle_row",
+    "decision_rows",
+    "job_columns",
+    "sends_shadows",
+    "window_row",
+]
 
 Row: TypeAlias = tuple[object, ...]
 
@@ -67,6 +93,7 @@ def columns_of(controller: Controller) -> Columns:
         migrated="Boolean",
         reason=list(REASONS),
         dwell="Int64",
+        refused="String",
     )
     return {
         "cycles": {
@@ -86,6 +113,7 @@ def columns_of(controller: Controller) -> Columns:
             "heard": "Boolean",
             "actuated": "Boolean",
             "interval_ns": "Int64",
+            "stamper_interval_ns": "Int64",
             "bound_ns": "Int64",
         },
         "windows": {
@@ -113,6 +141,30 @@ def columns_of(controller: Controller) -> Columns:
     }
 
 
+def job_columns(problem: Problem) -> Columns:
+    """Type of every column of the tables that are kept on request."""
+    nodes = list(problem.fabric.nodes)
+    return {
+        "jobs": {
+            "cycle": "Int64",
+            "task": list(problem.pipeline.tasks),
+            "node": nodes,
+            "ready_ns": "Int64",
+            "start_ns": "Int64",
+            "end_ns": "Int64",
+            "outcome": list(OUTCOMES),
+            "shadow": "Boolean",
+            "cpu_ns": "Int64",
+        },
+        "processes": {
+            "window": "Int64",
+            "process": "String",
+            "node": nodes,
+            "cpu_ns": "Int64",
+        },
+    }
+
+
 def cycle_row(cycle: LiveCycle, *, missed: bool) -> Row:
     """Row of ``cycles``."""
     return (
@@ -130,6 +182,7 @@ def cycle_row(cycle: LiveCycle, *, missed: bool) -> Row:
         cycle.heard,
         cycle.actuated,
         cycle.interval_ns,
+        cycle.stamper_interval_ns,
         None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
     )
 
@@ -183,9 +236,28 @@ def window_row(
     )
 
 
-def decision_rows(decisions: Iterable[Sequence[object]], first_window: int) -> list[Row]:
-    """Rows of ``decisions`` from the log of a controller whose first window had this number."""
-    return [(first_window + _count(row[0]), *map(_known, row[1:])) for row in decisions]
+def decision_rows(
+    decisions: Iterable[tuple[Sequence[object], str | None]], first_window: int
+) -> list[Row]:
+    """Rows of ``decisions``.
+
+    Parameters
+    ----------
+    decisions : iterable of (sequence, str or None)
+        Row of a controller's log, and why it was not followed; None where it was.
+    first_window : int
+        Number of the controller's first window.
+    """
+    return [_decision_row(row, why, first_window) for row, why in decisions]
+
+
+def _decision_row(row: Sequence[object], why: str | None, first_window: int) -> Row:
+    window, incumbent, placement, migrated, reason, *rest = row
+    if why is not None and migrated:
+        why = f"{placement}: {why}"
+        placement, migrated = incumbent, False
+    fixed = first_window + _count(window), incumbent, placement, migrated, reason
+    return (*fixed, *map(_known, rest), why)
 
 
 def _count(value: object) -> int:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import queue
 import uuid
+from collections.abc import Mapping
 from typing import Any
 
 from dwell.errors import LiveError
 from dwell.live.keys import Keys
 from dwell.live.messages import Answer, Ask, decode, encode
+from dwell.live.security import Security
 from dwell.live.transport.protocol import Sample
-from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import wire
+from dwell.live.wiring import Role
 from dwell.model import Problem
 
 __all__ = ["Visitor"]
@@ -25,15 +26,26 @@ class Visitor:
     Parameters
     ----------
     problem : Problem
+    environment : mapping of str to str, optional
+        With the variables of `dwell.live.security`; this process's own if left out.
+
+    Raises
+    ------
+    LiveError
+        If the cell leaves this computer, and there are no keys.
+    TrustError
+        If the keys are not those of somebody who visits.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
         self.problem = problem
         self._name = f"visitor-{uuid.uuid4().hex[:8]}"
         self._controller = f"controller@{problem.controller_node}"
         self._keys = Keys(problem.name)
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
-        self._transport = ZenohTransport(wire(problem).visitor(self._name, self._controller))
+        role = Role(self._name, problem.controller_node, "visitor")
+        security = Security.of(problem, role, environment)
+        self._transport = security.visit(self._name, self._controller)
         self._transport.subscribe(self._keys.answer(self._name), self._heard)
 
     def __enter__(self) -> Visitor:
@@ -67,8 +79,13 @@ class Visitor:
             If it is refused, or nobody answers.
         """
         ask = encode(Ask(self._name, what, about))
+        # Who only looks may do so with the keys of an observer.
+        key = self._keys.look() if what == "status" else self._keys.ask()
+        # One question is sent several times; what was answered to the one before is old.
+        while not self._answers.empty():
+            self._answers.get()
         for _ in range(max(round(patience_s / RESEND_S), 1)):
-            self._transport.put(self._keys.ask(), ask)
+            self._transport.put(key, ask)
             try:
                 answer = self._answers.get(timeout=RESEND_S)
             except queue.Empty:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from dwell.control import ClosedWindow, Controller, final_l95_ms
 from dwell.errors import LiveError
 from dwell.live.cycles import Ledger, LiveCycle
-from dwell.live.loads import NodeLoad
+from dwell.live.loads import NodeLoad, ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.tables import Row, cycle_row, decision_rows, sends_shadows, window_row
@@ -58,11 +58,14 @@ class Resume:
         Numbers of the first window and cycle that will be recorded.
     origin_ns : int, optional
         First release of the run, on the stamper's clock; that of the first stamp heard where None.
+    jobs : bool
+        Whether the jobs, and what each process took of the CPUs, are recorded, too.
     """
 
     window: int = 0
     cycle: int = 0
     origin_ns: int | None = None
+    jobs: bool = False
 
 
 @dataclass(eq=False, slots=True)
@@ -140,9 +143,15 @@ class LiveWindows:
         self.ignored = 0
         self._ledger = Ledger(problem, offsets)
         self._loads = {node: NodeLoad() for node in problem.fabric.nodes}
+        self._processes = ProcessLoads()
+        self._keeps_jobs = resume.jobs
+        # First cycle whose jobs are not recorded yet, and windows whose processes are not.
+        self._next_jobs = resume.cycle
+        self._unwritten: deque[LiveWindow] = deque()
         self._size = problem.window_cycles
         self._period_ns = round(problem.pipeline.period_ms * 1e6)
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._proven_ns = int(PROVEN_SHARE * self._deadline_ns)
         self._grace_ns = round(problem.controller.close_grace_ms * 1e6)
         self._longest = 8 * self._size + KEPT_CYCLES
         self._kept = 4 * self._size + KEPT_CYCLES
@@ -152,7 +161,9 @@ class LiveWindows:
         self._recorded: deque[LiveCycle] = deque()
         self._newest: tuple[LiveCycle, int | None] | None = None
         self._newest_done = (-1, -1)
-        self._mixed = self._ordered = False
+        self._ordered = False
+        # What `_begin` found, as long as nothing has changed that.
+        self._beginning: tuple[int, bool] | None = None
         self._lead = 0
         self._first_window = self._next_window = resume.window
         self._next_row = resume.cycle
@@ -161,6 +172,9 @@ class LiveWindows:
         self._changed_windows: set[int] = set()
         self._in_flight: dict[int, LiveCycle] = {}
         self._decisions_taken = 0
+        # Of the log's decisions: the one whose order is under way, and why some were not followed.
+        self._open_decision: int | None = None
+        self._refused: dict[int, str] = {}
 
     # ------------------------------------------------------------------ what is heard
 
@@ -202,21 +216,60 @@ class LiveWindows:
         if cycle.row >= 0:
             self._ledger.settle(cycle)
             self._touch(cycle)
+        else:
+            # Now rather than all at once when the window closes.
+            self._ledger.settle(cycle, most_ns=self._proven_ns)
+
+    def measured(self, run: int, intervals: Iterable[tuple[int, int]]) -> None:
+        """The stamper has measured how long cycles took, ns."""
+        for number, interval_ns in intervals:
+            cycle = self._by_key.get((run, number))
+            if cycle is not None:
+                cycle.stamper_interval_ns = interval_ns
+                if cycle.row >= 0:
+                    self._changed[cycle.row] = cycle
 
     def loaded(self, load: Load) -> None:
         """A node's agent has read its counters."""
         if load.node in self._loads:
             self._loads[load.node].report(load)
+            if self._keeps_jobs:
+                self._processes.report(load.node, load.at_ns, load.processes)
         else:
             self.ignored += 1
 
-    def ordered(self) -> None:
-        """A migration is under way: the next window begins with it, or goes on when `refused`."""
-        self._ordered = True
+    def spent(self, node: str, at_ns: int, who: str, cpu_ns: int) -> None:
+        """Take note of what a process has taken of its node's CPU since it was started."""
+        if self._keeps_jobs:
+            self._processes.report(node, at_ns, [(who, cpu_ns)])
 
-    def refused(self) -> None:
+    def ordered(self, *, decided: bool = False) -> None:
+        """A migration is under way: the next window begins with it, or goes on when `refused`.
+
+        Parameters
+        ----------
+        decided : bool
+            Whether it is what the controller decided last. That is recorded only once it is known
+            what has become of it.
+        """
+        self._ordered, self._beginning = True, None
+        if decided:
+            self._open_decision = len(self._controller.log.decisions) - 1
+
+    def carried_out(self) -> None:
+        """The migration has come about."""
+        self._open_decision = None
+
+    def refused(self, why: str = "") -> None:
         """The migration will not come about: windows go on where they were."""
-        self._ordered = False
+        self._ordered, self._beginning = False, None
+        if self._open_decision is not None:
+            self._refused[self._open_decision] = why
+            self._open_decision = None
+
+    def overruled(self, why: str) -> None:
+        """What the controller decided last will not be ordered."""
+        self._refused[len(self._controller.log.decisions) - 1] = why
 
     def _note(self, stamp: Stamp, at_ns: int | None) -> LiveCycle | None:
         key = stamp.run, stamp.cycle
@@ -240,7 +293,7 @@ class LiveWindows:
         if cycle.row >= 0:
             self._touch(cycle)
         else:
-            self._mixed = self._mixed or cycle.segment != self._line[0].segment
+            self._beginning = None
 
     def _append(self, stamp: Stamp, at_ns: int | None) -> LiveCycle:
         if self.origin_ns is None or (self._newest is None and stamp.released_ns < self.origin_ns):
@@ -250,16 +303,21 @@ class LiveWindows:
             self._follow(*self._newest, stamp, at_ns)
         cycle = LiveCycle.of(stamp, self.origin_ns)
         line = self._line
-        between = self._between(line[-1], cycle) if line else ()
-        for other in (*between, cycle):
-            line.append(other)
-            self._by_key[other.key] = other
+        if line:
+            for other in self._between(line[-1], cycle):
+                self._add(other)
+        self._add(cycle)
         self._newest = cycle, at_ns
-        self._mixed = self._mixed or cycle.segment != line[0].segment
         if len(line) > self._longest:
             # Nobody has said what became of an order.
             self._drop(len(line) - self._size)
         return cycle
+
+    def _add(self, cycle: LiveCycle) -> None:
+        if not self._line or cycle.segment != self._line[-1].segment:
+            self._beginning = None
+        self._line.append(cycle)
+        self._by_key[cycle.key] = cycle
 
     def _follow(
         self, newest: LiveCycle, heard_ns: int | None, stamp: Stamp, at_ns: int | None
@@ -295,23 +353,24 @@ class LiveWindows:
             return None
         line.insert(place, cycle)
         self._by_key[cycle.key] = cycle
-        self._mixed = self._mixed or cycle.segment != line[0].segment
+        self._beginning = None
         return cycle
 
     # -------------------------------------------------------------- when a window closes
 
     def _begin(self) -> tuple[int, bool]:
         """Place in the line where the open window starts, and whether an order is awaited."""
-        start, ordered = 0, self._ordered
-        if self._mixed:
-            segment = self._line[0].segment
+        if self._beginning is None:
+            start, ordered = 0, self._ordered
+            segment = self._line[0].segment if self._line else None
             for place, cycle in enumerate(self._line):
                 if not cycle.heard or cycle.segment == segment:
                     continue
                 if place - start >= self._size and not ordered:
                     break
                 start, segment, ordered = place, cycle.segment, False
-        return start, ordered
+            self._beginning = start, ordered
+        return self._beginning
 
     def due_ns(self, now_ns: int) -> int | None:
         """Return when the next window closes, on the controller's clock; None if that is not known.
@@ -381,11 +440,13 @@ class LiveWindows:
             lead=self._lead,
             heard=sum(cycle.heard for cycle in cycles),
             bound_ns=bound_ns,
-            unproven=bound_ns > PROVEN_SHARE * self._deadline_ns,
+            unproven=bound_ns > self._proven_ns,
             used=self._controller.utilisation(closed),
             closed_unix_ns=unix_ns,
         )
         self._windows[self.last.number] = self.last
+        if self._keeps_jobs:
+            self._unwritten.append(self.last)
         self._changed_windows.add(self.last.number)
         self._next_window += 1
         self._lead = 0
@@ -406,13 +467,14 @@ class LiveWindows:
             self._changed[cycle.row] = cycle
             self._recorded.append(cycle)
         del self._line[:count]
-        self._mixed = any(cycle.segment != self._line[0].segment for cycle in self._line)
+        self._beginning = None
         while len(self._recorded) > self._kept:
             old = self._recorded.popleft()
             del self._by_key[old.key]
             self._in_flight.pop(old.row, None)
             if old.window is not None:
                 self._windows.pop(old.window, None)
+                self._controller.log.seen[old.window - self._first_window] = ()
 
     def _core_ns(self, first: LiveCycle, close_ns: int) -> NDArray[np.float64]:
         """Core-nanoseconds of every node in a window, shape (3, nodes).
@@ -426,15 +488,22 @@ class LiveWindows:
                 for at_ns in (first.at_ns, close_ns)
             )
             busy_ns, own_ns, shadow_ns, accelerator_ns = load.at(end_ns) - load.at(begin_ns)
-            cores = self.problem.fabric.nodes[node].cores
-            used[:, column] = max(busy_ns, cores * accelerator_ns), own_ns, shadow_ns
+            capacity = self.problem.fabric.nodes[node].capacity
+            used[:, column] = max(busy_ns, capacity * accelerator_ns), own_ns, shadow_ns
             load.forget(begin_ns)
         return used
 
     # --------------------------------------------------------------------- the record
 
-    def rows(self) -> Rows:
-        """Rows of the tables that are new, or have changed since the last call."""
+    def rows(self, *, last: bool = False) -> Rows:
+        """Rows of the tables that are new, or have changed since the last call.
+
+        Parameters
+        ----------
+        last : bool
+            Whether no more will be asked for. Jobs, and what processes took, are told a window
+            late: of some it is not known earlier.
+        """
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
                 self._changed[row] = cycle
@@ -444,15 +513,40 @@ class LiveWindows:
             for number in sorted(self._changed_windows)
             if number in self._windows
         ]
-        decisions = self._controller.log.decisions[self._decisions_taken :]
-        self._decisions_taken += len(decisions)
+        log, begin = self._controller.log.decisions, self._decisions_taken
+        undecided = None if last else self._open_decision
+        self._decisions_taken = end = len(log) if undecided is None else undecided
+        decisions = [(log[row], self._refused.pop(row, None)) for row in range(begin, end)]
+        # What is recorded is not kept: a controller runs for months.
+        log[begin:end] = [()] * len(decisions)
         self._changed.clear()
         self._changed_windows.clear()
         return {
             "cycles": cycles,
             "windows": windows,
             "decisions": decision_rows(decisions, self._first_window),
+            **(self._job_rows(last=last) if self._keeps_jobs else {}),
         }
+
+    def _job_rows(self, *, last: bool) -> Rows:
+        end = self._next_row if last else self._next_row - self._size
+        ready = [cycle for cycle in self._recorded if self._next_jobs <= cycle.row < end]
+        self._next_jobs = max(self._next_jobs, end)
+        processes: list[Row] = []
+        while self._unwritten and (last or self._unwritten[0].cycles[-1].row < end):
+            processes += self._process_rows(self._unwritten.popleft())
+        jobs = [row for cycle in ready for row in self._ledger.jobs(cycle)]
+        return {"jobs": jobs, "processes": processes}
+
+    def _process_rows(self, window: LiveWindow) -> Iterable[Row]:
+        first = window.cycles[0]
+        for node in self.problem.fabric.nodes:
+            begin_ns, end_ns = (
+                self.offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
+                for at_ns in (first.at_ns, window.close_ns)
+            )
+            spent = self._processes.between(node, begin_ns, end_ns)
+            yield from ((window.number, who, node, round(spent[who])) for who in sorted(spent))
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from dwell.errors import LiveError
@@ -200,6 +201,11 @@ class Worker:
         }
         self._state_lane = lane_of(problem.pipeline.tasks[task].state_bytes)
         self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
+        #: What is read before and after the stage is called; a stage that is said to use several
+        #: threads is charged with all that its process does meanwhile.
+        alone = problem.pipeline.tasks[task].on[place.node].threads == 1
+        self.cpu_clock: Callable[[], int] = time.thread_time_ns if alone else time.process_time_ns
+        self._cpu_ns = UNKNOWN
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
         self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
@@ -463,8 +469,13 @@ class Worker:
             self._jobs.appendleft(Job(inputs[0][0], by_source, shadow))
 
     def run(self, job: Job, started_ns: int) -> tuple[Message | None, int]:
-        """Call the stage; returns its output, None if it failed, and the state's age."""
+        """Call the stage; returns its output, None if it failed, and the state's age.
+
+        The CPU time of the call goes into the job's hop: that of this thread, or of the whole
+        process where the cell gives the task several threads on this node.
+        """
         stamp = job.header.stamp
+        self._cpu_ns = UNKNOWN
         state_age = self._recover(job) if self._stateful else UNKNOWN
         released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
         try:
@@ -480,11 +491,13 @@ class Worker:
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return None, state_age
+        begun_ns = self.cpu_clock()
         try:
             output = self.stage.process(inputs)
         except Exception as error:  # the user's code
             self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
             return None, state_age
+        self._cpu_ns = max(self.cpu_clock() - begun_ns, 0)
         if not isinstance(output, Message):
             what = type(output).__name__
             self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")
@@ -508,7 +521,8 @@ class Worker:
             return
         self.trouble = ""
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
-        hop = Hop(*(self.task, place.node, job.arrived_ns, started_ns, ended_ns, inputs, state_age))
+        spent = state_age, self._cpu_ns
+        hop = Hop(self.task, place.node, job.arrived_ns, started_ns, ended_ns, inputs, *spent)
         header = Header(stamp, self.task, place.node, kind, (*job.hops(), hop), job.shadow)
         head = encode(header)
         if self.is_sink:

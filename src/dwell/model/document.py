@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.fabric import Bursts, Link, Node
+from dwell.model.fabric import Bursts, Link, Node, Quota
 from dwell.model.live import LiveSettings
 from dwell.model.pipeline import Execution, Task
 from dwell.model.problem import ControllerSettings, Problem
@@ -144,6 +144,11 @@ def _bursts(path: str, bursts: Bursts | None, **more: object) -> Document | None
     return {"every_ms": every_ms, "for_ms": _process(f"{path}.for_ms", bursts.for_ms), **more}
 
 
+def _quota(quota: Quota) -> Document:
+    slack_ms = quota.slack_ms or None
+    return _filled({"cpu": quota.cpu, "period_ms": quota.period_ms, "slack_ms": slack_ms})
+
+
 def _node(node: Node) -> Document:
     quota, bursts = node.quota, node.bursts
     return _filled(
@@ -152,7 +157,8 @@ def _node(node: Node) -> Document:
             "cores": node.cores,
             "scheduler": node.scheduler,
             "accelerators": dict(node.accelerators),
-            "quota": {"cpu": quota.cpu, "period_ms": quota.period_ms} if quota else None,
+            "quota": _quota(quota) if quota else None,
+            "background": node.background or None,
             "bursts": _bursts(
                 f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
             ),

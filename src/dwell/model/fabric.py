@@ -9,12 +9,14 @@ from typing import Literal, TypeAlias
 
 from dwell.model.bounds import (
     ACCELERATORS,
+    BACKGROUND,
     BURST_MEAN,
     CORES,
     FOREIGN_THREADS,
     LOSS,
     QUOTA_CPU,
     QUOTA_PERIOD_MS,
+    QUOTA_SLACK_MS,
     RATE_MBPS,
     RETRANSMIT_MS,
     require,
@@ -52,14 +54,24 @@ class Bursts:
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """CPU bandwidth control: `cpu` cores' worth of run time in every `period_ms`."""
+    """CPU bandwidth control: `cpu` cores' worth of run time in every `period_ms`.
+
+    Parameters
+    ----------
+    cpu, period_ms : float
+    slack_ms : float
+        Run time that a core has drawn and keeps, beyond the end of a period, when it goes idle.
+        Linux keeps 1 ms.
+    """
 
     cpu: float
     period_ms: float
+    slack_ms: float = 0.0
 
     def __post_init__(self) -> None:
         QUOTA_CPU.check("quota.cpu", self.cpu)
         QUOTA_PERIOD_MS.check("quota.period_ms", self.period_ms)
+        QUOTA_SLACK_MS.check("quota.slack_ms", self.slack_ms)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +91,9 @@ class Node:
         Foreign work of other tenants, in every scenario.
     quota : Quota, optional
         CPU bandwidth limit on everything that runs there.
+    background : float
+        Cores that are always taken, in small pieces, by others than the jobs; less than
+        `capacity`.
     """
 
     name: str
@@ -88,6 +103,7 @@ class Node:
     accelerators: Mapping[str, int] = field(default_factory=FrozenDict)
     bursts: Bursts | None = None
     quota: Quota | None = None
+    background: float = 0.0
 
     def __post_init__(self) -> None:
         require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
@@ -99,12 +115,28 @@ class Node:
         if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
             delay = self.bursts.add_delay_ms
             require(False, "bursts.add_delay_ms", delay, "left out: only a link adds a delay")
+        BACKGROUND.check("background", self.background)
+        bound = f"less than {self.capacity:g}, what the node can do"
+        require(self.background < self.capacity, "background", self.background, bound)
         object.__setattr__(self, "accelerators", FrozenDict(self.accelerators))
 
     @property
     def capacity(self) -> float:
         """Cores' worth of work it can do: what its utilisation is relative to."""
         return min(self.quota.cpu, self.cores) if self.quota is not None else float(self.cores)
+
+    @property
+    def spare(self) -> float:
+        """Cores that jobs and foreign threads share; a quota is what the background takes from."""
+        return float(self.cores) if self.quota is not None else self.cores - self.background
+
+    @property
+    def budget_ms(self) -> float:
+        """Core time that jobs and foreign threads have in each of the quota's periods, ms."""
+        if self.quota is None:
+            return math.inf
+        cpu = self.capacity - self.background if self.background else self.quota.cpu
+        return cpu * self.quota.period_ms
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from dwell.model.bounds import (
     LEAD_CYCLES,
     MIN_DWELL,
     MIN_IMPROVEMENT,
+    PROBE_CYCLES,
     SHADOW_FRACTION,
     TIME_MS,
     WARMUP_WINDOWS,
@@ -64,6 +65,8 @@ class ControllerSettings:
         of its ``state_bytes``.
     guard_cycles : int
         Periods without a completion after which the guard on the robot moves to a fallback.
+    probe_cycles : int
+        Cycles that must complete through another placement, too, before the guard's is left for it.
     fallbacks : tuple of str
         Candidates the guard may move to, best first; none switches the guard off.
     order_delay_ms : float
@@ -85,6 +88,7 @@ class ControllerSettings:
     half_life_windows: float = 2.0
     migration: str = "warm"
     guard_cycles: int = 3
+    probe_cycles: int = 30
     fallbacks: tuple[str, ...] = ()
     order_delay_ms: float = 0.0
     order_lead_cycles: int = 0
@@ -94,6 +98,7 @@ class ControllerSettings:
         MIN_DWELL.check("min_dwell", self.min_dwell)
         MIN_IMPROVEMENT.check("min_improvement", self.min_improvement)
         GUARD_CYCLES.check("guard_cycles", self.guard_cycles)
+        PROBE_CYCLES.check("probe_cycles", self.probe_cycles)
         LEAD_CYCLES.check("order_lead_cycles", self.order_lead_cycles)
         TIME_MS.check("order_delay_ms", self.order_delay_ms)
         TIME_MS.check("close_grace_ms", self.close_grace_ms)

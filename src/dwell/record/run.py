@@ -21,6 +21,7 @@ __all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run", "require_free", "sea
 SCHEMA_VERSION = 1
 OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down")
 TABLES = ("cycles", "windows", "decisions")
+MORE_TABLES = ("jobs", "processes")
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
@@ -33,7 +34,8 @@ class Run:
     meta : mapping
         JSON-able: problem, scenario, policy, seed, versions, schema version.
     tables : mapping of str to DataFrame, or to a function that makes it
-        ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs``; made when first asked for.
+        ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs`` and ``processes``; made
+        when first asked for.
     """
 
     def __init__(self, meta: Mapping[str, Any], tables: Mapping[str, Table]) -> None:
@@ -74,6 +76,31 @@ class Run:
         if "jobs" not in self._tables:
             raise RunError("this run kept no jobs; simulate with jobs=True (`dwell run --jobs`)")
         return self._table("jobs")
+
+    @property
+    def processes(self) -> pl.DataFrame:
+        """One row a window and process of a live cell: CPU time that it took.
+
+        Raises
+        ------
+        RunError
+            If the run was made without them, or simulated.
+        """
+        if "processes" not in self._tables:
+            raise RunError("this run kept no processes; `dwell controller --jobs` does")
+        return self._table("processes")
+
+    @property
+    def has_processes(self) -> bool:
+        """Whether the run kept what each process took of the CPUs."""
+        return "processes" in self._tables
+
+    @property
+    def run_id(self) -> str | None:
+        """What the stamps of a live run carry, unlike any other run's; None of a simulated one."""
+        if "run" not in self.cycles.columns or self.cycles.is_empty():
+            return None
+        return str(self.cycles["run"][0])
 
     @property
     def has_jobs(self) -> bool:
@@ -191,7 +218,8 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     missing = [name for name in TABLES if not (folder / f"{name}.parquet").is_file()]
     if missing:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
-    names = [*TABLES, *(["jobs"] if (folder / "jobs.parquet").is_file() else [])]
+    more = [name for name in MORE_TABLES if (folder / f"{name}.parquet").is_file()]
+    names = [*TABLES, *more]
     return Run(meta, {name: _reader(folder / f"{name}.parquet") for name in names})
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dwell.errors import SimulationError
+from dwell.io.claimed import write_whole
 from dwell.model import FrozenDict, Problem
 from dwell.report import chapter_tables
 from dwell.report.drawing import draw
@@ -17,7 +18,6 @@ from dwell.report.paper_page import Made, paper_html
 from dwell.report.svg import drawn, in_page, pdf_file, svg_file
 from dwell.study.paper.chapter import Chapter, Figure
 from dwell.study.paper.running import Scale
-from dwell.study.parts import write_whole
 from dwell.study.software import versions
 
 if TYPE_CHECKING:

@@ -112,6 +112,7 @@ class _Layout:
         self.out_flows: list[int] = []
         self.sites: list[list[int]] = []
         self.servers: list[list[int]] = []
+        self.servers_f: list[list[float]] = []
         self.hops: list[list[int]] = []
         self.links: list[list[int]] = []
         self.layer_rows: list[dict[int, int]] = []
@@ -146,11 +147,16 @@ class _Layout:
             self.node_row[key] = len(self.node_row)
             scheduler = SCHEDULER_CODE[node.scheduler]
             cpu = self._add_server(key, None, scheduler, node.cores)
+            of = self.servers_f[-1]
+            of[k.SPARE], of[k.BACKGROUND] = node.spare, node.background
+            of[k.SPEED] = 1.0 if node.scheduler == "fair" else node.spare / node.cores
             cpu[k.QUOTA_T] = -1
             if node.quota is not None:
                 period_ns = round(node.quota.period_ms * 1e6)
-                quota_ns = round(node.quota.cpu * period_ns)
-                cpu[k.PERIOD_NS], cpu[k.QUOTA_NS], cpu[k.LEFT_NS] = period_ns, quota_ns, quota_ns
+                quota_ns = max(round(node.budget_ms * 1e6), 1)
+                cpu[k.PERIOD_NS], cpu[k.QUOTA_NS] = period_ns, quota_ns
+                cpu[k.SLACK_NS] = round(node.quota.slack_ms * 1e6)
+                cpu[k.POOL_NS if cpu[k.SLACK_NS] else k.LEFT_NS] = quota_ns
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
 
@@ -160,6 +166,8 @@ class _Layout:
         row[k.NODE_OF], row[k.IS_CPU], row[k.NEXT_KEY] = self.node_row[node], int(not kind), -1
         self.server_row[node, kind] = len(self.servers)
         self.servers.append(row)
+        self.servers_f.append([0.0] * k.N_SERVER_F)
+        self.servers_f[-1][k.SPEED], self.servers_f[-1][k.SPARE] = 1.0, float(cores)
         self.server_workers.append(0)
         return row
 
@@ -343,8 +351,6 @@ class _Layout:
 
         changes = np.concatenate(self.changes)
         changes = changes[np.argsort(changes[:, 0], kind="stable")]
-        speed = np.zeros((len(servers), k.N_SERVER_F))
-        speed[:, k.SPEED] = 1.0
         stamps = np.zeros((cells, cycles), np.int16)
         stamps[[row[k.PARENT] >= 0 for row in self.cell_rows]] = -1
         tables = k.Tables(
@@ -373,7 +379,7 @@ class _Layout:
             cells=_table(self.cell_rows, k.N_CELL),
             sites=_table(self.sites, k.N_SITE),
             servers=servers,
-            servers_f=speed,
+            servers_f=np.array(self.servers_f, np.float64),
             links=_table(self.links, k.N_LINK),
             run_v=np.zeros(room),
             run_key=np.zeros(room, np.int64),

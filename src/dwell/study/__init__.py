@@ -8,6 +8,7 @@ from dwell.study.intervals import Interval, under
 from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
 from dwell.study.sensitivity import Parameter, sobol_design, sobol_indices, sobol_pairs
 from dwell.study.study import Contender, Point, Study, load_study
+from dwell.study.validation import Validation, validate
 
 __all__ = [
     "AIM",
@@ -22,6 +23,7 @@ __all__ = [
     "Point",
     "Study",
     "StudyResult",
+    "Validation",
     "canonical_demo",
     "compare",
     "load_study",
@@ -33,4 +35,5 @@ __all__ = [
     "sobol_indices",
     "sobol_pairs",
     "under",
+    "validate",
 ]

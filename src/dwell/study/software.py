@@ -6,15 +6,14 @@ import hashlib
 import json
 import pickle
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
-from importlib.resources import files
-from importlib.resources.abc import Traversable
 from typing import Any
 
 from dwell import __version__
 from dwell.errors import SimulationError
+from dwell.io.sources import digest_of
 from dwell.model.document import to_document
 from dwell.study.study import Contender, Study
 
@@ -38,26 +37,12 @@ def versions() -> dict[str, str]:
 
 @cache
 def _software() -> tuple[tuple[str, str], ...]:
-    digest = hashlib.sha256()
-    for name in SOURCES:
-        for path, text in _sources(files("dwell").joinpath(name), name):
-            digest.update(path.encode())
-            digest.update(text)
-    return (*versions().items(), ("sources", digest.hexdigest()[:16]))
+    return (*versions().items(), ("sources", digest_of(SOURCES)))
 
 
 def software() -> dict[str, str]:
     """Return the versions, and a digest of the sources of this package that make numbers."""
     return dict(_software())
-
-
-def _sources(entry: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
-    """Yield every Python file below an entry, in the order of their paths."""
-    if entry.is_dir():
-        for inner in sorted(entry.iterdir(), key=lambda one: one.name):
-            yield from _sources(inner, f"{path}/{inner.name}")
-    elif path.endswith(".py"):
-        yield path, entry.read_bytes()
 
 
 def describe(study: Study) -> dict[str, Any]:

@@ -13,32 +13,44 @@ import heapq
 import os
 import select
 import signal
+import sys
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from itertools import count
-from types import TracebackType
-from typing import NoReturn, Self, cast
+from typing import NoReturn, cast
 
 from dwell.errors import LiveError
-from dwell.testbed.child import PARENT_CHECK_S, Child, Parent
+from dwell.testbed.child import PARENT_CHECK_S, Child, Parent, Started
 
 __all__ = ["Burner"]
 
 MAX_THREADS = 1_000
 # Turns of an empty loop between two looks at whether the parent lives: below a millisecond.
 TURNS = 20_000
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class Burner:
+class Burner(Started):
     """Burns what it can get of some CPUs, on command.
 
     Parameters
     ----------
     cpus : collection of int
         Where the threads run; the kernel spreads them over these.
+    prefix : sequence of str
+        Words of a command that runs the words behind them, in the same process: as a group of
+        processes that the threads are to be in.
+    program : sequence of str
+        A command that keeps one CPU busy, in place of this module's own empty loop.
     """
 
-    def __init__(self, cpus: Collection[int]) -> None:
+    def __init__(
+        self,
+        cpus: Collection[int],
+        *,
+        prefix: Sequence[str] = (),
+        program: Sequence[str] = (),
+    ) -> None:
         allowed = os.sched_getaffinity(0)
         missing = sorted(set(cpus) - allowed)
         if missing or not cpus:
@@ -48,7 +60,9 @@ class Burner:
         #: Ids of the threads as of the last answer: each is a process.
         self.pids: tuple[int, ...] = ()
         self._cpus = sorted(cpus)
-        self._child = Child("dwell.testbed.burner", f"burner on {','.join(map(str, self._cpus))}")
+        self._program = list(program)
+        name = f"burner on {','.join(map(str, self._cpus))}"
+        self._child = Child("dwell.testbed.burner", name, prefix=prefix)
 
     @property
     def pid(self) -> int:
@@ -66,7 +80,9 @@ class Burner:
             If it has been started before, or does not start.
         """
         _check(threads)
-        answer = self._child.start({"cpus": self._cpus, "threads": threads})
+        answer = self._child.start(
+            {"cpus": self._cpus, "threads": threads, "program": self._program}
+        )
         self.pids = tuple(cast("list[int]", answer["pids"]))
 
     def set(self, threads: int, *, at_ns: int | None = None) -> int:
@@ -102,20 +118,6 @@ class Burner:
         self._child.stop()
         self.pids = ()
 
-    def __enter__(self) -> Self:
-        """Start it, with no threads."""
-        self.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End it."""
-        self.stop()
-
 
 def _check(threads: int) -> None:
     from dwell.model.bounds import Bound  # the burner's own process does without the model
@@ -133,6 +135,7 @@ def main() -> None:
     fire = _Fire()
     try:
         settings = parent.receive()
+        fire.program = cast("list[str]", settings["program"])
         os.sched_setaffinity(0, cast("list[int]", settings["cpus"]))
         fire.burn(cast("int", settings["threads"]))
         parent.answer({"pids": fire.pids})
@@ -170,27 +173,46 @@ class _Fire:
 
     def __init__(self) -> None:
         self.pids: list[int] = []
+        self.program: list[str] = []
 
     def burn(self, threads: int) -> None:
         """Have so many of them."""
         while len(self.pids) < threads:
-            self.pids.append(_fork())
+            self.pids.append(_fork(self.program))
         ended, self.pids = self.pids[threads:], self.pids[:threads]
         for pid in ended:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+                os.killpg(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
 
 
-def _fork() -> int:
+def _fork(program: Sequence[str]) -> int:
+    """Start a busy process that leads a process group and ends with this one."""
     parent = os.getpid()
     pid = os.fork()
     if pid == 0:
+        os.setpgid(0, 0)
+        if program:
+            _become(program, parent)
         while os.getppid() == parent:
             for _ in range(TURNS):
                 pass
         os._exit(0)
+    with contextlib.suppress(OSError):  # of both sides whoever comes first
+        os.setpgid(pid, pid)
     return pid
+
+
+def _become(program: Sequence[str], parent: int) -> None:
+    import ctypes
+
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    try:
+        if os.getppid() == parent:
+            os.execvp(program[0], list(program))  # noqa: S606 (what the parent was told to run)
+    except OSError as error:
+        print(f"{program[0]}: {error.strerror}", file=sys.stderr)
+    os._exit(127)
 
 
 if __name__ == "__main__":

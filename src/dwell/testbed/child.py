@@ -10,12 +10,14 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
-from typing import TypeAlias, cast
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Self, TypeAlias, cast
 
 from dwell.errors import LiveError
 
-__all__ = ["PARENT_CHECK_S", "Child", "Json", "Parent"]
+__all__ = ["PARENT_CHECK_S", "Child", "Json", "Parent", "Started"]
 
 Json: TypeAlias = dict[str, object]
 
@@ -26,6 +28,32 @@ STOP_S = 2.0
 RECEIVE_BYTES = 2**16
 #: How often a child looks for its parent, beside the end of their connection.
 PARENT_CHECK_S = 0.5
+
+
+class Started(ABC):
+    """What runs from the beginning of a ``with`` statement to its end."""
+
+    @abstractmethod
+    def start(self) -> None:
+        """Start it."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End it; safe to call twice."""
+
+    def __enter__(self) -> Self:
+        """Start it."""
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it."""
+        self.stop()
 
 
 class Child:
@@ -40,11 +68,24 @@ class Child:
         Run as ``python -m``; its main function makes a `Parent`.
     name : str
         For messages.
+    descriptors : sequence of int
+        Open files that it has under the same numbers.
+    prefix : sequence of str
+        Words of a command that runs the words behind them, in the same process.
     """
 
-    def __init__(self, module: str, name: str) -> None:
+    def __init__(
+        self,
+        module: str,
+        name: str,
+        descriptors: Sequence[int] = (),
+        *,
+        prefix: Sequence[str] = (),
+    ) -> None:
         self._module = module
         self._name = name
+        self._descriptors = tuple(descriptors)
+        self._prefix = tuple(prefix)
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
         self._lock = threading.Lock()
@@ -76,7 +117,9 @@ class Child:
         with theirs:
             # Standard output and error are the parent's: a child that fails says why there.
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
-                [sys.executable, "-P", "-m", self._module], stdin=theirs.fileno()
+                [*self._prefix, sys.executable, "-P", "-m", self._module],
+                stdin=theirs.fileno(),
+                pass_fds=self._descriptors,
             )
         self._socket = ours
         try:

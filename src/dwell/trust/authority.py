@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import base64
 import ipaddress
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import cast
 
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -21,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dwell.errors import TrustError
-from dwell.trust.roster import Role, Roster, Subject, write_private
+from dwell.trust.roster import ROLES, Role, Roster, Subject, write_private
 
 __all__ = ["AUTHORITY", "DAYS", "Authority"]
 
@@ -120,16 +121,22 @@ class Authority:
         return cls(folder, key, certificate, Roster.read(own / "roster.json", key.public_key()))
 
     def issue(
-        self, name: str, role: Role, addresses: Collection[str] = (), *, days: int = DAYS
+        self,
+        name: str,
+        role: str | None = None,
+        addresses: Collection[str] | None = None,
+        *,
+        days: int = DAYS,
     ) -> Path:
         """Issue a certificate with a new key; one that the subject had is revoked.
 
         Parameters
         ----------
         name : str
-        role : {"node", "controller", "operator", "observer"}
-        addresses : collection of str
-            Where it is reached: host names and IP addresses.
+        role : {"node", "controller", "operator", "observer"}, optional
+            The one that it had if left out.
+        addresses : collection of str, optional
+            Where it is reached: host names and IP addresses; those it had if left out.
         days : int
             How long it holds, 1 to 3650.
 
@@ -147,16 +154,20 @@ class Authority:
         roster, before = self.roster, self.roster.subjects.get(name)
         if name == AUTHORITY:
             raise TrustError(f"{name!r} is the authority's own name; choose another")
-        if before is not None and before.role != role:
-            raise TrustError(f"{name} is a {before.role}; revoke it before it becomes a {role}")
+        if role is None and before is None:
+            raise TrustError(f"{name} is new; say its role, {', '.join(ROLES)}")
+        if before is not None and role not in (None, before.role):
+            raise TrustError(f"{name} has the role {before.role}; revoke it to make it {role}")
         key = Ed25519PrivateKey.generate()
         serial = x509.random_serial_number()
         generation = 1 + max(before.generation if before else 0, self._last_generation(name))
         public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
         expires = min(_now() + timedelta(days=days), self.certificate.not_valid_after_utc)
         encoded = base64.b64encode(public).decode()
-        subject = Subject(name, role, generation, serial, encoded, expires.date().isoformat())
-        certificate = self._certificate(subject, key, addresses, expires)
+        played = cast("Role", role or (before.role if before else None))
+        subject = Subject(name, played, generation, serial, encoded, expires.date().isoformat())
+        names = self._names(name) if addresses is None else map(_general_name, addresses)
+        certificate = self._certificate(subject, key, list(dict.fromkeys(names)), expires)
         folder = self.folder / name
         _make(folder)
         write_private(folder / "key.pem", _pem(key))
@@ -183,15 +194,29 @@ class Authority:
         rest = {one: its for one, its in roster.subjects.items() if one != name}
         self._publish(replace(roster, subjects=rest, revoked=(*roster.revoked, subject.serial)))
 
-    def _last_generation(self, name: str) -> int:
-        """Return the generation of the newest certificate that a subject's folder has."""
+    def _last(self, name: str) -> x509.Certificate | None:
+        """Return the newest certificate that a subject's folder has."""
         try:
-            data = (self.folder / name / "cert.pem").read_bytes()
-            written = x509.load_pem_x509_certificate(data).subject
+            return x509.load_pem_x509_certificate((self.folder / name / "cert.pem").read_bytes())
         except (OSError, ValueError):
+            return None
+
+    def _last_generation(self, name: str) -> int:
+        last = self._last(name)
+        if last is None:
             return 0
-        found = str(written.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+        found = str(last.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
         return int(found.rpartition(".")[2])
+
+    def _names(self, name: str) -> Iterable[x509.GeneralName]:
+        """Return the addresses that a subject had."""
+        last = self._last(name)
+        if last is None:
+            return ()
+        try:
+            return last.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            return ()
 
     def _publish(self, roster: Roster) -> None:
         """Write the roster to everybody's folder, those of the revoked aside."""
@@ -204,10 +229,9 @@ class Authority:
         self,
         subject: Subject,
         key: Ed25519PrivateKey,
-        addresses: Collection[str],
+        names: Sequence[x509.GeneralName],
         expires: datetime,
     ) -> x509.Certificate:
-        names = [_general_name(address) for address in dict.fromkeys(addresses)]
         uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = (
             _builder(_name(subject.common_name), self.certificate.subject, key, expires)

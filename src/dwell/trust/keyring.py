@@ -16,10 +16,8 @@ from cryptography.x509.oid import NameOID
 from dwell.errors import TrustError
 from dwell.trust.roster import Roster, Subject
 
-__all__ = ["KEYS", "SOON_DAYS", "Keyring"]
+__all__ = ["SOON_DAYS", "Keyring"]
 
-#: Variable of the environment that names a process's keyring.
-KEYS = "DWELL_KEYS"
 #: From how many days before its end on a certificate is warned of.
 SOON_DAYS = 30
 

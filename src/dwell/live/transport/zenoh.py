@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.transport.expressions import require_expression, require_key
+from dwell.live.transport.losses import Losses
 from dwell.live.transport.protocol import Lane, Receive, Sample
 from dwell.live.wiring import Entry, Session, session_of
 from dwell.model import FrozenDict
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 __all__ = ["ZenohSettings", "ZenohTransport"]
 
 _LOG = logging.getLogger(__name__)
+_SENT_BY = "zenoh/bytes;"
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
 #: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
 _PUBLISHERS = 256
@@ -108,6 +110,8 @@ class ZenohTransport:
     entry : Entry
         Where it listens and to whom it connects, from `Wiring.entry`.
     settings : ZenohSettings
+    losses : Losses, optional
+        Messages that it leaves out; what the environment asks for if left out.
 
     Raises
     ------
@@ -115,7 +119,13 @@ class ZenohTransport:
         If Zenoh is not installed, or a port is taken.
     """
 
-    def __init__(self, entry: Entry, settings: ZenohSettings | None = None) -> None:
+    def __init__(
+        self,
+        entry: Entry,
+        settings: ZenohSettings | None = None,
+        *,
+        losses: Losses | None = None,
+    ) -> None:
         try:
             import zenoh
         except ImportError:
@@ -123,6 +133,7 @@ class ZenohTransport:
         self.entry = entry
         self.settings = settings or ZenohSettings()
         self._zenoh = zenoh
+        self._losses = losses or Losses.of(entry.role.who, entry.role.node)
         self._closed = False
         # Read and filled without a lock: a publisher too many does no harm.
         self._ways: dict[tuple[str, Lane], _Way] = {}
@@ -147,7 +158,7 @@ class ZenohTransport:
     ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
         way = self._ways.get((key, lane)) or self._way(key, lane)
-        if way is None or self._closed:
+        if way is None or self._closed or (way.lost is not None and way.lost()):
             return
         # Zenoh takes no views: whoever has one pays for a copy more.
         data = payload if isinstance(payload, bytes) else bytes(payload)
@@ -163,6 +174,8 @@ class ZenohTransport:
         require_expression(key)
         for name, session in list(self._sessions.items()):
             deliver = self._deliver(receive, "control" if name == "control" else "images")
+            if self._losses is not None:
+                deliver = self._unless_lost(deliver, self._losses)
             # Called in the thread that read the message: one hand-over less, and a receiver that
             # is behind makes its senders drop instead of growing a queue here.
             session.declare_subscriber(
@@ -225,6 +238,7 @@ class ZenohTransport:
         try:
             publisher = session.declare_publisher(
                 key,
+                encoding=self._encoding(),
                 congestion_control=self._zenoh.CongestionControl.DROP,
                 priority=priority,
                 express=True,
@@ -235,7 +249,8 @@ class ZenohTransport:
                 return None
             raise
         pool = self._pool if name == "local" else None
-        way = _Way(publisher.put, pool, self.settings.shared_bytes)
+        lost = None if self._losses is None else self._losses.sending(key)
+        way = _Way(publisher.put, pool, self.settings.shared_bytes, lost)
         while len(self._ways) >= _PUBLISHERS:
             dropped = self._ways.pop(next(iter(self._ways)), None)
             if dropped is not None and dropped.sender is not None:
@@ -280,6 +295,23 @@ class ZenohTransport:
 
         return deliver
 
+    def _encoding(self) -> zenoh.Encoding | None:
+        """Return what tells receivers the node that sent a message, where some are to be lost."""
+        if self._losses is None:
+            return None
+        return self._zenoh.Encoding(f"{_SENT_BY}{self._losses.node}")
+
+    @staticmethod
+    def _unless_lost(
+        deliver: Callable[[zenoh.Sample], None], losses: Losses
+    ) -> Callable[[zenoh.Sample], None]:
+        def filtered(sample: zenoh.Sample) -> None:
+            source = str(sample.encoding).removeprefix(_SENT_BY)
+            if losses.receives(str(sample.key_expr), source):
+                deliver(sample)
+
+        return filtered
+
 
 _kept = threading.local()
 
@@ -301,6 +333,7 @@ class _Way:
     put: _Put
     pool: _Pool | None
     shared_bytes: int
+    lost: Callable[[], bool] | None = None
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
 

@@ -1,0 +1,208 @@
+"""`dwell testbed campaign`: measure every policy in every scenario, or go on with that."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import typer
+
+import dwell
+from dwell.cli.output import print_json, working, write_file
+from dwell.model import Problem
+from dwell.report.campaign_page import campaign_html
+from dwell.report.campaign_text import campaign_text
+from dwell.study.campaign import Measured, read_measured
+from dwell.testbed.campaign import (
+    Campaign,
+    default_entrants,
+    default_scenarios,
+    entrant,
+)
+from dwell.testbed.execution import Play, State, run_campaign
+from dwell.testbed.playing import interruptible
+from dwell.testbed.timeline import changes_of
+
+__all__ = ["Request", "report_campaign", "run_campaign_file"]
+
+INTERRUPTED = 130
+PAGE = "report.html"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What was asked for; None is the default.
+
+    Parameters
+    ----------
+    cell : Path
+    scenarios, policies : tuple of str
+        Empty for the default ones.
+    repetitions : int
+    seconds : float
+        Of each run.
+    seed : int
+    out : Path or None
+    name : str
+        Of the testbed.
+    minutes : float or None
+    inventory : Path or None
+        Of real hosts, in place of the testbed.
+    report : bool
+        Whether nothing is measured: only the report of what is there is written.
+    """
+
+    cell: Path
+    scenarios: tuple[str, ...]
+    policies: tuple[str, ...]
+    repetitions: int
+    seconds: float
+    seed: int
+    out: Path | None
+    name: str
+    minutes: float | None = None
+    inventory: Path | None = None
+    report: bool = False
+
+
+def run_campaign_file(request: Request, *, as_json: bool) -> bool:
+    """Measure, write the report, and print what it comes to.
+
+    Returns
+    -------
+    bool
+        Whether no run was given up.
+
+    Raises
+    ------
+    DwellError
+        If something asked for is wrong, this machine cannot do it, the folder holds something else,
+        or the cell does not come up.
+    typer.Exit
+        If it was interrupted.
+    """
+    problem = dwell.load(request.cell)
+    folder = request.out or Path("campaigns", re.sub(r"[^\w.-]", "_", problem.name))
+    if request.report:
+        report_campaign(folder, folder / PAGE, as_json=as_json)
+        return True
+    scenarios = request.scenarios or default_scenarios(problem)
+    entrants = tuple(entrant(problem, name) for name in request.policies)
+    play, where = _player(request, problem, scenarios)
+    campaign = Campaign(
+        problem,
+        scenarios,
+        entrants or default_entrants(problem),
+        request.repetitions,
+        request.seconds,
+        request.seed,
+        where,
+    )
+    state = _run(campaign, folder, play, request)
+    if state.done:
+        measured = _write_page(folder, folder / PAGE)
+        _print(measured, folder, folder / PAGE, state, as_json=as_json)
+    else:
+        typer.echo(f"no run is done; see {folder}", err=True)
+    return not state.given_up and bool(state.done or state.left)
+
+
+def _player(request: Request, problem: Problem, scenarios: Sequence[str]) -> tuple[Play, str]:
+    """Return what makes a run, and where; refuse what can be played in no run."""
+    outages = request.inventory is None
+    changes = [one for name in scenarios for one in changes_of(problem, name, outages=outages)]
+    if request.inventory is not None:
+        from dwell.testbed.inventory import load_inventory
+        from dwell.testbed.real_hosts import require_commands, run_on_hosts
+
+        inventory = load_inventory(request.inventory, problem)
+        require_commands(inventory, changes)
+        return partial(run_on_hosts, inventory), inventory.digest
+    from dwell.testbed.run import require_machine, run_once
+
+    require_machine([problem])
+    return partial(run_once, beside=request.cell.resolve().parent), "testbed"
+
+
+def _run(campaign: Campaign, folder: Path, play: Play, request: Request) -> State:
+    try:
+        with interruptible():
+            return run_campaign(
+                campaign,
+                folder,
+                play,
+                name=request.name,
+                minutes=request.minutes,
+                tell=partial(typer.echo, err=True),
+            )
+    except KeyboardInterrupt:
+        done = len(list(folder.glob("runs/*/run.json")))
+        typer.echo(
+            f"interrupted: {done} of {len(campaign.plan())} runs are done and stay in {folder}; "
+            "the same command goes on from there",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def report_campaign(folder: Path, page: Path, *, as_json: bool) -> None:
+    """Write the report of a campaign, finished or not, and print what it comes to.
+
+    Raises
+    ------
+    RunError
+        If the folder is no campaign, or none of its runs is done.
+    """
+    measured = _write_page(folder, page)
+    _print(measured, folder, page, None, as_json=as_json)
+
+
+def _write_page(folder: Path, page: Path) -> Measured:
+    with working("writing the report"):
+        measured = read_measured(folder)
+        write_file(page, campaign_html(measured))
+    return measured
+
+
+def _print(
+    measured: Measured, folder: Path, page: Path, state: State | None, *, as_json: bool
+) -> None:
+    if as_json:
+        print_json(_told(measured, folder, page, state))
+        return
+    typer.echo(f"{campaign_text(measured)}\n\nruns: {folder}/runs\nreport: {page}")
+    if state is not None and state.given_up:
+        typer.echo(f"given up: {_listed(state.given_up)}", err=True)
+    if state is not None and state.left:
+        typer.echo(f"{state.left} runs are left; the same command goes on", err=True)
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names)
+
+
+def _told(measured: Measured, folder: Path, page: Path, state: State | None) -> dict[str, Any]:
+    from dwell.study.campaign_questions import questions
+
+    found: dict[str, Any] = {
+        "folder": folder,
+        "report": page,
+        "planned": measured.planned,
+        "done": measured.log.height,
+        "repetitions": measured.repetitions,
+        "excluded_windows": int(measured.log["excluded"].sum()),
+        "failed_attempts": measured.failed.height,
+        "given_up": [] if state is None else list(state.given_up),
+        "questions": [
+            {"question": one.title, "answer": one.answer, "verdict": one.verdict}
+            for one in questions(measured)
+        ],
+        "table": measured.comparison.table().to_dicts(),
+        "profiles": measured.profiles.to_dicts(),
+        "links": measured.links.to_dicts(),
+    }
+    return found

@@ -1,0 +1,172 @@
+"""`dwell keys`: who may take part in a live cell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dwell.cli.output import aligned, print_json
+
+if TYPE_CHECKING:
+    from dwell.model import Problem
+    from dwell.trust.roster import Roster
+
+__all__ = ["keys"]
+
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the authority.")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Node of the cell, or another subject.")]
+Days = Annotated[int, typer.Option(help="How long certificates hold.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+keys = typer.Typer(
+    no_args_is_help=True,
+    help="Issue and revoke the certificates of a live cell's hosts, controller and operators.",
+)
+
+
+@keys.command()
+def init(
+    cell: Annotated[Path, typer.Argument(metavar="CELL", help="Cell file.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Where the authority and all keyrings go.")
+    ],
+    days: Days = 365,
+    as_json: AsJson = False,
+) -> None:
+    """Make a cell's own authority, and keyrings for its nodes, its controller and an operator."""
+    import dwell
+    from dwell.trust.authority import Authority
+
+    problem = dwell.load(cell)
+    authority = Authority.create(out, problem.name, days=days)
+    for node in problem.fabric.nodes:
+        authority.issue(node, "node", _addresses(problem, node), days=days)
+    on = _addresses(problem, problem.controller_node)
+    authority.issue("controller", "controller", on, days=days)
+    authority.issue("operator", "operator", days=days)
+    _show(authority.roster, as_json=as_json)
+    if not as_json:
+        typer.echo(
+            f"\n{out}/ca stays here: whoever has it can be anybody.\n"
+            "Take every other folder to its host alone, and name it there with --keys."
+        )
+
+
+def _addresses(problem: Problem, node: str) -> list[str]:
+    """Return where a node is reached, from anywhere."""
+    from dwell.model import Host
+
+    host = problem.live.hosts.get(node) or Host()
+    return [host.address, *(seen.address for seen in host.seen_from.values())]
+
+
+@keys.command()
+def issue(
+    folder: Folder,
+    name: Name,
+    role: Annotated[
+        str | None,
+        typer.Option(help="node, controller, operator or observer; the one it had if not given."),
+    ] = None,
+    address: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST", help="Where it is reached; may be repeated."),
+    ] = None,
+    days: Days = 365,
+    as_json: AsJson = False,
+) -> None:
+    """Issue a certificate with a new key; the one that the subject had is revoked."""
+    from dwell.trust.authority import Authority
+
+    authority = Authority.open(folder)
+    authority.issue(name, role, address, days=days)
+    _show(authority.roster, as_json=as_json)
+    _remind(authority.roster, as_json=as_json)
+
+
+@keys.command()
+def revoke(folder: Folder, name: Name, as_json: AsJson = False) -> None:
+    """Take a subject's certificate back."""
+    from dwell.trust.authority import Authority
+
+    authority = Authority.open(folder)
+    authority.revoke(name)
+    _show(authority.roster, as_json=as_json)
+    _remind(authority.roster, as_json=as_json)
+
+
+@keys.command()
+def show(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder of an authority, or a keyring.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """List the subjects, with what they may do and until when."""
+    from dwell.trust.authority import AUTHORITY, Authority
+    from dwell.trust.keyring import Keyring
+
+    if (folder / AUTHORITY).is_dir():
+        _show(Authority.open(folder).roster, as_json=as_json)
+        return
+    keyring = Keyring.open(folder)
+    _show(keyring.roster, own=keyring.own.name, as_json=as_json)
+
+
+def _remind(roster: Roster, *, as_json: bool) -> None:
+    if not as_json:
+        typer.echo(
+            f"\nTake roster.json (number {roster.number}) to every host, and start its processes "
+            "again:\nuntil then it goes by the one that it has."
+        )
+
+
+def _show(roster: Roster, *, own: str = "", as_json: bool) -> None:
+    today = datetime.now(UTC).date()
+    if as_json:
+        print_json(
+            {
+                "cell": roster.cell,
+                "number": roster.number,
+                "subjects": {
+                    subject.name: {
+                        "role": subject.role,
+                        "generation": subject.generation,
+                        "expires": subject.expires,
+                        "days": _days(subject.expires, today),
+                    }
+                    for subject in roster.subjects.values()
+                },
+                "revoked": len(roster.revoked),
+            }
+        )
+        return
+    rows: list[Sequence[str]] = [
+        (
+            subject.name,
+            subject.role,
+            str(subject.generation),
+            subject.expires,
+            _remark(_days(subject.expires, today)),
+            "this keyring" if subject.name == own else "",
+        )
+        for subject in roster.subjects.values()
+    ]
+    typer.echo(f"cell {roster.cell}, roster {roster.number}, {len(roster.revoked)} revoked\n")
+    typer.echo(aligned(("subject", "role", "generation", "ends", "", ""), rows))
+
+
+def _days(expires: str, today: date) -> int:
+    return (date.fromisoformat(expires) - today).days
+
+
+def _remark(days: int) -> str:
+    from dwell.trust.keyring import SOON_DAYS
+
+    if days < 0:
+        return "has ended"
+    return f"in {days} days" if days < SOON_DAYS else ""

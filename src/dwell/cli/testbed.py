@@ -1,0 +1,252 @@
+"""`dwell testbed`: cells on hosts, links and CPUs of their own, on one machine."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dwell.cli.output import aligned, print_json
+
+__all__ = ["testbed"]
+
+FAILED = 1
+
+Cell = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
+Name = Annotated[str, typer.Option(help="Of the testbed, among others on this machine.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+testbed = typer.Typer(
+    no_args_is_help=True,
+    help="Run cells on hosts, links and CPUs of their own on this machine, and measure them.",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class _Length:
+    """How long a run is: so many windows, or so many seconds."""
+
+    windows: int | None
+    seconds: float | None
+
+    def __post_init__(self) -> None:
+        if self.windows is not None and self.seconds is not None:
+            raise typer.BadParameter("--windows and --seconds: give one of them")
+
+
+@testbed.command()
+def run(
+    cell: Cell,
+    scenario: Annotated[str, typer.Option(help="What is played.")] = "baseline",
+    policy: Annotated[
+        str | None, typer.Option(help="A policy or a candidate, instead of the cell's policy.")
+    ] = None,
+    windows: Annotated[
+        int | None, typer.Option(min=1, help="Length, the warm-up included; 60 if not given.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=1, help="Length instead, the warm-up included.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of delays and losses.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where logs and the run go; below testbed-out if not given.",
+        ),
+    ] = None,
+    name: Name = "bed",
+    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job of the run.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Play a scenario once, and take everything down again. Needs root."""
+    import dwell
+    from dwell.testbed.run import length_s, run_once
+
+    length = _Length(windows, seconds)
+    problem = dwell.load(cell)
+    folder = out or _folder(problem.name, scenario, policy or problem.controller.policy, seed)
+    found = run_once(
+        problem,
+        scenario=scenario,
+        policy=policy,
+        seconds=length.seconds or length_s(problem, length.windows or 60),
+        seed=seed,
+        out=folder,
+        name=name,
+        jobs=jobs,
+        beside=cell.parent,
+        tell=_say,
+    )
+    _sum_up(found, as_json=as_json)
+
+
+def _folder(*parts: object) -> Path:
+    """Return the folder of a run that names none; a name may hold what a file name may not."""
+    return Path("testbed-out", re.sub(r"[^\w.-]", "_", "-".join(map(str, parts))))
+
+
+def _sum_up(folder: Path, *, as_json: bool) -> None:
+    """Print what the run showed; it has failed where the machine was under pressure."""
+    import dwell
+    from dwell.testbed.run import summary
+
+    found = dwell.open_run(folder)
+    pressure = found.meta.get("pressure") or {}
+    told = summary(found)
+    failed = bool(pressure.get("failed"))
+    if as_json:
+        head = {key: found.meta.get(key) for key in ("cell", "scenario", "seed", "policy")}
+        print_json({**head, **told, "failed": failed, "why": pressure.get("why"), "run": folder})
+    else:
+        typer.echo(_lines(told))
+        typer.echo(f"\nrun: {folder}")
+    if failed:
+        _say(
+            f"error: the machine was the bottleneck in {told['excluded']} of {told['windows']} "
+            f"windows ({pressure['why']}); run it on a machine that does nothing else"
+        )
+        raise typer.Exit(FAILED)
+
+
+def _lines(told: dict[str, Any]) -> str:
+    def number(value: float | None, scale: float, unit: str) -> str:
+        return "-" if value is None else f"{scale * value:.1f} {unit}"
+
+    rows = [
+        ("windows after the warm-up", str(told["windows"])),
+        ("excluded: the machine was the bottleneck", str(told["excluded"])),
+        ("L95, mean of windows", number(told["l95_ms"], 1.0, "ms")),
+        ("missed deadlines (V_D)", number(told["violation_rate"], 100.0, "%")),
+        ("migrations", str(told["migrations"])),
+    ]
+    rows += [
+        (f"utilisation of {node}", number(used, 100.0, "%"))
+        for node, used in told["utilisation"].items()
+    ]
+    return aligned(("", ""), rows).lstrip("\n")
+
+
+@testbed.command()
+def doctor(
+    cells: Annotated[
+        list[Path] | None, typer.Argument(metavar="CELL...", help="Cell files to have checked too.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what this machine can do as a testbed and what it cannot, and what to install."""
+    import dwell
+    from dwell.testbed.doctor import examine
+
+    findings = examine([dwell.load(cell) for cell in cells or ()])
+    missing = [one for one in findings if one.needed and not one.ok]
+    if as_json:
+        rows = [
+            {"name": one.name, "ok": one.ok, "needed": one.needed, "found": one.found}
+            | {"remedy": one.remedy}
+            for one in findings
+        ]
+        print_json({"ok": not missing, "findings": rows})
+    else:
+        for one in findings:
+            mark = "ok" if one.ok else "MISSING" if one.needed else "without"
+            typer.echo(f"{mark:8} {one.name}: {one.found}")
+            if not one.ok and one.remedy:
+                typer.echo(f"{'':8} {one.remedy}")
+    if missing:
+        raise typer.Exit(FAILED)
+
+
+@testbed.command()
+def campaign(
+    cell: Cell,
+    scenarios: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,NAME", help="The paper's four if not given."),
+    ] = None,
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,NAME",
+            help="Policies, candidates, or policies with an estimator, as cusum+corrected; all "
+            "candidates, atp, dtp and cusum+corrected if not given.",
+        ),
+    ] = None,
+    repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Length of each run, the warm-up included.")
+    ] = 120.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the order, of delays and losses.")] = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Of the campaign; campaigns/CELL if not given."),
+    ] = None,
+    name: Name = "campaign",
+    minutes: Annotated[
+        float | None, typer.Option(min=0, help="Begin no run that would end after these.")
+    ] = None,
+    inventory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Real hosts (YAML), instead of this machine's testbed."),
+    ] = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Measure nothing: report on what is there.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure every policy in every scenario again and again, in random order, and report.
+
+    What is done stays in the folder, whatever ends the work: the same command goes on.
+    """
+    from dwell.cli.campaign import Request, run_campaign_file
+
+    request = Request(
+        cell, _names(scenarios), _names(policies), repetitions, seconds, seed, out, name
+    )
+    request = replace(request, minutes=minutes, inventory=inventory, report=report)
+    if not run_campaign_file(request, as_json=as_json):
+        raise typer.Exit(FAILED)
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+
+@testbed.command()
+def calibrate(
+    cell: Cell,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Cell file to write.")],
+    runs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="RUN...",
+            help="Folders of runs with their jobs: baseline, and single-task stress. Without any, "
+            "the baseline is run under every candidate.",
+        ),
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Of each run that is made, the warm-up included.")
+    ] = 120.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of its delays and losses.")] = 1,
+    name: Name = "calibrate",
+    real: Annotated[
+        bool,
+        typer.Option("--real", help="The links are real: their delays are what was measured."),
+    ] = False,
+) -> None:
+    """Put what runs have shown of tasks and links into a cell file."""
+    from dwell.testbed.calibrate import calibrate as write_calibrated
+    from dwell.testbed.calibrate import make_runs
+
+    if not runs:
+        folder = out.with_name(f"{out.stem}.runs")
+        runs = make_runs(cell, folder, seconds=seconds, seed=seed, name=name, tell=_say)
+    write_calibrated(cell, runs, out, emulated=not real, say=typer.echo)
+    typer.echo(f"written to {out}")
+
+
+def _say(line: str) -> None:
+    typer.echo(line, err=True)

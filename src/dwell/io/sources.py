@@ -1,0 +1,35 @@
+"""A digest of this package's own sources: whether two results were made by the same code."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+
+__all__ = ["digest_of"]
+
+
+def digest_of(names: Iterable[str]) -> str:
+    """Return 16 hexadecimal digits that change with any Python file among several.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Files and folders below the package, as ``sim`` or ``cost.py``.
+    """
+    digest = hashlib.sha256()
+    for name in names:
+        for path, text in _sources(files("dwell").joinpath(name), name):
+            digest.update(path.encode())
+            digest.update(text)
+    return digest.hexdigest()[:16]
+
+
+def _sources(entry: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
+    """Yield every Python file below an entry, in the order of their paths."""
+    if entry.is_dir():
+        for inner in sorted(entry.iterdir(), key=lambda one: one.name):
+            yield from _sources(inner, f"{path}/{inner.name}")
+    elif path.endswith(".py"):
+        yield path, entry.read_bytes()

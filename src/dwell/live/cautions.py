@@ -1,0 +1,51 @@
+"""What is allowed in a cell file, and seldom meant in one that is run live."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from dwell.errors import Fault
+from dwell.model import Problem
+
+__all__ = ["find_cautions"]
+
+
+def find_cautions(problem: Problem) -> Iterator[Fault]:
+    """Yield what a live cell does not do as its file says, or not as well as it could.
+
+    Of a cell without hosts, which is none, nothing.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    if problem.live.hosts:
+        yield from _side_by_side(problem)
+        yield from _early_closes(problem)
+
+
+def _side_by_side(problem: Problem) -> Iterator[Fault]:
+    """Yield tasks whose jobs overlap in the simulator, and not in the one worker of a live node."""
+    for task in problem.pipeline.tasks.values():
+        for node, execution in task.on.items():
+            if execution.workers > 1:
+                yield Fault(
+                    f"tasks.{task.name}.on.{node}.workers",
+                    f"{execution.workers} is for the simulator: a live worker does one job at a "
+                    "time; set 1, or start threads within the stage",
+                )
+
+
+def _early_closes(problem: Problem) -> Iterator[Fault]:
+    """Yield a grace within which the guard has not spoken of a window's last cycles."""
+    settings = problem.controller
+    patience_ms = settings.guard_cycles * problem.pipeline.period_ms
+    if settings.fallbacks and settings.close_grace_ms < patience_ms:
+        yield Fault(
+            "controller.close_grace_ms",
+            f"{settings.close_grace_ms:g} is less than guard_cycles periods = {patience_ms:g} ms: "
+            "a window that closes before the guard acts may bring an order to a placement that the "
+            "fault has broken, too, and the guard waits for that one again: up to "
+            f"{2 * settings.guard_cycles + 1} cycles are lost instead of "
+            f"{settings.guard_cycles + 1}",
+        )

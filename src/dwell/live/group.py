@@ -1,0 +1,91 @@
+"""ControlGroup: what the kernel has counted for the group of processes that this one belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dwell.errors import LiveError
+
+__all__ = ["ControlGroup", "own_group"]
+
+PROCESS = Path("/proc/self")
+#: What counts CPU time in a group's folder: of version 1 and 2.
+COUNTERS = {"cgroup": "cpuacct.usage", "cgroup2": "cpu.stat"}
+
+
+@dataclass(frozen=True, slots=True)
+class ControlGroup:
+    """A control group.
+
+    Parameters
+    ----------
+    counter : Path
+        ``cpuacct.usage`` (version 1, nanoseconds) or ``cpu.stat`` (version 2, microseconds).
+    """
+
+    counter: Path
+
+    def used_ns(self) -> int:
+        """CPU time that its processes have taken, those that have ended included.
+
+        Raises
+        ------
+        LiveError
+            If that cannot be read.
+        """
+        try:
+            text = self.counter.read_text()
+            if self.counter.name == COUNTERS["cgroup"]:
+                return int(text)
+            return int(dict(line.split() for line in text.splitlines())["usage_usec"]) * 1000
+        except (OSError, ValueError, KeyError) as error:
+            raise LiveError(f"{self.counter}: cannot be read ({error})") from None
+
+
+def own_group(process: Path = PROCESS) -> ControlGroup | None:
+    """Return the control group of this process; None where that is the root, or nothing counts.
+
+    Parameters
+    ----------
+    process : Path
+        Folder of the process below ``/proc``.
+    """
+    try:
+        groups = _groups((process / "cgroup").read_text())
+        mounts = list(_mounts((process / "mountinfo").read_text()))
+    except OSError:
+        return None
+    for kind, controllers, root, folder in mounts:
+        wanted = "cpuacct" if kind == "cgroup" else ""
+        group = groups.get(wanted)
+        if group is None or wanted not in controllers or not _below(group, root):
+            continue
+        counter = folder / group.removeprefix(root).lstrip("/") / COUNTERS[kind]
+        if group != root and counter.is_file():
+            return ControlGroup(counter)
+    return None
+
+
+def _below(group: str, root: str) -> bool:
+    return group == root or group.startswith(root.rstrip("/") + "/")
+
+
+def _groups(text: str) -> dict[str, str]:
+    """Return the group in each hierarchy, by controller; version 2 has the empty name."""
+    found = {}
+    for line in text.splitlines():
+        _, controllers, group = line.split(":", 2)
+        found.update(dict.fromkeys(controllers.split(","), group))
+    return found
+
+
+def _mounts(text: str) -> Iterator[tuple[str, tuple[str, ...], str, Path]]:
+    """Return version, controllers, root and place of every hierarchy that is mounted (proc(5))."""
+    for line in text.splitlines():
+        words = line.split()
+        kind, options = words[words.index("-") + 1], words[-1].split(",")
+        if kind in COUNTERS:
+            controllers = tuple(options) if kind == "cgroup" else ("",)
+            yield kind, controllers, words[3], Path(words[4])

@@ -1,0 +1,113 @@
+"""Permissions: whose certificate may put under which key of a cell.
+
+All processes of a node share its certificate, so what is told apart here are nodes, the controller
+and people. A key that is not listed is nobody's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+
+from dwell.live.keys import MAIN, SHADOW, Keys
+from dwell.live.wiring import roles
+from dwell.model import Problem
+from dwell.trust.roster import Roster
+
+__all__ = ["CONTROLLER", "senders", "subjects"]
+
+#: Subject that orders.
+CONTROLLER = "controller"
+
+
+def senders(problem: Problem) -> dict[str, frozenset[str]]:
+    """Return who may put, by key; the names are those of nodes, and `CONTROLLER`.
+
+    Questions are missing: who may ask them is in nobody's cell file.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    keys, pipeline = Keys(problem.name), problem.pipeline
+    stamper, relay = problem.stamper_node, problem.live.relay or problem.controller_node
+    first = next(task for name, task in pipeline.tasks.items() if not pipeline.inputs(name))
+    everywhere = frozenset(node for task in pipeline.tasks.values() for node in task.on)
+    found: dict[str, frozenset[str]] = {
+        **_of_stages(problem, keys),
+        keys.ended(): everywhere,
+        keys.stamped(): frozenset([stamper]),
+        keys.accepted(): frozenset([stamper]),
+        keys.order(): frozenset([CONTROLLER]),
+        keys.answer("*"): frozenset([CONTROLLER]),
+        keys.carried(): frozenset([relay]),
+        keys.gathered(): frozenset([relay]),
+    }
+    if problem.live.release == "frames":
+        found[keys.frame()] = frozenset(first.on)
+    for role in roles(problem):
+        sender = CONTROLLER if role.kind == "controller" else role.node
+        found[keys.beat(role.node, role.who)] = frozenset([sender])
+    for node in problem.fabric.nodes:
+        found[keys.load(node)] = frozenset([node])
+    # What is sent twice may be handed to the relay by whoever may send it.
+    twice = {"done", "ended", "beat", "accepted", "load"}
+    found |= {keys.relay(key): who for key, who in found.items() if keys.word(key) in twice}
+    return found
+
+
+def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
+    """Return who may put what stages send to one another, and what is about their states."""
+    pipeline = problem.pipeline
+    found: dict[str, frozenset[str]] = {}
+    restored: set[str] = set()
+    for name, task in pipeline.tasks.items():
+        flows = pipeline.inputs(name)
+        before = {node for flow in flows for node in pipeline.tasks[flow.source].on}
+        sources = frozenset(before) if flows else frozenset([problem.stamper_node])
+        for node in task.on:
+            found[keys.inputs(name, node, MAIN)] = sources
+            if flows:
+                found[keys.inputs(name, node, SHADOW)] = sources
+        if not pipeline.outputs(name):
+            found[keys.command(name)] = frozenset(task.on)
+            found[keys.done(name)] = frozenset(task.on)
+        if len(task.on) > 1:
+            restored.update(task.on)
+            for node in task.on:
+                found[keys.snapshot(name, node)] = frozenset([CONTROLLER])
+                found[keys.state(name, node)] = frozenset(task.on) - {node}
+    if restored:
+        found[keys.restored()] = frozenset(restored)
+    return found
+
+
+def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
+    """Return who of a roster may put, by key.
+
+    Parameters
+    ----------
+    problem : Problem
+    roster : Roster
+    """
+    keys = Keys(problem.name)
+    of_role: Mapping[str, Iterable[str]] = {
+        role: [subject.name for subject in roster.of_role(role)]
+        for role in ("controller", "operator", "observer")
+    }
+    known = {subject.name: subject.role for subject in roster.subjects.values()}
+
+    def allowed(names: Iterable[str]) -> frozenset[str]:
+        """Those who are still there, and are what the cell file takes them for."""
+        return frozenset(
+            name
+            for name in names
+            if known.get(name) == ("controller" if name == CONTROLLER else "node")
+        )
+
+    found: dict[str, Collection[str]] = {
+        key: allowed(names) for key, names in senders(problem).items()
+    }
+    people = [*of_role["controller"], *of_role["operator"]]
+    found[keys.ask()] = frozenset(people)
+    found[keys.look()] = frozenset([*people, *of_role["observer"]])
+    return found

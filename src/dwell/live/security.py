@@ -1,0 +1,227 @@
+"""Security of a process: its keys where the cell has some, and nothing but loopback where not.
+
+Both settings come from the environment, so that an agent's processes have them of it.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dwell.errors import Fault, LiveError, TrustError
+from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
+from dwell.live.wiring import Role, wire
+from dwell.model import FrozenDict, Problem
+from dwell.trust import KEYS
+
+if TYPE_CHECKING:
+    from dwell.trust.keyring import Keyring
+
+__all__ = ["INSECURE", "KEYS", "Security", "exposed"]
+
+#: Variable of the environment: ``1`` allows addresses beyond this computer without keys.
+INSECURE = "DWELL_INSECURE"
+#: A certificate that ends soon is spoken of once a day.
+REMIND_S = 86_400.0
+#: Of people, and of what runs where the controller does.
+VISITORS = ("operator", "observer", "controller")
+
+
+@dataclass(frozen=True, slots=True)
+class Security:
+    """What a process of a cell is protected by.
+
+    Parameters
+    ----------
+    problem : Problem
+    keyring : Keyring, optional
+        Its keys; without, whoever reaches its ports can say anything.
+    """
+
+    problem: Problem
+    keyring: Keyring | None = None
+
+    @classmethod
+    def of(
+        cls, problem: Problem, role: Role, environment: Mapping[str, str] | None = None
+    ) -> Security:
+        """Return what the environment gives a process.
+
+        Parameters
+        ----------
+        problem : Problem
+        role : Role
+            A process of the cell, or a visitor.
+        environment : mapping of str to str, optional
+            This process's own if left out.
+
+        Raises
+        ------
+        TrustError
+            If the keys are not this cell's or not this process's, or are damaged, revoked or
+            expired.
+        LiveError
+            If there are none, and the cell leaves this computer.
+        """
+        given = os.environ if environment is None else environment
+        folder = given.get(KEYS, "")
+        if folder:
+            keyring = _keyring(Path(folder), problem, role)
+            _require_own(keyring, role)
+            return cls(problem, keyring)
+        found = cls(problem)
+        faults = list(exposed(problem))
+        if faults and given.get(INSECURE, "") != "1":
+            raise LiveError("\n".join(map(str, faults)))
+        return found
+
+    def transport(self, who: str) -> ZenohTransport:
+        """Open the sessions of a process of the cell.
+
+        Raises
+        ------
+        LiveError
+            If there is no such process, or a port is taken.
+        """
+        wiring = wire(self.problem, protocol=self._protocol)
+        return ZenohTransport(wiring.entry(who), self._settings())
+
+    def visit(self, who: str, to: str) -> ZenohTransport:
+        """Open a session of somebody who is no part of the cell, to a process that is."""
+        wiring = wire(self.problem, protocol=self._protocol)
+        return ZenohTransport(wiring.visitor(who, to), self._settings())
+
+    def warnings(self) -> Iterator[str]:
+        """Yield what its log should say, again and again."""
+        if self.keyring is None:
+            addresses = sorted(set(_beyond(self.problem).values()))
+            if addresses:
+                yield (
+                    "INSECURE: no keys; whoever reaches the ports at "
+                    f"{', '.join(addresses)} can move the stages of cell {self.problem.name!r} "
+                    "and command its actuators; make keys with dwell keys init"
+                )
+        elif ends := self.keyring.warning():
+            yield f"warning: {ends}"
+
+    def remind(self, say: Callable[[str], None], stopped: threading.Event) -> None:
+        """Have the log say now what is wrong with the keys, and every day from now on."""
+
+        def repeat() -> None:
+            while not stopped.wait(REMIND_S):
+                self._tell(say)
+
+        self._tell(say)
+        threading.Thread(target=repeat, name="keys", daemon=True).start()
+
+    def _tell(self, say: Callable[[str], None]) -> None:
+        for line in self.warnings():
+            say(line)
+
+    @property
+    def _protocol(self) -> str:
+        return "tcp" if self.keyring is None else "tls"
+
+    def _settings(self) -> ZenohSettings:
+        if self.keyring is None:
+            return ZenohSettings()
+        return ZenohSettings(more=FrozenDict(_tls(self.problem, self.keyring)))
+
+
+def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:
+    """Open the keyring of a process.
+
+    The folder is it, or has it by the name of its subject, of the cell, or of both.
+
+    Raises
+    ------
+    TrustError
+        If it is none.
+    """
+    try:
+        from dwell.trust.keyring import Keyring
+    except ImportError:
+        raise TrustError("keys need cryptography; pip install 'dwell[live]'") from None
+    names = {"visitor": ("operator", "observer"), "controller": ("controller",)}
+    places = [folder]
+    for name in names.get(role.kind, (role.node,)):
+        places += [folder / name, folder / problem.name / name]
+    places.append(folder / problem.name)
+    found = next((place for place in places if (place / "cert.pem").exists()), folder)
+    return Keyring.open(found, cell=problem.name)
+
+
+def _require_own(keyring: Keyring, role: Role) -> None:
+    """Raise a TrustError unless a keyring is the one that a process has to have."""
+    own = keyring.own
+    where = f"{keyring.folder}: keys of {own.name}, a subject with the role {own.role}"
+    if role.kind == "visitor":
+        if own.role not in VISITORS:
+            raise TrustError(f"{where}; visiting takes those of an operator, or of an observer")
+    elif role.kind == "controller":
+        if own.role != "controller" or own.name != "controller":
+            raise TrustError(f"{where}; {role.who} takes those of the controller")
+    elif (own.role, own.name) != ("node", role.node):
+        raise TrustError(f"{where}; {role.who} takes those of node {role.node}")
+
+
+def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
+    """Zenoh's settings for mutual TLS and nothing else."""
+    from dwell.live.permissions import subjects
+    from dwell.trust.acl import access_control
+
+    certificate, key = str(keyring.folder / "cert.pem"), str(keyring.folder / "key.pem")
+    tls = "transport/link/tls"
+    may_put = subjects(problem, keyring.roster)
+    return {
+        "transport/link/protocols": ["tls"],
+        f"{tls}/root_ca_certificate": str(keyring.folder / "ca.pem"),
+        f"{tls}/listen_certificate": certificate,
+        f"{tls}/listen_private_key": key,
+        f"{tls}/connect_certificate": certificate,
+        f"{tls}/connect_private_key": key,
+        f"{tls}/enable_mtls": True,
+        f"{tls}/verify_name_on_connect": True,
+        f"{tls}/close_link_on_expiration": True,
+        "access_control": access_control(keyring.roster, f"dwell/{problem.name}", may_put),
+    }
+
+
+def exposed(problem: Problem) -> Iterator[Fault]:
+    """Yield every address of a cell that takes it beyond this computer.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    for path, address in _beyond(problem).items():
+        yield Fault(
+            path,
+            f"{address} is beyond this computer, and without keys whoever reaches it can move "
+            "stages and command actuators; make keys with dwell keys init and name them with "
+            "--keys, or say --insecure in a network that you trust",
+        )
+
+
+def _beyond(problem: Problem) -> dict[str, str]:
+    """Return addresses that are not loopback, by where they stand in the cell file."""
+    found = {}
+    for node, host in problem.live.hosts.items():
+        found[f"live.hosts.{node}.address"] = host.address
+        for other, end in host.seen_from.items():
+            found[f"live.hosts.{node}.seen_from.{other}.address"] = end.address
+    return {path: address for path, address in found.items() if not _loopback(address)}
+
+
+def _loopback(address: str) -> bool:
+    if address == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return False

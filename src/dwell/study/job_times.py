@@ -1,0 +1,201 @@
+"""What the jobs of measured runs took on each node, and their messages on each link."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dwell.model import Problem
+from dwell.study.intervals import Interval, mean_interval
+from dwell.study.summary import order_statistic
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.record import Run
+
+__all__ = ["jobs_of", "links_of", "profiles_of"]
+
+BASELINE = "baseline"
+ENDS = ("", "_low", "_high", "_p5", "_p50", "_p95")
+#: Points of a distribution of delays.
+POINTS = 101
+
+
+def jobs_of(run: Run, scenario: str, policy: str, number: int) -> pl.DataFrame:
+    """Return the finished jobs of the cycles that count, those of shadows left out.
+
+    Parameters
+    ----------
+    run : Run
+        With its jobs.
+    scenario, policy : str
+    number : int
+        Tells the run from others.
+
+    Returns
+    -------
+    DataFrame
+        ``cycle``, ``task``, ``node``, ``ready_ns``, ``start_ns``, ``end_ns``, ``cpu_ns`` where it
+        was measured; ``scenario``, ``policy``, ``run``.
+    """
+    import polars as pl
+
+    first = int(run.windows.filter(~pl.col("warmup"))["first_cycle"][0])
+    jobs = run.jobs.filter(pl.col("cycle") >= first)
+    if "shadow" in jobs.columns:
+        jobs = jobs.filter(~pl.col("shadow"))
+    columns = ["cycle", "task", "node", "ready_ns", "start_ns", "end_ns"]
+    columns += ["cpu_ns"] if "cpu_ns" in jobs.columns else []
+    return jobs.filter(pl.col("end_ns").is_not_null()).select(
+        *(pl.col(name).cast(pl.String) if name in ("task", "node") else name for name in columns),
+        scenario=pl.lit(scenario),
+        policy=pl.lit(policy),
+        run=pl.lit(number),
+    )
+
+
+def profiles_of(jobs: pl.DataFrame | None, problem: Problem) -> pl.DataFrame:
+    """Return what the jobs of every task took on every node, in the baseline.
+
+    Parameters
+    ----------
+    jobs : DataFrame or None
+        Of all runs; None where none kept them.
+    problem : Problem
+
+    Returns
+    -------
+    DataFrame
+        ``task``, ``node``, ``jobs``, ``runs``; ``wall_ms`` from start to end, and ``cpu_ms``, the
+        core time (null where it was not measured): each the mean over runs of their means, with its
+        interval (``_low``, ``_high``), and ``_p5``, ``_p50``, ``_p95`` of all jobs; ``told_ms``,
+        what the cell says of its mean.
+    """
+    import polars as pl
+
+    rows: list[dict[str, object]] = []
+    if jobs is not None:
+        baseline = jobs.filter(pl.col("scenario") == BASELINE)
+        for task in problem.pipeline.tasks:
+            for node in problem.fabric.nodes:
+                mine = baseline.filter((pl.col("task") == task) & (pl.col("node") == node))
+                if mine.is_empty():
+                    continue
+                mine = mine.with_columns(wall_ns=pl.col("end_ns") - pl.col("start_ns"))
+                row: dict[str, object] = {"task": task, "node": node, "jobs": mine.height}
+                row |= {"runs": mine["run"].n_unique(), **_spread(mine, "wall")}
+                row |= _spread(mine, "cpu") if "cpu_ns" in mine.columns else {}
+                rows.append(row | {"told_ms": _told_ms(problem, task, node)})
+    names = [f"{kind}_ms{end}" for kind in ("wall", "cpu") for end in ENDS]
+    schema = {"task": pl.String(), "node": pl.String(), "jobs": pl.Int64(), "runs": pl.Int64()}
+    schema |= {name: pl.Float64() for name in (*names, "told_ms")}
+    return pl.DataFrame(rows, schema=schema).fill_nan(None)
+
+
+def _spread(jobs: pl.DataFrame, kind: str) -> dict[str, float | None]:
+    """Mean over runs, its interval, and percentiles of what jobs took, milliseconds."""
+    import polars as pl
+
+    known = jobs.filter(pl.col(f"{kind}_ns").is_not_null())
+    if known.is_empty():
+        return {f"{kind}_ms{end}": None for end in ENDS}
+    taken_ms = (known[f"{kind}_ns"] / 1e6).to_numpy()
+    means = known.group_by("run").agg(pl.col(f"{kind}_ns").mean()).sort("run")
+    over: Interval = mean_interval((means[f"{kind}_ns"] / 1e6).to_numpy())
+    ranked = [order_statistic(taken_ms, percent) for percent in (5, 50, 95)]
+    values: Sequence[float] = (*over, *ranked)
+    return dict(zip((f"{kind}_ms{end}" for end in ENDS), values, strict=True))
+
+
+def _told_ms(problem: Problem, task: str, node: str) -> float | None:
+    on = problem.pipeline.tasks[task].on.get(node)
+    return None if on is None else float(on.exec_ms.expectation)
+
+
+def links_of(jobs: pl.DataFrame | None, problem: Problem) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return what messages took, from the end of the job that sent one until it was there.
+
+    Only of flows into tasks with a single input: what becomes ready when the last of several inputs
+    is there says nothing of the others.
+
+    Parameters
+    ----------
+    jobs : DataFrame or None
+    problem : Problem
+
+    Returns
+    -------
+    table : DataFrame
+        ``scenario``, ``link``, ``flow``, ``messages``, ``mean_ms``, ``std_ms``, ``p50_ms``,
+        ``p95_ms``.
+    distribution : DataFrame
+        ``scenario``, ``link``, ``delay_ms``, ``share`` within it.
+    """
+    import polars as pl
+
+    inputs = [flow.target for flow in problem.pipeline.flows]
+    flows = [flow for flow in problem.pipeline.flows if inputs.count(flow.target) == 1]
+    text = ("scenario", "link", "flow")
+    numbers = ("mean_ms", "std_ms", "p50_ms", "p95_ms")
+    empty = pl.DataFrame(
+        schema=dict.fromkeys(text, pl.String)
+        | {"messages": pl.Int64}
+        | dict.fromkeys(numbers, pl.Float64)
+    )
+    shares = pl.DataFrame(
+        schema={"scenario": pl.String, "link": pl.String}
+        | dict.fromkeys(("delay_ms", "share"), pl.Float64)
+    )
+    if jobs is None or not flows:
+        return empty, shares
+    keys = ["run", "scenario", "cycle"]
+    sent = [
+        jobs.filter(pl.col("task") == flow.source)
+        .select(*keys, "end_ns", source="node")
+        .join(
+            jobs.filter(pl.col("task") == flow.target).select(*keys, "ready_ns", target="node"),
+            on=keys,
+        )
+        .filter(pl.col("source") != pl.col("target"))
+        .select(
+            "scenario",
+            link=pl.col("source") + "->" + pl.col("target"),
+            flow=pl.lit(f"{flow.source} to {flow.target}"),
+            took_ms=(pl.col("ready_ns") - pl.col("end_ns")) / 1e6,
+        )
+        for flow in flows
+    ]
+    every = pl.concat(sent)
+    if every.is_empty():
+        return empty, shares
+    took = pl.col("took_ms")
+    table = every.group_by(*text, maintain_order=True).agg(
+        messages=pl.len().cast(pl.Int64),
+        mean_ms=took.mean(),
+        std_ms=took.std(),
+        p50_ms=took.median(),
+        p95_ms=took.quantile(0.95, "higher"),
+    )
+    # The scenarios as they come; by name within.
+    scenarios = list(every["scenario"].unique(maintain_order=True))
+    order = pl.col("scenario").replace_strict(scenarios, list(range(len(scenarios))))
+    return table.sort(order, "link", "flow"), _shares(every.sort(order, "link"))
+
+
+def _shares(sent: pl.DataFrame) -> pl.DataFrame:
+    """Distribution of delays by scenario and link, at evenly spaced shares."""
+    import polars as pl
+
+    shares = np.linspace(0, 1, POINTS)
+    parts = []
+    for (scenario, link), mine in sent.group_by("scenario", "link", maintain_order=True):
+        delays_ms = np.quantile(mine["took_ms"].to_numpy(), shares, method="higher")
+        parts.append(
+            pl.DataFrame({"delay_ms": delays_ms, "share": shares}).select(
+                pl.lit(scenario).alias("scenario"), pl.lit(link).alias("link"), pl.all()
+            )
+        )
+    return pl.concat(parts)

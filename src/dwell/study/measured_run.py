@@ -1,0 +1,325 @@
+"""A run that was measured, read for validation: what it is a run of, and which of it counts.
+
+A run may be compared with a cell if it is a run of that cell: what calibration changes (execution
+times, delays, rates, payloads) may differ, what the cell is made of may not.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from dwell.errors import DwellError, RunError
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
+from dwell.model import Placement, Problem
+from dwell.model.document import to_document
+from dwell.model.scenario import Disturbance, Scenario
+from dwell.policies.registry import by_name
+from dwell.study.predicting import Asked
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.record import Run
+
+__all__ = ["MeasuredRun", "excluded_windows", "read_measured"]
+
+Document: TypeAlias = Mapping[str, Any]
+
+#: Policies by the name of their class, which is what a run's record says.
+POLICIES = {
+    "DTP": "dtp",
+    "ATP": "atp",
+    "LatencyFirst": "latency-first",
+    "WorkFunction": "work-function",
+    "Cusum": "cusum",
+}
+NODE_FIELDS = ("tier", "cores", "scheduler", "accelerators", "quota")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredRun:
+    """A run, and the problem that says what it should show.
+
+    Parameters
+    ----------
+    name : str
+        Of the run's folder.
+    run : Run
+    problem : Problem
+        The calibrated cell with this run's warm-up, its scenario as it was played and, where it
+        never moved, its placement.
+    scenario : str
+    policy : str
+        A policy's name, or a candidate's for the placement that never moves.
+    estimator : str
+    guard : bool
+        Whether the cell's guard could act.
+    excluded : mapping of int to str
+        Windows that are left out, and why.
+    """
+
+    name: str
+    run: Run
+    problem: Problem
+    scenario: str
+    policy: str
+    estimator: str
+    guard: bool
+    excluded: Mapping[int, str]
+
+    @property
+    def moves(self) -> bool:
+        """Whether its policy may move."""
+        return self.policy not in self.problem.candidates
+
+    @property
+    def contender(self) -> str:
+        """The policy with its estimator, ``dtp+corrected``; a candidate's name alone."""
+        return f"{self.policy}+{self.estimator}" if self.moves else self.policy
+
+    @property
+    def asked(self) -> Asked:
+        """What is to be simulated for it."""
+        return Asked(
+            self.problem,
+            self.scenario,
+            self.policy,
+            self.estimator,
+            self.run.windows.height,
+            self.guard,
+            self.run.has_jobs,
+            frozenset(self.excluded),
+        )
+
+
+def read_measured(name: str, run: Run, problem: Problem) -> MeasuredRun:
+    """Find out what a run is a run of, and refuse one that the cell cannot predict.
+
+    Parameters
+    ----------
+    name : str
+        Of the run, for messages.
+    run : Run
+        Live, or simulated.
+    problem : Problem
+        The calibrated cell.
+
+    Raises
+    ------
+    RunError
+        With every fault that was found: another cell, a scenario or a policy that the cell does
+        not have, settings that differ.
+    """
+    meta = run.meta
+    recorded = meta.get("problem")
+    if not isinstance(recorded, Mapping):
+        raise RunError(f"{name}: its record does not say which cell it ran")
+    own = json.loads(json.dumps(to_document(problem)))
+    faults = [*_other_cell(recorded, own)]
+    scenario = str(meta.get("scenario") or "")
+    if scenario not in problem.scenarios:
+        known = ", ".join(problem.scenarios)
+        faults.append(f"scenario {scenario!r} is not in the cell (it has {known})")
+    if faults:
+        raise RunError("\n".join(f"{name}: {fault}" for fault in faults))
+    try:
+        excluded = excluded_windows(meta)
+        estimator = _estimator(meta)
+        policy, problem = _policy(meta, recorded, own, problem)
+        warmup = int(run.windows["warmup"].sum())
+        items = _as_played(meta, recorded, own, problem, scenario, run)
+        problem = replace(
+            problem,
+            warmup_windows=warmup,
+            scenarios={**problem.scenarios, scenario: items},
+        )
+    except DwellError as error:
+        raise RunError(f"{name}: {error}") from None
+    live = meta.get("kind", "simulated") != "simulated"
+    guard = bool(problem.controller.fallbacks) if live else bool(meta.get("guard", False))
+    return MeasuredRun(
+        name=name,
+        run=run,
+        problem=problem,
+        scenario=scenario,
+        policy=policy,
+        estimator=estimator,
+        guard=guard,
+        excluded=excluded,
+    )
+
+
+def excluded_windows(meta: Mapping[str, Any]) -> dict[int, str]:
+    """Return the windows that a run's record says to leave out, and why.
+
+    Parameters
+    ----------
+    meta : mapping
+        ``excluded_windows``, or ``excluded`` of ``pressure``: numbers, mappings with ``window``
+        and ``reason``, or a mapping of number to reason. None where both are missing.
+
+    Raises
+    ------
+    RunError
+        If it is something else.
+    """
+    found: dict[int, str] = {}
+    pressure = meta.get("pressure")
+    named = {
+        "excluded_windows": meta.get("excluded_windows"),
+        "pressure.excluded": pressure.get("excluded") if isinstance(pressure, Mapping) else None,
+    }
+    for field, told in named.items():
+        pairs = told.items() if isinstance(told, Mapping) else map(_numbered, told or ())
+        try:
+            found.update({int(number): str(reason) for number, reason in pairs})
+        except (TypeError, ValueError):
+            raise RunError(f"{field} is {told!r}; numbers of windows are wanted") from None
+    return found
+
+
+def _numbered(item: object) -> tuple[Any, Any]:
+    if isinstance(item, Mapping):
+        return item.get("window"), item.get("reason", "excluded")
+    if isinstance(item, Sequence) and not isinstance(item, str) and len(item) == 2:
+        return item[0], item[1]
+    return item, "excluded"
+
+
+# ------------------------------------------------------------------------------------- the cell
+
+
+def _other_cell(theirs: Document, own: Document) -> Iterator[str]:
+    """Yield in what two cells differ, calibration aside."""
+    for field in ("name", "period_ms", "deadline_ms", "window_cycles"):
+        if theirs.get(field) != own[field]:
+            was, now = theirs.get(field), own[field]
+            yield f"it is a run of another cell: {field} is {was!r}, not {now!r}"
+    for field in ("nodes", "tasks"):
+        there, here = theirs.get(field, {}), own[field]
+        if set(there) != set(here):
+            was, now = _names(there), _names(here)
+            yield f"it is a run of another cell: its {field} are {was}, not {now}"
+    for name in own["nodes"].keys() & theirs.get("nodes", {}).keys():
+        there, here = theirs["nodes"][name], own["nodes"][name]
+        for field in NODE_FIELDS:
+            if there.get(field) != here.get(field):
+                was, now = there.get(field), here.get(field)
+                yield f"nodes.{name}.{field} was {was!r} in the run and is {now!r} in the cell"
+    for name in own["tasks"].keys() & theirs.get("tasks", {}).keys():
+        there, here = theirs["tasks"][name], own["tasks"][name]
+        if there.get("input") != here.get("input"):
+            was, now = there.get("input"), here.get("input")
+            yield f"tasks.{name}.input was {was!r} in the run and is {now!r} in the cell"
+    there, here = ({f"{one['from']}->{one['to']}" for one in doc["flows"]} for doc in (theirs, own))
+    if there != here:
+        yield f"it is a run of another cell: its flows are {_names(there)}, not {_names(here)}"
+
+
+def _names(values: Any) -> str:
+    return ", ".join(sorted(map(str, values))) or "none"
+
+
+# ----------------------------------------------------------------------------------- the policy
+
+
+def _policy(
+    meta: Mapping[str, Any], theirs: Document, own: Document, problem: Problem
+) -> tuple[str, Problem]:
+    """Return the policy's name, and the problem with the candidates that the run had."""
+    told = str(meta.get("policy") or "")
+    head = re.split(r"[(\s]", told, maxsplit=1)[0]
+    if head == "Static":
+        found = re.search(r"initial='([^']+)'", told)
+        name = found.group(1) if found else str(theirs.get("controller", {}).get("policy"))
+    else:
+        name = POLICIES.get(head, told)
+    problem = _with_candidates(problem, theirs.get("candidates", {}), own["candidates"])
+    policy = by_name(name, problem)
+    if name in problem.candidates:
+        return name, problem
+    if told != head and repr(policy) != told:
+        raise RunError(f"policy was {told}; by the cell it would be {policy!r}")
+    if theirs.get("objective") != own["objective"]:
+        raise RunError(
+            f"policy {name} had another objective than the cell's: {theirs.get('objective')}, "
+            f"not {own['objective']}"
+        )
+    return name, problem
+
+
+def _with_candidates(problem: Problem, theirs: Document, own: Document) -> Problem:
+    """Return the problem with a run's candidates: what could be chosen, or tried, is its own.
+
+    A candidate that the cell has under this name with other nodes is refused.
+    """
+    for name, nodes in theirs.items():
+        if name in own and dict(nodes) != dict(own[name]):
+            raise RunError(
+                f"candidate {name} was {dict(nodes)} in the run; in the cell {own[name]}"
+            )
+    if list(theirs) == list(own):
+        return problem
+    return replace(problem, candidates={name: Placement(theirs[name]) for name in theirs})
+
+
+def _estimator(meta: Mapping[str, Any]) -> str:
+    told = str(meta.get("estimator") or "profile")
+    names = {getattr(maker, "__name__", name): name for name, maker in ESTIMATORS.items()}
+    name = names.get(told, told)
+    if name not in ESTIMATORS:
+        raise RunError(f"estimator {told!r} is not known (here: {', '.join(ESTIMATORS)})")
+    return name
+
+
+# --------------------------------------------------------------------------------- the scenario
+
+
+def _as_played(
+    meta: Mapping[str, Any],
+    theirs: Document,
+    own: Document,
+    problem: Problem,
+    name: str,
+    run: Run,
+) -> Scenario:
+    """Return the cell's scenario with the times at which its disturbances were played."""
+    items, written = problem.scenario(name), own["scenarios"].get(name, [])
+    played = meta.get("played")
+    if played is None:
+        if theirs.get("scenarios", {}).get(name, []) != written:
+            raise RunError(f"scenario {name!r} was another one in the run than it is in the cell")
+        return items
+    left = list(zip(items, map(_timeless, written), strict=True))
+    end_s = _end_s(run.cycles)
+    found: list[Disturbance] = []
+    for told in played:
+        match = next((pair for pair in left if pair[1] == _timeless(told)), None)
+        if match is None:
+            raise RunError(f"{json.dumps(told)} was played, which scenario {name!r} does not have")
+        left.remove(match)
+        begin_s = float(told.get("at_s", 0.0))
+        until_s = begin_s + float(told.get("for_s", math.inf))
+        if until_s <= 0:
+            continue
+        begin_s = max(begin_s, 0.0)
+        # What was on to the end of a run had no end within it.
+        for_s = math.inf if until_s >= end_s else until_s - begin_s
+        found.append(replace(match[0], at_s=begin_s, for_s=for_s))
+    return tuple(found)
+
+
+def _timeless(item: Document) -> dict[str, Any]:
+    return {key: value for key, value in item.items() if key not in ("at_s", "for_s")}
+
+
+def _end_s(cycles: pl.DataFrame) -> float:
+    """When the last cycle was released, less what two clocks' roundings may differ by."""
+    return float(np.max(cycles["release_ns"].to_numpy(), initial=0)) / 1e9 - 0.1

@@ -1,0 +1,301 @@
+"""QoS sample: cycles and windows of several runs, pooled, and as units that can be resampled.
+
+A unit is a window of a measured run, or a whole simulated run. Every figure is a function of how
+often each unit counts: once each for the figure itself, at random for its interval.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import SimulationError
+from dwell.study.summary import count_in, latency_ms, order_statistic
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.model import Problem
+    from dwell.record import Run
+
+__all__ = ["PARTS", "Piece", "QosSample", "piece_of"]
+
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+
+PARTS = ("compute", "queue", "network")
+CYCLES = (
+    "release_ns",
+    "placement",
+    "latency_ns",
+    "missed",
+    *(f"{part}_ns" for part in PARTS),
+)
+#: Points at which distributions are kept for resampling; the figure itself is exact.
+POINTS = 4000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Piece:
+    """What counts of one run: no warm-up, and no window that is excluded.
+
+    Parameters
+    ----------
+    windows : DataFrame
+        As in the run.
+    cycles : DataFrame
+        What is needed of the run's, and ``place``, the row of their window in `windows`. Cycles
+        between two windows belong to the one before them.
+    migrations : int
+        Those of the policy, after the warm-up.
+    """
+
+    windows: pl.DataFrame
+    cycles: pl.DataFrame
+    migrations: int
+
+
+def piece_of(run: Run, problem: Problem, excluded: Collection[int] = ()) -> Piece:
+    """Take from a run what counts.
+
+    Parameters
+    ----------
+    run : Run
+    problem : Problem
+    excluded : collection of int
+        Numbers of windows.
+
+    Raises
+    ------
+    SimulationError
+        If nothing is left.
+    """
+    import polars as pl
+
+    counted = count_in(run, problem.window_cycles)
+    first = counted.windows["first_cycle"].to_numpy()
+    place = np.searchsorted(first, counted.cycles["cycle"].to_numpy(), side="right") - 1
+    keep = ~counted.windows["window"].is_in([*excluded]).to_numpy()
+    if not keep.any():
+        raise SimulationError("every window after the warm-up is excluded")
+    renumbered = np.cumsum(keep) - 1
+    moved = counted.decisions.filter(
+        counted.decisions["migrated"] & (counted.decisions["reason"].cast(str) != "guard")
+    )
+    cycles = counted.cycles.select(*CYCLES).with_columns(
+        place=pl.Series(renumbered[place], dtype=pl.Int64)
+    )
+    return Piece(counted.windows.filter(keep), cycles.filter(keep[place]), moved.height)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QosSample:
+    """Runs of one group.
+
+    Parameters
+    ----------
+    latency_ms : float64 array, shape (cycles,)
+        Ascending; infinite for cycles that never finished.
+    late : bool array, shape (cycles,)
+        Whether each missed though it took no longer than D: its window was closed by then.
+    deadline_ms : float
+    lengths : tuple of int
+        Units of each run.
+    grid_ms : float64 array, shape (points,)
+    counts : float64 array, shape (units, points + 1)
+        Cycles of each unit up to each point and beyond the one before; the last: beyond all.
+    sums : mapping of str to float64 array, shape (units, 2)
+        By figure: its sum over the unit, and over how many.
+    parts_ms : mapping of str to float
+        Mean over cycles that finished of the time spent computing, waiting and on the network.
+    placed : mapping of str to int
+        Cycles by candidate.
+    windows : int
+    """
+
+    latency_ms: Floats
+    late: NDArray[np.bool_]
+    deadline_ms: float
+    lengths: tuple[int, ...]
+    grid_ms: Floats
+    counts: Floats
+    sums: Mapping[str, Floats]
+    parts_ms: Mapping[str, float]
+    placed: Mapping[str, int]
+    windows: int
+
+    @classmethod
+    def of(cls, pieces: Sequence[Piece], problem: Problem, *, by_window: bool) -> QosSample:
+        """Pool runs.
+
+        Parameters
+        ----------
+        pieces : sequence of Piece
+            At least one.
+        problem : Problem
+        by_window : bool
+            Whether the windows are the units; the runs elsewhere.
+        """
+        import polars as pl
+
+        heights = [piece.windows.height for piece in pieces]
+        lengths = tuple(heights) if by_window else (len(pieces),)
+        begin = np.cumsum([0, *heights])
+        windows = pl.concat([piece.windows for piece in pieces], how="diagonal_relaxed")
+        cycles = pl.concat([piece.cycles for piece in pieces], how="diagonal_relaxed")
+        run_of_window = np.repeat(np.arange(len(pieces)), heights)
+        run_of_cycle = np.repeat(np.arange(len(pieces)), [one.cycles.height for one in pieces])
+        window_of_cycle = begin[run_of_cycle] + cycles["place"].to_numpy()
+        of_window = np.arange(len(windows)) if by_window else run_of_window
+        of_cycle = window_of_cycle if by_window else run_of_cycle
+        units = sum(lengths)
+        final_ms, missed = latency_ms(cycles), cycles["missed"].to_numpy()
+        order = np.argsort(final_ms, kind="stable")
+        grid_ms = _grid(final_ms[order])
+        deadline_ms = problem.pipeline.deadline_ms
+        deadline_ns = round(deadline_ms * 1e6)
+        soon = (cycles["latency_ns"].fill_null(deadline_ns + 1) <= deadline_ns).to_numpy()
+        return cls(
+            latency_ms=final_ms[order],
+            late=(missed & soon)[order],
+            deadline_ms=deadline_ms,
+            lengths=lengths,
+            grid_ms=grid_ms,
+            counts=_counts(np.searchsorted(grid_ms, final_ms), of_cycle, units, len(grid_ms) + 1),
+            sums={
+                "violation_rate": _sums(missed.astype(np.float64), of_cycle, units),
+                **_window_sums(windows, problem, of_window, units),
+                "migrations": _migrations(pieces, of_window, units),
+            },
+            parts_ms={part: _mean(cycles[f"{part}_ns"]) / 1e6 for part in PARTS},
+            placed=dict(cycles["placement"].cast(pl.String).value_counts().rows()),
+            windows=len(windows),
+        )
+
+    @property
+    def l95_ms(self) -> float:
+        """95th percentile of all cycles, an order statistic; a lost cycle is infinite."""
+        return order_statistic(self.latency_ms, 95)
+
+    @property
+    def units(self) -> int:
+        """How many units there are."""
+        return sum(self.lengths)
+
+    def figure(self, name: str) -> float:
+        """Return the mean of a figure of `sums`; NaN where there is none."""
+        total, count = self.sums[name].sum(axis=0)
+        return float(total / count) if count else math.nan
+
+    def resampled(self, name: str, weights: Floats) -> Floats:
+        """Return a figure in every resample.
+
+        Parameters
+        ----------
+        name : str
+            Of `sums`, or ``l95_ms``.
+        weights : float64 array, shape (draws, units)
+            How often each unit counts.
+        """
+        if name == "l95_ms":
+            return self._resampled_l95(weights)
+        total, count = (weights @ self.sums[name]).T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found: Floats = total / count
+        return found
+
+    def _resampled_l95(self, weights: Floats) -> Floats:
+        within = (weights @ self.counts).cumsum(axis=1)
+        rank = np.ceil(0.95 * within[:, -1:] - 1e-9)
+        place = (within < rank).sum(axis=1)
+        found: Floats = np.append(self.grid_ms, np.inf)[place]
+        return found
+
+    def rate_if(self, factor: float) -> float:
+        """V_D, if every latency were `factor` times what it is."""
+        longer = self.latency_ms * factor > self.deadline_ms
+        return float((longer | self.late).mean())
+
+    def factor_for(self, rate: float) -> float:
+        """Return by what latencies would have to be multiplied for V_D to be `rate`.
+
+        Returns
+        -------
+        float
+            NaN where none does, or almost any: no cycle is to miss, or every one.
+        """
+        here = self.latency_ms[~self.late]
+        wanted = round(rate * len(self.latency_ms)) - int(self.late.sum())
+        if wanted <= 0 or wanted >= len(here):
+            return math.nan
+        at = here[len(here) - wanted]
+        return self.deadline_ms / float(at) if 0 < at < math.inf else math.nan
+
+    def share_near(self, allowed: float) -> float:
+        """Share of the cycles whose latency lies within `allowed` of the deadline."""
+        low, high = self.deadline_ms * (1 - allowed), self.deadline_ms * (1 + allowed)
+        return float(((self.latency_ms >= low) & (self.latency_ms <= high)).mean())
+
+
+def _grid(ascending: Floats) -> Floats:
+    """Return the values themselves, or quantiles of them where they are many."""
+    values = np.unique(ascending[np.isfinite(ascending)])
+    if len(values) <= POINTS:
+        return values
+    picked = np.rint(np.linspace(0, len(values) - 1, POINTS)).astype(np.int64)
+    found: Floats = values[picked]
+    return found
+
+
+def _counts(place: Ints, unit: Ints, units: int, points: int) -> Floats:
+    flat = np.bincount(unit * points + place, minlength=units * points)
+    return flat.reshape(units, points).astype(np.float64)
+
+
+def _sums(values: Floats, unit: Ints, units: int) -> Floats:
+    """Sum and number, by unit, of the values that are there."""
+    there = ~np.isnan(values)
+    total = np.bincount(unit[there], weights=values[there], minlength=units)
+    return np.stack([total, np.bincount(unit[there], minlength=units)], axis=1)
+
+
+def _window_sums(
+    windows: pl.DataFrame, problem: Problem, unit: Ints, units: int
+) -> dict[str, Floats]:
+    def column(name: str) -> Floats:
+        values: Floats = windows[name].cast(float).fill_null(math.nan).to_numpy()
+        return values
+
+    placed = windows["placement"].cast(str).to_numpy()
+    return {
+        "window_l95_ms": _sums(column("seen_l95_ms"), unit, units),
+        **{f"u_{node}": _sums(column(f"u_{node}"), unit, units) for node in problem.fabric.nodes},
+        **{
+            f"share_{name}": _sums((placed == name).astype(np.float64), unit, units)
+            for name in problem.candidates
+        },
+    }
+
+
+def _migrations(pieces: Sequence[Piece], of_window: Ints, units: int) -> Floats:
+    """Migrations a run: those of a run are spread over its windows."""
+    heights = np.array([piece.windows.height for piece in pieces])
+    moved = np.array([piece.migrations for piece in pieces], np.float64)
+    share = np.repeat(1 / heights, heights)
+    return np.stack(
+        [
+            np.bincount(of_window, weights=np.repeat(moved, heights) * share, minlength=units),
+            np.bincount(of_window, weights=share, minlength=units),
+        ],
+        axis=1,
+    )
+
+
+def _mean(values: pl.Series) -> float:
+    mean = values.mean()
+    return float(mean) if isinstance(mean, float) else math.nan

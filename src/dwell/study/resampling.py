@@ -1,0 +1,86 @@
+"""Resampling runs and stretches of windows: what measured figures could as well have been.
+
+Windows that follow each other are not independent, and neither are those of one run: what the
+machine was up to lasts longer. So a resample takes runs with replacement, and within each of them
+blocks of consecutive windows (the moving block bootstrap [1], round the end of the run, so that
+every window is as likely as any other [2]). With few runs the first step alone would see too
+little of what differs between them, and the second adds what a run of another hour would have
+shown; with one run there is only the second.
+
+1. H. R. Künsch, The jackknife and the bootstrap for general stationary observations, *Annals of
+   Statistics* 17(3), 1989. DOI 10.1214/aos/1176347265.
+2. D. N. Politis, J. P. Romano, A circular block-resampling procedure for stationary data, in
+   *Exploring the Limits of Bootstrap*, Wiley, 1992.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED
+
+__all__ = ["DRAWS", "block_windows", "ends", "resample_units", "resample_windows"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: So many that the quantiles of 2.5 % are order statistics of the resamples.
+DRAWS = 999
+
+
+def block_windows(windows: int) -> int:
+    """Consecutive windows of a block: the cube root of a run's, rounded up, as theory has it."""
+    return max(1, math.ceil(math.cbrt(windows) - 1e-9))
+
+
+def resample_windows(lengths: Sequence[int], *, seed: int = RESAMPLING_SEED) -> Floats:
+    """How often each window is in each resample.
+
+    Parameters
+    ----------
+    lengths : sequence of int
+        Windows of every run, each at least 1.
+    seed : int
+        Of the resamples.
+
+    Returns
+    -------
+    float64 array, shape (DRAWS, windows of all runs)
+        Whole numbers.
+    """
+    rng = np.random.default_rng(seed)
+    begin = np.concatenate(([0], np.cumsum(lengths)))
+    weights = np.zeros((DRAWS, int(begin[-1])))
+    for draw in weights:
+        for run in rng.integers(len(lengths), size=len(lengths)):
+            count = lengths[run]
+            size = block_windows(count)
+            starts = rng.integers(count, size=-(-count // size))
+            taken = (starts[:, None] + np.arange(size)).ravel()[:count] % count
+            draw[begin[run] : begin[run + 1]] += np.bincount(taken, minlength=count)
+    return weights
+
+
+def resample_units(count: int, *, seed: int = RESAMPLING_SEED) -> Floats:
+    """How often each of `count` independent units is in each resample, shape (DRAWS, count)."""
+    rng = np.random.default_rng(seed)
+    return rng.multinomial(count, np.full(count, 1 / count), size=DRAWS).astype(np.float64)
+
+
+def ends(resampled: Floats) -> tuple[float, float]:
+    """Return the ends of the interval: order statistics, since values may be infinite.
+
+    Parameters
+    ----------
+    resampled : float64 array, shape (DRAWS,)
+        The figure in every resample; NaN at both ends if any is.
+    """
+    if np.isnan(resampled).any():
+        return math.nan, math.nan
+    rank = round((len(resampled) + 1) * (1 - CONFIDENCE) / 2)
+    ordered = np.sort(resampled)
+    return float(ordered[rank - 1]), float(ordered[-rank])

@@ -1,0 +1,142 @@
+"""The sum-of-means predictor: what a cell would do if nothing varied and nothing waited.
+
+Every task takes its mean time on its node, every message its mean delay and the time its bytes
+take at the link's rate; the latency of a cycle is the longest path through the pipeline. A node's
+quota, and foreign threads that take their share, slow a task down by their mean. That is what one
+computes on the back of an envelope, and what a simulator has to do better than.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from dwell.model import Problem
+from dwell.model.fabric import Link, Node
+from dwell.model.placement import Placement
+from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance
+
+__all__ = ["sum_of_means", "sums_of_shares"]
+
+
+def sum_of_means(
+    problem: Problem, placement: Placement, scenario: str, begin_s: float, end_s: float
+) -> float:
+    """Latency (ms) that a placement would always have, if it had its mean.
+
+    Parameters
+    ----------
+    problem : Problem
+    placement : Placement
+    scenario : str
+        Disturbances count by the share of the time in which they are on.
+    begin_s, end_s : float
+        Time that counts, since the first release.
+
+    Returns
+    -------
+    float
+        Messages that are lost are left out, and so are nodes and links that are down.
+    """
+    items = problem.scenario(scenario)
+    tasks, links = problem.pipeline.tasks, problem.fabric.links
+    done_ms: dict[str, float] = {}
+
+    def done(name: str) -> float:
+        if name in done_ms:
+            return done_ms[name]
+        ready = 0.0
+        for flow in problem.pipeline.inputs(name):
+            arrived = done(flow.source)
+            source, target = placement[flow.source], placement[name]
+            if source != target:
+                link = links[f"{source}->{target}"]
+                disturbed = _on(items, link.name, begin_s, end_s)
+                arrived += _message_ms(link, flow.payload_bytes, disturbed)
+            ready = max(ready, arrived)
+        task, node = tasks[name], problem.fabric.nodes[placement[name]]
+        mean_ms = task.on[node.name].exec_ms.expectation
+        if task.scale is not None:
+            mean_ms *= problem.pipeline.scales[task.scale].expectation
+        slower = _slow_down(node, _on(items, node.name, begin_s, end_s))
+        done_ms[name] = ready + task.offset_ms + mean_ms * slower
+        return done_ms[name]
+
+    return max(done(name) for name in tasks)
+
+
+def sums_of_shares(
+    sums_ms: Mapping[str, float], cycles: Mapping[str, int], deadline_ms: float
+) -> tuple[float, float]:
+    """L95 and V_D of cycles of several placements, each with the latency of its sum.
+
+    Parameters
+    ----------
+    sums_ms : mapping of str to float
+        By candidate.
+    cycles : mapping of str to int
+        How many cycles were measured under each: the predictor is told where they ran.
+    deadline_ms : float
+
+    Returns
+    -------
+    l95_ms, violation_rate : float
+        For a single placement its sum, and 0 or 1.
+    """
+    names = sorted(cycles, key=lambda name: sums_ms[name])
+    counts = np.array([cycles[name] for name in names])
+    within = counts.cumsum()
+    l95_ms = sums_ms[names[int(np.searchsorted(within, math.ceil(0.95 * within[-1])))]]
+    late = sum(cycles[name] for name in names if sums_ms[name] > deadline_ms)
+    return l95_ms, late / int(within[-1])
+
+
+def _on(
+    items: Iterable[Disturbance], name: str, begin_s: float, end_s: float
+) -> list[tuple[Disturbance, float]]:
+    """Return what is done to a node or link, with the share of the time in which it is."""
+    found: list[tuple[Disturbance, float]] = []
+    for item in items:
+        target = item.node if isinstance(item, NodeDisturbance) else item.link
+        overlap = min(item.at_s + item.for_s, end_s) - max(item.at_s, begin_s)
+        if target != name or item.down or overlap <= 0:
+            continue
+        share = overlap / (end_s - begin_s)
+        if item.episodes is not None:
+            on_s, off_s = (
+                item.episodes.for_s.expectation,
+                item.episodes.every_s.expectation,
+            )
+            share *= on_s / (on_s + off_s)
+        found.append((item, share))
+    return found
+
+
+def _slow_down(node: Node, on: Iterable[tuple[Disturbance, float]]) -> float:
+    """Return the mean slow-down of a lone thread among foreign ones, each with the same share."""
+    threads = sum(
+        share * item.stress_threads for item, share in on if isinstance(item, NodeDisturbance)
+    )
+    bursts = node.bursts
+    if bursts is not None:
+        on_ms, off_ms = bursts.for_ms.expectation, bursts.every_ms.expectation
+        threads += bursts.threads * on_ms / (on_ms + off_ms)
+    return 1 / min(1.0, node.capacity / (1 + threads))
+
+
+def _message_ms(link: Link, size_bytes: int, on: Iterable[tuple[Disturbance, float]]) -> float:
+    on = list(on)
+    mean_ms = link.delay_ms.expectation
+    rate_mbps = link.rate_mbps
+    for item, share in on:
+        if isinstance(item, LinkDisturbance):
+            if item.add_delay_ms is not None:
+                mean_ms += share * item.add_delay_ms.expectation
+            rate_mbps = min(rate_mbps, item.rate_mbps)
+    bursts = link.bursts
+    if bursts is not None:
+        on_ms, off_ms = bursts.for_ms.expectation, bursts.every_ms.expectation
+        mean_ms += bursts.add_delay_ms.expectation * on_ms / (on_ms + off_ms)
+    return mean_ms + size_bytes * 8e-3 / rate_mbps

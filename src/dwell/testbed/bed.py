@@ -1,0 +1,451 @@
+"""Bed: the hosts, links and CPUs of some cells on this machine, with the cells running on them.
+
+Nothing here moves a stage: it plays what a scenario does to nodes and links, and what a controller
+makes of it is the controller's. Cells that share nodes (their edge, say) share hosts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+from dwell.errors import LiveError
+from dwell.live.security import INSECURE
+from dwell.live.transport.losses import LOSSES, LossFile
+from dwell.live.transport.orphans import remove_orphans
+from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.model import Host, Link, Node, NodeDisturbance, Problem
+from dwell.model.scenario import Disturbance
+from dwell.testbed.allotment import allot, nodes_of
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.groups import Groups
+from dwell.testbed.hosts import Hosts
+from dwell.testbed.leftovers import Claim
+from dwell.testbed.link import TunLink
+from dwell.testbed.playing import come_up
+from dwell.testbed.processes import Processes, expected
+from dwell.testbed.stress import Stress
+from dwell.testbed.timeline import Change, is_down, link_changes, link_with, threads_on
+from dwell.testbed.watcher import Watcher
+
+__all__ = ["Bed", "require_playable"]
+
+FIRST_PORT = 7_450
+#: With a share of a CPU, a node's processes take a while to start.
+START_S = 120.0
+LOSS_FILE = "losses"
+#: What the cell did until everybody was there.
+STARTING = "starting"
+
+
+def require_playable(problems: Sequence[Problem]) -> None:
+    """Refuse cells with something that a testbed does not have.
+
+    Raises
+    ------
+    LiveError
+        With every fault.
+    """
+    faults = []
+    for problem in problems:
+        faults += [
+            f"nodes.{node.name}.bursts: drawn foreign work is not played"
+            for node in problem.fabric.nodes.values()
+            if node.bursts is not None
+        ]
+        faults += [
+            f"links {link.name}: bursts of extra delay are not played"
+            for link in problem.fabric.links.values()
+            if link.bursts is not None
+        ]
+    try:
+        _links_of(problems)
+    except LiveError as error:
+        faults.append(str(error))
+    if faults:
+        raise LiveError("; ".join(dict.fromkeys(faults)))
+
+
+def _links_of(problems: Sequence[Problem]) -> dict[str, Link]:
+    found: dict[str, Link] = {}
+    for problem in problems:
+        for name, link in problem.fabric.links.items():
+            if found.setdefault(name, link) != link:
+                raise LiveError(f"links {name}: two cells share it and say different things of it")
+    return found
+
+
+def _pairs_of(problems: Sequence[Problem]) -> list[tuple[str, str]]:
+    """Return who is linked: the agents of a cell all talk to each other."""
+    found: dict[frozenset[str], tuple[str, str]] = {}
+    for problem in problems:
+        for pair in combinations(problem.fabric.nodes, 2):
+            found.setdefault(frozenset(pair), pair)
+    return list(found.values())
+
+
+def _with_hosts(problems: Sequence[Problem], address: Callable[[str], str]) -> tuple[Problem, ...]:
+    """Return cells that know where their nodes are; on a shared node each has ports of its own."""
+    following: dict[str, int] = {}
+    found = []
+    for problem in problems:
+        everybody = roles(problem)
+        hosts = {}
+        for node in problem.fabric.nodes:
+            port = following.get(node, FIRST_PORT)
+            hosts[node] = Host(address(node), port)
+            there = sum(role.node == node for role in everybody)
+            following[node] = port + PORTS_PER_ROLE * there
+        found.append(replace(problem, live=replace(problem.live, hosts=hosts)))
+    return tuple(found)
+
+
+def _modules(beside: Path | None) -> dict[str, str]:
+    """Return the variable that makes the modules beside a cell file known to all processes."""
+    if beside is None:
+        return {}
+    paths = [str(beside.resolve()), os.environ.get("PYTHONPATH", "")]
+    return {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
+
+
+class Bed:
+    """Cells on hosts of their own on this machine; a context manager.
+
+    Parameters
+    ----------
+    problems : Problem or sequence of Problem
+        Where their nodes are is put into them.
+    folder : Path
+        For cell files, states, logs and runs.
+    name : str
+        Of this testbed, among others on this machine.
+    seed : int
+        Of delays and losses.
+    beside : Path, optional
+        Folder of the cell files: of the modules of their stages, and of their traces.
+    more : sequence of str
+        Further arguments of the controllers.
+    cpus : sequence of int, optional
+        Those that nodes may use; all that this process may use if left out.
+
+    Attributes
+    ----------
+    problems : tuple of Problem
+    links : dict of frozenset of str to TunLink
+        By pair of nodes.
+    watchers : tuple of Watcher
+        Of every cell.
+
+    Raises
+    ------
+    LiveError
+        If the cells cannot be played, or this machine has too few CPUs for their nodes.
+    """
+
+    def __init__(
+        self,
+        problems: Problem | Sequence[Problem],
+        folder: Path,
+        *,
+        name: str,
+        seed: int = 0,
+        beside: Path | None = None,
+        more: Sequence[str] = (),
+        cpus: Sequence[int] | None = None,
+    ) -> None:
+        self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
+        require_playable(self.problems)
+        self.shares = allot(self.problems, cpus or sorted(os.sched_getaffinity(0)))
+        self.nodes: dict[str, Node] = nodes_of(self.problems)
+        self.folder, self.name, self.seed = folder.resolve(), name, seed
+        self.links: dict[frozenset[str], TunLink] = {}
+        self.watchers: tuple[Watcher, ...] = ()
+        self.stress: dict[str, Stress] = {}
+        self._usual = _links_of(self.problems)
+        self._beside, self._more = beside, tuple(more)
+        self._on: list[Disturbance] = []
+        self._claim = Claim(name, list(self.nodes))
+        self._claimed = False
+        # Run of each cell that is no part of any measurement any more.
+        self._past: dict[str, object] = {}
+        self._stack = ExitStack()
+
+    # --------------------------------------------------------------------- up and down
+
+    def claim(self) -> None:
+        """Take the name, and clear away what a dead testbed of this name left.
+
+        Raises
+        ------
+        LiveError
+            If a testbed of this name runs, or something else is in the way.
+        """
+        if not self._claimed:
+            self._stack.enter_context(self._claim)
+            self._stack.callback(remove_orphans)
+            self._claimed = True
+
+    def __enter__(self) -> Bed:
+        """Make hosts, links and groups, and start everything; `come_up` waits for it."""
+        try:
+            self.claim()
+            self._make()
+            for node in self.nodes:
+                self._processes.start_agent(node)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End everything."""
+        self.close()
+
+    def _make(self) -> None:
+        enter = self._stack.enter_context
+        nodes, pairs = list(self.nodes), _pairs_of(self.problems)
+        self._hosts = enter(Hosts(self.name, nodes, pairs))
+        self._groups = enter(Groups(self.name, self.shares))
+        self.problems = _with_hosts(self.problems, self._hosts.address)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._losses = enter(LossFile(self.folder / LOSS_FILE, nodes, seed=self.seed))
+        for number, pair in enumerate(pairs):
+            self.links[frozenset(pair)] = enter(self._link(pair, number))
+        for link in self._usual.values():
+            if link.retransmit_ms is None:
+                self._losses.set(link.source, link.target, link.loss)
+        for node in nodes:
+            self._start_stress(node)
+        self._stack.callback(self._stop_stress)
+        environment = {
+            "DWELL_WORLD": str(self.folder / "world"),
+            LOSSES: str(self._losses.path),
+            # Its hosts' addresses lead nowhere but to each other.
+            INSECURE: "1",
+            **_modules(self._beside),
+        }
+        self._processes = Processes(
+            self.problems,
+            self.folder,
+            inside=self._inside,
+            environment=environment,
+            more=self._more,
+            traces=self._beside,
+        )
+        self._processes.write()
+        self._stack.callback(self._processes.stop)
+        self.watchers = tuple(enter(self._watcher(problem)) for problem in self.problems)
+
+    def _inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
+        return self._groups.inside(node, self._hosts.inside(node, words))
+
+    def _link(self, pair: tuple[str, str], number: int) -> TunLink:
+        """Return the link of a pair; a direction that the cells do not have has no delay."""
+        usual: dict[tuple[str, str], Conditions] = {}
+        retransmit_ms: dict[tuple[str, str], float] = {}
+        for link in self._usual.values():
+            if {link.source, link.target} != set(pair):
+                continue
+            way = link.source, link.target
+            usual[way] = link_with(link, ())
+            if link.retransmit_ms is None:
+                usual[way] = replace(usual[way], loss=0.0)
+            else:
+                retransmit_ms[way] = link.retransmit_ms
+        one, other = pair
+        devices = {one: self._hosts.tun(one, other), other: self._hosts.tun(other, one)}
+        seed = self.seed * len(self.nodes) ** 2 + number
+        return TunLink(pair, devices, usual, retransmit_ms=retransmit_ms, seed=seed)
+
+    def _watcher(self, problem: Problem) -> Watcher:
+        prefix = self._hosts.inside(problem.controller_node, [])
+        return Watcher(self._processes.file_of(problem), prefix)
+
+    def _start_stress(self, node: str) -> None:
+        stress = Stress(self._groups.inside(node, []), self.shares[node].cpus)
+        stress.__enter__()
+        self.stress[node] = stress
+
+    def _stop_stress(self) -> None:
+        for node in list(self.stress):
+            self.stress.pop(node).__exit__(None, None, None)
+
+    def close(self) -> None:
+        """End everything, and leave nothing behind; safe to call twice."""
+        self._stack.close()
+        self._claimed = False
+
+    # ------------------------------------------------------------------------- running
+
+    def expected(self, problem: Problem) -> list[str]:
+        """Return the processes of a cell without its controller."""
+        return [who for node in problem.fabric.nodes for who in expected(problem, node)]
+
+    def come_up(self, *, patience_s: float = START_S) -> None:
+        """Wait until everybody is there, with every cell on its initial placement.
+
+        Controllers that never move anything look after the cells until then; the runs that they
+        write are in `STARTING`, and no part of any measurement.
+
+        Raises
+        ------
+        LiveError
+            If the cells do not come up.
+        """
+        for problem in self.problems:
+            node = problem.controller_node
+            if f"controller@{node}" not in self._processes.running:
+                more = ["--policy", problem.initial]
+                self._processes.start_controller(node, out=self.folder / STARTING, more=more)
+        for problem, watcher in zip(self.problems, self.watchers, strict=True):
+            status = come_up(
+                watcher.status, self.expected(problem), self.folder, patience_s=patience_s
+            )
+            self._past[problem.name] = status["run"]
+        self._processes.stop_controllers()
+
+    def begin(self, *, patience_s: float = START_S) -> list[int]:
+        """Begin a new run of every cell, with controllers that know nothing of the time before.
+
+        Returns
+        -------
+        list of int
+            First release of each, on its stamper's clock.
+
+        Raises
+        ------
+        LiveError
+            If a run does not begin, or somebody is missing.
+        """
+        for problem in self.problems:
+            self._restart_stamper(problem)
+        self._processes.start_controllers()
+        return [
+            self._origin(problem, watcher, patience_s)
+            for problem, watcher in zip(self.problems, self.watchers, strict=True)
+        ]
+
+    def _restart_stamper(self, problem: Problem) -> None:
+        """Have a stamper begin anew, as if its cell had never run."""
+        node = problem.stamper_node
+        state = self._processes.folder_of(problem) / node
+        mark = state / f"stamper@{node}.pid"
+        pid = int(json.loads(mark.read_text(encoding="utf-8"))["pid"])
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGSTOP)  # so that it writes no book any more
+        (state / f"stamper@{node}.book").unlink(missing_ok=True)
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+    def _origin(self, problem: Problem, watcher: Watcher, patience_s: float) -> int:
+        until = time.monotonic() + patience_s
+        while time.monotonic() < until:
+            status = come_up(
+                watcher.status, self.expected(problem), self.folder, patience_s=patience_s
+            )
+            # A late answer of the controller before tells of the run before.
+            new = status["run"] is not None and status["run"] != self._past.get(problem.name)
+            if new and status.get("origin_ns") is not None:
+                self._past[problem.name] = status["run"]
+                return int(status["origin_ns"])
+            time.sleep(0.05)
+        raise LiveError(f"cell {problem.name!r} releases no cycles; see the logs in {self.folder}")
+
+    def stop_controllers(self) -> None:
+        """End the controllers and wait until they have written their runs."""
+        self._processes.stop_controllers()
+
+    # --------------------------------------------------------------------- disturbances
+
+    def apply(self, change: Change) -> None:
+        """Have nodes and links do what begins or ends."""
+        item, before = change.item, self._on
+        self._on = [other for other in before if other is not item]
+        if change.begins:
+            self._on.append(item)
+        if isinstance(item, NodeDisturbance):
+            self._apply_to_node(item.node, before)
+        else:
+            self._apply_to_link(self._usual[item.link], before)
+
+    def _apply_to_node(self, node: str, before: Sequence[Disturbance]) -> None:
+        was, now = is_down(node, before), is_down(node, self._on)
+        if now and not was:
+            self._take_down(node)
+        elif was and not now:
+            self._bring_up(node)
+        elif not now:
+            self.stress[node].set(threads_on(node, self._on))
+
+    def _take_down(self, node: str) -> None:
+        """Kill everything on a node at once, as a loss of power does."""
+        self._groups.kill(node)
+        self._processes.forget(node)
+        with suppress(LiveError):
+            self.stress.pop(node).__exit__(None, None, None)
+
+    def _bring_up(self, node: str) -> None:
+        self._start_stress(node)
+        self.stress[node].set(threads_on(node, self._on))
+        self._processes.start_agent(node)
+        if any(problem.controller_node == node for problem in self.problems):
+            self._processes.start_controller(node)
+
+    def _apply_to_link(self, link: Link, before: Sequence[Disturbance]) -> None:
+        changes = link_changes(link, before, self._on)
+        if link.retransmit_ms is None and "loss" in changes:
+            self._losses.set(link.source, link.target, changes.pop("loss"))
+        way = self.links[frozenset((link.source, link.target))]
+        was, now = is_down(link.name, before), is_down(link.name, self._on)
+        if was != now:
+            way.down(link.source, link.target, now)
+        if changes:
+            way.set(link.source, link.target, **changes)
+
+    # ---------------------------------------------------------------------------- facts
+
+    @property
+    def used_ns(self) -> dict[str, Callable[[], int]]:
+        """What reads the CPU time that a node has taken so far, by node."""
+        return {node: self._reader(node) for node in self.nodes}
+
+    def _reader(self, node: str) -> Callable[[], int]:
+        return lambda: self._groups.used_ns(node)
+
+    @property
+    def cpus(self) -> list[int]:
+        """CPUs that nodes use."""
+        return sorted({cpu for share in self.shares.values() for cpu in share.cpus})
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a run ought to say of the testbed that it was made on, ready for JSON."""
+        return {
+            "name": self.name,
+            "kernel": os.uname().release,
+            "cpus": os.cpu_count(),
+            "nodes": dict(self._node_facts()),
+            "links": {
+                "-".join(link.pair): {"scheduling": link.scheduling} for link in self.links.values()
+            },
+        }
+
+    def _node_facts(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        for node, share in self.shares.items():
+            quota = share.quota
+            yield (
+                node,
+                {
+                    "cpus": list(share.cpus),
+                    "quota": None
+                    if quota is None
+                    else {"cpu": quota.cpu, "period_ms": quota.period_ms},
+                },
+            )

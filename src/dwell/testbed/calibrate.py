@@ -1,0 +1,449 @@
+"""Calibrate: a cell file with the execution times, delays and backgrounds that runs have shown.
+
+Beside the cell ``CELL.yaml`` stand its samples, ``CELL.samples.parquet``, and
+``CELL.calibration.json``: what everything was worked out from, and how the cell predicts the very
+runs that it was made from. That is no validation; `dwell validate` refuses those runs.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import DwellError, RunError
+from dwell.model import Problem, Trace
+from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
+from dwell.testbed.measured import (
+    Measured,
+    Site,
+    backgrounds,
+    floors,
+    look_at,
+    own_delays,
+    sites,
+)
+from dwell.testbed.trace_names import move_traces
+
+__all__ = ["Calibrated", "calibrate", "make_runs"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Seed of the delays that stand for a link's own process, and of the cell's own check.
+SEED = 20_260_101
+#: Least execution time written, ms: one of nothing is no execution time.
+LEAST_MS = 1e-3
+#: Windows that the check simulates of every run at most.
+CHECK_WINDOWS = 300
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What was written.
+
+    Parameters
+    ----------
+    cell, samples, sidecar : Path
+    problem : Problem
+        As the cell file says it now.
+    report : dict
+        What the sidecar says.
+    missing : tuple of str
+        Tasks and links that no run has visited, and that are as they were.
+    """
+
+    cell: Path
+    samples: Path
+    sidecar: Path
+    problem: Problem
+    report: dict[str, Any]
+    missing: tuple[str, ...]
+
+
+def calibrate(
+    cell: Path,
+    runs: Sequence[Path],
+    out: Path,
+    *,
+    emulated: bool = True,
+    say: Callable[[str], None] = print,
+) -> Calibrated:
+    """Put what runs have shown into a cell.
+
+    Parameters
+    ----------
+    cell : Path
+        Cell file; the runs may be of another one with the same tasks and nodes.
+    runs : sequence of Path
+        Folders of runs that kept their jobs: between them every task on every node, undisturbed.
+    out : Path
+        Cell file to write.
+    emulated : bool
+        Whether links have the delays that the cell asks for, and only what they add is measured;
+        else their delays are what was measured.
+    say : callable
+        Takes lines about what was found.
+
+    Raises
+    ------
+    DwellError
+        If the cell or a run cannot be read or used, all faults at once, or `out` is the cell.
+    OSError
+        If the files cannot be written.
+    """
+    import dwell
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise RunError(f"{out}: a cell file ends in .yaml")
+    if out.exists() and out.samefile(cell):
+        raise RunError(f"{out} is the cell itself; name another file")
+    problem = dwell.load(cell)
+    measured = _looked_at(runs, problem)
+    found = sites(measured, problem)
+    behind = backgrounds(measured, found, problem)
+    added_ms, delays_ms = _links(measured, found, problem, emulated=emulated)
+    document = _document(cell, out)
+    samples = out.with_name(f"{out.stem}.samples.parquet")
+    _write_samples(samples, found, delays_ms, measured, added_ms)
+    _put_in(document, samples.name, found, delays_ms, behind)
+    _write_cell(out, document, cell, runs)
+    written = dwell.load(out)
+    missing = _missing(problem, found, delays_ms)
+    report = {
+        "runs": [path.resolve().name for path in runs],
+        "ids": [one.run.run_id for one in measured if one.run.run_id is not None],
+        "cell": problem.name,
+        **stamp(),
+        "emulated_links": emulated,
+        "tasks": {task_name(*site): _about(of) for site, of in found.items()},
+        "links": {
+            link: {"added_ms": _short(added_ms.get(link)), "mean_ms": _short(values.mean())}
+            for link, values in delays_ms.items()
+        },
+        "background": {node: _short(value) for node, value in behind.items()},
+        "check": [row for one in measured if (row := _check(one, written)) is not None],
+        "missing": list(missing),
+    }
+    sidecar = out.with_name(f"{out.stem}.calibration.json")
+    sidecar.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    for line in _told(report):
+        say(line)
+    return Calibrated(out, samples, sidecar, written, report, missing)
+
+
+def make_runs(
+    cell: Path,
+    folder: Path,
+    *,
+    seconds: float,
+    seed: int,
+    name: str,
+    tell: Callable[[str], None] = print,
+) -> list[Path]:
+    """Run the baseline under every candidate on a testbed, with the jobs; returns the runs.
+
+    Parameters
+    ----------
+    cell : Path
+        Cell file.
+    folder : Path
+        For the runs, a folder each.
+    seconds : float
+        Of each, the warm-up included.
+    seed : int
+        Of delays and losses.
+    name : str
+        Of the testbed.
+    tell : callable
+        Takes a line on what happens.
+
+    Raises
+    ------
+    DwellError
+        If the cell cannot be run here, or the machine was the bottleneck of a run.
+    """
+    import dwell
+    from dwell.testbed.run import run_once
+
+    problem = dwell.load(cell)
+    runs = []
+    for candidate in problem.candidates:
+        run = run_once(
+            problem,
+            scenario="baseline",
+            policy=candidate,
+            seconds=seconds,
+            seed=seed,
+            out=folder / candidate,
+            name=name,
+            jobs=True,
+            beside=cell.parent,
+            tell=tell,
+        )
+        pressure = dwell.open_run(run).meta.get("pressure") or {}
+        if pressure.get("failed"):
+            raise RunError(
+                f"{run}: the machine was the bottleneck ({pressure.get('why')}); measure on one "
+                "that does nothing else"
+            )
+        runs.append(run)
+    return runs
+
+
+def _looked_at(runs: Sequence[Path], problem: Problem) -> list[Measured]:
+    import dwell
+
+    names = [path.resolve().name for path in runs]
+    if not runs:
+        raise RunError("no runs; name the folders of runs that kept their jobs")
+    faults = [f"{name}: named twice" for name in sorted({n for n in names if names.count(n) > 1})]
+    measured = []
+    for name, path in zip(names, runs, strict=True):
+        try:
+            measured.append(look_at(name, dwell.open_run(path), problem))
+        except DwellError as error:
+            faults.append(str(error))
+    if faults:
+        raise RunError("\n".join(faults))
+    return measured
+
+
+def _links(
+    measured: Sequence[Measured],
+    found: Mapping[tuple[str, str], Site],
+    problem: Problem,
+    *,
+    emulated: bool,
+) -> tuple[dict[str, float], dict[str, Floats]]:
+    """What each link adds, and the delays of its messages, ms."""
+    if not emulated:
+        own = own_delays(measured, found, problem)
+        return {}, {link_name(*link): values for link, values in own.items()}
+    size = max((len(of.samples_ms) for of in found.values()), default=1)
+    rng = np.random.default_rng(SEED)
+    asked_ms = {
+        (link.source, link.target): link.delay_ms.marginal(rng, size)
+        for link in problem.fabric.links.values()
+        if not isinstance(link.delay_ms, Trace)
+    }
+    added_ms = floors(measured, found, problem, asked_ms)
+    # One that no message took adds what the others do.
+    usual_ms = float(np.mean(list(added_ms.values()))) if added_ms else 0.0
+    added = {link_name(*link): added_ms.get(link, usual_ms) for link in asked_ms}
+    return added, {
+        link_name(*link): values + added[link_name(*link)] for link, values in asked_ms.items()
+    }
+
+
+# ------------------------------------------------------------------------------- the files
+
+
+def _write_samples(
+    path: Path,
+    found: Mapping[tuple[str, str], Site],
+    delays_ms: Mapping[str, Floats],
+    measured: Sequence[Measured],
+    added_ms: Mapping[str, float],
+) -> None:
+    """Write all columns with one number of rows: columns of one file share them in a replay."""
+    columns = {task_name(*site): of.samples_ms for site, of in found.items()}
+    if not columns:
+        raise RunError("no task has enough jobs in windows that can be used")
+    rows = min(len(values) for values in (*columns.values(), *delays_ms.values()))
+    about = {"runs": [one.name for one in measured], **stamp()}
+    measurements = [
+        Measurement(
+            task_name(*site),
+            {task_name(*site): np.maximum(_evenly(of.samples_ms, rows), LEAST_MS)},
+            {"kind": "task", "task": site[0], "node": site[1], **about, **_about(of)},
+        )
+        for site, of in found.items()
+    ]
+    for link, values in delays_ms.items():
+        source, _, target = link.partition("->")
+        of_link: dict[str, Any] = {
+            "kind": "link",
+            "from": source,
+            "to": target,
+            "rate_mbps": None,
+            **about,
+        }
+        of_link["added_ms"] = added_ms.get(link)
+        measurements.append(Measurement(link, {link: _evenly(values, rows)}, of_link))
+    write_profile(path, measurements)
+
+
+def _evenly(values: Floats, rows: int) -> Floats:
+    """So many of the values: runs of neighbours, spread over the whole."""
+    if len(values) == rows:
+        return values
+    blocks = min(10, rows)
+    starts = np.linspace(0, len(values) - -(-rows // blocks), blocks).astype(int)
+    sizes = np.diff(np.linspace(0, rows, blocks + 1).astype(int))
+    return np.concatenate(
+        [values[start : start + size] for start, size in zip(starts, sizes, strict=True)]
+    )
+
+
+def _document(cell: Path, out: Path) -> dict[str, Any]:
+    """Return the cell file as plain values, its traces named from where the new file will be."""
+    from dwell.io.faults import Faults
+    from dwell.io.yaml_text import read_yaml
+
+    text = read_yaml(str(cell), Faults(str(cell)))
+    if not isinstance(text, dict):
+        raise RunError(f"{cell}: no cell")
+    document = copy.deepcopy(text)
+    document.setdefault("name", cell.stem)
+    move_traces(document, Path(os.path.relpath(cell.resolve().parent, out.resolve().parent)))
+    return document
+
+
+def _put_in(
+    document: dict[str, Any],
+    file: str,
+    found: Mapping[tuple[str, str], Site],
+    delays_ms: Mapping[str, Floats],
+    behind: Mapping[str, float],
+) -> None:
+    def replay(column: str) -> dict[str, Any]:
+        return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
+
+    for task, node in found:
+        document["tasks"][task]["on"][node]["exec_ms"] = replay(task_name(task, node))
+        # The samples have what the task shares with others already.
+        document["tasks"][task].pop("scale", None)
+    for node, cores in behind.items():
+        document["nodes"][node]["background"] = _short(cores)
+    links = []
+    for entry in document.get("links") or ():
+        ways = [(entry["from"], entry["to"])]
+        if entry.get("both_ways"):
+            ways.append((entry["to"], entry["from"]))
+        for source, target in ways:
+            one = {name: value for name, value in entry.items() if name != "both_ways"}
+            one |= {"from": source, "to": target}
+            if f"{source}->{target}" in delays_ms:
+                one["delay_ms"] = replay(f"{source}->{target}")
+            links.append(one)
+    if links:
+        document["links"] = links
+
+
+def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[Path]) -> None:
+    import yaml
+
+    class Plain(yaml.SafeDumper):
+        def ignore_aliases(self, data: object) -> bool:
+            return True
+
+    names = ", ".join(path.resolve().name for path in runs)
+    text = yaml.dump(
+        copy.deepcopy(document), Dumper=Plain, sort_keys=False, width=100, allow_unicode=True
+    )
+    head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
+    head += f"# Runs: {names}\n"
+    draft = out.with_name(f".{out.name}.draft")
+    draft.write_text(head + text, encoding="utf-8")
+    draft.replace(out)
+
+
+def _missing(
+    problem: Problem, found: Mapping[tuple[str, str], Site], delays_ms: Mapping[str, Floats]
+) -> tuple[str, ...]:
+    tasks = (
+        task_name(task.name, node)
+        for task in problem.pipeline.tasks.values()
+        for node in task.on
+        if (task.name, node) not in found
+    )
+    return *tasks, *(link for link in problem.fabric.links if link not in delays_ms)
+
+
+# ------------------------------------------------------------------------------ the report
+
+
+def _about(of: Site) -> dict[str, Any]:
+    return {
+        "mean_ms": _short(of.samples_ms.mean()),
+        "std_ms": _short(of.samples_ms.std()),
+        "stage_ms": _short(of.stage_ms),
+        "messaging_ms": _short(of.overhead_ms),
+        "ends_ms": _short(of.ends_ms),
+        "jobs": len(of.samples_ms),
+        "of_runs": list(of.runs),
+    }
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None else float(f"{value:.5g}")
+
+
+def _check(one: Measured, problem: Problem) -> dict[str, Any] | None:
+    """Set what the cell says of a run that it was made from beside what that one showed."""
+    import polars as pl
+
+    from dwell.sim import draw, simulate_realisation
+
+    scenario = str(one.run.meta.get("scenario") or "baseline")
+    scenario = "baseline" if scenario == "live" else scenario
+    if one.placement not in problem.candidates or scenario not in problem.scenarios:
+        return None
+    problem = replace(problem, warmup_windows=2)
+    windows = min(max(one.windows, 50), CHECK_WINDOWS)
+    real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
+    played = simulate_realisation(problem, real, policy=one.placement)
+    row: dict[str, Any] = {"run": one.name, "scenario": scenario, "placement": one.placement}
+    for what, run in (("measured", one.run), ("predicted", played)):
+        counted = run.windows.filter(~pl.col("warmup") & ~pl.col("mixed"))
+        cycles = _in_windows(run.cycles, counted, problem.window_cycles)
+        latency_ms = cycles["latency_ns"].fill_null(np.iinfo(np.int64).max).to_numpy() / 1e6
+        l95_ms = float(np.quantile(latency_ms, 0.95, method="inverted_cdf"))
+        row[what] = {
+            "l95_ms": _short(l95_ms) if l95_ms < 1e9 else None,
+            "mean_ms": _short(latency_ms[latency_ms < 1e9].mean()),
+            "violation_rate": _short(counted["violation_rate"].to_numpy().mean()),
+            **{f"u_{n}": _short(counted[f"u_{n}"].to_numpy().mean()) for n in problem.fabric.nodes},
+        }
+    return row
+
+
+def _in_windows(cycles: Any, windows: Any, size: int) -> Any:
+    import polars as pl
+
+    first = windows["first_cycle"].to_numpy()
+    inside = (first[:, None] + np.arange(size)).ravel()
+    return cycles.filter(pl.col("cycle").is_in(inside.tolist()))
+
+
+def _told(report: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for name, of in report["tasks"].items():
+        lines.append(
+            f"{name}: {of['mean_ms']:.3g} ms ({of['stage_ms']:.3g} stage, {of['messaging_ms']:.3g} "
+            f"messaging, {of['ends_ms']:.3g} begin and end), {of['jobs']} jobs"
+        )
+    lines += [f"{name}: {of['mean_ms']:.3g} ms" for name, of in report["links"].items()]
+    lines += [
+        f"{node}: background {value:.3g} cores" for node, value in report["background"].items()
+    ]
+    for row in report["check"]:
+        pairs = (
+            f"{name} {_shown(row['measured'][name])} measured, {_shown(row['predicted'][name])} "
+            "predicted"
+            for name in ("l95_ms", "mean_ms", "violation_rate")
+        )
+        lines.append(f"{row['run']} ({row['scenario']}, {row['placement']}): {'; '.join(pairs)}")
+    lines += [f"{name}: not measured, as it was" for name in report["missing"]]
+    return lines
+
+
+def _shown(value: float | None) -> str:
+    return "none" if value is None else f"{value:.4g}"

@@ -1,0 +1,90 @@
+"""Where this machine keeps its groups of processes: cgroup v2, or the controllers of v1."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dwell.errors import LiveError
+
+__all__ = ["Cgroups", "find_cgroups"]
+
+#: What v1 needs, and what it uses beside where it is mounted.
+NEEDED = ("cpu", "cpuacct")
+USED = (*NEEDED, "cpuset", "freezer")
+
+
+@dataclass(frozen=True, slots=True)
+class Cgroups:
+    """The hierarchies in which groups are made.
+
+    Parameters
+    ----------
+    version : {1, 2}
+    folders : mapping of str to Path
+        Controller to the top of its hierarchy. With version 2 all are the same.
+    """
+
+    version: int
+    folders: Mapping[str, Path]
+
+    @property
+    def tops(self) -> tuple[Path, ...]:
+        """The hierarchies, each once (v1 may have two controllers in one)."""
+        return tuple(dict.fromkeys(self.folders.values()))
+
+    def groups(self, *names: str) -> list[Path]:
+        """Return the folders of a group, one in each hierarchy, whether they exist or not."""
+        return [top.joinpath(*names) for top in self.tops]
+
+    def __str__(self) -> str:
+        """Return version and controllers, for messages."""
+        return f"cgroup v{self.version} with {', '.join(self.folders)}"
+
+
+def find_cgroups(mounts: Path = Path("/proc/self/mountinfo")) -> Cgroups:
+    """Return where groups with a quota can be made: v2 where it has the CPU, otherwise v1.
+
+    Raises
+    ------
+    LiveError
+        If neither has it.
+    """
+    try:
+        found = list(_mounted(mounts.read_text()))
+    except OSError as error:
+        raise LiveError(f"{mounts} cannot be read ({error.strerror})") from None
+    for kind, top, _ in found:
+        if kind == "cgroup2" and "cpu" in (has := _controllers(top)):
+            return Cgroups(2, {name: top for name in ("cpu", "cpuset") if name in has})
+    folders: dict[str, Path] = {}
+    for kind, top, options in found:
+        if kind == "cgroup":
+            folders.update({name: top for name in USED if name in options})
+    missing = [name for name in NEEDED if name not in folders]
+    if not missing:
+        return Cgroups(1, {name: folders[name] for name in USED if name in folders})
+    raise LiveError(
+        "no control groups for the CPU: no cgroup v2 with the controller cpu is mounted, nor "
+        f"cgroup v1 with {' and '.join(missing)}; in a container, start it with "
+        "--privileged --cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup"
+    )
+
+
+def _mounted(text: str) -> Iterator[tuple[str, Path, Sequence[str]]]:
+    """Yield kind, place and options of each mounted hierarchy (proc_pid_mountinfo(5))."""
+    for line in text.splitlines():
+        before, _, after = line.partition(" - ")
+        words = after.split()
+        if words and words[0] in ("cgroup", "cgroup2"):
+            place = os.fsdecode(before.split()[4].encode().decode("unicode_escape"))
+            yield words[0], Path(place), words[2].split(",")
+
+
+def _controllers(top: Path) -> list[str]:
+    try:
+        return (top / "cgroup.controllers").read_text().split()
+    except OSError:
+        return []

@@ -1,0 +1,283 @@
+"""What this machine can and cannot do as a testbed, found by trying, and what to do about it.
+
+Whatever is made for a trial is removed at once; nothing is changed that stays.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from dwell.errors import LiveError
+from dwell.model import Problem, Quota
+from dwell.testbed.allotment import FREE_CORES, FREE_OF_A_CORE, allot
+from dwell.testbed.cgroups import find_cgroups
+from dwell.testbed.groups import Groups, Share
+from dwell.testbed.hosts import Hosts
+from dwell.testbed.leftovers import Claim
+from dwell.testbed.stress import STRESS_NG
+
+__all__ = ["Finding", "examine"]
+
+#: Periods that are tried, shortest first; with less of a CPU the kernel does not take the first.
+PERIODS_MS = (2.0, 4.0, 10.0, 20.0, 100.0)
+SHARE = 0.5
+#: Short beside tasks of some ten milliseconds; with longer periods short tasks do not notice.
+SHORT_MS = 10.0
+TRIAL_S = 0.3
+#: What a group may use beyond its quota in a trial: it pays back what the kernel let pass.
+ALLOWANCE = 1.25
+# Names of the doctor's own trials: one that was killed is cleaned up by one that comes later.
+TRIALS = tuple(f"doctor-{number}" for number in range(8))
+ALONE = "one"
+PAIR = ("one", "two")
+PRIVILEGED = "run it as root; in a container, start that with --privileged"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing looked at.
+
+    Parameters
+    ----------
+    name : str
+        What, in a few words.
+    ok : bool
+    found : str
+        What was found.
+    remedy : str
+        What to do about it; empty if there is nothing to do.
+    needed : bool
+        Whether a testbed cannot run without.
+    """
+
+    name: str
+    ok: bool
+    found: str
+    remedy: str = ""
+    needed: bool = True
+
+
+def examine(problems: Sequence[Problem] = ()) -> list[Finding]:
+    """Look at all that a testbed needs of this machine.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        Cells that are to run at the same time; their quotas have to fit.
+
+    Returns
+    -------
+    list of Finding
+        A testbed of these cells can run here if all are well that are needed.
+    """
+    return [
+        _root(),
+        _command("ip", "iproute2", "ip"),
+        _command("nsenter", "util-linux", "nsenter"),
+        *_tried(),
+        _pinning(),
+        _cores(problems),
+        _stress_ng(),
+        _pressure(),
+        _netem(),
+        _fifo(),
+    ]
+
+
+def _root() -> Finding:
+    if os.geteuid() == 0:
+        return Finding("root", True, "root")
+    return Finding("root", False, f"user {os.geteuid()}", "sudo dwell testbed ...")
+
+
+def _command(name: str, package: str, command: str) -> Finding:
+    if where := shutil.which(command):
+        return Finding(name, True, where)
+    return Finding(name, False, "not installed", f"apt-get install {package}")
+
+
+# ------------------------------------------------------------------------- what is tried
+
+
+def _tried() -> list[Finding]:
+    try:
+        with ExitStack() as stack:
+            name = _take_name(stack)
+            return [
+                _attempt("network namespaces", lambda: _host(name), PRIVILEGED),
+                _attempt(
+                    "TUN devices",
+                    lambda: _devices(name),
+                    "modprobe tun; in a container, start that with --device /dev/net/tun",
+                ),
+                _attempt("CPU quotas", lambda: _quotas(name), PRIVILEGED),
+                _shortest_period(name),
+            ]
+    except LiveError as error:
+        return [Finding("trials", False, str(error), PRIVILEGED)]
+
+
+def _take_name(stack: ExitStack) -> str:
+    for name in TRIALS[:-1]:
+        with suppress(LiveError):
+            return stack.enter_context(Claim(name, PAIR)).name
+    return stack.enter_context(Claim(TRIALS[-1], PAIR)).name
+
+
+def _attempt(name: str, attempt: Callable[[], str], remedy: str) -> Finding:
+    try:
+        return Finding(name, True, attempt())
+    except LiveError as error:
+        return Finding(name, False, str(error), remedy)
+
+
+def _host(name: str) -> str:
+    with Hosts(name, [ALONE], []):
+        return "made and removed"
+
+
+def _devices(name: str) -> str:
+    with Hosts(name, PAIR, [PAIR]):
+        return "made and removed"
+
+
+def _quotas(name: str) -> str:
+    cgroups = find_cgroups()
+    with Groups(name, {ALONE: Share(quota=Quota(SHARE, 100.0))}, cgroups=cgroups):
+        return str(cgroups)
+
+
+def _shortest_period(name: str) -> Finding:
+    what = "shortest period of a quota"
+    said = "none was taken"
+    for period_ms in PERIODS_MS:
+        try:
+            used = _share_used(name, Quota(SHARE, period_ms))
+        except LiveError as error:
+            said = str(error)
+            continue
+        if used <= ALLOWANCE * SHARE:
+            found = f"{period_ms:g} ms (a busy process with {SHARE:g} CPU got {used:.2f})"
+            remedy = "" if (ok := period_ms <= SHORT_MS) else "another kernel"
+            return Finding(what, ok, found, remedy)
+        said = f"a busy process with {SHARE:g} CPU got {used:.2f}"
+    return Finding(what, False, said, "a kernel with CFS_BANDWIDTH, and rights to use it")
+
+
+def _share_used(name: str, quota: Quota) -> float:
+    """Return the share of a CPU that a busy process gets with a quota."""
+    with Groups(name, {ALONE: Share(quota=quota)}) as groups:
+        words = groups.inside(ALONE, ["/bin/sh", "-c", "while :; do :; done"])
+        with subprocess.Popen(words, stderr=subprocess.DEVNULL) as busy:  # noqa: S603 (our own words)
+            try:
+                used_ns, began_ns = groups.used_ns(ALONE), time.monotonic_ns()
+                time.sleep(TRIAL_S)
+                used_ns = groups.used_ns(ALONE) - used_ns
+                return used_ns / (time.monotonic_ns() - began_ns)
+            finally:
+                busy.kill()
+
+
+# ------------------------------------------------------------------------- what is looked up
+
+
+def _pinning() -> Finding:
+    name = "CPUs of a group"
+    with suppress(LiveError):
+        if "cpuset" in find_cgroups().folders:
+            return Finding(name, True, "by cpuset")
+    if shutil.which("taskset"):
+        return Finding(name, True, "by affinity (no controller cpuset)")
+    return Finding(name, False, "no cpuset, no taskset", "apt-get install util-linux")
+
+
+def _cores(problems: Sequence[Problem]) -> Finding:
+    cpus = sorted(os.sched_getaffinity(0))
+    most = len(cpus) - FREE_CORES
+    free = f"{most:g} for nodes, at most {1 - FREE_OF_A_CORE:g} of each"
+    found = f"{len(cpus)} ({free})"
+    if most <= 0:
+        return Finding("CPUs", False, found, "a machine with more CPUs")
+    if not problems:
+        return Finding("CPUs", True, found)
+    try:
+        shares = allot(problems, cpus)
+    except LiveError as error:
+        return Finding("CPUs", False, str(error), "smaller quotas, or a machine with more CPUs")
+    told = ", ".join(
+        f"{node} on {','.join(map(str, share.cpus))}" for node, share in shares.items()
+    )
+    return Finding("CPUs", True, f"{found}: {told}")
+
+
+def _stress_ng() -> Finding:
+    command = STRESS_NG[0]
+    if where := shutil.which(command):
+        return Finding(command, True, where, needed=False)
+    found = "not installed; stress is a loop of Dwell's own"
+    return Finding(command, False, found, f"apt-get install {command}", needed=False)
+
+
+def _pressure() -> Finding:
+    name = "pressure (PSI)"
+    try:
+        Path("/proc/pressure/cpu").read_text()
+    except OSError as error:
+        found = f"/proc/pressure/cpu: {error.strerror}"
+        return Finding(name, False, found, "boot with psi=1", needed=False)
+    return Finding(name, True, "/proc/pressure/cpu", needed=False)
+
+
+def _netem() -> Finding:
+    """Look it up without a trial: that would load the module, and leave it loaded."""
+    name = "tc netem"
+    if Path("/sys/module/sch_netem").exists() or "CONFIG_NET_SCH_NETEM=y" in _configuration():
+        return Finding(name, True, "in this kernel", needed=False)
+    if _module("sch_netem"):
+        return Finding(name, True, "a module of this kernel", needed=False)
+    found = "not in this kernel; links do without: delays and losses are Dwell's own"
+    return Finding(name, False, found, needed=False)
+
+
+def _configuration() -> str:
+    release = os.uname().release
+    with suppress(OSError):
+        return gzip.decompress(Path("/proc/config.gz").read_bytes()).decode()
+    with suppress(OSError):
+        return Path(f"/boot/config-{release}").read_text()
+    return ""
+
+
+def _module(name: str) -> bool:
+    folder = Path("/lib/modules", os.uname().release)
+    with suppress(OSError):
+        return f"/{name}.ko" in (folder / "modules.dep").read_text()
+    return False
+
+
+def _fifo() -> Finding:
+    name = "real-time priority (SCHED_FIFO)"
+    failed: list[OSError] = []
+
+    def rise() -> None:  # of this thread alone, which ends at once
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        except OSError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=rise)
+    thread.start()
+    thread.join()
+    if failed:
+        found = f"refused ({failed[0].strerror}); links may be late while CPUs are busy"
+        return Finding(name, False, found, PRIVILEGED, needed=False)
+    return Finding(name, True, "granted", needed=False)

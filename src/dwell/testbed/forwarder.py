@@ -1,0 +1,243 @@
+"""The process of a TUN link: reads packets from either side, and hands each over at its instant.
+
+Packets of one flow that follow each other closely are a burst: a message, in pieces of 64 kB. Each
+direction takes packets one after another at its rate; then they travel for a delay drawn once a
+burst. Within a flow nothing overtakes; flows do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import gc
+import os
+import select
+import time
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import TypedDict, cast
+
+from dwell.errors import DwellError
+from dwell.testbed.child import Json, Parent
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.draws import Draws
+from dwell.testbed.event_loop import Loop
+from dwell.testbed.orders import Orders, Set
+from dwell.testbed.packets import kind_of
+from dwell.testbed.punctuality import come_first
+
+__all__ = ["LATE_MS", "main"]
+
+#: Limits of the classes of lateness, ms; the last class has none.
+LATE_MS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+LATE_NS = tuple(round(each * 1e6) for each in LATE_MS)
+
+PACKET_BYTES = 65_536
+# Packets read at a time, a message of 300 kB; what is due does not wait for more.
+AT_ONCE = 5
+# Of one direction, waiting at the rate and on their way; more is lost, as in a full buffer.
+WAITING_BYTES = 64 << 20
+# Flows remembered; those that have nothing on its way are forgotten where there are more.
+FLOWS = 1_024
+
+
+class _Settings(TypedDict):
+    nodes: list[str]
+    descriptors: list[int]
+    sets: list[Set]
+    retransmit_ns: dict[str, int]
+    gap_ns: int
+    longest_ns: int
+    seed: int
+    cpus: list[int] | None
+
+
+@dataclass(slots=True)
+class _Counts:
+    packets: int = 0
+    bytes: int = 0
+    bursts: int = 0
+    held: int = 0
+    vanished: int = 0
+    ignored: int = 0
+    delay_ns: int = 0
+    squares: float = 0.0
+    waited_ns: int = 0
+    late_ns: int = 0
+    late_max_ns: int = 0
+    late: list[int] = field(default_factory=lambda: [0] * (len(LATE_NS) + 1))
+
+    def left(self, size_bytes: int, late_ns: int) -> None:
+        self.packets += 1
+        self.bytes += size_bytes
+        self.late_ns += late_ns
+        self.late_max_ns = max(self.late_max_ns, late_ns)
+        self.late[bisect_right(LATE_NS, late_ns)] += 1
+
+    def began(self, delay_ns: int, waits_ns: int) -> None:
+        self.bursts += 1
+        self.delay_ns += delay_ns
+        self.squares += float(delay_ns) ** 2
+        self.waited_ns += waits_ns
+
+
+@dataclass(slots=True)
+class _Flow:
+    """Packets of one 5-tuple, and the burst that is the last of them."""
+
+    begun_ns: int = 0
+    last_ns: int = 0
+    delay_ns: int = 0
+    due_ns: int = 0
+
+
+class _Direction:
+    """One way of the link."""
+
+    served_ns = 0
+
+    def __init__(self, loop: Loop, settings: _Settings, index: int) -> None:
+        self.draws = Draws((settings["seed"], index))
+        self.counts = _Counts()
+        self._loop = loop
+        self._source = settings["descriptors"][index]
+        self._target = settings["descriptors"][1 - index]
+        self._retransmit_ns = settings["retransmit_ns"].get(settings["nodes"][index], 0)
+        self._gap_ns, self._longest_ns = settings["gap_ns"], settings["longest_ns"]
+        self._flows: dict[bytes, _Flow] = {}
+        self._free_ns = 0
+        self._waiting_bytes = 0
+        os.set_blocking(self._source, False)
+        loop.watch(self._source, select.EPOLLIN, self)
+
+    def ready(self, _events: int) -> None:
+        """Take in what has come; it came when this was called, however long reading it takes."""
+        self.served_ns = time.monotonic_ns()
+        for _ in range(AT_ONCE):
+            try:
+                packet = os.read(self._source, PACKET_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:  # the device is gone, and its node with it
+                self._loop.watch(self._source, 0, self)
+                return
+            self._take(packet, self.served_ns)
+
+    def _take(self, packet: bytes, now_ns: int) -> None:
+        kind = kind_of(packet)
+        counts, conditions = self.counts, self.draws.conditions
+        if kind is None:
+            counts.ignored += 1
+            return
+        if conditions.cut is not None or self._waiting_bytes > WAITING_BYTES:
+            counts.vanished += 1
+            return
+        self._free_ns = max(now_ns, self._free_ns)
+        self._free_ns += round(len(packet) * 8e3 / conditions.rate_mbps)
+        flow = self._flows.get(kind.flow)
+        begins = (
+            flow is None
+            or now_ns - flow.last_ns > self._gap_ns
+            or now_ns - flow.begun_ns > self._longest_ns
+        )
+        if flow is None:
+            flow = self._flows[kind.flow] = _Flow()
+            self._forget(now_ns)
+        if begins:
+            flow.begun_ns = now_ns
+            flow.delay_ns = self.draws.delay_ns()
+            if kind.data:
+                flow.delay_ns += self._held_back()
+                arrival_ns = self._free_ns + flow.delay_ns
+                counts.began(flow.delay_ns, max(0, flow.due_ns - arrival_ns))
+        flow.last_ns = now_ns
+        flow.due_ns = max(self._free_ns + flow.delay_ns, flow.due_ns)
+        self._waiting_bytes += len(packet)
+        self._loop.at(flow.due_ns, partial(self._leave, packet))
+
+    def _held_back(self) -> int:
+        """Draw how long a burst is held back until an attempt to send it is not lost, ns."""
+        held_ns = 0
+        while self._retransmit_ns and self.draws.lose():
+            held_ns += self._retransmit_ns
+        self.counts.held += held_ns > 0
+        return held_ns
+
+    def _leave(self, packet: bytes, due_ns: int) -> None:
+        self._waiting_bytes -= len(packet)
+        try:
+            os.write(self._target, packet)
+        except OSError as error:
+            if error.errno == errno.EBADF:
+                raise
+            # The device is down, or its node is gone.
+            self.counts.vanished += 1
+            return
+        self.counts.left(len(packet), time.monotonic_ns() - due_ns)
+
+    def _forget(self, now_ns: int) -> None:
+        if len(self._flows) > FLOWS:
+            old_ns = now_ns - self._longest_ns
+            self._flows = {
+                name: flow
+                for name, flow in self._flows.items()
+                if flow.due_ns > now_ns or flow.last_ns > old_ns or not flow.last_ns
+            }
+
+
+class _Link:
+    """The two directions."""
+
+    def __init__(self, settings: _Settings) -> None:
+        self.loop = Loop()
+        self._directions = {
+            name: _Direction(self.loop, settings, index)
+            for index, name in enumerate(settings["nodes"])
+        }
+        self.apply(settings["sets"])
+
+    def conditions_from(self, source: str) -> Conditions:
+        """Those of the direction from a node."""
+        return self._directions[source].draws.conditions
+
+    def apply(self, sets: Sequence[Set]) -> None:
+        """Change conditions."""
+        for item in sets:
+            self._directions[item["source"]].draws.apply(item["changes"])
+
+    def stats(self, *, reset: bool) -> Json:
+        """Return what has passed each direction."""
+        cpu_s = time.process_time()
+        counted: Json = {
+            name: {**asdict(direction.counts), "cpu_s": cpu_s}
+            for name, direction in self._directions.items()
+        }
+        if reset:
+            for direction in self._directions.values():
+                direction.counts = _Counts()
+        return counted
+
+
+def main() -> None:
+    """Forward until the parent ends, or wants it to."""
+    parent = Parent()
+    with contextlib.suppress(EOFError):
+        settings = cast("_Settings", parent.receive())
+        try:
+            if settings["cpus"] is not None:
+                os.sched_setaffinity(0, settings["cpus"])
+            link = _Link(settings)
+        except (DwellError, OSError) as error:
+            parent.answer({"error": str(error)})
+            return
+        Orders(parent, link)
+        parent.answer({"scheduling": come_first()})
+        gc.freeze()
+        while parent.alive:
+            link.loop.turn()
+
+
+if __name__ == "__main__":
+    main()

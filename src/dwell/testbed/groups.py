@@ -1,0 +1,327 @@
+"""Groups of processes that stand for the CPUs of nodes: a quota, which CPUs, the time used.
+
+A quota is the kernel's CPU bandwidth control (Turner, Rao, Rao: CPU bandwidth control for CFS,
+Linux Symposium 2010): in every period the group runs for the quota at most. All of a testbed's
+groups are in one of its own, ``dwell-NAME``, so that what belongs to it is known from outside.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from dwell.errors import LiveError
+from dwell.model import Quota
+from dwell.testbed.cgroups import Cgroups, find_cgroups
+
+__all__ = ["Groups", "Share", "group_name", "remove_group"]
+
+#: What the kernel takes (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).
+MIN_US = 1_000
+MAX_PERIOD_US = 1_000_000
+# How long killed processes may take to be gone; a group with a quota ends them in its own time.
+GONE_S = 10.0
+CHECK_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What a node has of this machine's CPUs.
+
+    Parameters
+    ----------
+    cpus : tuple of int
+        Those it may use; all if empty.
+    quota : Quota, optional
+        How much of them.
+    """
+
+    cpus: tuple[int, ...] = ()
+    quota: Quota | None = None
+
+    def faults(self, node: str) -> list[str]:
+        """Return why no kernel takes its quota; nothing if one does."""
+        if self.quota is None:
+            return []
+        period_us, quota_us = _microseconds(self.quota)
+        faults = []
+        if not MIN_US <= period_us <= MAX_PERIOD_US:
+            period = f"{self.quota.period_ms:g}"
+            faults.append(f"nodes.{node}.quota.period_ms: {period} is not between 1 and 1000")
+        if quota_us < MIN_US:
+            faults.append(
+                f"nodes.{node}.quota: {self.quota.cpu:g} CPU in every {self.quota.period_ms:g} ms "
+                f"is {quota_us / 1e3:g} ms a period; the kernel takes no less than 1 ms: use a "
+                "longer period"
+            )
+        return faults
+
+
+def _missing(node: str, share: Share) -> list[str]:
+    allowed = os.sched_getaffinity(0)
+    if not (missing := sorted(set(share.cpus) - allowed)):
+        return []
+    asked, known = (", ".join(map(str, some)) for some in (missing, sorted(allowed)))
+    return [f"nodes.{node}: CPU {asked} is not there; this process may use {known}"]
+
+
+def _microseconds(quota: Quota) -> tuple[int, int]:
+    """Return period and run time in it, as the kernel takes them."""
+    return round(quota.period_ms * 1e3), round(quota.cpu * quota.period_ms * 1e3)
+
+
+def group_name(name: str) -> str:
+    """Return the group that all groups of a testbed are in."""
+    return f"dwell-{name}"
+
+
+class Groups:
+    """One group per node; a context manager, at whose end nothing in them lives.
+
+    Parameters
+    ----------
+    name : str
+        Of the testbed.
+    shares : mapping of str to Share
+        By node.
+    cgroups : Cgroups, optional
+        Where; found if left out.
+
+    Raises
+    ------
+    LiveError
+        If this machine has no groups with quotas, or cannot have these.
+    """
+
+    def __init__(
+        self, name: str, shares: Mapping[str, Share], *, cgroups: Cgroups | None = None
+    ) -> None:
+        faults = [
+            fault
+            for node, share in shares.items()
+            for fault in (*share.faults(node), *_missing(node, share))
+        ]
+        if faults:
+            raise LiveError("\n".join(faults))
+        self._cgroups = find_cgroups() if cgroups is None else cgroups
+        self._parent = group_name(name)
+        self._shares = dict(shares)
+        self._made = False
+
+    def __enter__(self) -> Self:
+        """Make the groups.
+
+        Raises
+        ------
+        LiveError
+            If groups of this name exist, or cannot be made.
+        """
+        for folder in self._cgroups.groups(self._parent):
+            if folder.exists():
+                raise LiveError(f"the group {folder} exists already; use another name")
+        self._made = True
+        try:
+            self._make()
+        except OSError as error:
+            self.close()
+            reason = f"{error.filename}: {error.strerror}"
+            raise LiveError(f"no groups of processes can be made here ({reason})") from None
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End what is in them, and remove them."""
+        self.close()
+
+    def _make(self) -> None:
+        for folder in self._cgroups.groups(self._parent):
+            self._hand_down(folder.parent)
+            folder.mkdir()
+            if self._cgroups.version == 1:
+                _inherit_cpus(folder)
+            self._hand_down(folder)
+        self._weigh()
+        for node, share in self._shares.items():
+            for folder in self._cgroups.groups(self._parent, node):
+                folder.mkdir()
+                if self._cgroups.version == 1:
+                    _inherit_cpus(folder)
+            if share.cpus and "cpuset" in self._cgroups.folders:
+                cpus = ",".join(map(str, share.cpus))
+                _write(self._folder("cpuset", node) / "cpuset.cpus", cpus)
+            if share.quota is not None:
+                self._limit(node, share.quota)
+
+    def _hand_down(self, folder: Path) -> None:
+        """Let the groups inside a group have controllers, which version 2 does not by itself."""
+        if self._cgroups.version == 1:
+            return
+        control = folder / "cgroup.subtree_control"
+        has = control.read_text().split() if control.exists() else []
+        if wanted := [name for name in self._cgroups.folders if name not in has]:
+            _write(control, " ".join(f"+{name}" for name in wanted))
+
+    def _weigh(self) -> None:
+        """Give the group of all as much weight as its groups would have beside it."""
+        folder, count = self._cgroups.folders["cpu"] / self._parent, max(1, len(self._shares))
+        if self._cgroups.version == 2:
+            _write(folder / "cpu.weight", str(min(100 * count, 10_000)))
+        else:
+            _write(folder / "cpu.shares", str(min(1_024 * count, 262_144)))
+
+    def _limit(self, node: str, quota: Quota) -> None:
+        period_us, quota_us = _microseconds(quota)
+        folder = self._folder("cpu", node)
+        if self._cgroups.version == 2:
+            _write(folder / "cpu.max", f"{quota_us} {period_us}")
+            return
+        _write(folder / "cpu.cfs_period_us", str(period_us))
+        _write(folder / "cpu.cfs_quota_us", str(quota_us))
+
+    def _folder(self, controller: str, node: str) -> Path:
+        self._require(node)
+        return self._cgroups.folders[controller] / self._parent / node
+
+    def _require(self, node: str) -> None:
+        if node not in self._shares:
+            known = ", ".join(self._shares)
+            raise LiveError(f"there is no group of a node {node!r}; there are {known}")
+
+    def inside(self, node: str, words: Sequence[str]) -> list[str]:
+        """Return a command that runs another in a node's group, in the same process."""
+        self._require(node)
+        cpus = self._shares[node].cpus
+        folders = " ".join(
+            shlex.quote(str(folder)) for folder in self._cgroups.groups(self._parent, node)
+        )
+        enter = f'for to in {folders}; do echo 0 > "$to/cgroup.procs" || exit 126; done; exec "$@"'
+        pinned: list[str] = []
+        if cpus and "cpuset" not in self._cgroups.folders:
+            pinned = ["taskset", "--cpu-list", ",".join(map(str, cpus))]
+        return ["/bin/sh", "-c", enter, "sh", *pinned, *words]
+
+    def used_ns(self, node: str) -> int:
+        """Return the CPU time that a node's group has used since it was made."""
+        if self._cgroups.version == 1:
+            return int((self._folder("cpuacct", node) / "cpuacct.usage").read_text())
+        counts = (self._folder("cpu", node) / "cpu.stat").read_text().split()
+        return 1_000 * int(counts[counts.index("usage_usec") + 1])
+
+    def pids(self, node: str) -> list[int]:
+        """Return the processes in a node's group."""
+        return _pids(self._folder("cpu", node))
+
+    def kill(self, node: str) -> None:
+        """End all processes of a node, stopped and frozen ones too, and wait until they are gone.
+
+        Raises
+        ------
+        LiveError
+            If some do not end.
+        """
+        self._require(node)
+        _kill(self._cgroups.groups(self._parent, node))
+
+    def close(self) -> None:
+        """End what is in the groups, and remove them; safe to call twice."""
+        if self._made:
+            remove_group(self._parent, self._cgroups)
+            self._made = False
+
+
+def remove_group(parent: str, cgroups: Cgroups) -> None:
+    """End all that is in a group and the groups in it, and remove them; nothing if there is none.
+
+    Raises
+    ------
+    LiveError
+        If something does not end.
+    """
+    inner = {
+        group.name
+        for folder in cgroups.groups(parent)
+        if folder.is_dir()
+        for group in folder.iterdir()
+        if group.is_dir()
+    }
+    for names in [*((parent, group) for group in sorted(inner)), (parent,)]:
+        folders = [folder for folder in cgroups.groups(*names) if folder.is_dir()]
+        _kill(folders)
+        for folder in folders:
+            _remove(folder)
+
+
+def _inherit_cpus(folder: Path) -> None:
+    """Give a group of v1 its parent's CPUs and memory: it has none at first."""
+    for name in ("cpuset.mems", "cpuset.cpus"):
+        if (folder / name).exists():
+            _write(folder / name, (folder.parent / name).read_text().strip())
+
+
+def _write(file: Path, value: str) -> None:
+    try:
+        file.write_text(value)
+    except OSError as error:
+        # A write that the kernel refuses has no file name of its own.
+        raise OSError(error.errno, f"{error.strerror} for {value!r}", str(file)) from None
+
+
+def _pids(folder: Path) -> list[int]:
+    try:
+        pids = [int(pid) for pid in (folder / "cgroup.procs").read_text().split()]
+    except FileNotFoundError:
+        return []
+    # 0 stands for one of another PID namespace; to kill it would be to kill this process's group.
+    return [pid for pid in pids if pid > 0]
+
+
+def _kill(folders: Sequence[Path]) -> None:
+    """Kill until nobody is left: whoever was started meanwhile is in the group too."""
+    until = time.monotonic() + GONE_S
+    while alive := sorted({pid for folder in folders for pid in _pids(folder)}):
+        for pid in alive:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        for folder in folders:
+            _thaw(folder)
+        if time.monotonic() > until:
+            raise LiveError(f"processes {', '.join(map(str, alive))} of {folders[0]} do not end")
+        time.sleep(CHECK_S)
+
+
+def _thaw(folder: Path) -> None:
+    """Let frozen processes run to their end: those of v1 do not notice that they are killed."""
+    for name, value in (("freezer.state", "THAWED"), ("cgroup.freeze", "0")):
+        if (folder / name).exists():
+            with suppress(OSError):
+                (folder / name).write_text(value)
+
+
+def _remove(folder: Path) -> None:
+    until = time.monotonic() + GONE_S
+    while True:
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            if time.monotonic() > until:
+                raise LiveError(f"{folder} cannot be removed ({error.strerror})") from None
+            time.sleep(CHECK_S)
+        else:
+            return

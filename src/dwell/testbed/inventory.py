@@ -1,0 +1,222 @@
+"""Inventory: which real host each node of a cell is, and how commands get there.
+
+```yaml
+dwell-inventory: 1
+hosts:
+  R1: {run: ssh -o BatchMode=yes robot-1, address: 10.0.0.11, python: /opt/dwell/bin/python}
+  E: {run: ssh -o BatchMode=yes edge, address: 10.0.0.2, cpus: 2-7}
+links:
+  R1->E:
+    begin: sudo impair on {mean_ms} {std_ms} {loss_percent}
+    end: sudo impair off
+```
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from dwell.errors import Fault, ProblemError
+from dwell.model import Problem
+
+__all__ = ["Inventory", "LinkCommands", "RealHost", "load_inventory"]
+
+VERSION = 1
+FORMAT = "dwell-inventory"
+FOLDER = "/var/tmp/dwell"  # noqa: S108 - on the hosts; a folder of the testbed's own is made in it
+#: stress-ng, or as many busy loops.
+STRESS = (
+    "if command -v stress-ng >/dev/null; then exec stress-ng --quiet --cpu {threads}; fi; "
+    "i=0; while [ $i -lt {threads} ]; do while :; do :; done & i=$((i + 1)); done; wait"
+)
+HOST_KEYS = ("run", "address", "port", "python", "folder", "cpus", "stress")
+LINK_KEYS = ("begin", "end")
+CPUS = re.compile(r"\d+(-\d+)?(,\d+(-\d+)?)*")
+
+
+@dataclass(frozen=True, slots=True)
+class RealHost:
+    """A host.
+
+    Parameters
+    ----------
+    run : tuple of str
+        Words that, with a line for a shell behind them, have it done there: ``ssh robot-1``.
+    address : str
+        Where its processes are reached from the other hosts.
+    port : int
+        First one.
+    python : str
+        The interpreter there that has this package, with the cell's stages.
+    folder : str
+        Where files may be put there.
+    cpus : str
+        Those that the cell may use, as ``2-7``; any where empty.
+    stress : str
+        Line for a shell that loads ``{threads}`` threads until it is told to end.
+    """
+
+    run: tuple[str, ...]
+    address: str
+    port: int = 7450
+    python: str = "python3"
+    folder: str = FOLDER
+    cpus: str = ""
+    stress: str = STRESS
+
+
+@dataclass(frozen=True, slots=True)
+class LinkCommands:
+    """Lines for a shell on the host that a link leaves from.
+
+    Parameters
+    ----------
+    begin : str
+        With ``{mean_ms}``, ``{std_ms}`` of the extra delay, ``{loss_percent}``, ``{rate_mbps}``.
+    end : str
+    """
+
+    begin: str
+    end: str
+
+
+@dataclass(frozen=True, slots=True)
+class Inventory:
+    """The hosts of a cell.
+
+    Parameters
+    ----------
+    hosts : mapping of str to RealHost
+        By node.
+    links : mapping of str to LinkCommands
+        By directed link, ``R1->E``.
+    """
+
+    hosts: Mapping[str, RealHost]
+    links: Mapping[str, LinkCommands]
+
+    @property
+    def digest(self) -> str:
+        """What a campaign knows these hosts by."""
+        told = {
+            "hosts": {name: asdict(host) for name, host in self.hosts.items()},
+            "links": {name: asdict(link) for name, link in self.links.items()},
+        }
+        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+        return f"hosts {digest}"
+
+
+def load_inventory(path: str | PathLike[str], problem: Problem) -> Inventory:
+    """Read an inventory for a cell.
+
+    Parameters
+    ----------
+    path : str or path
+    problem : Problem
+        Every node of which has to be there.
+
+    Raises
+    ------
+    ProblemError
+        With every fault.
+    """
+    source = str(path)
+    try:
+        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ProblemError(f"cannot be read ({error.strerror})", source) from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ProblemError(f"is not YAML ({error})".replace("\n", " "), source) from None
+    faults: list[Fault] = []
+    found = _inventory(document, problem, faults)
+    if faults or found is None:
+        raise ProblemError(faults, source)
+    return found
+
+
+def _inventory(document: Any, problem: Problem, faults: list[Fault]) -> Inventory | None:
+    if not isinstance(document, dict) or document.get(FORMAT) != VERSION:
+        faults.append(Fault(FORMAT, f"must be {VERSION}: this is no inventory of this version"))
+        return None
+    _keys("", document, (FORMAT, "hosts", "links"), (), faults)
+    hosts, links = (_mapping(document.get(key), key, faults) for key in ("hosts", "links"))
+    nodes = list(problem.fabric.nodes)
+    _keys("hosts", hosts, nodes, nodes, faults)
+    _keys("links", links, list(problem.fabric.links), (), faults)
+    return Inventory(
+        {str(name): _host(f"hosts.{name}", host, faults) for name, host in hosts.items()},
+        {str(name): _link(f"links.{name}", link, faults) for name, link in links.items()},
+    )
+
+
+def _mapping(value: Any, path: str, faults: list[Fault]) -> Mapping[Any, Any]:
+    if value is None:
+        return {}
+    if isinstance(value, dict):
+        return value
+    faults.append(Fault(path, f"is {value!r}; it must be a mapping"))
+    return {}
+
+
+def _keys(
+    path: str,
+    given: Mapping[Any, Any],
+    known: Collection[str],
+    needed: Collection[str],
+    faults: list[Fault],
+) -> None:
+    """Note what is there and unknown, and what is needed and not there."""
+    before = f"{path}." if path else ""
+    faults += [
+        Fault(f"{before}{key}", f"is unknown here; there may be {', '.join(known)}")
+        for key in given
+        if key not in known
+    ]
+    faults += [Fault(f"{before}{key}", "is missing") for key in needed if not given.get(key)]
+
+
+def _host(path: str, value: Any, faults: list[Fault]) -> RealHost:
+    told = dict(_mapping(value, path, faults))
+    _keys(path, told, HOST_KEYS, ("run", "address"), faults)
+    run = told.get("run", "")
+    try:
+        words = tuple(map(str, run)) if isinstance(run, list) else tuple(shlex.split(str(run)))
+    except ValueError as error:
+        faults.append(Fault(f"{path}.run", f"is {run!r}, which is no command line ({error})"))
+        words = ()
+    port = told.get("port", 7450)
+    if type(port) is not int or not 1 <= port <= 65_000:
+        faults.append(Fault(f"{path}.port", f"is {port!r}; it must be in [1, 65000]"))
+        port = 7450
+    folder = str(told.get("folder", FOLDER))
+    if not folder.startswith("/"):
+        faults.append(Fault(f"{path}.folder", f"is {folder!r}; it must begin with /"))
+    cpus = str(told.get("cpus", ""))
+    if cpus and not CPUS.fullmatch(cpus):
+        faults.append(Fault(f"{path}.cpus", f"is {cpus!r}; write 0,2-3"))
+    stress = str(told.get("stress", STRESS))
+    if "{threads}" not in stress:
+        faults.append(Fault(f"{path}.stress", "must say where the number goes: {threads}"))
+    address, python = str(told.get("address", "")), str(told.get("python", "python3"))
+    return RealHost(words, address, port, python, folder, cpus, stress)
+
+
+def _link(path: str, value: Any, faults: list[Fault]) -> LinkCommands:
+    told = dict(_mapping(value, path, faults))
+    _keys(path, told, LINK_KEYS, LINK_KEYS, faults)
+    commands = LinkCommands(str(told.get("begin", "")), str(told.get("end", "")))
+    try:
+        commands.begin.format(mean_ms=0, std_ms=0, loss_percent=0, rate_mbps=0)
+    except (KeyError, IndexError, ValueError) as error:
+        faults.append(Fault(f"{path}.begin", f"cannot be filled in ({error!r})"))
+    return commands

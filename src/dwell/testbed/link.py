@@ -1,0 +1,249 @@
+"""The link of two hosts, emulated: a process between the TUN devices that lead to the other one.
+
+What differs from a real link:
+
+* The unit is the burst: packets of one flow (addresses, protocol, ports) in one direction that
+  follow each other within a gap. That is a message, as long as messages of one connection are
+  further apart than the gap; of closer ones the first draws the delay of all.
+* Within a flow nothing overtakes, as a TCP connection would put it in order anyway: a message whose
+  delay is drawn shorter arrives right behind the one before it. Flows overtake each other.
+* A bare acknowledgement of TCP is delayed like a message, and overtakes them.
+* It never loses a packet while it is up. Where a loss means that a message is sent again, its burst
+  is held back by whole timeouts. Where it means that the message is gone, the transport of the
+  sender leaves it out (`dwell.live.transport.losses`), because TCP would send it again.
+* While it is down packets vanish, and TCP sends them again after it is up: after 0.2 s at the
+  soonest, and twice as long after every further attempt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import cast
+
+from dwell.errors import LiveError
+from dwell.testbed.child import Child, Json, Started
+from dwell.testbed.conditions import Conditions, Scheduling, to_json
+
+__all__ = ["GAP_MS", "LONGEST_MS", "Passed", "TunLink"]
+
+#: A sender that is stopped by its CPU quota in the middle of a message goes on within 4 ms.
+GAP_MS = 4.0
+#: From then on a flow that never pauses draws its next delay.
+LONGEST_MS = 20.0
+NO_CONDITIONS: Mapping[tuple[str, str], Conditions] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """What has passed one direction.
+
+    Parameters
+    ----------
+    packets, bytes : int
+        Handed over.
+    bursts : int
+        Of data, begun.
+    held : int
+        Of them, held back for a timeout or more.
+    vanished : int
+        Packets lost to an outage, a full queue or a host that is gone.
+    ignored : int
+        Packets that are no cell's: IPv6, multicast, broadcast.
+    delay_mean_ms, delay_std_ms : float
+        Drawn for bursts of data, timeouts included.
+    waited_mean_ms : float
+        What bursts of data waited for the one before them in their flow.
+    late_mean_ms, late_max_ms : float
+        What packets left later than they were due.
+    late : tuple of int
+        Packets by lateness: up to 0.1, 0.2, 0.3, 0.5, 1, 2, 5, 10, 20, 50 ms, and above.
+    cpu_s : float
+        CPU time of the process since its start, both directions.
+    """
+
+    packets: int
+    bytes: int
+    bursts: int
+    held: int
+    vanished: int
+    ignored: int
+    delay_mean_ms: float
+    delay_std_ms: float
+    waited_mean_ms: float
+    late_mean_ms: float
+    late_max_ms: float
+    late: tuple[int, ...]
+    cpu_s: float
+
+
+class TunLink(Started):
+    """The link between two hosts, as its parent sees it; a context manager.
+
+    Parameters
+    ----------
+    pair : pair of str
+        Nodes.
+    descriptors : mapping of str to int
+        Of each node the TUN device that leads to the other, without packet information.
+    usual : mapping of (source, target) to Conditions
+        At the beginning; a direction that is not there has no delay, loss or limit.
+    retransmit_ms : mapping of (source, target) to float
+        Timeout of the directions that send again what was lost; others may have no `loss`.
+    seed : int
+        Of delays and losses.
+    gap_ms, longest_ms : float
+        Pause that ends a burst, and time after which one ends without.
+    cpus : collection of int, optional
+        Where it runs; anywhere if left out.
+
+    Raises
+    ------
+    LiveError
+        If a direction or descriptor is not of the pair, or conditions are none of such a link.
+    """
+
+    def __init__(
+        self,
+        pair: tuple[str, str],
+        descriptors: Mapping[str, int],
+        usual: Mapping[tuple[str, str], Conditions] = NO_CONDITIONS,
+        *,
+        retransmit_ms: Mapping[tuple[str, str], float] | None = None,
+        seed: int = 0,
+        gap_ms: float = GAP_MS,
+        longest_ms: float = LONGEST_MS,
+        cpus: Collection[int] | None = None,
+    ) -> None:
+        self.pair = pair
+        self.name = f"link {pair[0]}-{pair[1]}"
+        if pair[0] == pair[1] or set(descriptors) != set(pair):
+            raise LiveError(f"{self.name}: needs one device each of two nodes")
+        files = [descriptors[node] for node in pair]
+        timeouts = dict(retransmit_ms or {})
+        for source, target in timeouts:
+            self._require(source, target)
+        self._repeats = frozenset(source for source, _ in timeouts)
+        self._child = Child("dwell.testbed.forwarder", self.name, files)
+        self._settings: Json = {
+            "nodes": pair,
+            "descriptors": files,
+            "sets": [self._change(*way, _all_of(each)) for way, each in usual.items()],
+            "retransmit_ns": {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
+            "gap_ns": round(gap_ms * 1e6),
+            "longest_ns": round(longest_ms * 1e6),
+            "seed": seed,
+            "cpus": sorted(cpus) if cpus is not None else None,
+        }
+        #: How well it can keep its instants beside busy threads.
+        self.scheduling: Scheduling = "usual"
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._child.pid
+
+    def start(self) -> None:
+        """Start it; returns when it forwards.
+
+        Raises
+        ------
+        LiveError
+            If a value of the conditions is out of its bounds, or it does not start.
+        """
+        answer = self._child.start(self._settings)
+        self.scheduling = cast("Scheduling", answer["scheduling"])
+
+    def stop(self) -> None:
+        """End it; what is on its way is lost. Safe to call twice."""
+        self._child.stop()
+
+    def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
+        """Change some conditions of a direction for what begins its way from then on.
+
+        Parameters
+        ----------
+        source, target : str
+        at_ns : int, optional
+            When, by the monotonic clock; at once if left out or past.
+        **changes
+            Fields of `Conditions`.
+
+        Returns
+        -------
+        int
+            The instant from which they hold, ns of the monotonic clock.
+
+        Raises
+        ------
+        LiveError
+            If there is no such direction or field, a value is out of its bounds or none that this
+            kind of link has, or the process has ended.
+        """
+        return self._send([self._change(source, target, changes)], at_ns)
+
+    def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
+        """Begin or end an outage of a direction; returns the instant, as `set`.
+
+        What is on its way already arrives.
+        """
+        return self.set(source, target, at_ns=at_ns, cut="drop" if down else None)
+
+    def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:
+        """Return what has passed each direction since this was last asked.
+
+        Raises
+        ------
+        LiveError
+            If the process has ended.
+        """
+        answer = self._child.ask({"do": "stats", "reset": reset})
+        counted = cast("dict[str, Json]", answer["stats"])
+        first, second = self.pair
+        return {way: _passed(counted[way[0]]) for way in ((first, second), (second, first))}
+
+    def _require(self, source: str, target: str) -> None:
+        if {source, target} != set(self.pair):
+            raise LiveError(f"{self.name} does not go from {source} to {target}")
+
+    def _change(self, source: str, target: str, changes: Mapping[str, object]) -> Json:
+        self._require(source, target)
+        way = f"{self.name}, {source} to {target}"
+        if changes.get("loss") and source not in self._repeats:
+            raise LiveError(
+                f"{way}: without retransmit_ms it loses nothing; the transport of the sender "
+                "leaves messages out"
+            )
+        if changes.get("cut") == "hold":
+            raise LiveError(f"{way}: what is sent while it is down vanishes (cut='drop')")
+        return {"source": source, "changes": to_json(changes)}
+
+    def _send(self, sets: Iterable[Json], at_ns: int | None) -> int:
+        answer = self._child.ask({"do": "set", "sets": list(sets), "at_ns": at_ns})
+        return cast("int", answer["at_ns"])
+
+
+def _all_of(conditions: Conditions) -> dict[str, object]:
+    return {item.name: getattr(conditions, item.name) for item in fields(conditions)}
+
+
+def _passed(counted: Json) -> Passed:
+    found = cast("dict[str, float]", counted)
+    bursts, packets = max(found["bursts"], 1), max(found["packets"], 1)
+    mean_ns = found["delay_ns"] / bursts
+    variance = max(found["squares"] / bursts - mean_ns**2, 0.0)
+    return Passed(
+        packets=int(found["packets"]),
+        bytes=int(found["bytes"]),
+        bursts=int(found["bursts"]),
+        held=int(found["held"]),
+        vanished=int(found["vanished"]),
+        ignored=int(found["ignored"]),
+        delay_mean_ms=mean_ns / 1e6,
+        delay_std_ms=variance**0.5 / 1e6,
+        waited_mean_ms=found["waited_ns"] / bursts / 1e6,
+        late_mean_ms=found["late_ns"] / packets / 1e6,
+        late_max_ms=found["late_max_ns"] / 1e6,
+        late=tuple(cast("list[int]", counted["late"])),
+        cpu_s=found["cpu_s"],
+    )

@@ -1,0 +1,546 @@
+"""Measured: what runs that kept their jobs show of tasks, links and nodes.
+
+A job costs its node more CPU than its stage takes: its worker reads and writes messages, and at
+both ends of the pipeline a stamp and a command are handed over. A simulator that knows nothing of
+messages on one node, and of what they cost, is told so by way of the execution times:
+
+- a worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. Runs in which it has jobs
+  and runs in which it has none tell the two apart; a worker that always has jobs idles like others;
+- a source's job takes, besides, what passes between a release and its start, and a sink's what
+  passes between its end and the command's hand-over, as where the quota does not interfere.
+
+Everything else that a node does (agents, stampers, sinks, the controller, workers without jobs) is
+its background. A link adds to the delay that is asked of it what a message takes beyond that, its
+transmission and the CPU time of sender and receiver, which their jobs have already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.errors import RunError
+from dwell.model import Problem
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from dwell.record import Run
+
+__all__ = [
+    "Disturbed",
+    "Measured",
+    "Site",
+    "Visit",
+    "backgrounds",
+    "floors",
+    "look_at",
+    "own_delays",
+    "sites",
+]
+
+Floats: TypeAlias = NDArray[np.float64]
+SiteName: TypeAlias = tuple[str, str]
+
+#: Least number of jobs from which a task's execution times are taken.
+LEAST_JOBS = 100
+#: Quantile of a waiting time at which a quota has hardly had a part in it.
+UNHINDERED = 0.25
+#: The same of a message's delay, where its link's own is compared with what was asked for.
+QUICK = 0.1
+#: Bytes that cost as much CPU as sending or receiving a message at all.
+MESSAGE_BYTES = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbed:
+    """What a run's scenario did.
+
+    Parameters
+    ----------
+    nodes : frozenset of str
+        With foreign threads, or down.
+    links : frozenset of (str, str)
+    """
+
+    nodes: frozenset[str]
+    links: frozenset[tuple[str, str]]
+
+    @classmethod
+    def of(cls, meta: Mapping[str, Any]) -> Disturbed:
+        """Read a run's record.
+
+        Raises
+        ------
+        RunError
+            If its scenario is not among those of its cell.
+        """
+        scenario = str(meta.get("scenario") or "baseline")
+        scenarios = meta["problem"].get("scenarios") or {}
+        if scenario not in scenarios and scenario not in ("baseline", "live"):
+            raise RunError(f"scenario {scenario!r} is none of the cell's; what was it?")
+        nodes, links = set(), set()
+        for item in (*scenarios.get(scenario, ()), *_played(meta)):
+            if "node" in item:
+                nodes.add(str(item["node"]))
+            if "link" in item:
+                source, _, target = str(item["link"]).partition("->")
+                links.add((source, target))
+                if item.get("both_ways"):
+                    links.add((target, source))
+        return cls(frozenset(nodes), frozenset(links))
+
+
+def _played(meta: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
+    played = meta.get("played")
+    found = played if isinstance(played, Sequence) and not isinstance(played, str) else ()
+    return (item for item in found if isinstance(item, Mapping))
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """Jobs of one task on one node in one run.
+
+    Parameters
+    ----------
+    cpu_ms : float64 array, shape (jobs,)
+        CPU time of the stage, in the order of cycles; 0 of a task that an accelerator runs.
+    stage_ms : float64 array, shape (jobs,)
+        Time that the stage needs where nothing hinders it.
+    """
+
+    cpu_ms: Floats
+    stage_ms: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """One run: what its windows show that are neither warm-up nor mixed nor excluded.
+
+    Parameters
+    ----------
+    name : str
+    run : Run
+    disturbed : Disturbed
+    placement : str
+        Candidate of all its windows; empty where it moved.
+    windows, cycles : int
+        Used.
+    jobs_s : float
+        Time in which the jobs of the used windows became due, seconds.
+    visits : dict of (str, str) to Visit
+        By task and node.
+    rates : dict of (str, str) to float
+        Cores that each process took, by node and process.
+    starts : dict of (str, str, bool) to float
+        Jobs a second, by task, node, and whether they are shadows.
+    spent_ms : dict of (str, str, bool) to float
+        Mean CPU time of their stage.
+    used : dict of str to float
+        Cores that were busy on each node.
+    begins_ms, ends_ms : dict of (str, str) to float
+        Of sources: from a release to the start of the job. Of sinks: from the end of the job to
+        that of the cycle. Unhindered.
+    delays_ms : dict of (str, str, str, str) to float64 array
+        By source, target, and the nodes of both: from the end of the job that sent a message to its
+        arrival.
+    """
+
+    name: str
+    run: Run
+    disturbed: Disturbed
+    placement: str
+    windows: int
+    cycles: int
+    jobs_s: float
+    visits: dict[SiteName, Visit]
+    rates: dict[tuple[str, str], float]
+    starts: dict[tuple[str, str, bool], float]
+    spent_ms: dict[tuple[str, str, bool], float]
+    used: dict[str, float]
+    begins_ms: dict[SiteName, float] = field(default_factory=dict)
+    ends_ms: dict[SiteName, float] = field(default_factory=dict)
+    delays_ms: dict[tuple[str, str, str, str], Floats] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A task on a node, over all runs.
+
+    Parameters
+    ----------
+    samples_ms : float64 array, shape (jobs,)
+        What an undisturbed job takes of the node, its share of messaging included.
+    stage_ms, overhead_ms, ends_ms : float
+        Means of the stage alone, its worker's messaging, and the ends of the pipeline.
+    runs : tuple of str
+        That they are from.
+    """
+
+    samples_ms: Floats
+    stage_ms: float
+    overhead_ms: float
+    ends_ms: float
+    runs: tuple[str, ...]
+
+
+def look_at(name: str, run: Run, problem: Problem) -> Measured:
+    """Take out of a run what there is to measure.
+
+    Raises
+    ------
+    RunError
+        If it kept no jobs or no CPU times, is of another pipeline, or no window can be used.
+    """
+    import polars as pl
+
+    if not run.has_jobs or "cpu_ns" not in run.jobs.columns:
+        raise RunError(f"{name}: it kept no jobs with CPU times; record it with --jobs")
+    _require_same(name, run, problem)
+    windows = _usable(run)
+    if not windows.height:
+        raise RunError(f"{name}: no window is left after warm-up, mixed and excluded ones")
+    size = problem.window_cycles
+    in_window = (
+        windows.select("window", cycle=pl.int_ranges("first_cycle", pl.col("first_cycle") + size))
+        .explode("cycle")
+        .cast({"cycle": pl.Int64})
+    )
+    jobs = run.jobs.with_columns(pl.col("cycle").cast(pl.Int64))
+    if "shadow" not in jobs.columns:
+        jobs = jobs.with_columns(shadow=False)
+    jobs = jobs.join(in_window, on="cycle").filter(pl.col("outcome").cast(str) == "done")
+    jobs = jobs.with_columns(
+        pl.col("task", "node").cast(str), took=pl.col("end_ns") - pl.col("start_ns")
+    ).filter(pl.col("cpu_ns").is_not_null() & (pl.col("took") >= 0))
+    jobs = jobs.sort("cycle", maintain_order=True)
+    placements = set(windows["placement"].cast(str))
+    jobs_s = windows.height * size * problem.pipeline.period_ms / 1e3
+    visits, starts, spent_ms = {}, {}, {}
+    for (task, node, shadow), of in jobs.group_by("task", "node", "shadow", maintain_order=True):
+        key = str(task), str(node), bool(shadow)
+        cpu_ms = of["cpu_ns"].to_numpy() / 1e6
+        starts[key] = of.height / jobs_s
+        spent_ms[key] = float(cpu_ms.mean())
+        if not shadow:
+            execution = problem.pipeline.tasks[key[0]].on[key[1]]
+            on_cpu = execution.accelerator is None
+            stage_ms = cpu_ms / execution.threads if on_cpu else of["took"].to_numpy() / 1e6
+            visits[key[:2]] = Visit(cpu_ms, np.asarray(stage_ms, np.float64))
+    own = jobs.filter(~pl.col("shadow"))
+    return Measured(
+        name=name,
+        run=run,
+        disturbed=Disturbed.of(run.meta),
+        placement=placements.pop() if len(placements) == 1 else "",
+        windows=windows.height,
+        cycles=windows.height * size,
+        jobs_s=jobs_s,
+        visits=visits,
+        rates=_rates(run, windows, problem),
+        starts=starts,
+        spent_ms=spent_ms,
+        used={
+            node: float(windows[f"u_{node}"].to_numpy().mean()) * of.capacity
+            for node, of in problem.fabric.nodes.items()
+        },
+        delays_ms=_delays(own, problem),
+        begins_ms=_begins(own, run, problem),
+        ends_ms=_ends(own, run, problem),
+    )
+
+
+def _require_same(name: str, run: Run, problem: Problem) -> None:
+    theirs = run.meta.get("problem")
+    if not isinstance(theirs, Mapping):
+        raise RunError(f"{name}: its record does not say which cell it ran")
+    faults = [
+        f"{name}: its {what} are {', '.join(sorted(theirs.get(what, {})))}, those of the cell "
+        f"{', '.join(sorted(own))}"
+        for what, own in (("tasks", problem.pipeline.tasks), ("nodes", problem.fabric.nodes))
+        if set(theirs.get(what, {})) != set(own)
+    ]
+    sites = run.jobs.select("task", "node").unique().cast(dict.fromkeys(("task", "node"), str))
+    faults += [
+        f"{name}: {task} ran on {node}, where the cell has no such task"
+        for task, node in sites.iter_rows()
+        if not faults and node not in problem.pipeline.tasks[task].on
+    ]
+    for field_name, here in (
+        ("window_cycles", problem.window_cycles),
+        ("period_ms", problem.pipeline.period_ms),
+    ):
+        if theirs.get(field_name) != here:
+            faults.append(f"{name}: {field_name} was {theirs.get(field_name)}, not {here}")
+    if faults:
+        raise RunError("\n".join(faults))
+
+
+def _usable(run: Run) -> pl.DataFrame:
+    import polars as pl
+
+    windows = run.windows.filter(~pl.col("warmup") & ~pl.col("mixed"))
+    if "unproven" in windows.columns:
+        windows = windows.filter(~pl.col("unproven"))
+    pressure = run.meta.get("pressure")
+    out = pressure.get("excluded", ()) if isinstance(pressure, Mapping) else ()
+    return windows.filter(~pl.col("window").is_in([int(number) for number in out]))
+
+
+def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str, str], float]:
+    """Cores that each process took in the windows; each counts from its release to its close."""
+    import polars as pl
+
+    if not run.has_processes:
+        return {}
+    size, grace_ns = problem.window_cycles, problem.controller.close_grace_ms * 1e6
+    span_ns = windows.height * (size * problem.pipeline.period_ms * 1e6 + grace_ns)
+    found = run.processes.filter(pl.col("window").is_in(windows["window"].to_list()))
+    sums = found.group_by(pl.col("node").cast(str), "process").agg(pl.col("cpu_ns").sum())
+    return {(node, process): cpu_ns / span_ns for node, process, cpu_ns in sums.iter_rows()}
+
+
+def _delays(own: pl.DataFrame, problem: Problem) -> dict[tuple[str, str, str, str], Floats]:
+    """Delays of messages, by flow and nodes; of joins it is not known which input came last."""
+    import polars as pl
+
+    found: dict[tuple[str, str, str, str], Floats] = {}
+    for flow in problem.pipeline.flows:
+        if len(problem.pipeline.inputs(flow.target)) > 1:
+            continue
+        sent = own.filter(pl.col("task") == flow.source).select("cycle", "end_ns", "node")
+        came = own.filter(pl.col("task") == flow.target).select("cycle", "ready_ns", to="node")
+        both = sent.join(came, on="cycle", maintain_order="left")
+        for (node, to), of in both.group_by("node", "to", maintain_order=True):
+            delay_ms = (of["ready_ns"] - of["end_ns"]).to_numpy() / 1e6
+            found[flow.source, flow.target, str(node), str(to)] = delay_ms
+    return found
+
+
+def _begins(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:
+    import polars as pl
+
+    released = run.cycles.select(pl.col("cycle").cast(pl.Int64), "release_ns")
+    found: dict[SiteName, float] = {}
+    for task in problem.pipeline.tasks.values():
+        if problem.pipeline.inputs(task.name):
+            continue
+        of = own.filter(pl.col("task") == task.name).join(released, on="cycle")
+        wait_ms = (of["start_ns"] - of["release_ns"]).to_numpy() / 1e6 - task.offset_ms
+        found |= _unhindered(task.name, of["node"].to_list(), wait_ms)
+    return found
+
+
+def _ends(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:
+    import polars as pl
+
+    sinks = [name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)]
+    if len(sinks) > 1:
+        return {}
+    cycles = run.cycles.filter(pl.col("latency_ns").is_not_null())
+    done = cycles.select(
+        pl.col("cycle").cast(pl.Int64), done=pl.col("release_ns") + pl.col("latency_ns")
+    )
+    of = own.filter(pl.col("task") == sinks[0]).join(done, on="cycle")
+    return _unhindered(sinks[0], of["node"].to_list(), (of["done"] - of["end_ns"]).to_numpy() / 1e6)
+
+
+def _unhindered(task: str, nodes: Sequence[str], wait_ms: Floats) -> dict[SiteName, float]:
+    where = np.array(nodes)
+    return {
+        (task, str(node)): max(float(np.quantile(wait_ms[where == node], UNHINDERED)), 0.0)
+        for node in np.unique(where)
+    }
+
+
+# ------------------------------------------------------------------------------------ tasks
+
+
+def sites(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, Site]:
+    """Execution times of every task on every node that was visited undisturbed."""
+    overhead_ms = _overheads(measured, problem)
+    found: dict[SiteName, Site] = {}
+    for site in sorted({site for one in measured for site in one.visits}):
+        of = [one for one in measured if site in one.visits and site[1] not in one.disturbed.nodes]
+        if sum(len(one.visits[site].stage_ms) for one in of) < LEAST_JOBS:
+            continue
+        stage_ms = np.concatenate([one.visits[site].stage_ms for one in of])
+        over_ms = overhead_ms.get(site, 0.0)
+        # What its worker has to do with a stamp or a command is part of its messaging.
+        known_ms = over_ms * MESSAGE_BYTES / _message_bytes(problem, site[0])
+        ends_ms = float(
+            np.mean(
+                [
+                    sum(max(ends[site] - known_ms, 0.0) for ends in of_both if site in ends)
+                    for of_both in ((one.begins_ms, one.ends_ms) for one in of)
+                ]
+            )
+        )
+        names = tuple(one.name for one in of)
+        samples_ms = stage_ms + (over_ms + ends_ms)
+        found[site] = Site(samples_ms, float(stage_ms.mean()), over_ms, ends_ms, names)
+    return found
+
+
+def _overheads(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
+    """CPU time, ms, that every worker takes for a job besides its stage's."""
+    of: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    for one in measured:
+        for (node, process), rate in one.rates.items():
+            task, at, rest = process.partition("@")
+            worker = at and task in problem.pipeline.tasks and rest == node
+            if not worker or node in one.disturbed.nodes:
+                continue
+            key = task, node, False
+            jobs = one.starts.get(key, 0.0)
+            # Cores besides those of the stage, and jobs a millisecond.
+            besides = rate - jobs * one.spent_ms.get(key, 0.0) / 1e3
+            of.setdefault((process, task, node), []).append((jobs / 1e3, besides))
+    idle: list[float] = []
+    open_ones: list[tuple[str, str, str]] = []
+    overhead_ms: dict[SiteName, float] = {}
+    for (process, task, node), points in of.items():
+        jobs, besides = np.array(points).T
+        if jobs.max() == 0.0:
+            idle.append(max(float(besides.mean()), 0.0))
+        elif np.ptp(jobs) > 0.5 * jobs.max():
+            slope, start = np.polyfit(jobs, besides, 1)
+            idle.append(max(float(start), 0.0))
+            overhead_ms[task, node] = max(float(slope), 0.0)
+        else:
+            open_ones.append((process, task, node))
+    usual = float(np.mean(idle)) if idle else 0.0
+    for process, task, node in open_ones:
+        jobs, besides = np.array(of[process, task, node]).T
+        overhead_ms[task, node] = max(float((besides - usual).mean() / jobs.mean()), 0.0)
+    return overhead_ms
+
+
+# ------------------------------------------------------------------------------------ nodes
+
+
+def backgrounds(
+    measured: Sequence[Measured], found: Mapping[SiteName, Site], problem: Problem
+) -> dict[str, float]:
+    """Cores of every node that neither its jobs nor foreign threads took.
+
+    Of a node with a quota its control group says what was taken in all; elsewhere, where others
+    may have the same CPUs, only the cell's own processes are counted.
+    """
+    result = {}
+    for node, of in problem.fabric.nodes.items():
+        left = []
+        for one in measured:
+            processes = [rate for (where, _), rate in one.rates.items() if where == node]
+            if node in one.disturbed.nodes or not processes:
+                continue
+            used = one.used[node] if of.quota is not None else sum(processes)
+            sites_ = ((key, rate) for key, rate in one.starts.items() if key[1] == node)
+            jobs = sum(rate * _cores_ms(key, one, found, problem) / 1e3 for key, rate in sites_)
+            left.append((used - jobs, one.windows))
+        if left:
+            values, weights = zip(*left, strict=True)
+            mean = float(np.average(values, weights=weights))
+            result[node] = min(max(mean, 0.0), 0.9 * of.capacity)
+    return result
+
+
+def _cores_ms(
+    key: tuple[str, str, bool],
+    one: Measured,
+    found: Mapping[SiteName, Site],
+    problem: Problem,
+) -> float:
+    """Core time, ms, of a job as a simulator will charge it."""
+    execution = problem.pipeline.tasks[key[0]].on[key[1]]
+    if execution.accelerator is not None:
+        return 0.0
+    site = found.get(key[:2])
+    if site is None:
+        return one.spent_ms[key]
+    return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.ends_ms)
+
+
+# ------------------------------------------------------------------------------------ links
+
+
+def floors(
+    measured: Sequence[Measured],
+    found: Mapping[SiteName, Site],
+    problem: Problem,
+    asked_ms: Mapping[tuple[str, str], Floats],
+) -> dict[tuple[str, str], float]:
+    """What the messages of every link take beyond what was asked of it, ms.
+
+    Parameters
+    ----------
+    asked_ms : mapping of (str, str) to float64 array
+        Delays that the cell asks of each link.
+    """
+    over: dict[tuple[str, str], list[float]] = {}
+    for one in measured:
+        for (source, target, node, to), delay_ms in one.delays_ms.items():
+            link = node, to
+            hindered = {node, to} & one.disturbed.nodes or link in one.disturbed.links
+            if link not in asked_ms or hindered or len(delay_ms) < LEAST_JOBS:
+                continue
+            known_ms = _sending_ms(source, target, node, to, found, problem)
+            quick_ms = float(np.quantile(delay_ms, QUICK) - np.quantile(asked_ms[link], QUICK))
+            over.setdefault(link, []).append(quick_ms - known_ms)
+    return {link: max(float(np.median(values)), 0.0) for link, values in over.items()}
+
+
+def own_delays(
+    measured: Sequence[Measured], found: Mapping[SiteName, Site], problem: Problem
+) -> dict[tuple[str, str], Floats]:
+    """Delays of every link as they were measured, ms, for links that nobody emulates."""
+    delays: dict[tuple[str, str], list[Floats]] = {}
+    for one in measured:
+        for (source, target, node, to), delay_ms in one.delays_ms.items():
+            link = node, to
+            hindered = {node, to} & one.disturbed.nodes or link in one.disturbed.links
+            if (
+                "->".join(link) in problem.fabric.links
+                and not hindered
+                and len(delay_ms) >= LEAST_JOBS
+            ):
+                known_ms = _sending_ms(source, target, node, to, found, problem)
+                delays.setdefault(link, []).append(np.maximum(delay_ms - known_ms, 0.0))
+    return {link: np.concatenate(values) for link, values in delays.items()}
+
+
+def _sending_ms(
+    source: str,
+    target: str,
+    node: str,
+    to: str,
+    found: Mapping[SiteName, Site],
+    problem: Problem,
+) -> float:
+    """Transmission time of a message, and the CPU time of its sender and its receiver."""
+    pipeline = problem.pipeline
+    (flow,) = (f for f in pipeline.flows if (f.source, f.target) == (source, target))
+    sending_ms = flow.payload_bytes * 8 / (problem.fabric.links[f"{node}->{to}"].rate_mbps * 1e3)
+    for task, where in ((source, node), (target, to)):
+        site = found.get((task, where))
+        if site is not None:
+            sending_ms += site.overhead_ms * _share(problem, task, source, target)
+    return sending_ms
+
+
+def _share(problem: Problem, task: str, source: str, target: str) -> float:
+    """Share of a task's messaging that one of its flows is, by messages and by bytes."""
+    (of,) = (f for f in problem.pipeline.flows if (f.source, f.target) == (source, target))
+    return (MESSAGE_BYTES + of.payload_bytes) / _message_bytes(problem, task)
+
+
+def _message_bytes(problem: Problem, task: str) -> int:
+    """Messages that a task's worker reads and writes for a job, each for so many bytes."""
+    inputs, outputs = problem.pipeline.inputs(task), problem.pipeline.outputs(task)
+    # A source hears a stamp, and a sink's command is heard by its actuator.
+    messages = max(len(inputs), 1) + max(len(outputs), 1)
+    return messages * MESSAGE_BYTES + sum(flow.payload_bytes for flow in (*inputs, *outputs))

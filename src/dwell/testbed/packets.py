@@ -1,0 +1,60 @@
+"""What an emulated link has to know of a packet: which flow it is of, and what it carries."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["Kind", "kind_of"]
+
+ICMP, TCP, UDP = 1, 6, 17
+FIN_SYN_RST = 0x07
+# Don't-fragment left out: more fragments, and where in the packet this one begins.
+FRAGMENT = 0x3FFF
+MULTICAST = 224
+LEAST_BYTES = 20
+TCP_BYTES = 20
+
+
+class Kind(NamedTuple):
+    """Of a packet.
+
+    Parameters
+    ----------
+    flow : bytes
+        Same for all packets of one 5-tuple. Bare acknowledgements of TCP are a flow of their own.
+    data : bool
+        Whether it may be a part of a message, and is no bare acknowledgement.
+    """
+
+    flow: bytes
+    data: bool
+
+
+def kind_of(packet: bytes) -> Kind | None:
+    """Return a packet's kind; None for what is no cell's: the kernel's own, on every interface.
+
+    That is all of IPv6 (router solicitations, neighbours, listeners), multicast, broadcast, and
+    what is neither TCP, UDP nor ICMP.
+
+    Parameters
+    ----------
+    packet : bytes
+        As a TUN device without packet information gives it.
+    """
+    if len(packet) < LEAST_BYTES or packet[0] >> 4 != 4:
+        return None
+    protocol = packet[9]
+    if packet[16] >= MULTICAST or protocol not in (TCP, UDP, ICMP):
+        return None
+    addresses = packet[9:10] + packet[12:20]
+    begin = (packet[0] & 0x0F) * 4
+    whole = not int.from_bytes(packet[6:8], "big") & FRAGMENT
+    if protocol == ICMP or not whole:
+        # Only the first fragment has the ports.
+        return Kind(addresses, True)
+    flow = addresses + packet[begin : begin + 4]
+    if protocol == TCP and len(packet) >= begin + TCP_BYTES:
+        head = begin + (packet[begin + 12] >> 4) * 4
+        carries = len(packet) > head or packet[begin + 13] & FIN_SYN_RST
+        return Kind(flow, True) if carries else Kind(b"\0" + flow, False)
+    return Kind(flow, True)

@@ -1,0 +1,259 @@
+"""Playing a scenario on a cell that runs, and telling its run what was played when."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, TypeAlias
+
+from dwell.errors import DwellError, LiveError
+from dwell.live.hosting import clock_of
+from dwell.model import Problem
+from dwell.model.document import to_document
+from dwell.record import Run, open_run, seal_run
+from dwell.testbed.timeline import Change
+
+__all__ = [
+    "LOOK_S",
+    "Ask",
+    "Played",
+    "begun",
+    "come_up",
+    "interruptible",
+    "longest_run",
+    "make_folder",
+    "play",
+    "undisturbed",
+]
+
+#: Takes for how many seconds to wait, and returns how the cell is; a LiveError if nobody answers.
+Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
+
+#: Time between two looks at a cell.
+LOOK_S = 0.5
+START_S = 30.0
+
+
+@dataclass(slots=True)
+class Played:
+    """What was played in a run, and when: its controller knows nothing of it.
+
+    Instants are of the clock that the cell's processes read on this computer.
+
+    Parameters
+    ----------
+    problem : Problem
+    scenario : str
+    seed : int
+    begun_ns, ended_ns : dict of int to int
+        By `id` of the disturbance.
+    """
+
+    problem: Problem
+    scenario: str
+    seed: int
+    begun_ns: dict[int, int] = field(default_factory=dict)
+    ended_ns: dict[int, int] = field(default_factory=dict)
+
+    def changed(self, change: Change) -> None:
+        """Note that a change has been made."""
+        instants = self.begun_ns if change.begins else self.ended_ns
+        instants[id(change.item)] = clock_of(self.problem)()
+
+    def disturbances(self) -> list[tuple[object, Mapping[str, Any]]]:
+        """Return the scenario's items, each as the cell file has it."""
+        written = to_document(self.problem)["scenarios"].get(self.scenario, [])
+        return list(zip(self.problem.scenario(self.scenario), written, strict=True))
+
+    def plan(self) -> list[Mapping[str, Any]]:
+        """Return what is to be played."""
+        return [written for _, written in self.disturbances()]
+
+    def active(self) -> list[Mapping[str, Any]]:
+        """Return what is on now."""
+        on = self.begun_ns.keys() - self.ended_ns.keys()
+        return [written for item, written in self.disturbances() if id(item) in on]
+
+    def note(self, folder: Path, **more: object) -> Run:
+        """Tell the run, whose time begins with the first release.
+
+        Parameters
+        ----------
+        folder : Path
+        **more
+            To be said of it as well.
+        """
+        run = open_run(folder)
+        notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
+        span = begun(run)
+        if span is not None:
+            origin_ns, end_ns = span
+            notes["played"] = [
+                {
+                    **written,
+                    "at_s": round((begun_ns - origin_ns) / 1e9, 3),
+                    "for_s": round((self.ended_ns.get(id(item), end_ns) - begun_ns) / 1e9, 3),
+                }
+                for item, written in self.disturbances()
+                if (begun_ns := self.begun_ns.get(id(item))) is not None
+            ]
+        return seal_run(folder, **notes, **more)
+
+
+def begun(run: Run) -> tuple[int, int] | None:
+    """Return the first and the last release of a run, ns of its stamper's clock; None without."""
+    origin_ns, cycles = run.meta.get("origin_ns"), run.cycles
+    if not isinstance(origin_ns, int) or cycles.is_empty():
+        return None
+    return origin_ns, origin_ns + int(cycles["release_ns"][-1])
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Have whoever ends this process, or closes its terminal, interrupt it as Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Have nobody interrupt what takes everything down, nor whoever is impatient."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def make_folder(out: Path, mark: str, whose: str) -> None:
+    """Make the folder of what is played; one with the mark is replaced.
+
+    Raises
+    ------
+    LiveError
+        If it holds something else.
+    """
+    if (out / mark).is_file():
+        shutil.rmtree(out)
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise LiveError(f"{out} exists and is not {whose}; choose another folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / mark).touch()
+
+
+def come_up(
+    ask: Ask, awaited: Sequence[str], folder: Path, *, patience_s: float = START_S
+) -> Mapping[str, Any]:
+    """Wait until everybody is there; returns how the cell is then.
+
+    Parameters
+    ----------
+    ask : callable
+    awaited : sequence of str
+        Names of processes.
+    folder : Path
+        Where the logs are, for the message.
+    patience_s : float
+
+    Raises
+    ------
+    LiveError
+        If they are not, with what is known of those that are missing.
+    """
+    until = time.monotonic() + patience_s
+    missing: Mapping[str, str] = {"the controller": "has not answered"}
+    while True:
+        if time.monotonic() > until:
+            found = "; ".join(f"{who} {why}" for who, why in sorted(missing.items()))
+            raise LiveError(
+                f"after {patience_s:.0f} s the cell is not complete: {found}; see the logs in "
+                f"{folder}"
+            )
+        try:
+            status = ask(1.0)
+        except LiveError:
+            continue
+        heard = status["processes"]
+        missing = {
+            who: heard[who]["note"] or "is not ready" if who in heard else "has not been heard"
+            for who in awaited
+            if who not in heard or not heard[who]["ready"]
+        }
+        if not missing:
+            return status
+        time.sleep(0.1)
+
+
+def play(
+    changes: Sequence[Change],
+    seconds: float,
+    now_s: Callable[[], float],
+    apply: Callable[[Change], None],
+    look: Callable[[float], None],
+    *,
+    every_s: float = LOOK_S,
+) -> None:
+    """Make the changes of a scenario at their times.
+
+    Parameters
+    ----------
+    changes : sequence of Change
+        In the order of time.
+    seconds : float
+        How long it is played.
+    now_s : callable
+        Returns the time since the beginning.
+    apply : callable
+        Makes a change.
+    look : callable
+        Takes the time; called after every change, and at every multiple of `every_s`.
+    every_s : float
+    """
+    waiting = list(changes)
+    while (at_s := now_s()) < seconds:
+        while waiting and waiting[0].at_s <= at_s:
+            apply(waiting.pop(0))
+        look(at_s)
+        # Looks do not drift, and what begins or ends in between does so in time.
+        following_s = min((math.floor(at_s / every_s) + 1) * every_s, seconds)
+        if waiting:
+            following_s = min(following_s, waiting[0].at_s)
+        time.sleep(max(following_s - now_s(), 0.0))
+
+
+def longest_run(runs: Path, cell: str | None = None) -> Path | None:
+    """Return the longest of the runs in a folder; None where there is none.
+
+    Parameters
+    ----------
+    runs : Path
+    cell : str, optional
+        Runs of other cells do not count.
+    """
+    found: list[tuple[int, Path]] = []
+    for folder in sorted(runs.iterdir()) if runs.is_dir() else ():
+        try:
+            meta = open_run(folder).meta
+        except DwellError:
+            continue
+        if cell is None or meta.get("cell") == cell:
+            found.append((int(meta.get("windows", 0)), folder))
+    return max(found)[1] if found else None

@@ -1,0 +1,197 @@
+"""The processes of a cell that somebody has to start: an agent on every node, and the controller.
+
+All others are started by the agents. They end with the process that made this (`OWNER`), whatever
+becomes of those in between.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeAlias
+
+import yaml
+
+from dwell.errors import LiveError
+from dwell.live.leash import OWNER
+from dwell.live.wiring import roles
+from dwell.model import Problem
+from dwell.model.document import to_document
+from dwell.testbed.trace_names import move_traces
+
+__all__ = ["Inside", "Processes", "expected", "outright"]
+
+#: Takes a node and the words of a command; returns those that run it there, in the same process.
+Inside: TypeAlias = Callable[[str, Sequence[str]], Sequence[str]]
+
+STOP_S = 5.0
+#: A controller writes its run before it ends.
+CONTROLLER_STOP_S = 30.0
+KILL_S = 10.0
+
+
+def outright(node: str, words: Sequence[str]) -> Sequence[str]:
+    """Return a command as it is: the node is this computer."""
+    return words
+
+
+def expected(problem: Problem, node: str) -> list[str]:
+    """Return the processes of a node that its agent starts, and the agent."""
+    return [role.who for role in roles(problem) if role.node == node and role.kind != "controller"]
+
+
+class Processes:
+    """Agents and controllers of cells that share some nodes.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+        With every node among `live.hosts`, and names of their own.
+    folder : Path
+        For cell files, states, logs and runs. Where there are several cells, each has a folder of
+        its name in it; the runs are in ``runs``.
+    inside : callable, optional
+        Has a command run on a node; on this computer if left out.
+    environment : mapping of str to str, optional
+        Variables that all processes get as well.
+    cpus : mapping of str to int, optional
+        Of each node; one that is not there uses any.
+    more : sequence of str
+        Further arguments of the controllers.
+    traces : Path, optional
+        Folder where the names of trace files begin; this process's own if left out.
+
+    Attributes
+    ----------
+    running : dict of str to Popen
+        By name: ``agent@R1``, ``controller@E``; of several cells ``agent@R1 of CELL``.
+    """
+
+    def __init__(
+        self,
+        problems: Sequence[Problem],
+        folder: Path,
+        *,
+        inside: Inside = outright,
+        environment: Mapping[str, str] | None = None,
+        cpus: Mapping[str, int] | None = None,
+        more: Sequence[str] = (),
+        traces: Path | None = None,
+    ) -> None:
+        names = [problem.name for problem in problems]
+        if len(set(names)) < len(names):
+            raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
+        self.problems, self.folder = tuple(problems), folder
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.environment = {OWNER: str(os.getpid()), **(environment or {})}
+        self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
+        self._traces = Path() if traces is None else traces
+
+    def folder_of(self, problem: Problem) -> Path:
+        """Return where a cell's file is, and the states of its nodes."""
+        return self.folder if len(self.problems) == 1 else self.folder / problem.name
+
+    def file_of(self, problem: Problem) -> Path:
+        """Return a cell's file."""
+        return self.folder_of(problem) / "cell.yaml"
+
+    def write(self) -> None:
+        """Write the cell files."""
+        for problem in self.problems:
+            file = self.file_of(problem)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            document = to_document(problem)
+            move_traces(document, self._traces.resolve())
+            text = yaml.safe_dump(document, sort_keys=False)
+            file.write_text(text, encoding="utf-8")
+
+    def start_agent(self, node: str) -> None:
+        """Start a node's agent, or start it again; of every cell that has the node."""
+        for problem in self.problems:
+            if node not in problem.fabric.nodes:
+                continue
+            state = self.folder_of(problem) / node
+            words = ["agent", "--node", node, "--state", str(state), *self._on_cpus(node)]
+            self._start(self._name("agent", node, problem), node, words, [problem])
+
+    def start_controllers(self, *, out: Path | None = None, more: Sequence[str] = ()) -> None:
+        """Start the controllers, one on every node that decides for cells.
+
+        Parameters
+        ----------
+        out : Path, optional
+            Where the runs' folders go; ``runs`` if left out.
+        more : sequence of str
+            Further arguments.
+        """
+        for node in dict.fromkeys(problem.controller_node for problem in self.problems):
+            self.start_controller(node, out=out, more=more)
+
+    def start_controller(
+        self, node: str, *, out: Path | None = None, more: Sequence[str] = ()
+    ) -> None:
+        """Start a node's controller, or start it again."""
+        cells = [problem for problem in self.problems if problem.controller_node == node]
+        runs = self.folder / "runs" if out is None else out
+        words = ["controller", "--out", str(runs), *self._on_cpus(node), *self._more, *more]
+        self._start(f"controller@{node}", node, words, cells)
+
+    def _on_cpus(self, node: str) -> list[str]:
+        return ["--cpus", str(self._cpus[node])] if node in self._cpus else []
+
+    def _name(self, kind: str, node: str, problem: Problem) -> str:
+        who = f"{kind}@{node}"
+        return who if len(self.problems) == 1 else f"{who} of {problem.name}"
+
+    def _start(
+        self, who: str, node: str, words: Sequence[str], problems: Sequence[Problem]
+    ) -> None:
+        command = [sys.executable, "-m", "dwell", *words]
+        for problem in problems:
+            command += ["--cell", str(self.file_of(problem))]
+        with (self.folder / f"{who}.log").open("ab") as log:
+            self.running[who] = subprocess.Popen(  # noqa: S603 - our own command
+                self._inside(node, command),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, **self.environment},
+                process_group=0,
+            )
+
+    def forget(self, node: str) -> None:
+        """Take note that everything on a node has been killed."""
+        for who in [who for who in self.running if self._on(who) == node]:
+            self.running.pop(who).wait(KILL_S)
+
+    @staticmethod
+    def _on(who: str) -> str:
+        return who.partition("@")[2].partition(" of ")[0]
+
+    def stop_controllers(self) -> None:
+        """End the controllers and wait until they have written their runs."""
+        self.end([who for who in self.running if who.startswith("controller@")], CONTROLLER_STOP_S)
+
+    def stop(self) -> None:
+        """End everything, the agents after the controllers."""
+        self.stop_controllers()
+        self.end(list(self.running), STOP_S)
+
+    def end(self, names: Iterable[str], patience_s: float) -> None:
+        """Tell some to end, and kill those that have not when patience is over."""
+        ending = [self.running.pop(who) for who in names]
+        for process in ending:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + patience_s
+        for process in ending:
+            try:
+                process.wait(max(deadline - time.monotonic(), 0.1))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()

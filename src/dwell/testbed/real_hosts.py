@@ -1,0 +1,380 @@
+"""Real hosts: a cell on the computers of an inventory, run as one on a testbed is.
+
+Everything that is put on a host is in one folder of this testbed's name there, which is removed
+before the next run. Links are what they are; only what the inventory has commands for can be
+disturbed. Nothing is known of the hosts' pressure: no window is excluded.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tarfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from dwell.errors import LiveError
+from dwell.live.leash import OWNER
+from dwell.live.visiting import Visitor
+from dwell.model import Host, LinkDisturbance, NodeDisturbance, Normal, Problem
+from dwell.model.document import to_document
+from dwell.policies import by_name
+from dwell.record import open_run, seal_run
+from dwell.testbed.inventory import Inventory
+from dwell.testbed.playing import come_up, longest_run, make_folder, play, undisturbed
+from dwell.testbed.processes import Processes, expected
+from dwell.testbed.remote import local_words, script_of
+from dwell.testbed.timeline import Change, changes_of
+
+__all__ = ["RealHosts", "require_commands", "run_on_hosts"]
+
+MARK = ".dwell-testbed"
+NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
+#: For a command that is to end by itself.
+COMMAND_S = 60.0
+START_S = 120.0
+STOP_S = 10.0
+
+
+class RealHosts:
+    """A cell on real hosts; a context manager.
+
+    Parameters
+    ----------
+    problem : Problem
+        Where its nodes are is put into it.
+    inventory : Inventory
+    folder : Path
+        For cell file and logs on this computer.
+    name : str
+        Of this testbed, among others on those hosts.
+    more : sequence of str
+        Further arguments of the controller.
+
+    Raises
+    ------
+    LiveError
+        If the name is none.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        inventory: Inventory,
+        folder: Path,
+        *,
+        name: str,
+        more: Sequence[str] = (),
+    ) -> None:
+        if not NAME.fullmatch(name):
+            raise LiveError(f"name is {name!r}; it must be letters, digits, - and _, at most 32")
+        hosts = {node: Host(host.address, host.port) for node, host in inventory.hosts.items()}
+        self.problem = replace(problem, live=replace(problem.live, hosts=hosts))
+        self.inventory, self.folder, self.name = inventory, folder.resolve(), name
+        self.stress: dict[int, subprocess.Popen[bytes]] = {}
+        self._on: dict[int, LinkDisturbance] = {}
+        self._stack = ExitStack()
+        self.processes = Processes([self.problem], self.folder, inside=self.inside, more=more)
+
+    def __enter__(self) -> RealHosts:
+        """Put the cell file everywhere, and start the agents."""
+        try:
+            self.processes.write()
+            self._stack.callback(self._undisturb)
+            self._stack.callback(self.processes.stop)
+            for node in self.problem.fabric.nodes:
+                self._prepare(node)
+            for node in self.problem.fabric.nodes:
+                self.processes.start_agent(node)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End everything."""
+        self.close()
+
+    def close(self) -> None:
+        """End everything, and take disturbances back."""
+        self._stack.close()
+
+    # ------------------------------------------------------------------------ commands
+
+    def there(self, node: str) -> str:
+        """Folder of this testbed on a node's host."""
+        return f"{self.inventory.hosts[node].folder}/dwell-{self.name}-{node}"
+
+    def inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
+        """Return a command that runs words on a node's host, and ends them when it is ended.
+
+        The interpreter, and the folder on this computer, become those there.
+        """
+        return self._words(node, [self._translated(node, word) for word in words])
+
+    def _words(self, node: str, words: Sequence[str], *, whole: bool = False) -> list[str]:
+        host = self.inventory.hosts[node]
+        environment = {
+            name: value
+            for name, value in os.environ.items()
+            if name.startswith("DWELL_") and name != OWNER
+        }
+        if "--cpus" not in words and host.cpus and "dwell" in words:
+            words = [*words, "--cpus", host.cpus]
+        script = script_of(words, self.there(node), environment, whole=whole)
+        return local_words(host.run, script)
+
+    def _translated(self, node: str, word: str) -> str:
+        if word == sys.executable:
+            return self.inventory.hosts[node].python
+        here = str(self.folder)
+        if word == here or word.startswith(f"{here}/"):
+            return self.there(node) + word.removeprefix(here)
+        return word
+
+    def shell(self, node: str, line: str, data: bytes = b"") -> bytes:
+        """Have a line done by a shell on a node's host; return what it says.
+
+        Raises
+        ------
+        LiveError
+            If that fails, or takes too long.
+        """
+        command = [*self.inventory.hosts[node].run, line]
+        try:
+            done = subprocess.run(  # noqa: S603 - the inventory's
+                command, input=data, capture_output=True, timeout=COMMAND_S, check=False
+            )
+        except OSError as error:
+            raise LiveError(f"{node}: {command[0]} cannot be run ({error.strerror})") from None
+        except subprocess.TimeoutExpired:
+            raise LiveError(f"{node}: no answer within {COMMAND_S:.0f} s: {line}") from None
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip().splitlines()
+            raise LiveError(
+                f"{node}: {shlex.join(command)} ended with code {done.returncode}"
+                f"{f' ({said[-1]})' if said else ''}"
+            )
+        return done.stdout
+
+    def _prepare(self, node: str) -> None:
+        folder = shlex.quote(self.there(node))
+        text = self.processes.file_of(self.problem).read_bytes()
+        self.shell(node, f"rm -rf {folder} && mkdir -p {folder} && cat > {folder}/cell.yaml", text)
+        python = shlex.quote(self.inventory.hosts[node].python)
+        self.shell(node, f"cd {folder} && {python} -c 'import dwell'")
+
+    # ------------------------------------------------------------------------- running
+
+    def begin(self, visitor: Visitor) -> None:
+        """Wait until everybody is there, and begin a run that knows nothing of the time before.
+
+        Raises
+        ------
+        LiveError
+            If the cell does not come up.
+        """
+        problem = self.problem
+        node = problem.controller_node
+        awaited = [who for name in problem.fabric.nodes for who in expected(problem, name)]
+
+        def ask(patience_s: float) -> Mapping[str, Any]:
+            return visitor.ask("status", patience_s=patience_s)
+
+        more = ["--policy", problem.initial]
+        self.processes.start_controller(node, out=self.folder / "starting", more=more)
+        come_up(ask, awaited, self.folder, patience_s=START_S)
+        self.processes.stop_controllers()
+        stamper = problem.stamper_node
+        mark = f"{shlex.quote(self.there(stamper))}/{stamper}/stamper@{stamper}"
+        number = f"""sed 's/.*"pid": *\\([0-9]*\\).*/\\1/' {mark}.pid"""
+        self.shell(stamper, f"rm -f {mark}.book; kill -KILL $({number})")
+        self.processes.start_controller(node)
+        until = time.monotonic() + START_S
+        while come_up(ask, awaited, self.folder, patience_s=START_S).get("origin_ns") is None:
+            if time.monotonic() > until:
+                raise LiveError(f"cell {problem.name!r} releases no cycles; see {self.folder}")
+            time.sleep(0.05)
+
+    def fetch_runs(self) -> None:
+        """Bring what the controller has written to this computer.
+
+        Raises
+        ------
+        LiveError
+            If it has written nothing.
+        """
+        node = self.problem.controller_node
+        data = self.shell(node, f"tar -C {shlex.quote(self.there(node))} -cf - runs")
+        with tarfile.open(fileobj=io.BytesIO(data)) as archive:
+            archive.extractall(self.folder, filter="data")
+
+    # --------------------------------------------------------------------- disturbances
+
+    def apply(self, change: Change) -> None:
+        """Have a host or a link do what begins or ends."""
+        item = change.item
+        if isinstance(item, NodeDisturbance):
+            if not change.begins:
+                self._end_stress(id(item))
+            elif item.stress_threads:
+                line = self.inventory.hosts[item.node].stress.format(threads=item.stress_threads)
+                words = self._words(item.node, ["sh", "-c", line], whole=True)
+                self.stress[id(item)] = subprocess.Popen(  # noqa: S603 - the inventory's
+                    words,
+                    env={**os.environ, OWNER: str(os.getpid())},
+                    process_group=0,
+                )
+        elif change.begins:
+            self.shell(item.source, self.inventory.links[item.link].begin.format(**_filled(item)))
+            self._on[id(item)] = item
+        else:
+            self._on.pop(id(item), None)
+            self.shell(item.source, self.inventory.links[item.link].end)
+
+    def _end_stress(self, number: int) -> None:
+        process = self.stress.pop(number, None)
+        if process is None:
+            return
+        process.terminate()
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def _undisturb(self) -> None:
+        for number in list(self.stress):
+            self._end_stress(number)
+        for item in self._on.values():
+            self.shell(item.source, self.inventory.links[item.link].end)
+        self._on.clear()
+
+
+def require_commands(inventory: Inventory, changes: Sequence[Change]) -> None:
+    """Refuse what an inventory has no commands for.
+
+    Raises
+    ------
+    LiveError
+        With all of it.
+    """
+    items = [change.item for change in changes]
+    links = {item.link for item in items if isinstance(item, LinkDisturbance)}
+    missing = sorted(links - set(inventory.links))
+    if missing:
+        raise LiveError(
+            f"the inventory has no commands that disturb {', '.join(missing)}; give them under "
+            "`links`"
+        )
+
+
+def _filled(item: LinkDisturbance) -> dict[str, float]:
+    delay = item.add_delay_ms
+    return {
+        "mean_ms": 0.0 if delay is None else round(delay.expectation, 3),
+        "std_ms": delay.std if isinstance(delay, Normal) else 0.0,
+        "loss_percent": 100 * item.loss,
+        "rate_mbps": item.rate_mbps,
+    }
+
+
+def run_on_hosts(
+    inventory: Inventory,
+    problem: Problem,
+    *,
+    scenario: str,
+    policy: str,
+    seconds: float,
+    seed: int,
+    out: Path,
+    name: str,
+    jobs: bool = False,
+) -> Path:
+    """Run a cell on real hosts, and return the folder of its run on this computer.
+
+    Parameters
+    ----------
+    inventory : Inventory
+    problem : Problem
+    scenario, policy : str
+    seconds : float
+        From the first release on, the warm-up included.
+    seed : int
+        Noted; nothing is drawn on real hosts.
+    out : Path
+        For logs and the run; one of a run before is replaced.
+    name : str
+    jobs : bool
+        Whether the run keeps its jobs.
+
+    Raises
+    ------
+    DwellError
+        If something cannot be played there, or the cell does not come up.
+    """
+    by_name(policy, problem)
+    problem = replace(problem, controller=replace(problem.controller, policy=policy))
+    changes = changes_of(problem, scenario)
+    hosts = RealHosts(problem, inventory, out, name=name, more=["--jobs"] if jobs else [])
+    require_commands(inventory, changes)
+    make_folder(out, MARK, "a testbed's")
+    instants: dict[tuple[int, bool], float] = {}
+    with ExitStack() as stack:
+
+        def close() -> None:
+            with undisturbed():
+                hosts.close()
+
+        stack.callback(close)
+        hosts.__enter__()
+        visitor = stack.enter_context(Visitor(hosts.problem))
+        hosts.begin(visitor)
+        begun_s = time.monotonic()
+
+        def now_s() -> float:
+            return time.monotonic() - begun_s
+
+        def apply(change: Change) -> None:
+            hosts.apply(change)
+            instants[id(change.item), change.begins] = now_s()
+
+        play(changes, seconds, now_s, apply, lambda at_s: None)
+        hosts.processes.stop_controllers()
+        hosts.fetch_runs()
+    folder = longest_run(out / "runs")
+    if folder is None:
+        raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
+    _note(folder, problem, scenario, seed, instants)
+    shutil.rmtree(out / "starting", ignore_errors=True)
+    return folder
+
+
+def _note(
+    folder: Path,
+    problem: Problem,
+    scenario: str,
+    seed: int,
+    instants: Mapping[tuple[int, bool], float],
+) -> None:
+    """Tell the run what was played, by this computer's clock since the run was seen to begin."""
+    release_ns = open_run(folder).cycles["release_ns"]
+    end_s = float(release_ns[-1]) / 1e9 if len(release_ns) else 0.0
+    written = to_document(problem)["scenarios"].get(scenario, [])
+    played = []
+    for item, entry in zip(problem.scenario(scenario), written, strict=True):
+        begun_s = instants.get((id(item), True))
+        if begun_s is not None:
+            ended_s = instants.get((id(item), False), max(end_s, begun_s))
+            for_s = round(ended_s - begun_s, 3)
+            played.append({**entry, "at_s": round(begun_s, 3), "for_s": for_s})
+    seal_run(folder, scenario=scenario, seed=seed, played=played)

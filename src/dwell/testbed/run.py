@@ -1,0 +1,258 @@
+"""One run on a testbed: everything checked, made, played, sealed, and taken down again."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from dwell.errors import LiveError
+from dwell.live.hosting import clock_of
+from dwell.model import NodeDisturbance, Problem
+from dwell.policies import by_name
+from dwell.record import Run, open_run
+from dwell.testbed.bed import STARTING, Bed
+from dwell.testbed.doctor import examine
+from dwell.testbed.playing import (
+    Played,
+    begun,
+    interruptible,
+    longest_run,
+    make_folder,
+    play,
+    undisturbed,
+)
+from dwell.testbed.pressure import Rule, Span, judged
+from dwell.testbed.sampling import Sampler
+from dwell.testbed.timeline import Change, changes_of
+
+__all__ = ["MARK", "length_s", "require_machine", "run_once", "spans_of"]
+
+#: A folder with this file is a testbed's, and may be replaced by its next run.
+MARK = ".dwell-testbed"
+#: Time for a controller's last window, beyond its grace.
+LAST_S = 0.5
+
+
+def length_s(problem: Problem, windows: int) -> float:
+    """Return how long a cell runs for so many windows, the warm-up among them, seconds.
+
+    Every move makes the window after it begin later: a run with moves has some windows less.
+    """
+    cycles_ms = windows * problem.window_cycles * problem.pipeline.period_ms
+    return (cycles_ms + problem.controller.close_grace_ms) / 1e3 + LAST_S
+
+
+def require_machine(problems: Sequence[Problem]) -> None:
+    """Refuse to run what this machine cannot.
+
+    Raises
+    ------
+    LiveError
+        With everything that is missing, and what to do about it.
+    """
+    missing = [one for one in examine(problems) if one.needed and not one.ok]
+    if missing:
+        told = "; ".join(f"{one.name}: {one.found}; {one.remedy}" for one in missing)
+        raise LiveError(f"this machine cannot run the testbed: {told}")
+
+
+def run_once(
+    problem: Problem,
+    *,
+    scenario: str,
+    policy: str | None,
+    seconds: float,
+    seed: int,
+    out: Path,
+    name: str,
+    jobs: bool = False,
+    beside: Path | None = None,
+    rule: Rule | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> Path:
+    """Run a cell on a testbed of its own, and return the folder of its run.
+
+    Interrupted, it takes everything down, and seals what there is of the run.
+
+    Parameters
+    ----------
+    problem : Problem
+    scenario : str
+    policy : str or None
+        A policy or a candidate; the cell's own where None.
+    seconds : float
+        From the first release on, the warm-up included.
+    seed : int
+        Of delays and losses.
+    out : Path
+        For states, logs and the run; one of a run before is replaced.
+    name : str
+        Of the testbed, among others on this machine.
+    jobs : bool
+        Whether the run keeps its jobs.
+    beside : Path, optional
+        Folder of the cell file: of the modules of its stages, and of its traces.
+    rule : Rule, optional
+        Of the machine's pressure.
+    tell : callable
+        Takes a line on what happens.
+
+    Returns
+    -------
+    Path
+        Also where the machine was under too much pressure: its meta say ``failed``.
+
+    Raises
+    ------
+    DwellError
+        Before anything has been changed, if the cell, the scenario or the policy cannot be played
+        here; later, if the cell does not come up, or has written no run.
+    """
+    problem = _with_policy(problem, policy)
+    changes = changes_of(problem, scenario, outages=True)
+    arguments = ["--jobs"] if jobs else []
+    bed = Bed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
+    require_machine([problem])
+    rule = rule or Rule()
+    played = Played(problem, scenario, seed)
+    samplers: list[Sampler] = []
+    try:
+        with interruptible():
+            try:
+                # A folder that is replaced may be that of a testbed that runs.
+                bed.claim()
+                make_folder(out, MARK, "a testbed's")
+                bed.__enter__()
+                tell("starting the cell")
+                bed.come_up()
+                tell(f"playing {scenario} for {seconds:g} s")
+                _play(bed, changes, seconds, played, samplers, rule)
+            finally:
+                with undisturbed():
+                    bed.close()
+    except KeyboardInterrupt:
+        # Before it was played, what is there may be a run of long ago.
+        folder = longest_run(out / "runs") if samplers else None
+        if folder is not None:
+            _seal(folder, bed, played, samplers, rule, interrupted=True)
+            tell(f"interrupted; run: {folder}")
+        raise
+    folder = longest_run(out / "runs")
+    if folder is None:
+        raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
+    _seal(folder, bed, played, samplers, rule, interrupted=False)
+    shutil.rmtree(out / STARTING, ignore_errors=True)
+    return folder
+
+
+def _with_policy(problem: Problem, policy: str | None) -> Problem:
+    if policy is None:
+        return problem
+    by_name(policy, problem)
+    return replace(problem, controller=replace(problem.controller, policy=policy))
+
+
+def _play(
+    bed: Bed,
+    changes: Sequence[Change],
+    seconds: float,
+    played: Played,
+    samplers: list[Sampler],
+    rule: Rule,
+) -> None:
+    clock = clock_of(played.problem)
+    (origin_ns,) = bed.begin()
+    links = {"-".join(link.pair): link for link in bed.links.values()}
+
+    def apply(change: Change) -> None:
+        bed.apply(change)
+        played.changed(change)
+
+    with Sampler(bed.cpus, bed.used_ns, links, clock, rule) as sampler:
+        samplers.append(sampler)
+        play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
+    bed.stop_controllers()
+
+
+def _seal(
+    folder: Path,
+    bed: Bed,
+    played: Played,
+    samplers: Sequence[Sampler],
+    rule: Rule,
+    *,
+    interrupted: bool,
+) -> Run:
+    """Tell the run what was played, on what, and how the machine was."""
+    more: dict[str, object] = {"testbed": bed.facts()}
+    if interrupted:
+        more["interrupted"] = True
+    if samplers:
+        sampler = samplers[0]
+        spans = spans_of(open_run(folder), played)
+        pressure = judged(sampler.samples, spans, rule)
+        more["pressure"] = {**pressure, "trouble": sampler.trouble} if sampler.trouble else pressure
+        more["links"] = sampler.links()
+    return played.note(folder, **more)
+
+
+def spans_of(run: Run, played: Played) -> list[Span]:
+    """Return a run's windows in time, with the nodes that were stressed all through them."""
+    span = begun(run)
+    if span is None:
+        return []
+    origin_ns, _ = span
+    problem = played.problem
+    period_ns = round(problem.pipeline.period_ms * 1e6)
+    release_ns = run.cycles["release_ns"].to_list()
+    first = run.cycles["cycle"][0]
+    found = []
+    for window in run.windows.select("window", "first_cycle", "warmup").iter_rows(named=True):
+        row = window["first_cycle"] - first
+        last = min(row + problem.window_cycles, len(release_ns)) - 1
+        begin_ns = origin_ns + release_ns[row]
+        end_ns = origin_ns + release_ns[last] + period_ns
+        stressed = dict(_stressed(played, begin_ns, end_ns))
+        found.append(Span(window["window"], begin_ns, end_ns, window["warmup"], stressed))
+    return found
+
+
+def _stressed(played: Played, begin_ns: int, end_ns: int) -> Mapping[str, float]:
+    """Return the capacity of nodes with as many foreign threads as cores all the time."""
+    found: dict[str, float] = {}
+    for item, _ in played.disturbances():
+        if not isinstance(item, NodeDisturbance):
+            continue
+        node = played.problem.fabric.nodes[item.node]
+        begun_ns = played.begun_ns.get(id(item))
+        ended_ns = played.ended_ns.get(id(item), end_ns)
+        if item.stress_threads < node.cores or begun_ns is None:
+            continue
+        if begun_ns <= begin_ns and ended_ns >= end_ns:
+            found[item.node] = node.capacity
+    return found
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """Return what a run showed after its warm-up, in a few numbers."""
+    windows = run.windows.filter(~run.windows["warmup"])
+    pressure = run.meta.get("pressure") or {}
+    excluded = set(pressure.get("excluded", ()))
+    kept = windows.filter(~windows["window"].is_in(sorted(excluded)))
+    nodes = run.meta["problem"]["nodes"]
+    means = {node: _mean(kept[f"u_{node}"].mean()) for node in nodes}
+    return {
+        "windows": windows.height,
+        "excluded": len(excluded),
+        "l95_ms": _mean(kept["l95_ms"].mean()),
+        "violation_rate": _mean(kept["violation_rate"].mean()),
+        "utilisation": means,
+        "migrations": int(run.decisions["migrated"].sum()),
+    }
+
+
+def _mean(value: Any) -> float | None:
+    return None if value is None else float(value)

@@ -1,0 +1,160 @@
+"""Sampling: reads the counters of the machine and of a testbed ten times a second."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Self
+
+from dwell.errors import LiveError
+from dwell.testbed.forwarder import LATE_MS
+from dwell.testbed.link import Passed, TunLink
+from dwell.testbed.pressure import Rule, Sample
+from dwell.testbed.probe import Probe
+
+__all__ = ["EVERY_S", "Sampler", "cpu_times"]
+
+EVERY_S = 0.1
+STAT, PSI = Path("/proc/stat"), Path("/proc/pressure/cpu")
+# Fields of a CPU's line in /proc/stat.
+IDLE, IOWAIT, STEAL = 3, 4, 7
+
+
+class Sampler:
+    """Takes samples in a thread of its own until it is stopped; a context manager.
+
+    Parameters
+    ----------
+    cpus : collection of int
+        Those that nodes use.
+    used_ns : mapping of str to callable
+        CPU time that a node has taken so far, by node.
+    links : mapping of str to TunLink
+        By name. Their counters are read, and begin anew.
+    clock : callable
+        The run's, ns.
+    rule : Rule
+    """
+
+    def __init__(
+        self,
+        cpus: Collection[int],
+        used_ns: Mapping[str, Callable[[], int]],
+        links: Mapping[str, TunLink],
+        clock: Callable[[], int],
+        rule: Rule,
+    ) -> None:
+        self.samples: list[Sample] = []
+        #: What kept it from going on, if anything did.
+        self.trouble = ""
+        self._totals: dict[tuple[str, str], list[float]] = {}
+        self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
+        self._clock = clock
+        self._first_late = next((i for i, ms in enumerate(LATE_MS) if ms >= rule.late_ms), 0) + 1
+        self._probes = [Probe(cpu) for cpu in self._cpus]
+        self._stopped = threading.Event()
+        self._stack = ExitStack()
+        self._thread = threading.Thread(target=self._run, name="sampler", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Start it."""
+        try:
+            for probe in self._probes:
+                self._stack.enter_context(probe)
+        except BaseException:
+            self._stack.close()
+            raise
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take no more samples."""
+        self._stopped.set()
+        self._thread.join()
+        self._stack.close()
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        try:
+            while not self._stopped.wait(max(due_s - time.monotonic(), 0.0)):
+                self.samples.append(self._sample())
+                due_s = max(due_s + EVERY_S, time.monotonic())
+        except (LiveError, OSError) as error:
+            # What is not measured any more is excluded; the run itself goes on.
+            self.trouble = str(error)
+
+    def _sample(self) -> Sample:
+        idle_s, stolen_s = cpu_times(self._cpus)
+        at_ns = self._clock()
+        used_s = {node: read() / 1e9 for node, read in self._used_ns.items()}
+        probe_ms = {probe.cpu: probe.read().max_ms for probe in self._probes}
+        passed: dict[str, list[Passed]] = {}
+        for name, link in self._links.items():
+            ways = link.read()
+            passed[name] = list(ways.values())
+            for way, counted in ways.items():
+                self._add(way, counted)
+        return Sample(
+            at_ns=at_ns,
+            idle_s=idle_s,
+            stolen_s=stolen_s,
+            used_s=used_s,
+            waited_s=_waited_s(),
+            probe_ms=probe_ms,
+            packets={name: sum(one.packets for one in ways) for name, ways in passed.items()},
+            late={
+                name: sum(sum(one.late[self._first_late :]) for one in ways)
+                for name, ways in passed.items()
+            },
+            late_ms={
+                name: max((one.late_max_ms for one in ways), default=0.0)
+                for name, ways in passed.items()
+            },
+        )
+
+    def _add(self, way: tuple[str, str], counted: Passed) -> None:
+        n, mean_ms, std_ms = counted.bursts, counted.delay_mean_ms, counted.delay_std_ms
+        new = (n, n * mean_ms, n * (mean_ms**2 + std_ms**2), counted.held, counted.vanished)
+        old = self._totals.get(way, [0.0] * len(new))
+        self._totals[way] = [a + b for a, b in zip(old, new, strict=True)]
+
+    def links(self) -> dict[str, Any]:
+        """Return what the links have drawn for the messages of each direction, ready for JSON."""
+        found = {}
+        for (source, target), (n, total_ms, squares, held, vanished) in self._totals.items():
+            mean_ms = total_ms / max(n, 1)
+            std_ms = max(squares / max(n, 1) - mean_ms**2, 0.0) ** 0.5
+            found[f"{source}->{target}"] = {
+                "messages": int(n),
+                "delay_ms": {"mean": round(mean_ms, 4), "std": round(std_ms, 4)} if n else None,
+                "held": int(held),
+                "vanished": int(vanished),
+            }
+        return found
+
+
+def cpu_times(cpus: Collection[int]) -> tuple[dict[int, float], dict[int, float]]:
+    """Return for how long CPUs have been idle and stolen since the machine was started, seconds."""
+    tick_s = 1.0 / os.sysconf("SC_CLK_TCK")
+    wanted = {f"cpu{cpu}": cpu for cpu in cpus}
+    idle_s, stolen_s = {}, {}
+    for line in STAT.read_text().splitlines():
+        name, _, rest = line.partition(" ")
+        if name in wanted:
+            ticks = [int(field) for field in rest.split()]
+            idle_s[wanted[name]] = (ticks[IDLE] + ticks[IOWAIT]) * tick_s
+            stolen_s[wanted[name]] = ticks[STEAL] * tick_s if len(ticks) > STEAL else 0.0
+    return idle_s, stolen_s
+
+
+def _waited_s() -> float | None:
+    """Time of ``some`` in /proc/pressure/cpu."""
+    try:
+        line = PSI.read_text().splitlines()[0]
+    except (OSError, IndexError):
+        return None
+    return float(line.rpartition("total=")[2]) / 1e6

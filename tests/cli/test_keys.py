@@ -1,0 +1,81 @@
+"""`dwell keys`: what it prints, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from dwell.cli.commands import app
+
+CELL = "examples/canonical.yaml"
+
+
+def run(*words: str | Path) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["keys", *map(str, words)])
+    return result.exit_code, result.output
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    code, printed = run("init", CELL, "--out", tmp_path / "keys")
+    assert code == 0, printed
+    return tmp_path / "keys"
+
+
+def listed(folder: Path) -> dict[str, dict[str, object]]:
+    code, printed = run("show", folder, "--json")
+    assert code == 0
+    subjects: dict[str, dict[str, object]] = json.loads(printed)["subjects"]
+    return subjects
+
+
+def test_init_makes_a_keyring_for_everybody(folder: Path) -> None:
+    assert set(listed(folder)) == {"R1", "E", "R2", "controller", "operator"}
+    code, printed = run("show", folder / "R1")
+    assert code == 0
+    (line,) = (line for line in printed.splitlines() if "this keyring" in line)
+    assert line.split()[0] == "R1"
+    assert max(map(len, printed.splitlines())) <= 100
+
+
+def test_init_replaces_nothing(folder: Path) -> None:
+    before = (folder / "ca" / "key.pem").read_bytes()
+    code, printed = run("init", CELL, "--out", folder)
+    assert (code, "has an authority already" in printed) == (2, True)
+    assert (folder / "ca" / "key.pem").read_bytes() == before
+
+
+def test_revoke_and_issue(folder: Path) -> None:
+    assert run("revoke", folder, "R1")[0] == 0
+    assert "R1" not in listed(folder)
+    assert "say its role" in run("issue", folder, "R1")[1]
+    code, printed = run("issue", folder, "R1", "--role", "node", "--days", "10")
+    assert code == 0
+    assert "in 10 days" in printed
+    assert listed(folder)["R1"]["generation"] == 2
+    assert run("issue", folder, "eve", "--role", "observer")[0] == 0
+    assert listed(folder)["eve"]["role"] == "observer"
+
+
+def test_mistakes(folder: Path, tmp_path: Path) -> None:
+    for words, said in {
+        ("show", tmp_path / "none"): "key.pem: cannot be read",
+        ("revoke", folder, "R7"): "no subject 'R7'",
+        ("issue", folder, "x y", "--role", "node"): "no name of a subject",
+        ("issue", folder, "x", "--role", "king"): "no role 'king'",
+        ("issue", folder, "R1", "--days", "0"): "days is 0",
+        (
+            "issue",
+            folder,
+            "R1",
+            "--address",
+            "\u00e9\u2603",
+        ): "neither a host",
+    }.items():
+        code, printed = run(*words)
+        assert code == 2, printed
+        assert said in printed
+        assert "Traceback" not in printed

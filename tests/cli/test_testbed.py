@@ -1,0 +1,217 @@
+"""`dwell testbed run` and `doctor`: what they refuse, and that nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import psutil
+import pytest
+
+import dwell
+from dwell.testbed.cgroups import find_cgroups
+from dwell.testbed.groups import group_name
+from dwell.testbed.hosts import namespace_name, namespace_path
+from tests.testbed.light_cell import QUOTAS, document, write_cell
+from tests.testbed.machine import no_groups, no_hosts, own_name
+
+PATIENCE_S = 240.0
+NOT_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")
+MACHINE = pytest.mark.skipif(
+    bool(no_hosts() or no_groups() or os.cpu_count() == 1),
+    reason=no_hosts() or no_groups() or "a testbed needs two CPUs",
+)
+
+
+def command(*words: object) -> list[str]:
+    return [sys.executable, "-m", "dwell", "testbed", *map(str, words)]
+
+
+def dwell_testbed(*words: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command(*words), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+
+
+def left(name: str) -> list[str]:
+    """What a testbed of this name has left."""
+    found = [
+        str(path)
+        for node in QUOTAS
+        if (path := namespace_path(namespace_name(name, node))).exists()
+    ]
+    found += [str(path) for path in find_cgroups().groups(group_name(name)) if path.exists()]
+    return found
+
+
+def wait_for(event: Callable[[], object], what: str) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not event():
+        assert time.monotonic() < until, f"waited in vain for {what}"
+        time.sleep(0.1)
+
+
+# ------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--scenario", "impared"), "unknown scenario 'impared'"),
+        (("--policy", "dpt"), "dpt"),
+        (("--name", "no such/name"), "cannot be named"),
+        (("--windows", "3", "--seconds", "5"), "give one of them"),
+    ],
+)
+def test_what_is_unknown_is_an_error_before_anything_is_changed(
+    options: Sequence[str], said: str, tmp_path: Path
+) -> None:
+    cell = write_cell(tmp_path)
+    done = dwell_testbed("run", cell, "--out", tmp_path / "out", *options)
+    assert done.returncode != 0
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_disturbed_link_that_is_not_in_the_cell_is_an_error(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path, scenarios={"some": [{"link": "R1->R9", "loss": 0.1}]})
+    done = dwell_testbed("run", cell, "--scenario", "some", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert "R9" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_quotas_that_do_not_fit_are_an_error(tmp_path: Path) -> None:
+    nodes = document()["nodes"]
+    for node in nodes.values():
+        node["cores"], node["quota"]["cpu"] = 999, 999
+    done = dwell_testbed("run", write_cell(tmp_path, nodes=nodes), "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "too few for these nodes" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@NOT_ROOT
+def test_who_is_not_root_is_told(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path)
+    # Who is nobody may not be able to read where Python is: what is needed is
+    # imported before.
+    code = (
+        "import os, pathlib, sys, dwell, dwell.testbed.run as testbed\n"
+        "problem = dwell.load(sys.argv[1]); testbed.examine([problem])\n"
+        "os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
+        "try:\n"
+        "    testbed.run_once(problem, scenario='baseline', policy=None, seconds=5, seed=1, "
+        "out=pathlib.Path(sys.argv[2]), name='nobody')\n"
+        "except dwell.errors.LiveError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(cell), str(tmp_path / "out")],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert "this machine cannot run the testbed" in done.stdout, done.stderr
+    assert "root" in done.stdout
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_doctor_says_what_there_is(tmp_path: Path) -> None:
+    done = dwell_testbed("doctor", write_cell(tmp_path), "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode == (0 if found["ok"] else 1)
+    assert {"CPUs"} <= {row["name"] for row in found["findings"]}
+    assert all(row["ok"] or row["remedy"] for row in found["findings"] if row["needed"])
+
+
+# ------------------------------------------------------------------------------ real runs
+
+
+@MACHINE
+def test_a_run_plays_its_scenario_opens_and_leaves_nothing(tmp_path: Path) -> None:
+    name, cell = own_name(), write_cell(tmp_path)
+    options = ("--scenario", "impaired", "--windows", 4, "--name", name, "--json")
+    done = dwell_testbed("run", cell, "--out", tmp_path / "out", *options)
+    # 1 is what a machine that has a lot else to do ends with.
+    assert done.returncode in (0, 1), done.stderr
+    told = json.loads(done.stdout)
+    assert told["failed"] == (done.returncode == 1)
+    run = dwell.open_run(told["run"])
+    assert run.meta["scenario"] == "impaired"
+    assert {item.get("link", item.get("node")) for item in run.meta["played"]} == {
+        "R1->E",
+        "E->R1",
+        "E",
+    }
+    assert all(item["for_s"] > 0 for item in run.meta["played"])
+    assert run.windows["window"].to_list() == [0, 1, 2, 3][: run.windows.height]
+    assert set(run.windows["placement"]) == {"SO"}
+    assert len(run.meta["pressure"]["windows"]) == run.windows.height
+    assert run.meta["testbed"]["nodes"]["E"]["quota"] == {"cpu": 0.8, "period_ms": 4.0}
+    # It cannot have been less than the links' delay.
+    assert run.cycles["latency_ns"].drop_nulls().min() > 2_000_000  # type: ignore[operator]
+    assert run.meta["links"]["R1->E"]["messages"] > 0
+    assert left(name) == []
+
+
+@MACHINE
+def test_killed_it_is_cleared_away_by_the_next_of_its_name(tmp_path: Path) -> None:
+    name, cell = own_name(), write_cell(tmp_path)
+    with (tmp_path / "said").open("wb") as said:
+        first = subprocess.Popen(
+            command("run", cell, "--seconds", 600, "--out", tmp_path / "first", "--name", name),
+            stderr=said,
+        )
+    try:
+        stamper = tmp_path / "first" / "R1" / "stamper@R1.pid"
+        wait_for(lambda: stamper.exists() or first.poll() is not None, "the first one's stamper")
+        assert first.poll() is None, (tmp_path / "said").read_text()
+        # While it lives the name is its own.
+        refused = dwell_testbed("run", cell, "--out", tmp_path / "other", "--name", name)
+        assert refused.returncode == 1
+        assert "runs already" in refused.stderr
+        of_it = psutil.Process(first.pid).children(recursive=True)
+        first.kill()
+        first.wait()
+    finally:
+        first.kill()
+        first.wait()
+    options = ("--seconds", "5", "--name", name, "--json")
+    done = dwell_testbed("run", cell, "--out", tmp_path / "second", *options)
+    assert done.returncode in (0, 1), done.stderr
+    assert dwell.open_run(json.loads(done.stdout)["run"]).windows.height >= 1
+    assert left(name) == []
+    _, alive = psutil.wait_procs(of_it, timeout=PATIENCE_S)
+    assert alive == []
+
+
+@MACHINE
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_it_takes_everything_down(number: signal.Signals, tmp_path: Path) -> None:
+    name, cell = own_name(), write_cell(tmp_path)
+    with (tmp_path / "said").open("wb") as said:
+        one = subprocess.Popen(
+            command("run", cell, "--seconds", 600, "--out", tmp_path / "out", "--name", name),
+            stderr=said,
+        )
+    try:
+        mark = tmp_path / "out" / "R1" / "stamper@R1.pid"
+        wait_for(lambda: mark.exists() or one.poll() is not None, "the stamper")
+        of_it = psutil.Process(one.pid).children(recursive=True)
+        one.send_signal(number)
+        assert one.wait(PATIENCE_S) == 130
+    finally:
+        one.kill()
+        one.wait()
+    assert left(name) == []
+    assert not [process for process in of_it if process.is_running()]
+    assert "Traceback" not in (tmp_path / "said").read_text()

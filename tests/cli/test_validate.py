@@ -1,0 +1,80 @@
+"""`dwell validate`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import dwell
+from tests.cli.test_commands import SMALL, call, read_json
+
+CALIBRATED = "small.yaml"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with a cell and two of its runs, which is the current one."""
+    monkeypatch.chdir(tmp_path)
+    cell = tmp_path / CALIBRATED
+    cell.write_text(SMALL, encoding="utf-8")
+    problem = dwell.load(cell)
+    for policy in ("LOC", "OFF"):
+        dwell.simulate(problem, policy=policy, seed=9, windows=40).save(tmp_path / policy)
+    return tmp_path
+
+
+def test_page_table_and_text(folder: Path) -> None:
+    result = call("validate", "LOC", "OFF", "--cell", CALIBRATED, "--seeds", "2", "--out", "out")
+    assert result.exit_code == 0, result.output
+    assert "small: 2 runs, each simulated 2 times" in result.output
+    assert "report: out/report.html" in result.output
+    assert (folder / "out" / "report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE")
+    told = json.loads((folder / "out" / "validation.json").read_text(encoding="utf-8"))
+    assert [group["policy"] for group in told["groups"]] == ["LOC", "OFF"]
+
+
+def test_json(folder: Path) -> None:
+    told = read_json(call("validate", "LOC", "--cell", CALIBRATED, "--seeds", "2", "--json"))
+    assert told["report"] == "validations/small/report.html"
+    assert (folder / told["report"]).is_file()
+    assert set(told["verdicts"]) == {
+        "l95_ms",
+        "violation_rate",
+        "utilisation",
+        "dominant",
+        "sum_of_means",
+    }
+    assert told["figures"][0]["metric"] == "l95_ms"
+
+
+def refused(*arguments: str) -> str:
+    result = call("validate", *arguments, "--cell", CALIBRATED)
+    assert result.exit_code == 2
+    assert not Path("validations").exists()
+    return result.output
+
+
+def test_calibration_runs_are_refused(folder: Path) -> None:
+    assert "LOC: the cell was calibrated from this run" in refused(
+        "LOC", "OFF", "--calibrated-from", "./LOC"
+    )
+    sidecar = folder / "small.calibration.json"
+    sidecar.write_text('{"runs": ["elsewhere/OFF"]}', encoding="utf-8")
+    assert "OFF: the cell was calibrated from this run" in refused("LOC", "OFF")
+    # Ids are what counts where there are any: names may be those of another campaign's runs.
+    sidecar.write_text('{"runs": ["OFF"], "ids": ["1795"]}', encoding="utf-8")
+    told = read_json(call("validate", "OFF", "--cell", CALIBRATED, "--seeds", "2", "--json"))
+    assert told["groups"][0]["runs"] == ["OFF"]
+    shutil.rmtree("validations")
+    sidecar.write_text("[]", encoding="utf-8")
+    assert "small.calibration.json: cannot be read" in refused("LOC")
+
+
+@pytest.mark.usefixtures("folder")
+def test_folders_that_are_no_runs() -> None:
+    output = refused("LOC", "nowhere", "LOC")
+    assert "nowhere: no such folder" in output
+    assert "LOC: named twice" in output

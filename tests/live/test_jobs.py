@@ -1,0 +1,244 @@
+"""Jobs of live runs: instants, CPU time, shadows, what was replaced; what processes took."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+import dwell
+from dwell.live.agent import CpuCount
+from dwell.live.cell import Cell
+from dwell.live.group import own_group
+from dwell.live.loads import ProcessLoads
+from dwell.live.recording import RunRecorder
+from dwell.live.tables import columns_of, job_columns
+from dwell.live.windows import Resume, Rows
+from dwell.model import Problem
+from tests.live.small_world import MS, MemoryRecorder, World
+
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+CPU_NS = 1_234_567
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    cell = dwell.load("examples/canonical.yaml")
+    return replace(
+        cell,
+        controller=replace(cell.controller, fallbacks=(), close_grace_ms=40),
+        pipeline=replace(cell.pipeline, deadline_ms=33.0),
+        window_cycles=20,
+    )
+
+
+class JobRecorder(MemoryRecorder):
+    """Rows as they come, those of jobs as well."""
+
+    def open(self, run: int) -> Resume:
+        return replace(super().open(run), jobs=True)
+
+
+class Spent:
+    """A clock of CPU time that goes on by a fixed time between two looks."""
+
+    def __init__(self) -> None:
+        self.at_ns = 0
+
+    def __call__(self) -> int:
+        self.at_ns += CPU_NS
+        return self.at_ns
+
+
+def world_of(problem: Problem, policy: str, **more: object) -> World:
+    """Return a cell whose controller keeps the jobs."""
+
+    class Small(World):
+        def start(self, who: str) -> None:
+            if who.startswith("controller") and not isinstance(self.recorder, JobRecorder):
+                self.recorder = JobRecorder()
+            super().start(who)
+
+    return Small(problem, exec_ms=EXEC_MS, policy=policy, **more)  # type: ignore[arg-type]
+
+
+def frames(problem: Problem, rows: Rows | dict[str, list[tuple[object, ...]]]) -> pl.DataFrame:
+    """Return the jobs as a table."""
+    names = list(job_columns(problem)["jobs"])
+    return pl.DataFrame(rows["jobs"], schema=names, orient="row")
+
+
+def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
+    world = world_of(problem, "LOC")
+    for role in world.roles.values():
+        worker = getattr(role, "worker", None)
+        if worker is not None:
+            worker.cpu_clock = Spent()
+    world.run(4_000)
+    jobs = frames(problem, world.recorder.rows)
+    simulated = dwell.simulate(problem, policy="LOC", seed=1, windows=2, jobs=True).jobs
+    assert jobs.columns == [*simulated.columns, "shadow", "cpu_ns"]
+
+    nodes = {"sensing": "R1", "perception": "R1", "planning": "R2", "control": "R2"}
+    cycles = sorted(set(jobs["cycle"]))
+    assert cycles == list(range(len(cycles)))
+    assert len(cycles) >= 3 * problem.window_cycles
+    assert jobs["cycle"].is_sorted()
+    settled = jobs.filter(pl.col("cycle") > 5)
+    for cycle, of in settled.group_by("cycle"):
+        assert of["task"].to_list() == list(nodes), cycle
+        assert of["node"].to_list() == list(nodes.values())
+        assert of["ready_ns"].to_list()[1:] >= of["end_ns"].to_list()[:-1]
+    assert set(settled["outcome"]) == {"done"}
+    assert not settled["shadow"].any()
+    assert settled["cpu_ns"].unique().to_list() == [CPU_NS]
+    took = settled.with_columns(took=pl.col("end_ns") - pl.col("start_ns"))
+    for task, exec_ms in EXEC_MS.items():
+        assert took.filter(pl.col("task") == task)["took"].unique().to_list() == [exec_ms * MS]
+
+    # The latency of a cycle runs from its release to the end of its last job.
+    order = [*columns_of(cell_of(world).controller)["cycles"]]
+    table = pl.DataFrame(world.recorder.rows["cycles"], schema=order, orient="row")
+    table = table.unique("cycle", keep="last")
+    ends = settled.group_by("cycle").agg(pl.col("end_ns").max())
+    both = ends.join(table, on="cycle")
+    over = both["latency_ns"] - (both["end_ns"] - both["release_ns"])
+    # Until the sink has handed the command to the arm.
+    assert 0 <= over.min() <= over.max() < MS  # type: ignore[operator]
+
+
+def cell_of(world: World) -> Cell:
+    """Return the controller's side of the cell."""
+    cell = world.roles[f"controller@{world.problem.controller_node}"]
+    assert isinstance(cell, Cell)
+    return cell
+
+
+def test_a_job_that_was_replaced_is_known_without_instants(problem: Problem) -> None:
+    world = world_of(problem, "LOC")
+    for role in world.roles.values():
+        if getattr(getattr(role, "worker", None), "task", "") == "perception":
+            role.exec_ns = 80 * MS  # type: ignore[attr-defined]
+    world.run(4_000)
+    jobs = frames(problem, world.recorder.rows)
+    replaced = jobs.filter(pl.col("outcome") == "replaced")
+    assert len(replaced) > 20
+    assert set(replaced["task"]) == {"perception"}
+    assert replaced["start_ns"].null_count() == replaced["cpu_ns"].null_count() == len(replaced)
+    behind = set(jobs.filter(pl.col("task") == "planning")["cycle"])
+    assert behind.isdisjoint(replaced["cycle"])
+
+
+def test_shadow_jobs_are_told_apart(problem: Problem) -> None:
+    settings = replace(problem.controller, estimator="corrected", shadow_fraction=0.25)
+    world = world_of(replace(problem, controller=settings), "LOC")
+    world.run(6_000)
+    jobs = frames(problem, world.recorder.rows)
+    shadows = jobs.filter(pl.col("shadow"))
+    assert set(shadows["task"]) == {"perception", "planning"}
+    assert "E" in set(shadows["node"])
+    assert set(shadows["task"]).isdisjoint(["sensing", "control"])
+    own = jobs.filter(~pl.col("shadow"))
+    # Nothing is told twice, and what both share belongs to the cycle.
+    assert len(own.unique(["cycle", "task"])) == len(own)
+    shared = set(own.filter(pl.col("task") == "sensing")["cycle"])
+    assert set(shadows["cycle"]) <= shared
+
+
+def test_what_processes_take_is_kept_by_window(problem: Problem) -> None:
+    world = world_of(problem, "LOC")
+    world.run(4_000)
+    names = list(job_columns(problem)["processes"])
+    found = pl.DataFrame(world.recorder.rows["processes"], schema=names, orient="row")
+    agents = {f"agent@{node}" for node in problem.fabric.nodes}
+    assert set(found["process"]) == {*agents, "controller@E"}
+    assert found["cpu_ns"].min() >= 0  # type: ignore[operator]
+    windows = sorted(set(found["window"].to_list()))
+    assert windows == list(range(len(windows)))
+    assert len(windows) >= 3
+
+
+def test_processes_count_on_when_they_start_again() -> None:
+    loads = ProcessLoads()
+    for at_ns, cpu_ns in ((0, 500), (100, 600), (200, 50), (300, 150)):
+        loads.report("E", at_ns, [("a", cpu_ns)])
+    assert loads.between("E", 0, 300) == {"a": 250.0}
+    assert loads.between("E", 50, 250) == {"a": 150.0}
+    assert loads.between("R1", 0, 300) == {}
+    # A clock that begins anew has nothing to do with what was before.
+    loads.report("E", 10, [("a", 200)])
+    loads.report("E", 20, [("a", 230)])
+    assert loads.between("E", 10, 20) == {"a": 30.0}
+
+
+def test_jobs_survive_in_the_folder(problem: Problem, tmp_path: Path) -> None:
+    class Kept(World):
+        def start(self, who: str) -> None:
+            if who.startswith("controller"):
+                controller = dwell.control.Controller(self.problem, self.policy)
+                self.kept = RunRecorder(tmp_path, self.problem, controller, print, jobs=True)
+                self.recorder = self.kept  # type: ignore[assignment]
+            super().start(who)
+
+    world = Kept(problem, exec_ms=EXEC_MS, policy="LOC")
+    world.run(4_000)
+    cell = cell_of(world)
+    assert cell.windows is not None
+    folder = world.kept.finish(cell.windows.rows(last=True))
+    assert folder is not None
+    run = dwell.open_run(folder)
+    assert run.has_jobs
+    assert run.has_processes
+    in_windows = run.cycles.filter(~pl.col("lead"))["cycle"]
+    # At the end nothing is held back.
+    assert set(run.jobs["cycle"]) == set(in_windows)
+    assert run.processes["window"].max() == run.windows["window"].max()
+
+
+V1 = "31 23 0:28 / {at}/cpu rw - cgroup cgroup rw,cpu\n"
+ACCOUNT = "32 23 0:29 {root} {at}/cpuacct rw - cgroup cgroup rw,cpuacct\n"
+V2 = "33 23 0:30 / {at}/unified rw - cgroup2 cgroup2 rw\n"
+
+
+def process_in(folder: Path, groups: Sequence[str], mounts: str, root: str = "/") -> Path:
+    """Write what the kernel says of a process."""
+    (folder / "cgroup").write_text("".join(f"{line}\n" for line in groups))
+    (folder / "mountinfo").write_text(mounts.format(at=folder, root=root))
+    return folder
+
+
+def test_a_group_of_version_1_counts_nanoseconds(tmp_path: Path) -> None:
+    process = process_in(
+        tmp_path, ["2:cpuacct:/node-E", "1:cpu:/node-E", "0::/"], V1 + ACCOUNT + V2
+    )
+    assert own_group(process) is None
+    (tmp_path / "cpuacct" / "node-E").mkdir(parents=True)
+    (tmp_path / "cpuacct" / "node-E" / "cpuacct.usage").write_text("123456789\n")
+    group = own_group(process)
+    assert group is not None
+    assert group.used_ns() == 123_456_789
+    assert CpuCount(group=group).busy_ns() == 123_456_789
+
+
+def test_a_group_of_version_2_counts_microseconds(tmp_path: Path) -> None:
+    process = process_in(tmp_path, ["0::/dwell/node-E"], V2)
+    (tmp_path / "unified" / "dwell" / "node-E").mkdir(parents=True)
+    stat = "usage_usec 1234\nuser_usec 1000\nsystem_usec 234\n"
+    (tmp_path / "unified" / "dwell" / "node-E" / "cpu.stat").write_text(stat)
+    group = own_group(process)
+    assert group is not None
+    assert group.used_ns() == 1_234_000
+
+
+@pytest.mark.parametrize(("root", "group"), [("/", "/"), ("/box", "/box"), ("/box", "/boxes/E")])
+def test_the_root_is_no_group_of_its_own(tmp_path: Path, root: str, group: str) -> None:
+    process = process_in(tmp_path, [f"2:cpuacct:{group}", "0::/"], ACCOUNT + V2, root)
+    (tmp_path / "cpuacct").mkdir()
+    (tmp_path / "unified").mkdir()
+    (tmp_path / "cpuacct" / "cpuacct.usage").write_text("1\n")
+    (tmp_path / "unified" / "cpu.stat").write_text("usage_usec 1\n")
+    assert own_group(process) is None
+    assert own_group(tmp_path / "nowhere") is None

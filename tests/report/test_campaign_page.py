@@ -1,0 +1,136 @@
+"""The page and the text of a campaign, and the commands that write them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from dwell.cli.commands import app
+from dwell.model.document import to_document
+from dwell.report.campaign_page import campaign_html
+from dwell.report.campaign_text import WIDTH, campaign_text
+from dwell.study.campaign import Measured, read_measured
+from dwell.testbed.campaign import Campaign, default_entrants, default_scenarios, entrant
+from dwell.testbed.execution import run_campaign
+from tests.report.pages import Page
+from tests.study.cell import make_problem
+from tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
+
+PROBLEM = make_problem()
+SECONDS = (PROBLEM.warmup_windows + 4) * PROBLEM.window_cycles * PROBLEM.pipeline.period_ms / 1e3
+
+
+def made(folder: Path, names: tuple[str, ...], repetitions: int) -> Path:
+    entrants = tuple(entrant(PROBLEM, name) for name in names) or default_entrants(PROBLEM)
+    asked = Campaign(PROBLEM, default_scenarios(PROBLEM), entrants, repetitions, SECONDS)
+    play = SimulatedRuns(lambda names: "pressure" if len(names) == 3 else "")
+    run_campaign(asked, folder, play, tell=lambda line: None, wait=ALWAYS_IDLE)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made(tmp_path_factory.mktemp("campaign") / "there", (), 2)
+
+
+@pytest.fixture(scope="module")
+def measured(folder: Path) -> Measured:
+    return read_measured(folder)
+
+
+@pytest.fixture(scope="module")
+def page(measured: Measured) -> Page:
+    return Page(campaign_html(measured))
+
+
+def test_the_page_is_whole_and_loads_nothing(page: Page) -> None:
+    assert page.outside == []
+    assert "script" not in page.tags
+    assert len(page.ids) == len(set(page.ids))
+    for heading in ("Results", "Distributions", "What jobs and messages took", "What was run when"):
+        assert heading in page.headings
+    # Of every policy and scenario: four measures, five distributions; profiles and delays.
+    assert page.tags.count("svg") >= 13
+
+
+def test_the_page_says_what_kind_of_runs_they_are(page: Page) -> None:
+    assert "simulated in place of measurements" in page.text
+
+
+def test_the_page_counts_what_does_not(measured: Measured, page: Page) -> None:
+    text = page.text
+    runs = measured.log.height
+    assert f"{runs} of {4 * runs} windows after the warm-up were measured under pressure" in text
+    assert "Attempts that failed, and count nowhere: 1 were under pressure" in text
+    assert "whatever was measured" in text
+
+
+def test_the_text_fits_a_terminal(measured: Measured) -> None:
+    text = campaign_text(measured)
+    assert max(map(len, text.splitlines())) <= WIDTH
+    assert "RQ1" in text
+    assert "RQ2" in text
+    assert "CUSUM (corrected)" in text
+
+
+def test_a_campaign_of_one_policy_has_a_page(tmp_path: Path) -> None:
+    found = read_measured(made(tmp_path / "there", ("LOC",), 1))
+    page = Page(campaign_html(found))
+    assert "RQ1" not in page.text
+    assert "One repetition has no interval" in page.text
+    assert max(map(len, campaign_text(found).splitlines())) <= WIDTH
+
+
+def test_report_makes_the_page_of_a_campaign(folder: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    done = CliRunner().invoke(app, ["report", str(folder), "--out", str(page), "--json"])
+    assert done.exit_code == 0
+    told = json.loads(done.stdout)
+    assert told["done"] == told["planned"]
+    assert told["excluded_windows"] == told["done"]
+    assert {row["policy"] for row in told["table"]} >= {"LOC", "cusum+corrected"}
+    assert page.read_text().startswith("<!DOCTYPE html>")
+    wrong = CliRunner().invoke(app, ["report", str(folder), "--trace", str(tmp_path / "t.json")])
+    assert wrong.exit_code == 2
+    assert "is a campaign" in wrong.stderr
+
+
+def test_report_alone_measures_nothing(folder: Path, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(yaml.safe_dump(to_document(PROBLEM)))
+    asked = ["testbed", "campaign", str(cell), "--report", "--out"]
+    done = CliRunner().invoke(app, [*asked, str(folder)])
+    assert done.exit_code == 0
+    assert (folder / "report.html").is_file()
+    none = CliRunner().invoke(app, [*asked, str(tmp_path / "none")])
+    assert none.exit_code == 2
+    assert "not a campaign" in none.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--scenarios", "nowhere"], "nowhere"),
+        (["--scenarios", "baseline", "--policies", "nobody"], "nobody"),
+        (["--scenarios", "network-impairment"], "no commands that disturb"),
+        (["--scenarios", "baseline", "--policies", "LOC,LOC"], "'LOC' twice"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_made(
+    arguments: list[str], said: str, tmp_path: Path
+) -> None:
+    cell, hosts = tmp_path / "cell.yaml", tmp_path / "hosts.yaml"
+    cell.write_text(yaml.safe_dump(to_document(PROBLEM)))
+    told = {node: {"run": "false", "address": "10.0.0.1"} for node in PROBLEM.fabric.nodes}
+    hosts.write_text(yaml.safe_dump({"dwell-inventory": 1, "hosts": told}))
+    out = tmp_path / "there"
+    asked = ["testbed", "campaign", str(cell), "--inventory", str(hosts), "--out", str(out)]
+    done = CliRunner().invoke(app, [*asked, *arguments])
+    assert done.exit_code in (1, 2)
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not out.exists()

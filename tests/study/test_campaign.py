@@ -1,0 +1,223 @@
+"""What a campaign has measured, read from folders whose runs are simulated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+import dwell
+from dwell import Run
+from dwell.errors import RunError
+from dwell.record import seal_run
+from dwell.study.campaign import Measured, read_measured, without_excluded
+from dwell.study.campaign_questions import (
+    fault_scenarios,
+    needed_pairs,
+    questions,
+    stress_scenarios,
+    verdict,
+)
+from dwell.study.family import Family
+from dwell.study.paired import paired_difference
+from dwell.study.summary import summarise
+from dwell.testbed.campaign import Campaign, entrant
+from dwell.testbed.execution import run_campaign
+from tests.study.cell import make_problem
+from tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
+
+PROBLEM = make_problem()
+SCENARIOS = ("baseline", "robot-cpu-stress", "network-impairment")
+POLICIES = ("LOC", "SO", "HYB", "atp", "dtp")
+
+
+def campaign(repetitions: int) -> Campaign:
+    window_s = PROBLEM.window_cycles * PROBLEM.pipeline.period_ms / 1e3
+    return Campaign(
+        PROBLEM,
+        SCENARIOS,
+        tuple(entrant(PROBLEM, name) for name in POLICIES),
+        repetitions,
+        seconds=(PROBLEM.warmup_windows + 6) * window_s,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    found = tmp_path_factory.mktemp("campaign") / "there"
+    play = SimulatedRuns(lambda names: "error" if len(names) == 4 else "")
+    run_campaign(campaign(2), found, play, tell=lambda line: None, wait=ALWAYS_IDLE)
+    return found
+
+
+@pytest.fixture(scope="module")
+def measured(folder: Path) -> Measured:
+    return read_measured(folder)
+
+
+def test_a_repetition_takes_the_place_of_a_seed(measured: Measured) -> None:
+    comparison = measured.comparison
+    assert comparison.seeds == (1, 2)
+    assert comparison.scenarios == SCENARIOS
+    assert comparison.policies == POLICIES
+    assert comparison.runs.height == 3 * 5 * 2
+    assert len(comparison.values("baseline", "dtp", "violation_rate")) == 2
+    assert measured.repetitions == 2
+    assert measured.kinds == {"simulated"}
+
+
+def test_excluded_windows_and_failures_are_counted(measured: Measured) -> None:
+    # One of six windows of every run is excluded, see SimulatedRuns.
+    assert measured.log["excluded"].to_list() == [1] * 30
+    assert measured.log["windows"].to_list() == [6] * 30
+    assert set(measured.comparison.runs["windows"]) == {5}
+    assert measured.failed["outcome"].to_list() == ["error"]
+    assert measured.log["attempt"].max() == 2
+
+
+def test_excluded_windows_leave_with_their_cycles() -> None:
+    run = dwell.simulate(PROBLEM, scenario="baseline", policy="LOC", seed=1, windows=8, jobs=True)
+    gone = PROBLEM.warmup_windows + 1
+    told = Run(
+        {**run.meta, "pressure": {"excluded": [gone]}},
+        {
+            "cycles": run.cycles,
+            "windows": run.windows,
+            "decisions": run.decisions,
+            "jobs": run.jobs,
+        },
+    )
+    left = without_excluded(told, PROBLEM)
+    first = int(run.windows["first_cycle"][gone])
+    lost = set(range(first, first + PROBLEM.window_cycles))
+    assert set(run.cycles["cycle"]) - set(left.cycles["cycle"]) == lost
+    assert not lost & set(left.jobs["cycle"])
+    assert gone not in left.windows["window"]
+    row = summarise(left, PROBLEM, {}).row
+    assert row["cycles"] == (7 - PROBLEM.warmup_windows) * PROBLEM.window_cycles
+
+
+def test_profiles_are_of_the_baseline_and_links_of_every_scenario(measured: Measured) -> None:
+    profiles = measured.profiles
+    assert set(zip(profiles["task"], profiles["node"], strict=True)) >= {
+        (task, node)
+        for task, tasks in PROBLEM.pipeline.tasks.items()
+        for node in {placement[task] for placement in PROBLEM.candidates.values()}
+        if node in tasks.on
+    }
+    assert (profiles["wall_ms_p5"] <= profiles["wall_ms_p95"]).all()
+    assert profiles["cpu_ms"].is_null().all()
+    links = measured.links
+    assert links["scenario"].unique(maintain_order=True).to_list() == list(SCENARIOS)
+    rows = {(row["scenario"], row["link"]): row for row in links.to_dicts()}
+    impaired = [link for name, link in rows if name == "network-impairment" and "E" in link]
+    assert impaired
+    for link in impaired:
+        if ("baseline", link) in rows:
+            usual = rows["baseline", link]["mean_ms"]
+            assert rows["network-impairment", link]["mean_ms"] > usual + 5
+    shares = measured.delays.filter(pl.col("scenario") == "baseline")
+    for _, mine in shares.group_by("link"):
+        assert mine["share"].is_sorted()
+        assert mine["delay_ms"].is_sorted()
+
+
+def test_latencies_are_shares_of_all_cycles(measured: Measured) -> None:
+    runs, latencies = measured.comparison.runs, measured.comparison.latencies
+    deadline_ms = PROBLEM.pipeline.deadline_ms
+    for (scenario, policy), mine in runs.group_by("scenario", "policy"):
+        at = latencies.filter(
+            (pl.col("scenario") == scenario)
+            & (pl.col("policy") == policy)
+            & ((pl.col("latency_ms") - deadline_ms).abs() < 1e-6)
+        )["share"]
+        rates, cycles = (mine[name].to_numpy() for name in ("violation_rate", "cycles"))
+        assert at.item() == pytest.approx(1 - np.average(rates, weights=cycles))
+
+
+def test_a_campaign_that_goes_on_can_be_read(tmp_path: Path) -> None:
+    there = tmp_path / "there"
+    with pytest.raises(RunError, match="not a campaign"):
+        read_measured(there)
+
+    def stopped(names: object) -> str:
+        return "stop" if isinstance(names, list) and len(names) == 8 else ""
+
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(
+            campaign(3), there, SimulatedRuns(stopped), tell=lambda line: None, wait=ALWAYS_IDLE
+        )
+    found = read_measured(there)
+    assert (found.log.height, found.planned, found.repetitions) == (7, 45, 0)
+    # One repetition, and not everything of it: nothing is tested, nothing breaks.
+    for chapter in questions(found):
+        assert chapter.answer == "not shown"
+
+
+def test_questions_are_asked_where_they_apply(measured: Measured) -> None:
+    names = tuple(PROBLEM.scenarios)
+    assert "robot-cpu-stress" in stress_scenarios(PROBLEM, names)
+    assert fault_scenarios(PROBLEM, SCENARIOS) == ("network-impairment",)
+    one, two = questions(measured)
+    assert one.title.startswith("RQ1")
+    assert two.title.startswith("RQ2")
+    assert one.answer == two.answer == "not shown"
+    for chapter in (one, two):
+        assert "With 2 repetitions nothing can be shown" in chapter.verdict
+        assert all(not table.frame.is_empty() for table in chapter.tables)
+    comparison = replace(measured.comparison, policies=("LOC", "dtp"))
+    assert questions(replace(measured, comparison=comparison)) == ()
+
+
+def test_so_many_pairs_it_takes() -> None:
+    def shown(pairs: int, comparisons: int) -> bool:
+        item = paired_difference(np.arange(1.0, pairs + 1), np.zeros(pairs))
+        family = Family("?", "x", {str(i): item for i in range(comparisons)})
+        return set(family.verdicts.values()) == {"higher"}
+
+    for comparisons in (1, 2, 4, 8, 9):
+        needed = needed_pairs(comparisons)
+        assert shown(needed, comparisons)
+        assert not shown(needed - 1, comparisons)
+
+
+@pytest.mark.parametrize(
+    ("by_other", "answer"),
+    [
+        ({"LOC": -0.1, "SO": -0.2}, "yes"),
+        ({"LOC": 0.1, "SO": -0.2}, "no"),
+        ({"LOC": 0.0, "SO": -0.2}, "not shown"),
+    ],
+)
+def test_a_verdict_asks_for_all_others(by_other: dict[str, float], answer: str) -> None:
+    ramp = np.linspace(1.0, 1.1, 9)
+    family = Family(
+        "?",
+        "violation_rate",
+        {
+            f"net: HYB, {other}": paired_difference(0.5 + size * ramp, np.full(9, 0.5))
+            for other, size in by_other.items()
+        },
+    )
+    outcome = verdict(family, "HYB", ("LOC", "SO"))
+    assert outcome.answer == answer
+    assert "nothing can be shown" not in outcome.verdict
+    assert len(outcome.evidence) == 2
+
+
+def test_jobs_are_not_needed(folder: Path, tmp_path: Path) -> None:
+    run = dwell.simulate(PROBLEM, scenario="baseline", policy="LOC", seed=1, windows=8)
+
+    def play(problem: object, *, out: Path, **_: object) -> Path:
+        path = run.save(out / "runs" / "1")
+        seal_run(path, pressure=None)
+        return path
+
+    asked = replace(campaign(1), scenarios=("baseline",), entrants=(entrant(PROBLEM, "LOC"),))
+    run_campaign(asked, tmp_path / "there", play, tell=lambda line: None, wait=ALWAYS_IDLE)
+    found = read_measured(tmp_path / "there")
+    assert found.profiles.is_empty()
+    assert found.links.is_empty()

@@ -1,0 +1,125 @@
+"""The bed as a whole: what it refuses, and that it harms nodes and links as a scenario says."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import dwell
+from dwell.errors import LiveError
+from dwell.io import from_document
+from dwell.model import LinkDisturbance, NodeDisturbance
+from dwell.testbed.bed import Bed
+from dwell.testbed.hosts import namespace_path
+from dwell.testbed.timeline import Change
+from tests.testbed.light_cell import document, write_cell
+from tests.testbed.machine import no_groups, no_hosts, own_name
+
+#: Far more than any of it takes, on a machine that has a lot else to do.
+PATIENCE_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
+    """One that runs."""
+    if why := no_hosts() or no_groups():
+        pytest.skip(why)
+    folder = tmp_path_factory.mktemp("bed")
+    cell = write_cell(folder)
+    with Bed(dwell.load(cell), folder / "out", name=own_name(), beside=folder) as one:
+        one.come_up(patience_s=PATIENCE_S)
+        yield one
+
+
+def wait_for(event: Callable[[], object], what: str) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not event():
+        assert time.monotonic() < until, f"waited in vain for {what}"
+        time.sleep(0.1)
+
+
+def test_what_a_testbed_does_not_have_is_refused(tmp_path: Path) -> None:
+    nodes = document()["nodes"]
+    nodes["E"]["bursts"] = {"every_ms": 100, "for_ms": 10, "threads": 1}
+    links = [dict(link) for link in document()["links"]]
+    links[0]["bursts"] = {"every_ms": 100, "for_ms": 10, "add_delay_ms": 5}
+    problem = from_document(document(nodes=nodes, links=links))
+    with pytest.raises(LiveError, match=r"nodes\.E\.bursts.*links R1->E: bursts"):
+        Bed(problem, tmp_path / "out", name="refused")
+    assert not (tmp_path / "out").exists()
+
+
+def test_cells_that_share_a_link_have_to_agree_on_it(tmp_path: Path) -> None:
+    links = [dict(link) for link in document()["links"]]
+    links[0]["delay_ms"] = 7
+    one, other = from_document(document()), from_document(document(links=links, name="other"))
+    with pytest.raises(LiveError, match="links R1->E: two cells share it"):
+        Bed([one, other], tmp_path, name="refused")
+    assert len(Bed([one, replace(one, name="third")], tmp_path, name="fine").problems) == 2
+
+
+def test_a_run_begins_anew_with_everybody_there(bed: Bed) -> None:
+    (watcher,) = bed.watchers
+    begun_ns = time.monotonic_ns()
+    before = {bed.begin(patience_s=PATIENCE_S)[0]}
+    # Nothing of the time until everybody was there is part of it.
+    assert min(before) > begun_ns
+    status = watcher.status(10.0)
+    assert status["placement"] == "SO"
+    assert status["origin_ns"] in before
+    assert set(bed.expected(bed.problems[0])) <= status["processes"].keys()
+    bed.stop_controllers()
+    # Another one is another run.
+    again = bed.begin(patience_s=PATIENCE_S)[0]
+    assert again not in before
+    assert watcher.status(10.0)["run"] != status["run"]
+
+
+def test_stress_is_in_the_group_of_its_node(bed: Bed) -> None:
+    stress = NodeDisturbance("R2", stress_threads=2)
+    bed.apply(Change(0.0, stress, begins=True))
+    begun_ns = bed.used_ns["R2"]()
+    # Far less than its quota, far more than its stages take.
+    wait_for(lambda: bed.used_ns["R2"]() - begun_ns > 2_000_000_000, "two seconds of CPU time")
+    bed.apply(Change(1.0, stress, begins=False))
+
+
+def test_a_link_that_is_down_lets_nothing_through(bed: Bed) -> None:
+    link = bed.links[frozenset(("R1", "R2"))]
+    cut = LinkDisturbance("R1", "R2", down=True, loss=0.5)
+    bed.apply(Change(0.0, cut, begins=True))
+    wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
+    bed.apply(Change(1.0, cut, begins=False))
+    link.read()
+    wait_for(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
+
+
+def test_a_node_that_was_down_comes_back(bed: Bed) -> None:
+    (watcher,) = bed.watchers
+    if "controller@E" not in bed._processes.running:
+        bed.begin(patience_s=PATIENCE_S)
+    outage = NodeDisturbance("R2", down=True)
+    there = set(bed._groups.pids("R2"))
+    bed.apply(Change(0.0, outage, begins=True))
+    assert bed._groups.pids("R2") == []
+    bed.apply(Change(1.0, outage, begins=False))
+
+    def ready() -> bool:
+        heard = watcher.status(10.0)["processes"]
+        names = [who for who in bed.expected(bed.problems[0]) if "@R2" in who]
+        return all(who in heard and heard[who]["age_ms"] < 1_000 for who in names)
+
+    wait_for(ready, "the processes of R2")
+    assert not there & set(bed._groups.pids("R2"))
+
+
+def test_nothing_is_left(bed: Bed) -> None:
+    """The last: it takes the bed down."""
+    namespaces = [namespace_path(bed._hosts.namespace(node)) for node in bed.nodes]
+    assert all(path.exists() for path in namespaces)
+    bed.close()
+    assert not any(path.exists() for path in namespaces)

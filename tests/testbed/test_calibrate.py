@@ -1,0 +1,266 @@
+"""Calibrate: runs of a cell that is known give that cell back, from the file of another one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+import dwell
+from dwell.errors import RunError
+from dwell.model import Constant, Gamma, Problem, Quota
+from dwell.model.document import to_document
+from dwell.record import Run
+from dwell.sim import draw, simulate_realisation
+from dwell.testbed.calibrate import Calibrated, calibrate
+
+CELL = """
+dwell: 1
+name: known
+period_ms: 50
+deadline_ms: 50
+window_cycles: 30
+warmup_windows: 2
+nodes:
+  R1: {tier: robot, cores: 1, quota: {cpu: 0.4, period_ms: 4}}
+  E: {tier: edge, cores: 1, quota: {cpu: 0.8, period_ms: 4}}
+links:
+  - {from: R1, to: E, both_ways: true, delay_ms: {lognormal: {mean: 0.7, cv: 0.3}}, rate_mbps: 940}
+tasks:
+  see: {on: {R1: {exec_ms: 9}}}
+  find:
+    input: latest
+    on:
+      R1: {exec_ms: 9}
+      E: {exec_ms: 9}
+  act: {on: {R1: {exec_ms: 9}}}
+flows:
+  - {from: see, to: find, bytes: 300000}
+  - {from: find, to: act, bytes: 1000}
+candidates:
+  LOC: {find: R1}
+  OFF: {find: E}
+scenarios:
+  stress: [{node: E, stress_threads: 2}]
+  far: [{link: R1->E, add_delay_ms: 20}]
+objective:
+  weights: {latency: 1, violations: 3, robot: 0.2, edge: 0.1, switching: 0.2}
+  targets: {latency_ms: 50, robot: 0.9, edge: 0.9}
+  caps: {latency_ms: 400}
+controller: {on: E, policy: LOC, initial: LOC, estimator: profile}
+"""
+#: Of the stage alone, and of the messaging of a job's worker.
+STAGE_MS = {("see", "R1"): 1.6, ("find", "R1"): 5.0, ("find", "E"): 4.5, ("act", "R1"): 0.2}
+MESSAGING_MS = {("see", "R1"): 0.5, ("find", "R1"): 0.7, ("find", "E"): 0.6, ("act", "R1"): 0.2}
+IDLE = 0.004
+BACKGROUND = {"R1": 0.06, "E": 0.1}
+ADDED_MS = 0.35
+WINDOWS = 60
+BASE = 20_000
+
+
+@pytest.fixture(scope="module")
+def nominal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    cell = tmp_path_factory.mktemp("cell") / "known.yaml"
+    cell.write_text(CELL)
+    return cell
+
+
+@pytest.fixture(scope="module")
+def truth(nominal: Path) -> Problem:
+    """The cell that is there, which nobody knows."""
+    problem = dwell.load(nominal)
+    tasks = {
+        task.name: replace(
+            task,
+            on={
+                node: replace(
+                    of,
+                    exec_ms=Gamma(STAGE_MS[task.name, node] + MESSAGING_MS[task.name, node], 0.12),
+                )
+                for node, of in task.on.items()
+            },
+        )
+        for task in problem.pipeline.tasks.values()
+    }
+    fabric = replace(
+        problem.fabric,
+        nodes={n: replace(of, background=BACKGROUND[n]) for n, of in problem.fabric.nodes.items()},
+        links={
+            name: replace(link, delay_ms=replace(link.delay_ms, mean=0.7 + ADDED_MS))  # type: ignore[type-var]
+            for name, link in problem.fabric.links.items()
+        },
+    )
+    return replace(problem, pipeline=replace(problem.pipeline, tasks=tasks), fabric=fabric)
+
+
+def share(bytes_: int, of: int) -> float:
+    """Part of a task's messaging that a message is; as large as it is, and as any is."""
+    return (BASE + bytes_) / of
+
+
+def observed(truth: Problem, nominal: Path, placement: str, scenario: str = "baseline") -> Run:
+    """Record a run of the true cell as a live one is recorded."""
+    real = draw(truth, scenario=scenario, seed=7, windows=WINDOWS)
+    played = simulate_realisation(truth, real, policy=placement, jobs=True)
+    exec_ns = {site: real.exec_ns[row] for row, site in enumerate(real.sites)}
+    jobs = played.jobs.filter(pl.col("end_ns").is_not_null())
+    cycles, tasks, nodes = (jobs[name].to_list() for name in ("cycle", "task", "node"))
+    sites = list(zip(tasks, nodes, strict=True))
+    over_ns = np.array([round(MESSAGING_MS[site] * 1e6) for site in sites])
+    cpu_ns = np.array([exec_ns[s][c] for s, c in zip(sites, cycles, strict=True)]) - over_ns
+    # A worker reads before its stage starts, and writes after it has ended.
+    bytes_of = {"see": (0, 300_000), "find": (300_000, 1_000), "act": (1_000, 0)}
+    of = np.array([2 * BASE + sum(bytes_of[task]) for task in tasks])
+    read, wrote = (
+        np.array([BASE + bytes_of[task][i] for task in tasks]) / of * over_ns for i in (0, 1)
+    )
+    first = np.array(tasks) == "see"
+    jobs = jobs.with_columns(
+        ready_ns=pl.col("ready_ns") + pl.Series(np.where(first, 0, read)).cast(pl.Int64),
+        start_ns=pl.col("start_ns") + pl.Series(read).cast(pl.Int64),
+        end_ns=pl.col("end_ns") - pl.Series(wrote).cast(pl.Int64),
+        cpu_ns=pl.Series(cpu_ns),
+    )
+    document = to_document(dwell.load(nominal))
+    meta = {**played.meta, "kind": "live", "scenario": scenario, "problem": document}
+    tables: Mapping[str, Any] = {
+        "cycles": played.cycles,
+        "windows": played.windows,
+        "decisions": played.decisions,
+        "jobs": jobs,
+        "processes": processes(truth, played, jobs),
+    }
+    return Run(meta, tables)
+
+
+def processes(truth: Problem, played: Run, jobs: pl.DataFrame) -> pl.DataFrame:
+    """What the workers took in every window; of the rest only that there is something."""
+    rows = []
+    grace_ms = truth.controller.close_grace_ms
+    span_ns = (truth.window_cycles * truth.pipeline.period_ms + grace_ms) * 1e6
+    for window, first in played.windows.select("window", "first_cycle").iter_rows():
+        inside = jobs.filter(pl.col("cycle").is_between(first, first + truth.window_cycles - 1))
+        for task, node in STAGE_MS:
+            of = inside.filter((pl.col("task") == task) & (pl.col("node") == node))
+            spent_ns = int(of["cpu_ns"].sum()) + of.height * MESSAGING_MS[task, node] * 1e6
+            rows.append((window, f"{task}@{node}", node, round(spent_ns + IDLE * span_ns)))
+        rows += [(window, f"agent@{node}", node, 10**6) for node in BACKGROUND]
+    schema = {"window": pl.Int64, "process": pl.String, "node": pl.String, "cpu_ns": pl.Int64}
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+@pytest.fixture(scope="module")
+def folders(truth: Problem, nominal: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    at = tmp_path_factory.mktemp("runs")
+    plan = (("LOC", "baseline"), ("OFF", "baseline"), ("OFF", "stress"), ("OFF", "far"))
+    return [
+        observed(truth, nominal, placement, scenario).save(at / f"{placement}-{scenario}")
+        for placement, scenario in plan
+    ]
+
+
+@pytest.fixture(scope="module")
+def calibrated(
+    nominal: Path, folders: list[Path], tmp_path_factory: pytest.TempPathFactory
+) -> Calibrated:
+    out = tmp_path_factory.mktemp("out") / "measured.yaml"
+    return calibrate(nominal, folders, out, say=lambda line: None)
+
+
+def test_execution_times_are_found(calibrated: Calibrated) -> None:
+    about = calibrated.report["tasks"]
+    for (task, node), stage_ms in STAGE_MS.items():
+        found = about[f"{task}@{node}"]
+        assert found["stage_ms"] == pytest.approx(stage_ms, rel=0.02)
+        assert found["messaging_ms"] == pytest.approx(MESSAGING_MS[task, node], rel=0.06)
+        # What passes before the first job and after the last is its own messaging, no more.
+        assert found["ends_ms"] == pytest.approx(0.0, abs=0.05)
+    assert calibrated.missing == ()
+    # What is stressed says nothing of its node, and a link that is worse nothing of itself.
+    assert "OFF-stress" not in about["find@E"]["of_runs"]
+    assert "OFF-stress" in about["see@R1"]["of_runs"]
+
+
+def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
+    for node, cores in BACKGROUND.items():
+        assert calibrated.report["background"][node] == pytest.approx(cores, abs=0.006)
+    assert calibrated.problem.fabric.nodes["R1"].quota == Quota(0.4, 4)
+    for link in ("R1->E", "E->R1"):
+        assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("placement", "scenario"), [("LOC", "baseline"), ("OFF", "baseline"), ("OFF", "stress")]
+)
+def test_the_calibrated_cell_predicts_the_true_one(
+    calibrated: Calibrated, truth: Problem, placement: str, scenario: str
+) -> None:
+    shown = []
+    for problem, seed in ((truth, 11), (calibrated.problem, 12)):
+        real = draw(problem, scenario=scenario, seed=seed, windows=150)
+        run = simulate_realisation(problem, real, policy=placement)
+        latency_ms = run.cycles["latency_ns"].to_numpy() / 1e6
+        busy = [run.windows[f"u_{node}"].mean() for node in BACKGROUND]
+        shown.append((np.quantile(latency_ms, 0.95), latency_ms.mean(), *busy))
+    (true_l95, true_mean, *true_busy), (l95, mean, *busy) = shown
+    assert l95 == pytest.approx(true_l95, rel=0.03)
+    assert mean == pytest.approx(true_mean, rel=0.03)
+    assert busy == pytest.approx(true_busy, abs=0.02)
+
+
+def test_the_sidecar_names_the_runs_and_checks_the_cell(calibrated: Calibrated) -> None:
+    said = json.loads(calibrated.sidecar.read_text())
+    assert calibrated.sidecar.name == "measured.calibration.json"
+    assert said["runs"] == ["LOC-baseline", "OFF-baseline", "OFF-stress", "OFF-far"]
+    for row in said["check"]:
+        assert row["predicted"]["mean_ms"] == pytest.approx(row["measured"]["mean_ms"], rel=0.04)
+
+
+def test_links_that_nobody_emulates_have_their_own_delays(
+    nominal: Path, folders: list[Path], tmp_path: Path
+) -> None:
+    lan = tmp_path / "lan.yaml"
+    lan.write_text(CELL.replace("delay_ms: {lognormal: {mean: 0.7, cv: 0.3}}", "delay_ms: 0"))
+    said: list[str] = []
+    found = calibrate(lan, folders[:2], tmp_path / "out.yaml", emulated=False, say=said.append)
+    # Under a quota a message also waits for its sender's and its receiver's next period.
+    assert 1.0 < found.report["links"]["R1->E"]["mean_ms"] < 3.5
+    assert any(line.startswith("R1->E:") for line in said)
+
+
+def test_what_was_not_visited_stays(nominal: Path, folders: list[Path], tmp_path: Path) -> None:
+    said: list[str] = []
+    found = calibrate(nominal, folders[:1], tmp_path / "out.yaml", say=said.append)
+    assert found.missing == ("find@E",)
+    assert found.problem.pipeline.tasks["find"].on["E"].exec_ms == Constant(9)
+    assert "find@E: not measured, as it was" in said
+
+
+def test_bad_input_is_refused_all_at_once(
+    nominal: Path, truth: Problem, folders: list[Path], tmp_path: Path
+) -> None:
+    bare = dwell.simulate(truth, seed=1, windows=3, policy="LOC").save(tmp_path / "bare")
+    other = observed(truth, nominal, "LOC")
+    other.meta["problem"]["window_cycles"] = 20
+    other.meta["problem"]["nodes"]["X"] = {}
+    others = other.save(tmp_path / "other")
+    with pytest.raises(RunError) as caught:
+        calibrate(nominal, [bare, others, tmp_path / "none"], tmp_path / "out.yaml")
+    said = str(caught.value)
+    assert "bare: it kept no jobs with CPU times; record it with --jobs" in said
+    assert "other: its nodes are E, R1, X, those of the cell E, R1" in said
+    assert "other: window_cycles was 20, not 30" in said
+    assert "none: no such folder" in said
+    assert not (tmp_path / "out.yaml").exists()
+    for out, words in ((nominal, "is the cell itself"), (tmp_path / "out", "ends in .yaml")):
+        with pytest.raises(RunError, match=words):
+            calibrate(nominal, folders, out)
+    with pytest.raises(RunError, match="LOC-baseline: named twice"):
+        calibrate(nominal, [folders[0], folders[0]], tmp_path / "out.yaml")

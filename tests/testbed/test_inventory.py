@@ -1,0 +1,224 @@
+"""Inventories of real hosts; a shell of this computer stands where ssh would."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import yaml
+
+from dwell.errors import LiveError, ProblemError
+from dwell.live.leash import OWNER
+from dwell.model import LinkDisturbance, NodeDisturbance, Normal
+from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inventory
+from dwell.testbed.real_hosts import RealHosts, require_commands
+from dwell.testbed.remote import local_words, script_of
+from dwell.testbed.timeline import Change, changes_of
+from tests.study.cell import make_problem
+
+PROBLEM = make_problem()
+SHELL = ("sh", "-c")
+LINK = next(iter(PROBLEM.fabric.links.values()))
+
+
+def inventory(folder: Path, **links: LinkCommands) -> Inventory:
+    host = RealHost(SHELL, "127.0.0.1", python=sys.executable, folder=str(folder))
+    hosts = {
+        node: replace(host, port=21_450 + 100 * i) for i, node in enumerate(PROBLEM.fabric.nodes)
+    }
+    return Inventory(hosts, links)
+
+
+def written(folder: Path, document: object) -> Path:
+    file = folder / "hosts.yaml"
+    file.write_text(yaml.safe_dump(document), encoding="utf-8")
+    return file
+
+
+def hosts() -> dict[str, Any]:
+    return {node: {"run": "ssh host", "address": "10.0.0.1"} for node in PROBLEM.fabric.nodes}
+
+
+def until(done: Callable[[], bool]) -> None:
+    for _ in range(1000):
+        if done():
+            return
+        time.sleep(0.01)
+    pytest.fail("it did not happen")
+
+
+# -------------------------------------------------------------------------------- the file
+
+
+def test_an_inventory_is_read(tmp_path: Path) -> None:
+    told = hosts()
+    told["E"] |= {"run": ["ssh", "the edge"], "port": 8000, "cpus": "2-3", "folder": "/srv/dwell"}
+    links = {LINK.name: {"begin": "on {mean_ms} {std_ms} {loss_percent}", "end": "off"}}
+    found = load_inventory(
+        written(tmp_path, {"dwell-inventory": 1, "hosts": told, "links": links}), PROBLEM
+    )
+    assert found.hosts["R1"].run == ("ssh", "host")
+    edge = found.hosts["E"]
+    assert (edge.run, edge.port, edge.cpus, edge.folder) == (
+        ("ssh", "the edge"),
+        8000,
+        "2-3",
+        "/srv/dwell",
+    )
+    assert found.links[LINK.name].end == "off"
+    moved = replace(found, hosts={**found.hosts, "E": replace(edge, address="10.0.0.9")})
+    assert moved.digest != found.digest
+
+
+def test_every_fault_is_told_at_once(tmp_path: Path) -> None:
+    told = hosts()
+    del told["R2"]
+    told["E"] = {"run": "ssh 'edge", "port": 0, "cpus": "all", "folder": "dwell", "colour": "red"}
+    told["R9"] = {"run": "ssh r9", "address": "r9"}
+    links = {"R1->R9": {"begin": "on {jitter}", "end": ""}}
+    with pytest.raises(ProblemError) as caught:
+        load_inventory(
+            written(tmp_path, {"dwell-inventory": 1, "hosts": told, "links": links}), PROBLEM
+        )
+    paths = {fault.path for fault in caught.value.faults}
+    assert paths == {
+        "hosts.R2",
+        "hosts.R9",
+        *(f"hosts.E.{key}" for key in ("run", "port", "cpus", "folder", "colour", "address")),
+        "links.R1->R9",
+        "links.R1->R9.begin",
+        "links.R1->R9.end",
+    }
+
+
+@pytest.mark.parametrize("document", [None, [], {"hosts": {}}, {"dwell-inventory": 2}])
+def test_what_is_no_inventory_is_refused(tmp_path: Path, document: object) -> None:
+    with pytest.raises(ProblemError, match="dwell-inventory"):
+        load_inventory(written(tmp_path, document), PROBLEM)
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ProblemError, match="cannot be read"):
+        load_inventory(tmp_path / "none.yaml", PROBLEM)
+
+
+# --------------------------------------------------------------------- commands over there
+
+
+def test_a_command_ends_when_it_is_told_to(tmp_path: Path) -> None:
+    code = "import signal, sys; signal.signal(15, lambda *_: sys.exit(7)); print('up', flush=True)"
+    code += "; signal.pause(); signal.pause()"
+    script = script_of([sys.executable, "-c", code], str(tmp_path), {"DWELL_X": "it's"})
+    with subprocess.Popen(local_words(SHELL, script), stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"up\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 7
+
+
+def test_a_command_has_its_variables_and_its_code(tmp_path: Path) -> None:
+    code = f"import os, sys; print(os.environ['DWELL_X'], os.environ['{OWNER}'], os.getcwd())"
+    script = script_of(
+        [sys.executable, "-c", f"{code}; sys.exit(3)"], str(tmp_path), {"DWELL_X": "it's"}
+    )
+    done = subprocess.run(local_words(SHELL, script), capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    value, owner, folder = done.stdout.split()
+    assert value == "it's"
+    assert int(owner) != os.getpid()
+    assert Path(folder) == tmp_path
+
+
+def test_what_it_started_ends_with_it_where_its_caller_is_killed(tmp_path: Path) -> None:
+    line = "sleep 1000 & echo $! > child; sleep 1000"
+    script = script_of(["sh", "-c", line], str(tmp_path), {"DWELL_X": "1"}, whole=True)
+    process = subprocess.Popen(local_words(SHELL, script))
+    child = tmp_path / "child"
+    until(lambda: child.is_file() and child.read_text().strip() != "")
+    pid = int(child.read_text())
+    process.kill()
+    process.wait()
+    until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == "zombie")
+
+
+# ------------------------------------------------------------------------------- the hosts
+
+
+def test_paths_and_interpreter_become_those_over_there(tmp_path: Path) -> None:
+    over_there = inventory(tmp_path / "far")
+    cell = RealHosts(PROBLEM, over_there, tmp_path / "here", name="one")
+    words = cell.inside("E", [sys.executable, "-m", "dwell", str(tmp_path / "here" / "cell.yaml")])
+    assert f"{tmp_path}/far/dwell-one-E/cell.yaml" in words[-1]
+    assert str(tmp_path / "here") not in words[-1]
+    assert cell.problem.live.hosts["R2"].port != cell.problem.live.hosts["R1"].port
+
+
+def test_files_go_there_and_runs_come_back(tmp_path: Path) -> None:
+    cell = RealHosts(PROBLEM, inventory(tmp_path / "far"), tmp_path / "here", name="one")
+    cell.folder.mkdir()
+    there = tmp_path / "far" / f"dwell-one-{PROBLEM.controller_node}"
+    cell.shell("E", f"mkdir -p {there}/runs/7 && cat > {there}/runs/7/run.json", b"{}")
+    cell.fetch_runs()
+    assert (tmp_path / "here" / "runs" / "7" / "run.json").read_bytes() == b"{}"
+
+
+def test_a_line_that_fails_is_an_error_with_its_reason(tmp_path: Path) -> None:
+    cell = RealHosts(PROBLEM, inventory(tmp_path), tmp_path, name="one")
+    with pytest.raises(LiveError, match=r"E: .* ended with code 4 \(no such thing\)"):
+        cell.shell("E", "echo no such thing >&2; exit 4")
+
+
+def test_a_name_that_would_be_a_path_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LiveError, match=r"name is '\.\./other'"):
+        RealHosts(PROBLEM, inventory(tmp_path), tmp_path, name="../other")
+
+
+def test_disturbances_are_played_by_the_inventorys_commands(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    commands = LinkCommands(
+        f"echo on {{mean_ms}} {{std_ms}} {{loss_percent}} >> {log}", f"echo off >> {log}"
+    )
+    cell = RealHosts(PROBLEM, inventory(tmp_path, **{LINK.name: commands}), tmp_path, name="one")
+    item = LinkDisturbance(LINK.source, LINK.target, add_delay_ms=Normal(25.0, 5.0), loss=0.02)
+    cell.apply(Change(0.0, item, begins=True))
+    cell.apply(Change(1.0, item, begins=False))
+    assert log.read_text().splitlines() == ["on 25.0 5.0 2.0", "off"]
+
+
+def test_stress_runs_until_it_ends(tmp_path: Path) -> None:
+    threads = tmp_path / "threads"
+    over_there = inventory(tmp_path)
+    line = f"echo {{threads}} > {threads}; sleep 1000"
+    over_there = replace(
+        over_there,
+        hosts={name: replace(host, stress=line) for name, host in over_there.hosts.items()},
+    )
+    cell = RealHosts(PROBLEM, over_there, tmp_path, name="one")
+    Path(cell.there("E")).mkdir(parents=True)
+    item = NodeDisturbance("E", stress_threads=3)
+    cell.apply(Change(0.0, item, begins=True))
+    until(lambda: threads.is_file() and threads.read_text() == "3\n")
+    process = next(iter(cell.stress.values()))
+    cell.apply(Change(1.0, item, begins=False))
+    assert process.poll() is not None
+
+
+def test_links_without_commands_are_refused(tmp_path: Path) -> None:
+    changes = changes_of(PROBLEM, "network-impairment")
+    with pytest.raises(LiveError, match="no commands that disturb"):
+        require_commands(inventory(tmp_path), changes)
+    links = {
+        change.item.link: LinkCommands("true", "true")
+        for change in changes
+        if isinstance(change.item, LinkDisturbance)
+    }
+    require_commands(inventory(tmp_path, **links), changes)

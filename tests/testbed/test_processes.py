@@ -1,0 +1,108 @@
+"""Agents and controller of cells: how they are started, and that none is left."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import dwell
+from dwell.errors import LiveError
+from dwell.io import from_document
+from dwell.live.leash import OWNER
+from dwell.model import Problem
+from dwell.testbed.processes import Processes, expected
+from tests.testbed.light_cell import document
+
+# Notes its words and its owner, and stays; it takes SIGTERM as it comes.
+STAYS = (
+    "import json, os, sys, time; "
+    "print(json.dumps([sys.argv[1:], os.environ['{owner}'], os.environ['MINE']]), flush=True); "
+    "time.sleep(60)"
+).replace("{owner}", OWNER)
+
+
+@pytest.fixture
+def problem() -> Problem:
+    return from_document(document())
+
+
+def stays(node: str, words: Sequence[str]) -> Sequence[str]:
+    """Run something else with the words."""
+    return [sys.executable, "-c", STAYS, node, *words]
+
+
+def logged(file: Path) -> str:
+    """What a process has said, once it has."""
+    until = time.monotonic() + 30
+    while not (file.exists() and file.read_text().endswith("\n")) and time.monotonic() < until:
+        time.sleep(0.02)
+    return file.read_text()
+
+
+def test_each_runs_where_it_belongs_with_what_it_needs(problem: Problem, tmp_path: Path) -> None:
+    processes = Processes([problem], tmp_path, inside=stays, environment={"MINE": "yes"})
+    processes.write()
+    assert dwell.load(tmp_path / "cell.yaml") == problem
+    try:
+        processes.start_agent("R1")
+        processes.start_controllers(more=["--policy", "LOC"])
+        assert processes.running.keys() == {"agent@R1", "controller@E"}
+        agent = logged(tmp_path / "agent@R1.log")
+        assert f'["R1", "{sys.executable}", "-m", "dwell", "agent", "--node", "R1"' in agent
+        assert f'"--cell", "{tmp_path}/cell.yaml"], "{os.getpid()}", "yes"]' in agent
+        assert '"--policy", "LOC"' in logged(tmp_path / "controller@E.log")
+        started = list(processes.running.values())
+    finally:
+        processes.stop()
+    assert processes.running == {}
+    assert all(one.poll() is not None for one in started)
+
+
+def test_cells_that_share_a_node_have_an_agent_each_and_one_controller(
+    problem: Problem, tmp_path: Path
+) -> None:
+    other = replace(problem, name="other")
+    processes = Processes([problem, other], tmp_path, inside=stays, environment={"MINE": ""})
+    processes.write()
+    try:
+        processes.start_agent("E")
+        processes.start_controllers()
+        assert processes.running.keys() == {"agent@E of light", "agent@E of other", "controller@E"}
+        told = logged(tmp_path / "controller@E.log")
+        for name in ("light", "other"):
+            assert f"{tmp_path}/{name}/cell.yaml" in told
+        for one in processes.running.values():
+            one.kill()
+        processes.forget("E")
+        assert processes.running == {}
+    finally:
+        processes.stop()
+
+
+def test_two_cells_of_one_name_are_refused(problem: Problem, tmp_path: Path) -> None:
+    with pytest.raises(LiveError, match="two cells have one name"):
+        Processes([problem, problem], tmp_path)
+
+
+def test_a_cell_that_is_written_elsewhere_still_finds_its_traces(tmp_path: Path) -> None:
+    (tmp_path / "delays.csv").write_text("delay\n1.5\n2.5\n")
+    links = [dict(link) for link in document()["links"]]
+    links[0]["delay_ms"] = {"trace": {"file": "delays.csv", "column": "delay", "by": "row"}}
+    problem = from_document(document(links=links), folder=tmp_path)
+    processes = Processes([problem], tmp_path / "out", traces=tmp_path)
+    processes.write()
+    link = dwell.load(tmp_path / "out" / "cell.yaml").fabric.links["R1->E"]
+    assert link.delay_ms.expectation == 2.0
+
+
+def test_everybody_but_the_controller_is_expected(problem: Problem) -> None:
+    found = expected(problem, "E")
+    assert "agent@E" in found
+    assert "perception@E" in found
+    assert "controller@E" not in found

@@ -1,0 +1,66 @@
+"""A short campaign on a real testbed: two scenarios, three policies."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+import dwell
+from dwell.errors import LiveError
+from dwell.record import open_run
+from dwell.report.campaign_page import campaign_html
+from dwell.study.campaign import read_measured
+from dwell.testbed.campaign import Campaign, entrant
+from dwell.testbed.execution import read_campaign, run_campaign
+from dwell.testbed.idle import Quiet
+from dwell.testbed.run import require_machine, run_once
+from tests.testbed.machine import own_name
+
+CELL = Path(__file__).parents[2] / "examples" / "testbed" / "cell.yaml"
+#: Of each run; less only for a quick look.
+SECONDS = float(os.environ.get("DWELL_CAMPAIGN_SECONDS", "30"))
+SCENARIOS, POLICIES = ("baseline", "network-impairment"), ("LOC", "SO", "cusum+corrected")
+#: Others may use the machine that tests run on: that is recorded, and not waited for.
+QUIET = Quiet(for_s=1.0, patience_s=1.0)
+
+
+def _missing() -> str:
+    """Why this machine cannot run the testbed; empty if it can."""
+    try:
+        require_machine([dwell.load(CELL)])
+    except LiveError as error:
+        return str(error)
+    return ""
+
+
+def test_a_campaign_is_measured_and_reported(tmp_path: Path) -> None:
+    why = _missing()
+    if why:
+        pytest.skip(why)
+    problem = dwell.load(CELL)
+    asked = Campaign(
+        problem, SCENARIOS, tuple(entrant(problem, name) for name in POLICIES), 1, SECONDS
+    )
+    folder = tmp_path / "there"
+    told: list[str] = []
+    state = run_campaign(
+        asked, folder, run_once, name=own_name(), quiet=QUIET, repeats=1, tell=told.append
+    )
+    print("\n".join(told), file=sys.stderr)
+    # Pressure of other work may spoil runs of this one, and errors may not.
+    kept = read_campaign(folder)
+    assert [one for one in kept.failed if one["outcome"] == "error"] == []
+    assert state.done + len(state.given_up) == 6
+    for path in kept.done:
+        run = open_run(path)
+        assert run.meta["kind"] == "live"
+        assert run.windows.height > problem.warmup_windows
+        assert run.has_jobs
+    if not state.done:
+        pytest.skip("the machine was the bottleneck in every run")
+    measured = read_measured(folder)
+    assert measured.kinds == {"live"}
+    assert "What jobs and messages took" in campaign_html(measured)
