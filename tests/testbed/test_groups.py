@@ -158,7 +158,7 @@ def test_version_two_is_told_what_it_is_to_share(tmp_path: Path) -> None:
     group = tmp_path / "dwell-t" / "A"
     assert (tmp_path / "cgroup.subtree_control").read_text() == "+cpuset"
     assert (tmp_path / "dwell-t" / "cgroup.subtree_control").read_text() == "+cpu +cpuset"
-    assert (tmp_path / "dwell-t" / "cpu.weight").read_text() == "100"
+    assert (tmp_path / "dwell-t" / "cpu.weight").read_text() == "10000"
     assert (group / "cpu.max").read_text() == "1600 4000"
     assert (group / "cpuset.cpus").read_text() == str(CPU)
     assert groups.inside("A", ["true"])[-1] == "true"

@@ -10,7 +10,7 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import combinations
@@ -26,7 +26,7 @@ from dwell.model import Host, Link, Node, NodeDisturbance, Problem
 from dwell.model.scenario import Disturbance
 from dwell.testbed.allotment import allot, nodes_of
 from dwell.testbed.conditions import Conditions
-from dwell.testbed.groups import Groups
+from dwell.testbed.groups import PROBES, Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
 from dwell.testbed.link import TunLink
@@ -135,6 +135,8 @@ class Bed:
         Further arguments of the controllers.
     cpus : sequence of int, optional
         Those that nodes may use; all that this process may use if left out.
+    environment : mapping of str to str, optional
+        Variables that all processes get as well.
 
     Attributes
     ----------
@@ -160,6 +162,7 @@ class Bed:
         beside: Path | None = None,
         more: Sequence[str] = (),
         cpus: Sequence[int] | None = None,
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
         require_playable(self.problems)
@@ -171,6 +174,7 @@ class Bed:
         self.stress: dict[str, Stress] = {}
         self._usual = _links_of(self.problems)
         self._beside, self._more = beside, tuple(more)
+        self._environment = dict(environment or {})
         self._on: list[Disturbance] = []
         self._claim = Claim(name, list(self.nodes))
         self._claimed = False
@@ -213,7 +217,7 @@ class Bed:
         enter = self._stack.enter_context
         nodes, pairs = list(self.nodes), _pairs_of(self.problems)
         self._hosts = enter(Hosts(self.name, nodes, pairs))
-        self._groups = enter(Groups(self.name, self.shares))
+        self._groups = enter(Groups(self.name, {**self.shares, PROBES: Share()}))
         self.problems = _with_hosts(self.problems, self._hosts.address)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._losses = enter(LossFile(self.folder / LOSS_FILE, nodes, seed=self.seed))
@@ -231,6 +235,7 @@ class Bed:
             # Its hosts' addresses lead nowhere but to each other.
             INSECURE: "1",
             **_modules(self._beside),
+            **self._environment,
         }
         self._processes = Processes(
             self.problems,
@@ -243,6 +248,20 @@ class Bed:
         self._processes.write()
         self._stack.callback(self._processes.stop)
         self.watchers = tuple(enter(self._watcher(problem)) for problem in self.problems)
+
+    @property
+    def processes(self) -> Processes:
+        """Agents and controllers."""
+        return self._processes
+
+    @property
+    def probing(self) -> list[str]:
+        """First words of a command that runs as weighty as the nodes do, and belongs to none."""
+        return self._groups.inside(PROBES, [])
+
+    def beside(self, node: str) -> list[str]:
+        """Return a command's first words that have it run on a node's host, outside its group."""
+        return self._hosts.inside(node, [])
 
     def _inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
         return self._groups.inside(node, self._hosts.inside(node, words))

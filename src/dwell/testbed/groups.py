@@ -22,7 +22,7 @@ from dwell.errors import LiveError
 from dwell.model import Quota
 from dwell.testbed.cgroups import Cgroups, find_cgroups
 
-__all__ = ["Groups", "Share", "group_name", "remove_group"]
+__all__ = ["PROBES", "Groups", "Share", "group_name", "remove_group"]
 
 #: What the kernel takes (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).
 MIN_US = 1_000
@@ -76,6 +76,11 @@ def _missing(node: str, share: Share) -> list[str]:
 def _microseconds(quota: Quota) -> tuple[int, int]:
     """Return period and run time in it, as the kernel takes them."""
     return round(quota.period_ms * 1e3), round(quota.cpu * quota.period_ms * 1e3)
+
+
+#: A group beside those of the nodes, as heavy as they are, for what watches them. No node has
+#: such a name.
+PROBES = "~probes"
 
 
 def group_name(name: str) -> str:
@@ -177,12 +182,19 @@ class Groups:
             _write(control, " ".join(f"+{name}" for name in wanted))
 
     def _weigh(self) -> None:
-        """Give the group of all as much weight as its groups would have beside it."""
+        """Give the group of all its weight beside everything else on the machine.
+
+        Where every node has a quota it is the highest there is: the quotas leave the machine its
+        part, and nothing else shall decide what a node gets. Otherwise it is what the nodes' groups
+        would have by themselves.
+        """
         folder, count = self._cgroups.folders["cpu"] / self._parent, max(1, len(self._shares))
+        nodes = [share for name, share in self._shares.items() if name != PROBES]
+        bounded = all(share.quota is not None for share in nodes)
         if self._cgroups.version == 2:
-            _write(folder / "cpu.weight", str(min(100 * count, 10_000)))
+            _write(folder / "cpu.weight", str(10_000 if bounded else min(100 * count, 10_000)))
         else:
-            _write(folder / "cpu.shares", str(min(1_024 * count, 262_144)))
+            _write(folder / "cpu.shares", str(262_144 if bounded else min(1_024 * count, 262_144)))
 
     def _limit(self, node: str, quota: Quota) -> None:
         period_us, quota_us = _microseconds(quota)

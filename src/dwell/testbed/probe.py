@@ -1,7 +1,7 @@
 """Probe: how late a process that wants little of a CPU gets it.
 
-It sleeps 5 ms, and notes how much later than that it runs again: at normal priority, and in no
-node's group, so that no quota delays it. Nodes that use what their quotas grant make it late by
+It sleeps 5 ms, and notes how much later than that it runs again: at normal priority, in a group as
+weighty as the nodes' and without a quota. Nodes that use what their quotas grant make it late by
 less than one period of a quota; a machine that stands still, or has more to do than it can, makes
 it later.
 """
@@ -13,6 +13,7 @@ import gc
 import os
 import select
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -44,11 +45,13 @@ class Probe(Started):
     Parameters
     ----------
     cpu : int
+    prefix : sequence of str
+        First words of its command.
     """
 
-    def __init__(self, cpu: int) -> None:
+    def __init__(self, cpu: int, prefix: Sequence[str] = ()) -> None:
         self.cpu = cpu
-        self._child = Child("dwell.testbed.probe", f"probe of CPU {cpu}")
+        self._child = Child("dwell.testbed.probe", f"probe of CPU {cpu}", prefix=prefix)
 
     def start(self) -> None:
         """Start it.

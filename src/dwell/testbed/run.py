@@ -171,7 +171,7 @@ def _play(
         bed.apply(change)
         played.changed(change)
 
-    with Sampler(bed.cpus, bed.used_ns, links, clock, rule) as sampler:
+    with Sampler(bed.cpus, bed.used_ns, links, clock, rule, bed.probing) as sampler:
         samplers.append(sampler)
         play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
     bed.stop_controllers()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
@@ -38,6 +38,8 @@ class Sampler:
     clock : callable
         The run's, ns.
     rule : Rule
+    prefix : sequence of str
+        First words of the probes' commands.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class Sampler:
         links: Mapping[str, TunLink],
         clock: Callable[[], int],
         rule: Rule,
+        prefix: Sequence[str] = (),
     ) -> None:
         self.samples: list[Sample] = []
         #: What kept it from going on, if anything did.
@@ -55,7 +58,7 @@ class Sampler:
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
         self._first_late = next((i for i, ms in enumerate(LATE_MS) if ms >= rule.late_ms), 0) + 1
-        self._probes = [Probe(cpu) for cpu in self._cpus]
+        self._probes = [Probe(cpu, prefix) for cpu in self._cpus]
         self._stopped = threading.Event()
         self._stack = ExitStack()
         self._thread = threading.Thread(target=self._run, name="sampler", daemon=True)
