@@ -288,3 +288,12 @@ def test_faults_are_printed_with_their_lines() -> None:
     assert str(ProblemError("no")) == "no"
     again = pickle.loads(pickle.dumps(error))
     assert (again.faults, again.source) == (error.faults, error.source)
+
+
+@settings(max_examples=20)
+@given(problem=problems())
+def test_a_placement_that_never_moves_begins_on_itself(problem: Problem) -> None:
+    for name in problem.candidates:
+        assert problem.under(name).initial == name
+        assert problem.under(name).controller.policy == name
+    assert problem.under("atp").initial == problem.initial

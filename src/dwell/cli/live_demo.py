@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,7 @@ def play(
     with importlib.resources.as_file(importlib.resources.files("dwell.demo") / "cell.yaml") as file:
         problem = dwell.load(file)
     if policy is not None:
-        problem = replace(problem, controller=replace(problem.controller, policy=policy))
+        problem = problem.under(policy)
     changes = changes_of(problem, scenario)
     make_folder(out, MARK, "a demo's")
     problem = on_this_machine(problem)

@@ -145,8 +145,8 @@ def _bursts(path: str, bursts: Bursts | None, **more: object) -> Document | None
 
 
 def _quota(quota: Quota) -> Document:
-    slack_ms = quota.slack_ms or None
-    return _filled({"cpu": quota.cpu, "period_ms": quota.period_ms, "slack_ms": slack_ms})
+    more = {"slack_ms": quota.slack_ms or None, "tick_ms": quota.tick_ms or None}
+    return _filled({"cpu": quota.cpu, "period_ms": quota.period_ms, **more})
 
 
 def _node(node: Node) -> Document:

@@ -17,6 +17,7 @@ from dwell.model.bounds import (
     QUOTA_CPU,
     QUOTA_PERIOD_MS,
     QUOTA_SLACK_MS,
+    QUOTA_TICK_MS,
     RATE_MBPS,
     RETRANSMIT_MS,
     require,
@@ -62,16 +63,23 @@ class Quota:
     slack_ms : float
         Run time that a core has drawn and keeps, beyond the end of a period, when it goes idle.
         Linux keeps 1 ms.
+    tick_ms : float
+        Time between the ticks at which the kernel notices that the quota is used up, and lets
+        threads take turns; 0 for a kernel that notices at once and shares evenly. Linux: 1000 / HZ.
     """
 
     cpu: float
     period_ms: float
     slack_ms: float = 0.0
+    tick_ms: float = 0.0
 
     def __post_init__(self) -> None:
         QUOTA_CPU.check("quota.cpu", self.cpu)
         QUOTA_PERIOD_MS.check("quota.period_ms", self.period_ms)
         QUOTA_SLACK_MS.check("quota.slack_ms", self.slack_ms)
+        QUOTA_TICK_MS.check("quota.tick_ms", self.tick_ms)
+        # In nanoseconds it must not be none.
+        require(not 0 < self.tick_ms < 0.001, "quota.tick_ms", self.tick_ms, "0, or 0.001 at least")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +126,9 @@ class Node:
         BACKGROUND.check("background", self.background)
         bound = f"less than {self.capacity:g}, what the node can do"
         require(self.background < self.capacity, "background", self.background, bound)
+        if self.quota is not None and self.quota.tick_ms > 0:
+            tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
+            require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
         object.__setattr__(self, "accelerators", FrozenDict(self.accelerators))
 
     @property

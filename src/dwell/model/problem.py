@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import (
@@ -198,6 +198,17 @@ class Problem:
     def initial(self) -> str:
         """Name of the candidate that a run starts with."""
         return self.controller.initial or next(iter(self.candidates))
+
+    def under(self, policy: str) -> Problem:
+        """Return the problem with another policy, which begins where it belongs.
+
+        Parameters
+        ----------
+        policy : str
+            Its name; a candidate's for the placement that never moves, and so begins on it.
+        """
+        initial = policy if policy in self.candidates else self.controller.initial
+        return replace(self, controller=replace(self.controller, policy=policy, initial=initial))
 
     @property
     def censor_ms(self) -> float:

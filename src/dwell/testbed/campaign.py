@@ -9,7 +9,7 @@ their seed, and are compared as a pair.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,7 +57,7 @@ class Entrant(NamedTuple):
     def problem(self, problem: Problem) -> Problem:
         """Return the cell as it is run for this policy."""
         seen = with_settings(problem, {"controller.estimator": self.estimator})
-        return replace(seen, controller=replace(seen.controller, policy=self.policy))
+        return seen.under(self.policy)
 
 
 class Planned(NamedTuple):

@@ -323,7 +323,7 @@ def run_on_hosts(
         If something cannot be played there, or the cell does not come up.
     """
     by_name(policy, problem)
-    problem = replace(problem, controller=replace(problem.controller, policy=policy))
+    problem = problem.under(policy)
     changes = changes_of(problem, scenario)
     hosts = RealHosts(problem, inventory, out, name=name, more=["--jobs"] if jobs else [])
     require_commands(inventory, changes)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +110,9 @@ def run_once(
         Before anything has been changed, if the cell, the scenario or the policy cannot be played
         here; later, if the cell does not come up, or has written no run.
     """
-    problem = _with_policy(problem, policy)
+    if policy is not None:
+        by_name(policy, problem)
+        problem = problem.under(policy)
     changes = changes_of(problem, scenario, outages=True)
     arguments = ["--jobs"] if jobs else []
     bed = Bed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
@@ -146,13 +147,6 @@ def run_once(
     _seal(folder, bed, played, samplers, rule, interrupted=False)
     shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder
-
-
-def _with_policy(problem: Problem, policy: str | None) -> Problem:
-    if policy is None:
-        return problem
-    by_name(policy, problem)
-    return replace(problem, controller=replace(problem.controller, policy=policy))
 
 
 def _play(
