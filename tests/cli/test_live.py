@@ -99,6 +99,7 @@ class RealCell:
         self.problem = dwell.load(self.file)
         assert PORTS_PER_ROLE * len(roles(self.problem)) < 3 * 40
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.environment: dict[str, str] = dict(os.environ)
 
     def start(self, name: str, *arguments: str | Path) -> subprocess.Popen[bytes]:
         """Start a command; what it prints goes to a file."""
@@ -139,7 +140,7 @@ class RealCell:
         """Ask for the status until something holds."""
         limit_s = time.monotonic() + PATIENCE_S
         found: dict[str, Any] = {}
-        with Visitor(self.problem) as visitor:
+        with Visitor(self.problem, self.environment) as visitor:
             while time.monotonic() < limit_s:
                 try:
                     found = visitor.ask("status", patience_s=1.0)

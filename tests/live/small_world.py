@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
 from dwell.live.cell import Cell
-from dwell.live.keys import Keys
+from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
-from dwell.live.role import Place
+from dwell.live.role import Place, Sealing
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Entry, Stamper
@@ -166,6 +166,8 @@ class World:
         How long a job takes.
     delay_ms : float
         Of every message.
+    seals : mapping of str to Sealing, optional
+        By subject: each node and the controller.
     """
 
     def __init__(
@@ -177,6 +179,7 @@ class World:
         clocks: Mapping[str, Clock] | None = None,
         stages: Mapping[str, Callable[[str], Passing]] | None = None,
         policy: str | MinimalPolicy | None = None,
+        seals: Mapping[str, Sealing] | None = None,
     ) -> None:
         hosts = {
             node: Host("127.0.0.1", 10_000 + 1_000 * i)
@@ -200,6 +203,7 @@ class World:
         self.run_id = 1
         self.number = 0
         self.policy = policy
+        self.seals = seals or {}
         self.recorder = MemoryRecorder()
         for role in roles(problem):
             if role.kind != "controller" or policy is not None:
@@ -211,7 +215,9 @@ class World:
         role = next(role for role in roles(self.problem) if role.who == who)
         clock = self.clocks.get(role.node, Clock())
         end = self.network.transport(who, role.node, clock=clock)
-        place = Place(self.problem, who, role.node, end, self.lives)
+        subject = CONTROLLER if role.kind == "controller" else role.node
+        seals = self.seals.get(subject)
+        place = Place(self.problem, who, role.node, end, self.lives, seals=seals)
         made: Stamper | Sink | Quiet | Cell | Bench
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.run_id, end.now_ns)

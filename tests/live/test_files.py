@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
 from dwell.live.stamper import Entry
@@ -94,3 +95,34 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(LiveError, match="file/inside: cannot be made"):
         make_folder(tmp_path / "file" / "inside")
+
+
+def test_a_book_that_is_spoilt_is_that_of_the_time_before(tmp_path: Path) -> None:
+    path = tmp_path / "stamper.book"
+    book = BookFile(path)
+    entries = [Entry(7, 1024 * term, term, "SO", False) for term in range(1, 4)]
+    for entry in entries:
+        book.write(entry)
+    content = bytearray(path.read_bytes())
+    content[content.index(b'"term": 3')] ^= 1
+    path.write_bytes(content)
+    assert BookFile(path).read() == entries[1]
+
+
+@pytest.mark.skipif(not may_mount(), reason="nobody but root mounts a disk")
+def test_a_full_disk_keeps_nobody_from_remembering(tmp_path: Path) -> None:
+    folder = tmp_path / "disk"
+    with SmallDisk(folder) as disk:
+        book, highest = BookFile(folder / "book"), HighestFile(folder / "highest")
+        inflight = InFlight(folder / "inflight")
+        disk.fill()
+        entry = Entry(7, 1024, 3, "SO", True)
+        book.write(entry)
+        highest.store(7, 12)
+        inflight.begin(b"x" * 100_000)
+        inflight.end()
+        assert BookFile(folder / "book").read() == entry
+        assert HighestFile(folder / "highest").load() == (7, 12)
+        assert InFlight.read(folder / "inflight") is None
+        with pytest.raises(LiveError, match="No space left"):
+            BookFile(folder / "another")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.live import supervision
 from dwell.live.files import InFlight
 from dwell.live.supervision import Child, Supervisor
@@ -145,3 +147,24 @@ def test_what_does_not_listen_is_killed(tmp_path: Path, said: list[str]) -> None
     for pid in pids:
         assert pid is not None
         assert not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.skipif(not may_mount(), reason="nobody but root mounts a disk")
+def test_an_agent_outlives_a_full_disk(tmp_path: Path) -> None:
+    said: list[str] = []
+    with SmallDisk(tmp_path / "disk") as disk:
+        supervisor = Supervisor(disk.folder, said.append)
+        disk.fill()
+        child = supervisor.keep("worker@E", [sys.executable, "-c", "import time; time.sleep(60)"])
+        try:
+            supervisor.step()
+            supervisor.tend()
+            assert "No space left" in "; ".join(said)
+            assert not child.mark.exists()
+            disk.clear()
+            child.next_s = 0.0
+            supervisor.step()
+            supervisor.tend()
+            assert json.loads(child.mark.read_text())["pid"] == child.pid
+        finally:
+            supervisor.stop()

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
-from dwell.live.keys import Keys
-from dwell.live.permissions import CONTROLLER, senders, subjects
+from dwell.live.keys import CONTROLLER, Keys
+from dwell.live.permissions import senders, subjects
 from dwell.live.transport.expressions import matcher
 from dwell.live.transport.memory import MemoryTransport
 from dwell.live.wiring import roles

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -224,6 +225,38 @@ def demo(
     play(out, scenario, seconds, policy, seed, as_json=as_json)
 
 
+@live.command()
+def chaos(
+    cell: Annotated[
+        Path | None,
+        typer.Argument(metavar="[CELL]", help="Cell file; a light cell if not given."),
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
+    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the timeline.")] = 1,
+    only: Annotated[
+        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
+    ] = None,
+    hosts: Annotated[
+        bool,
+        typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
+
+    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
+    after the other, by a seed, for two minutes if nothing else is said.
+    """
+    from dwell.cli.chaos import run_chaos
+
+    run_chaos(cell, minutes, faults, seed, only, out, hosts=hosts, as_json=as_json)
+
+
 def _ask(
     cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
 ) -> None:
@@ -339,4 +372,6 @@ def _until_told() -> threading.Event:
 
 
 def _say(line: str) -> None:
-    typer.echo(line, err=True)
+    # A log on a disk that is full must not end who writes it.
+    with suppress(OSError):
+        typer.echo(line, err=True)

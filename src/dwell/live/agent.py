@@ -225,4 +225,4 @@ class Agent:
         spent = busy_ns, self._spent["own"], self._spent["shadow"]
         each = *processes.items(), (place.who, time.process_time_ns())
         load = Load(place.node, place.life, now_ns, *spent, used, each)
-        place.put_twice(place.keys.load(place.node), encode(load))
+        place.put_twice(place.keys.load(place.node), load)

@@ -17,8 +17,6 @@ from dwell.live.messages import (
     Answer,
     Ask,
     Beat,
-    Completion,
-    Load,
     Order,
     Restored,
     Snapshot,
@@ -149,13 +147,15 @@ class Cell:
                 case "stamped":
                     self._stamped(decode(sample.payload, Stamped), now_ns)
                 case "done" | "ended" if windows is not None:
-                    windows.completed(decode(sample.payload, Completion), now_ns)
+                    windows.completed(self.place.completion(sample), now_ns)
                 case "load" if windows is not None:
-                    windows.loaded(decode(sample.payload, Load))
+                    windows.loaded(self.place.load(sample))
                 case "accepted":
-                    self._answered(decode(sample.payload, Accepted), now_ns)
+                    answer = self.place.read(sample, Accepted, lambda _: self.place.stamper[0])
+                    self._answered(answer, now_ns)
                 case "restored":
-                    self._restored(decode(sample.payload, Restored), now_ns)
+                    restored = self.place.read(sample, Restored, lambda told: told.node)
+                    self._restored(restored, now_ns)
                 case "ask":
                     self._asked(decode(sample.payload, Ask), now_ns)
                 case "look":
@@ -222,6 +222,8 @@ class Cell:
     def _answered(self, answer: Accepted, now_ns: int) -> None:
         if answer.controller != self.name:
             return
+        # One that asked before had a clock that is ahead of this one.
+        self._number = max(self._number, answer.newest)
         held = self.held
         if held is None:
             self._begin_run(answer)
@@ -248,7 +250,7 @@ class Cell:
         if self.place.stamper[1] in self.pulse.strangers:
             # Its candidates may be others, of the same names.
             return
-        self.place.transport.put(self.place.keys.order(), encode(order))
+        self.place.put(self.place.keys.order(), order)
 
     def _next_number(self) -> int:
         self._number += 1
@@ -302,7 +304,7 @@ class Cell:
             number = self._next_number()
             move.awaited[number] = task
             asked = Snapshot(number, task, old[task], to, held.run, held.cycle)
-            self.place.transport.put(keys.snapshot(task, old[task]), encode(asked))
+            self.place.put(keys.snapshot(task, old[task]), asked)
 
     def _restored(self, restored: Restored, now_ns: int) -> None:
         move = self._move

@@ -7,6 +7,7 @@ import mmap
 import os
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,6 +19,9 @@ __all__ = ["BookFile", "HighestFile", "InFlight", "make_folder"]
 # Run and cycle, and a checksum of the two.
 _SLOT = struct.Struct("<qqI")
 _LENGTH = struct.Struct("<QI")
+# How often the book had been written, the length of what was, and a checksum of both.
+_PAGE = struct.Struct("<QII")
+_BOOK_BYTES = 2_048
 
 
 def make_folder(path: Path) -> Path:
@@ -37,27 +41,80 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+def _mapped(path: Path, size: int) -> mmap.mmap:
+    """Map a file of a fixed length, which is made where it is missing or has another one.
+
+    Its place on the disk is taken at once: who writes to it later needs none that might not be
+    there, and would be killed for that.
+
+    Raises
+    ------
+    OSError
+        If the disk is full.
+    """
+    with path.open("a+b") as file:
+        if file.seek(0, os.SEEK_END) != size:
+            file.truncate(0)
+        os.posix_fallocate(file.fileno(), 0, size)
+        return mmap.mmap(file.fileno(), size)
+
+
 class BookFile:
-    """A stamper's `Entry` as a small file, replaced as a whole."""
+    """A stamper's `Entry`, in two slots of mapped memory written in turn.
+
+    A disk that is full keeps nobody from writing it, and a process that dies while it writes spoils
+    the slot only that was not the last.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    LiveError
+        If it is not there yet, and the disk is full.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        try:
+            self._map = _mapped(path, 2 * _BOOK_BYTES)
+        except OSError as error:
+            raise LiveError(f"{path}: cannot be made ({error.strerror})") from None
+        self._number = max((number for number, _ in self._good()), default=0)
+
+    def _good(self) -> Iterator[tuple[int, Entry]]:
+        """Yield the good slots: how often it had been written then, and what was."""
+        for turn in (0, 1):
+            begin = turn * _BOOK_BYTES
+            number, length, check = _PAGE.unpack_from(self._map, begin)
+            text = self._map[begin + _PAGE.size : begin + _PAGE.size + length]
+            if not number or zlib.crc32(text, number & 0xFFFFFFFF) != check:
+                continue
+            try:
+                entry = Entry(**json.loads(text))
+            except (ValueError, TypeError):
+                continue
+            numbers = (entry.run, entry.reserved, entry.term)
+            if all(type(n) is int and n >= 0 for n in numbers):
+                yield number, entry
 
     def read(self) -> Entry | None:
         """Return what was written last; None where nothing was, or it cannot be read."""
-        try:
-            values = json.loads(self.path.read_text(encoding="utf-8"))
-            entry = Entry(**values)
-        except (OSError, ValueError, TypeError):
-            return None
-        numbers = (entry.run, entry.reserved, entry.term)
-        return entry if all(type(n) is int and n >= 0 for n in numbers) else None
+        found = max(self._good(), key=lambda one: one[0], default=None)
+        return None if found is None else found[1]
 
     def write(self, entry: Entry) -> None:
-        """Replace the file."""
-        draft = self.path.with_suffix(".new")
-        draft.write_text(json.dumps(asdict(entry)), encoding="utf-8")
-        draft.replace(self.path)
+        """Write the slot that was not the last."""
+        text = json.dumps(asdict(entry)).encode()
+        number = self._number + 1
+        begin = number % 2 * _BOOK_BYTES
+        place = begin + _PAGE.size
+        if place + len(text) > begin + _BOOK_BYTES:
+            raise LiveError(f"the placement's name is too long: {entry.placement[:40]}...")
+        self._map[place : place + len(text)] = text
+        check = zlib.crc32(text, number & 0xFFFFFFFF)
+        _PAGE.pack_into(self._map, begin, number, len(text), check)
+        self._number = number
 
 
 class HighestFile:
@@ -67,12 +124,7 @@ class HighestFile:
     """
 
     def __init__(self, path: Path) -> None:
-        size = 2 * _SLOT.size
-        with path.open("a+b") as file:
-            if file.seek(0, os.SEEK_END) != size:
-                file.truncate(0)
-                file.truncate(size)
-            self._map = mmap.mmap(file.fileno(), size)
+        self._map = _mapped(path, 2 * _SLOT.size)
         self._turn = 0
 
     def load(self) -> tuple[int, int]:
@@ -123,10 +175,12 @@ class InFlight:
             _LENGTH.pack_into(self._map, 0, 0, 0)
 
     def _grow(self, needed: int) -> None:
-        self._size = 1 << (needed - 1).bit_length()
-        with self._path.open("a+b") as file:
-            file.truncate(self._size)
-            self._map = mmap.mmap(file.fileno(), self._size)
+        """Make room; where the disk has none, nothing is noted, and the work goes on."""
+        size = 1 << (needed - 1).bit_length()
+        try:
+            self._map, self._size = _mapped(self._path, size), size
+        except OSError:
+            self._map, self._size = None, 0
 
     @staticmethod
     def read(path: Path) -> bytes | None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from dwell.errors import LiveError
+from dwell.live.clocks import wrong_clock
 from dwell.live.role import Role
 from dwell.live.stage import Message
 from dwell.live.transport.protocol import Sample, Transport
@@ -22,13 +23,14 @@ Clock = Callable[[], int]
 LONGEST_SLEEP_S = 0.2
 
 
-def clock_of(problem: Problem) -> Clock:
-    """Return what all processes of a live cell read the time from.
+def clock_of(problem: Problem, node: str = "") -> Clock:
+    """Return what all processes of a live cell, or of one of its nodes, read the time from.
 
     Where clocks are kept synchronous by others, that is the time of day; elsewhere a clock that
-    nobody sets.
+    nobody sets. In a trial it may be wrong on a node (see `dwell.live.clocks`).
     """
-    return time.time_ns if problem.live.clock == "system" else time.monotonic_ns
+    clock = time.time_ns if problem.live.clock == "system" else time.monotonic_ns
+    return wrong_clock(node, clock)
 
 
 def keep_collections_short() -> None:
@@ -91,7 +93,9 @@ class Hosted:
 
     def rest_ns(self) -> int:
         """Time until the role is due; negative where it is late."""
-        return self._due_ns - self.clock()
+        rest_ns = self._due_ns - self.clock()
+        # Nobody is left alone for longer: where it is more, the clock has been set back.
+        return rest_ns if rest_ns <= LONGEST_SLEEP_S * 1e9 else 0
 
     def wake(self) -> None:
         """Have the role do what is due."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 __all__ = ["Log"]
 
@@ -41,4 +42,6 @@ class Log:
                 return
             more = f" (and {self._left_out} lines before it)" if self._left_out else ""
             self._next_s, self._left_out = now_s + self._every_s, 0
-        self._say(f"{line}{more}")
+        # A log on a disk that is full must not end who writes it.
+        with suppress(OSError):
+            self._say(f"{line}{more}")

@@ -139,6 +139,8 @@ class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
         All jobs behind it, each once.
     shadow : bool
         Whether this is the shadow of the cycle and not the cycle itself.
+    seal : bytes
+        Signature of the stamp, by whoever has made it; empty without keys.
     """
 
     stamp: Stamp
@@ -147,6 +149,7 @@ class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
     kind: Annotated[str, msgspec.Meta(max_length=200)]
     hops: Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)] = ()
     shadow: bool = False
+    seal: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
 
 
 class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -423,6 +426,8 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Whether the guard's placement holds.
     proven : str
         Candidate that enough probes have completed through; empty for none.
+    newest : int
+        Highest number of an order that was carried out.
     """
 
     number: Count
@@ -434,12 +439,21 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     cycle: Count
     fallback: bool = False
     proven: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    newest: Count = 0
 
 
 T = TypeVar("T", bound=msgspec.Struct)
 
 _ENCODER = msgspec.msgpack.Encoder()
-_DECODERS: dict[type, msgspec.msgpack.Decoder[Any]] = {}
+# All made here, by one thread: msgspec crashes where a message is decoded in one thread while
+# another makes a decoder of a type that is part of both.
+_DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
+    kind: msgspec.msgpack.Decoder(kind)
+    for kind in (
+        *(Stamp, Stamped, Hop, Header, Completion, Heard, Beat, Order, Carried, Ask, Answer),
+        *(Load, Snapshot, State, Restored, Accepted),
+    )
+}
 
 
 def encode(message: msgspec.Struct) -> bytes:
@@ -465,10 +479,7 @@ def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
     """
     if len(data) > limit:
         raise LiveError(f"a {kind.__name__} of {len(data)} bytes; at most {limit} are read")
-    decoder = _DECODERS.get(kind)
-    if decoder is None:
-        decoder = _DECODERS[kind] = msgspec.msgpack.Decoder(kind)
     try:
-        return cast("T", decoder.decode(data))
+        return cast("T", _DECODERS[kind].decode(data))
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
         raise LiveError(f"no {kind.__name__}: {error}") from None

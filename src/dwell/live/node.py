@@ -19,7 +19,6 @@ from dwell.live.group import own_group
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, take_turns
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
-from dwell.live.role import Place
 from dwell.live.security import Security
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
@@ -79,6 +78,7 @@ def run_agent(
     wiring = wire(problem)
     who = f"agent@{node}"
     security = Security.of(problem, wiring.entry(who).role, environment)
+    security.remember(make_folder(folder))
     security.remind(say, stopped)
     transport = _listening(security, who, node)
     supervisor = Supervisor(make_folder(folder), say, environment=environment)
@@ -86,10 +86,10 @@ def run_agent(
         for role in wiring.on(node):
             if role.kind not in ("agent", "controller"):
                 supervisor.keep(role.who, command(role.who))
-        place = Place(problem, who, node, transport, time.time_ns(), say=Log(say))
+        place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
         agent = Agent(place, supervisor, _cpu_count(problem, node, say), gauge)
-        hosted = Hosted(agent, transport, clock_of(problem), stopped=stopped)
+        hosted = Hosted(agent, transport, clock_of(problem, node), stopped=stopped)
         keep_collections_short()
         hosted.run()
     finally:
@@ -180,7 +180,7 @@ def run_controller(
     if len(set(names)) < len(names):
         raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
     name = name or f"controller-{os.getpid()}"
-    # Cells take turns: none waits for long while others close their windows.
+    # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
     recorders = []
     with ExitStack() as stack:
@@ -192,13 +192,11 @@ def run_controller(
             security.remind(say, stopped)
             transport = security.transport(f"controller@{node}")
             stack.callback(transport.close)
-            place = Place(
-                *(problem, f"controller@{node}", node, transport, time.time_ns()), say=Log(say)
-            )
+            place = security.place(f"controller@{node}", node, transport, Log(say))
             controller = Controller(problem, policy)
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
-            clock = clock_of(problem)
-            cell = Cell(place, controller, recorder, name, clock())
+            clock = clock_of(problem, node)
+            cell = Cell(place, controller, recorder, name, time.time_ns())
             hosted.append(Hosted(cell, transport, clock, stopped=stopped, hurry=hurry))
             recorders.append((recorder, cell))
         keep_collections_short()

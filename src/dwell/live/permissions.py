@@ -8,15 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 
-from dwell.live.keys import MAIN, SHADOW, Keys
+from dwell.live.keys import CONTROLLER, MAIN, SHADOW, Keys
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.trust.roster import Roster
 
-__all__ = ["CONTROLLER", "senders", "subjects"]
-
-#: Subject that orders.
-CONTROLLER = "controller"
+__all__ = ["senders", "subjects"]
 
 
 def senders(problem: Problem) -> dict[str, frozenset[str]]:

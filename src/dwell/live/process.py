@@ -48,8 +48,9 @@ def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Eve
         If the keys that it has been given are not its.
     """
     entry = wire(problem).entry(who)
-    transport = Security.of(problem, entry.role).transport(who)
-    place = Place(problem, who, entry.role.node, transport, time.time_ns(), say=Log(_print))
+    security = Security.of(problem, entry.role)
+    transport = security.transport(who)
+    place = security.place(who, entry.role.node, transport, Log(_print))
     try:
         _run(problem, entry.role, place, make_folder(folder), stopped)
     finally:
@@ -63,7 +64,7 @@ def _run(
     sys.setswitchinterval(0.0005)
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
-        stamper = Stamper(place, book, time.time_ns(), clock_of(problem)())
+        stamper = Stamper(place, book, time.time_ns(), clock_of(problem, role.node)())
         _host(stamper, place, stopped)
     elif role.kind == "sink":
         actuator = _actuator(problem, role.task)
@@ -76,7 +77,7 @@ def _run(
 
 def _host(role: Role, place: Place, stopped: threading.Event) -> None:
     """Run a role in this thread until the process is told to end."""
-    hosted = Hosted(role, place.transport, clock_of(place.problem), stopped=stopped)
+    hosted = Hosted(role, place.transport, clock_of(place.problem, place.node), stopped=stopped)
     keep_collections_short()
     hosted.run()
 
@@ -123,7 +124,7 @@ def _work(
         *(worker, place.transport),
         stopped=stopped,
         note=note,
-        clock=clock_of(problem),
+        clock=clock_of(problem, role.node),
         ready=keep_collections_short,
     )
 
@@ -165,4 +166,4 @@ def _again(worker: Worker, path: Path) -> None:
         path.unlink()
     except (OSError, msgspec.MsgspecError):
         return
-    worker.retry(shadow, inputs, clock_of(worker.place.problem)())
+    worker.retry(shadow, inputs, clock_of(worker.place.problem, worker.place.node)())

@@ -3,20 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+import msgspec
 
 from dwell import __version__
-from dwell.errors import LiveError
+from dwell.errors import LiveError, TrustError
 from dwell.live.hearing import Hearing
-from dwell.live.keys import Keys
-from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Header, decode, encode
+from dwell.live.keys import CONTROLLER, Keys
+from dwell.live.messages import (
+    MAX_HEADER_BYTES,
+    Beat,
+    Carried,
+    Completion,
+    Header,
+    Load,
+    Stamp,
+    decode,
+    encode,
+)
 from dwell.live.offsets import Offsets
 from dwell.live.transport.protocol import Sample, Transport
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import fingerprint
 
+#: First words of the keys of what is sent twice: nothing else takes the detour.
+TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
+#: Signatures stand before what they are of.
+SIGNATURE_BYTES = 64
 #: What PTP and chrony on one network keep to.
 SYSTEM_BOUND_NS = 1_000_000
 #: Different complaints that are counted; a new one takes the place of the oldest.
@@ -28,7 +45,22 @@ REPEATED_NS = 10_000_000_000
 #: Beats of an earlier life, one after another, that no late message explains.
 RIVAL_BEATS = 5
 
-__all__ = ["Place", "Pulse", "Role"]
+__all__ = ["Place", "Pulse", "Role", "Sealing"]
+
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+
+class Sealing(Protocol):
+    """Signs messages and checks them; see `dwell.trust.signing.Seals`."""
+
+    def seal(self, word: str, data: bytes) -> bytes:
+        """Return a message with a signature before it."""
+        ...
+
+    def require(self, word: str, name: str, sealed: bytes) -> None:
+        """Raise a TrustError unless a subject has sealed a message."""
+        ...
 
 
 class Role(Protocol):
@@ -67,6 +99,8 @@ class Place:
         How often something arrived that could not be used, by what was wrong with it.
     say : callable, optional
         Takes every complaint for the process's log.
+    seals : Sealing, optional
+        Signs what it says and checks what it hears; without, nothing is signed.
     """
 
     problem: Problem
@@ -76,6 +110,7 @@ class Place:
     life: int = 0
     complaints: dict[str, int] = field(default_factory=dict)
     say: Callable[[str], None] | None = None
+    seals: Sealing | None = None
     complained: int = 0
     last_complaint: str = ""
 
@@ -114,12 +149,119 @@ class Place:
             system_bound_ns=SYSTEM_BOUND_NS if system else None,
         )
 
-    def put_twice(self, key: str, payload: bytes) -> None:
-        """Send a small message directly, and over the detour.
+    def put(self, key: str, message: msgspec.Struct) -> None:
+        """Send a small message, signed where there are keys."""
+        self.transport.put(key, self._sealed(key, message))
+
+    def _sealed(self, key: str, message: msgspec.Struct) -> bytes:
+        data = encode(message)
+        return data if self.seals is None else self.seals.seal(self.keys.word(key), data)
+
+    def read(self, sample: Sample, kind: type[T], by: Callable[[T], str]) -> T:
+        """Read a message that `put` or `put_twice` has sent.
+
+        Parameters
+        ----------
+        sample : Sample
+        kind : type
+            What it has to be.
+        by : callable
+            Returns the subject who has to have signed it: a node, or the controller.
+
+        Raises
+        ------
+        LiveError
+            If it is anything else, or signed by anybody else.
+        """
+        if self.seals is None:
+            return decode(sample.payload, kind)
+        message = decode(sample.payload[SIGNATURE_BYTES:], kind)
+        self._require(sample, by(message))
+        return message
+
+    def _require(self, sample: Sample, name: str) -> None:
+        """Raise a LiveError unless a message was signed by a subject."""
+        if self.seals is not None:
+            try:
+                self.seals.require(self.keys.word(sample.key), name, sample.payload)
+            except TrustError as error:
+                raise LiveError(str(error)) from None
+
+    def stamped(self, stamp: Stamp) -> bytes:
+        """Return the signature of a stamp that this process has made; nothing without keys."""
+        if self.seals is None:
+            return b""
+        return self.seals.seal("stamp", encode(stamp))[:SIGNATURE_BYTES]
+
+    def _require_stamped(self, seals: Sealing, header: Header) -> None:
+        """Raise a TrustError unless the stamper has stamped a cycle, or its source guessed it."""
+        names = {self.stamper[0]}
+        if not header.stamp.term:
+            pipeline = self.problem.pipeline
+            sources = (task for name, task in pipeline.tasks.items() if not pipeline.inputs(name))
+            names = {node for task in sources for node in task.on} - names
+        sealed = header.seal + encode(header.stamp)
+        for name in names:
+            with suppress(TrustError):
+                seals.require("stamp", name, sealed)
+                return
+        raise TrustError(f"stamp: cycle {header.stamp.cycle} is not signed by who may stamp it")
+
+    def completion(self, sample: Sample) -> Completion:
+        """Read what a sink, or a task where a cycle ended, says of a cycle.
+
+        Raises
+        ------
+        LiveError
+            If it is none, or about a task that does not run where it says.
+        """
+        done = self.read(sample, Completion, lambda done: done.node)
+        task = self.problem.pipeline.tasks.get(done.sink)
+        named = self.keys.word(sample.key) == "ended" or sample.key.endswith(f"/{done.sink}")
+        if task is None or done.node not in task.on or not named:
+            raise LiveError(f"{sample.key}: {done.sink} does not run on {done.node}")
+        return done
+
+    def load(self, sample: Sample) -> Load:
+        """Read what an agent says of its node.
+
+        Raises
+        ------
+        LiveError
+            If it is none, or about another node than its key says.
+        """
+        load = self.read(sample, Load, lambda load: load.node)
+        if not sample.key.endswith(f"/{load.node}"):
+            raise LiveError(f"{sample.key}: the load of {load.node}")
+        return load
+
+    def beat(self, sample: Sample) -> Beat:
+        """Read a beat.
+
+        One that came directly was let through for its sender's certificate; one that somebody has
+        carried here is believed for its signature.
+
+        Raises
+        ------
+        LiveError
+            If it is none, or another's than its key says.
+        """
+        signed = 0 if self.seals is None else SIGNATURE_BYTES
+        beat = decode(sample.payload[signed:], Beat)
+        if not sample.key.endswith(f"/{beat.node}/{beat.who}"):
+            raise LiveError(f"{sample.key}: a beat of {beat.who} on {beat.node}")
+        if not self.keys.came_directly(sample.key):
+            controls = beat.who == f"controller@{self.problem.controller_node}"
+            self._require(sample, CONTROLLER if controls else beat.node)
+        return beat
+
+    def put_twice(self, key: str, message: msgspec.Struct) -> None:
+        """Send a small message directly, and over the detour; signed where there are keys.
 
         Those on the relay's own node do so, too: the detour reaches whoever has no connection of
         its own to the sender.
         """
+        payload = self._sealed(key, message)
         self.transport.put(key, payload)
         self.transport.put(self.keys.relay(key), payload)
 
@@ -130,7 +272,12 @@ class Place:
         except LiveError as error:
             self.complain(error)
             return []
-        return [Sample(self.keys.detour(key), payload) for key, payload in carried.messages]
+        keys = self.keys
+        told = [Sample(keys.detour(key), payload) for key, payload in carried.messages]
+        fit = [one for one in told if keys.word(one.key) in TWICE]
+        if len(fit) < len(told):
+            self.complain(LiveError(f"{sample.key}: has what never takes the detour"))
+        return fit
 
     def complain(self, error: LiveError) -> None:
         """Count a message that could not be used; a flood of them takes no memory."""
@@ -144,10 +291,17 @@ class Place:
             self.say(what)
 
     def header(self, sample: Sample) -> Header | None:
-        """Read the header of a data message; None, and a complaint, where it is none."""
+        """Read the header of a data message; None, and a complaint, where it is none.
+
+        Or where nobody has stamped the cycle who may: one with too high a number would keep all
+        others from the actuator.
+        """
         try:
-            return decode(sample.header, Header, limit=MAX_HEADER_BYTES)
-        except LiveError as error:
+            header = decode(sample.header, Header, limit=MAX_HEADER_BYTES)
+            if self.seals is not None:
+                self._require_stamped(self.seals, header)
+            return header
+        except (LiveError, TrustError) as error:
             self.complain(LiveError(f"{sample.key}: {error}"))
             return None
 
@@ -193,6 +347,7 @@ class Pulse:
         self._repeat_until_ns = -(1 << 62)
         keys = place.keys
         self._key = keys.beat(place.node, place.who)
+        self._returned = keys.detour(self._key)
         direct = keys.beat("", "").removesuffix("/")
         self._prefix = direct, keys.detour(direct)
         # Beats as they came directly: their copies say nothing new, and need not be read.
@@ -210,7 +365,7 @@ class Pulse:
         if self._is_copy(sample):
             return None
         try:
-            beat = decode(sample.payload, Beat)
+            beat = self.place.beat(sample)
         except LiveError as error:
             who = sample.key.rpartition("/")[2]
             told = f"{who}: {error}; does Dwell {__version__} run there, as here?"
@@ -228,8 +383,10 @@ class Pulse:
         return None
 
     def _is_copy(self, sample: Sample) -> bool:
-        """Whether a beat is the copy of the last that came directly."""
+        """Whether a beat is the copy of the last that came directly, or of one of its own."""
         direct, detour = self._prefix
+        if sample.key == self._returned:
+            return True
         if sample.key.startswith(detour):
             return self._came.get(sample.key[len(detour) :]) == sample.payload
         name = sample.key[len(direct) :]
@@ -289,10 +446,12 @@ class Pulse:
 
     def wake(self, now_ns: int) -> int:
         """Send the beat that is due; returns when the next is."""
-        if now_ns >= self._next_ns:
+        # Due later than after a whole interval: the clock has been set back.
+        back = self._next_ns > now_ns + self._every_ns
+        if back or now_ns >= self._next_ns:
             self.send(now_ns)
             late = now_ns >= self._next_ns + self._every_ns
-            self._next_ns = (now_ns if late else self._next_ns) + self._every_ns
+            self._next_ns = (now_ns if late or back else self._next_ns) + self._every_ns
         return self._next_ns
 
     def send(self, now_ns: int) -> None:
@@ -306,7 +465,7 @@ class Pulse:
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
             *(self._digest, note[:2000], __version__),
         )
-        place.put_twice(self._key, encode(beat))
+        place.put_twice(self._key, beat)
 
     def _repeated(self, now_ns: int) -> str:
         """Return the last complaint, for a while after it was made."""

@@ -8,12 +8,15 @@ from __future__ import annotations
 import ipaddress
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault, LiveError, TrustError
+from dwell.live.role import Place
+from dwell.live.transport.protocol import Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.wiring import Role, wire
 from dwell.model import FrozenDict, Problem
@@ -80,6 +83,29 @@ class Security:
             raise LiveError("\n".join(map(str, faults)))
         return found
 
+    def remember(self, folder: Path) -> None:
+        """Take note of the roster in a node's folder; it never goes back to an earlier one.
+
+        Raises
+        ------
+        TrustError
+            If a later one was used there before: who has been revoked since would be back.
+        """
+        if self.keyring is None:
+            return
+        number, kept = self.keyring.roster.number, folder / f"{self.problem.name}.roster"
+        try:
+            before = int(kept.read_text())
+        except (OSError, ValueError):
+            before = 0
+        if number < before:
+            raise TrustError(
+                f"{self.keyring.folder}: roster {number} is older than {before}, which was used "
+                f"here before ({kept}); take the newest from the authority's folder"
+            )
+        if number > before:
+            kept.write_text(str(number))
+
     def transport(self, who: str) -> ZenohTransport:
         """Open the sessions of a process of the cell.
 
@@ -95,6 +121,15 @@ class Security:
         """Open a session of somebody who is no part of the cell, to a process that is."""
         wiring = wire(self.problem, protocol=self._protocol)
         return ZenohTransport(wiring.visitor(who, to), self._settings())
+
+    def place(self, who: str, node: str, transport: Transport, say: Callable[[str], None]) -> Place:
+        """Return where a role runs that is just started."""
+        seals = None
+        if self.keyring is not None:
+            from dwell.trust.signing import Seals
+
+            seals = Seals(self.keyring)
+        return Place(self.problem, who, node, transport, time.time_ns(), say=say, seals=seals)
 
     def warnings(self) -> Iterator[str]:
         """Yield what its log should say, again and again."""
@@ -204,7 +239,7 @@ def exposed(problem: Problem) -> Iterator[Fault]:
             path,
             f"{address} is beyond this computer, and without keys whoever reaches it can move "
             "stages and command actuators; make keys with dwell keys init and name them with "
-            "--keys, or say --insecure in a network that you trust",
+            "--keys, or say --insecure (DWELL_INSECURE=1) in a network that you trust",
         )
 
 

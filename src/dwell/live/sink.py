@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from dwell.errors import LiveError
-from dwell.live.messages import Completion, Header, encode
+from dwell.live.messages import Completion, Header
 from dwell.live.payloads import read_payload
 from dwell.live.role import Place, Pulse
 from dwell.live.stage import Actuator, Message
@@ -84,7 +84,7 @@ class Sink:
             self._alarm_ns = now_ns + self.max_age_ns
             self._apply(header, sample.payload, now_ns)
         done = Completion(header.stamp, self.task, now_ns, outcome, header.hops, self.place.node)
-        self.place.put_twice(self.place.keys.done(self.task), encode(done))
+        self.place.put_twice(self.place.keys.done(self.task), done)
 
     def age_ns(self, header: Header, now_ns: int) -> int:
         """Longest time that can have passed since a cycle's release, for all the clocks say."""
@@ -122,7 +122,9 @@ class Sink:
         if self._takes_over:
             self._takes_over = False
             self._alarm_ns = self._alarm_ns or now_ns + self.max_age_ns
-        if self._alarm_ns is not None and now_ns >= self._alarm_ns:
+        # An alarm further off than it was ever set: the clock has been set back.
+        back = self._alarm_ns is not None and self._alarm_ns > now_ns + self.max_age_ns
+        if self._alarm_ns is not None and (back or now_ns >= self._alarm_ns):
             self._alarm_ns = None
             self.counts["silences"] += 1
             silence = self.place.problem.live.silence

@@ -10,6 +10,7 @@ from dwell.control import shadow_stamps
 from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
 from dwell.live.intervals import Intervals
+from dwell.live.keys import CONTROLLER
 from dwell.live.messages import (
     Accepted,
     Beat,
@@ -18,7 +19,6 @@ from dwell.live.messages import (
     Order,
     Stamp,
     Stamped,
-    decode,
     encode,
 )
 from dwell.live.role import Place, Pulse
@@ -123,6 +123,9 @@ class Stamper:
         self._charge = ""
         self._charged_ns = 0
         self._answered: tuple[str, int, Accepted] | None = None
+        #: Highest number of an order that was carried out; numbers grow from controller to
+        #: controller, as they begin with the time of day.
+        self._newest = 0
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
 
@@ -150,11 +153,11 @@ class Stamper:
         try:
             match word := self.place.keys.word(sample.key):
                 case "order":
-                    self._order(decode(sample.payload, Order), now_ns)
+                    self._order(self.place.read(sample, Order, lambda _: CONTROLLER), now_ns)
                 case "frame":
                     self._frame(now_ns)
                 case "done" | "ended":
-                    done = decode(sample.payload, Completion)
+                    done = self.place.completion(sample)
                     self._completed(done, now_ns)
                     if word == "done" and done.stamp.run == self.run:
                         direct = self.place.keys.came_directly(sample.key)
@@ -199,7 +202,8 @@ class Stamper:
                 self._probes.discard(stamp.cycle)
                 self.probation.completed(stamp.cycle, now_ns)
             return
-        if done.outcome != "actuated" or stamp.cycle < self.guard.newest:
+        told = done.outcome == "actuated" and done.sink in self._sinks
+        if not told or stamp.cycle < self.guard.newest:
             return
         said = self._partial.setdefault(stamp.cycle, set())
         if done.sink in said:
@@ -233,9 +237,10 @@ class Stamper:
                 self.cycle,
                 self.guard.on_fallback,
                 self._proven(now_ns),
+                self._newest,
             )
             self._answered = order.controller, order.number, answer
-        self.place.put_twice(self.place.keys.accepted(), encode(answer))
+        self.place.put_twice(self.place.keys.accepted(), answer)
 
     def _proven(self, now_ns: int) -> str:
         wanted = self.probation.wanted if self.guard.on_fallback else None
@@ -277,12 +282,18 @@ class Stamper:
     def _accept(self, order: Order) -> None:
         if order.run == 0 and order.term == 0:
             return
+        if order.number > self._newest:
+            self._newest = order.number
+            self._settle(order)
+        if order.placement and (order.placement != self.placement or self.guard.on_fallback):
+            self._move(order.placement, by_guard=False)
+
+    def _settle(self, order: Order) -> None:
+        """Take over what an order says beside the placement; an earlier one changes none of it."""
         self._fraction = order.shadow_fraction
         self._forks = order.forks
         if self.guard.on_fallback and order.want in self.place.problem.candidates:
             self.probation.want(order.want)
-        if order.placement and (order.placement != self.placement or self.guard.on_fallback):
-            self._move(order.placement, by_guard=False)
 
     def _move(self, placement: str, *, by_guard: bool) -> None:
         """Change the placement: a new term, known to the book before any cycle has it."""
@@ -315,6 +326,8 @@ class Stamper:
         if fallback is not None:
             self._move(fallback, by_guard=True)
             self.pulse.send(now_ns)
+        if self._next_ns > now_ns + self.place.period_ns:
+            self._next_ns = now_ns  # the clock has been set back
         if self.timer and now_ns >= self._next_ns:
             behind = (now_ns - self._next_ns) // self.place.period_ns
             self.skipped += behind
@@ -371,7 +384,7 @@ class Stamper:
     def _send(self, stamp: Stamp, *, here: bool, elsewhere: bool) -> None:
         """Send a stamp to the sources on this node, or on the others."""
         place = self.place
-        header = encode(Header(stamp, STAMPER, place.node, "none"))
+        header = encode(Header(stamp, STAMPER, place.node, "none", seal=place.stamped(stamp)))
         for task, node, kind in self.routes.destinations(STAMPER, stamp):
             if here if node == place.node else elsewhere:
                 place.transport.put(place.keys.inputs(task, node, kind), b"", header)

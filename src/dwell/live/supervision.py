@@ -154,7 +154,10 @@ class Supervisor:
         child.note = f"{child.who} {reason}{f': {last}' if last else ''}"
         again = f"; start {child.starts + 1} in {wait_s:.1f} s" if child.failures > 1 else ""
         self._say(f"{child.note}{again}")
-        self._blame(child)
+        try:
+            self._blame(child)
+        except OSError as error:
+            self._say(f"{child.who}: what it died of cannot be kept ({error.strerror})")
 
     def _blame(self, child: Child) -> None:
         """Give the message that a worker died of to the next one, but not twice."""
@@ -177,7 +180,31 @@ class Supervisor:
         self._say(child.note)
 
     def _start(self, child: Child) -> None:
+        """Start a process; a disk that is full must not end the agent, and with it the node."""
         child.starts += 1
+        child.started_s = time.monotonic()
+        try:
+            self._run(child)
+        except OSError as error:
+            self._died(child, f"could not be started ({error.strerror})")
+            return
+        child.warm_bytes, child.growth = None, ""
+        self._write_mark(child)
+
+    def _write_mark(self, child: Child) -> None:
+        """Write who runs; the mark of somebody before it must not stay."""
+        draft = child.mark.with_suffix(".new")
+        try:
+            child.mark.unlink(missing_ok=True)
+            started = psutil.Process(child.pid).create_time()
+            draft.write_text(json.dumps({"pid": child.pid, "started": started}))
+            draft.replace(child.mark)
+        except OSError as error:
+            self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
+        except psutil.NoSuchProcess:
+            return
+
+    def _run(self, child: Child) -> None:
         with child.log.open("ab") as log:
             child.process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 child.command,
@@ -189,17 +216,13 @@ class Supervisor:
                 # process one of the groups that share the CPU, whatever runs in it.
                 process_group=0,
             )
-        child.started_s = time.monotonic()
-        child.warm_bytes, child.growth = None, ""
-        started = psutil.Process(child.process.pid).create_time()
-        draft = child.mark.with_suffix(".new")
-        draft.write_text(json.dumps({"pid": child.process.pid, "started": started}))
-        draft.replace(child.mark)
 
     def tend(self) -> None:
         """Look how much memory the processes have taken, and how much they have printed."""
         for child in self.children:
             _shorten(child.log, self._log_bytes)
+            if child.process is not None and not child.mark.exists():
+                self._write_mark(child)  # there was no room for it
             self._weigh(child)
 
     def _weigh(self, child: Child) -> None:

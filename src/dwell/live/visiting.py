@@ -7,7 +7,7 @@ import uuid
 from collections.abc import Mapping
 from typing import Any
 
-from dwell.errors import LiveError
+from dwell.errors import LiveError, TrustError
 from dwell.live.keys import Keys
 from dwell.live.messages import Answer, Ask, decode, encode
 from dwell.live.security import Security
@@ -44,7 +44,7 @@ class Visitor:
         self._keys = Keys(problem.name)
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         role = Role(self._name, problem.controller_node, "visitor")
-        security = Security.of(problem, role, environment)
+        security = self._security = Security.of(problem, role, environment)
         self._transport = security.visit(self._name, self._controller)
         self._transport.subscribe(self._keys.answer(self._name), self._heard)
 
@@ -77,7 +77,12 @@ class Visitor:
         ------
         LiveError
             If it is refused, or nobody answers.
+        TrustError
+            If the keys are those of somebody who may only look.
         """
+        keyring = self._security.keyring
+        if what != "status" and keyring is not None and keyring.own.role == "observer":
+            raise TrustError(f"{keyring.folder}: keys of an observer, who may look and no more")
         ask = encode(Ask(self._name, what, about))
         # Who only looks may do so with the keys of an observer.
         key = self._keys.look() if what == "status" else self._keys.ask()

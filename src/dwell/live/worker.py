@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from dwell.errors import LiveError
-from dwell.live.keys import MAIN, SHADOW
+from dwell.live.keys import CONTROLLER, MAIN, SHADOW
 from dwell.live.messages import (
     Completion,
     Header,
@@ -153,7 +153,8 @@ class _Source:
             before, at_ns = self._last.stamp, now_ns
             released_ns = before.released_ns + self._place.period_ns
             guess = Stamp(before.run, before.cycle + 1, 0, before.placement, released_ns)
-            header = Header(guess, STAMPER, self._place.node, "none")
+            seal = self._place.stamped(guess)
+            header = Header(guess, STAMPER, self._place.node, "none", seal=seal)
             self._guessed += 1
         else:
             return None
@@ -303,7 +304,7 @@ class Worker:
         here = Hop(self.task, place.node, at_ns, UNKNOWN, UNKNOWN, inputs)
         hops = (*job.hops(), here)
         ended = Completion(job.header.stamp, self.task, at_ns, outcome, hops, place.node)
-        place.put_twice(place.keys.ended(), encode(ended))
+        place.put_twice(place.keys.ended(), ended)
 
     # -------------------------------------------------------------------------- state
 
@@ -315,7 +316,7 @@ class Worker:
 
     def _about_state(self, sample: Sample) -> None:
         if "/snapshot/" in sample.key:
-            self._asked = decode(sample.payload, Snapshot)
+            self._asked = self.place.read(sample, Snapshot, lambda _: CONTROLLER)
             return
         state = decode(sample.header, State)
         if state.task != self.task:
@@ -355,7 +356,7 @@ class Worker:
 
     def _say_restored(self) -> None:
         if self._restored is not None:
-            self.place.transport.put(self.place.keys.restored(), encode(self._restored))
+            self.place.put(self.place.keys.restored(), self._restored)
             self._restored = None
 
     def _send_state(self, to: str, number: int) -> None:
@@ -523,7 +524,8 @@ class Worker:
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
         spent = state_age, self._cpu_ns
         hop = Hop(self.task, place.node, job.arrived_ns, started_ns, ended_ns, inputs, *spent)
-        header = Header(stamp, self.task, place.node, kind, (*job.hops(), hop), job.shadow)
+        seal, hops = job.header.seal, (*job.hops(), hop)
+        header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)
         if self.is_sink:
             place.transport.put(place.keys.command(self.task), data, head)

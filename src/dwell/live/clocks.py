@@ -1,0 +1,158 @@
+"""Clocks that are wrong on purpose: for trials of what a cell does when they jump or drift.
+
+All nodes of a cell on one computer read one clock, which nobody may set. Where the variable
+`DWELL_CLOCKS` names a file, the processes of a node add to it what the file says of that node, and
+whoever made the file changes that while they run. Without the variable nothing of this exists.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Self
+
+from dwell.errors import LiveError
+
+__all__ = ["CLOCKS", "ClockFile", "wrong_clock"]
+
+#: Names the file, for every process of a cell.
+CLOCKS = "DWELL_CLOCKS"
+
+PPB = 1_000_000_000
+
+_MAGIC = b"dwellclk"
+# Magic, and bytes of the names that follow the nodes' settings.
+_HEAD = struct.Struct("<8sQ")
+# Which of the two settings holds. Both: since when, ahead by how much then, and by what rate since.
+_TURN = struct.Struct("<Q")
+_SETTING = struct.Struct("<qqq")
+_NODE_BYTES = _TURN.size + 2 * _SETTING.size
+
+
+class ClockFile:
+    """What is wrong with the clocks of nodes: the side that writes.
+
+    A setting is written beside the one that holds, which then gives way to it at once: who reads
+    sees the one or the other.
+
+    Parameters
+    ----------
+    path : Path
+        Made anew; processes that have one of this name open keep it.
+    nodes : sequence of str
+    clock : callable
+        The true clock, that of the processes.
+
+    Raises
+    ------
+    LiveError
+        If it cannot be written.
+    """
+
+    def __init__(self, path: Path, nodes: Sequence[str], clock: Callable[[], int]) -> None:
+        self.path, self.nodes, self._clock = path, tuple(nodes), clock
+        names = json.dumps(self.nodes).encode()
+        content = bytearray(_HEAD.size + _NODE_BYTES * len(self.nodes))
+        _HEAD.pack_into(content, 0, _MAGIC, len(names))
+        draft = path.with_name(f"{path.name}.new")
+        try:
+            draft.write_bytes(content + names)
+            draft.replace(path)
+            with path.open("r+b") as file:
+                self._map = mmap.mmap(file.fileno(), len(content))
+        except OSError as error:
+            raise LiveError(f"{path}: cannot be written ({error.strerror})") from None
+
+    def set(self, node: str, *, jump_ns: int = 0, drift_ppb: int = 0) -> int:
+        """Have a node's clock jump now, and drift from now on; returns what it is ahead by.
+
+        Parameters
+        ----------
+        node : str
+        jump_ns : int
+            Added to what it is ahead by already.
+        drift_ppb : int
+            Instead of the drift before.
+
+        Raises
+        ------
+        LiveError
+            If there is no such node.
+        """
+        if node not in self.nodes:
+            raise LiveError(f"{self.path}: no node {node}; it has {', '.join(self.nodes)}")
+        begin = _HEAD.size + _NODE_BYTES * self.nodes.index(node)
+        turn, since_ns, ahead_ns, ppb = _read(self._map, begin)
+        now_ns = self._clock()
+        ahead_ns += (now_ns - since_ns) * ppb // PPB + jump_ns
+        following = 1 - turn
+        place = begin + _TURN.size + following * _SETTING.size
+        _SETTING.pack_into(self._map, place, now_ns, ahead_ns, drift_ppb)
+        _TURN.pack_into(self._map, begin, following)
+        return ahead_ns
+
+    def close(self) -> None:
+        """Write no more; the file stays."""
+        self._map.close()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Write no more."""
+        self.close()
+
+
+def wrong_clock(
+    node: str, clock: Callable[[], int], environment: Mapping[str, str] = os.environ
+) -> Callable[[], int]:
+    """Return the clock of a node: the one given, unless the variable says that it is wrong.
+
+    Raises
+    ------
+    LiveError
+        If there is no such file, it is another kind of file, or has no such node.
+    """
+    path = environment.get(CLOCKS, "")
+    if not path or not node:
+        return clock
+    content, names = _open(Path(path))
+    if node not in names:
+        raise LiveError(f"{CLOCKS}: {path}: no node {node}; it has {', '.join(names)}")
+    begin = _HEAD.size + _NODE_BYTES * names.index(node)
+
+    def wrong() -> int:
+        now_ns = clock()
+        _, since_ns, ahead_ns, ppb = _read(content, begin)
+        return now_ns + ahead_ns + (now_ns - since_ns) * ppb // PPB
+
+    return wrong
+
+
+def _read(content: mmap.mmap, begin: int) -> tuple[int, int, int, int]:
+    """Return which setting of a node holds, and the setting."""
+    (turn,) = _TURN.unpack_from(content, begin)
+    return (turn, *_SETTING.unpack_from(content, begin + _TURN.size + turn * _SETTING.size))
+
+
+def _open(path: Path) -> tuple[mmap.mmap, tuple[str, ...]]:
+    try:
+        with path.open("rb") as file:
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError) as error:
+        raise LiveError(f"{CLOCKS}: {path}: cannot be read ({error})") from None
+    try:
+        magic, length = _HEAD.unpack_from(content)
+        names = json.loads(content[len(content) - length :])
+        good = magic == _MAGIC and all(isinstance(name, str) for name in names)
+        good = good and len(content) == _HEAD.size + _NODE_BYTES * len(names) + length
+    except (struct.error, ValueError, TypeError):
+        good = False
+    if not good:
+        raise LiveError(f"{CLOCKS}: {path}: is no file of clocks")
+    return content, tuple(names)

@@ -1,0 +1,208 @@
+"""A live cell with keys, from the command line: real processes, and who may do what with them."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import dwell
+from dwell.cli.live import environment
+from dwell.live.keys import Keys
+from dwell.live.messages import Order, encode
+from dwell.live.security import INSECURE, Security
+from dwell.live.wiring import Role, wire
+from tests.cli.test_live import EXAMPLE, PATIENCE_S, RealCell, invoke
+from tests.live.transport.test_secure import Intruder, tls
+
+PIN = ("live", "pin", "SO")
+
+
+class SecureCell(RealCell):
+    """The example's cell; each command has the keyring of its own subject alone."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.keys = folder / "keys"
+        code, told, error = invoke("keys", "init", self.file, "--out", self.keys)
+        assert code == 0, error
+        assert "dwell keys" not in error
+        assert "ca stays here" in told
+        code, _, error = invoke("keys", "issue", self.keys, "watcher", "--role", "observer")
+        assert code == 0, error
+        # As on hosts of their own.
+        self.host = folder / "hosts"
+        for name in ("R1", "E", "R2", "controller", "operator", "watcher"):
+            shutil.copytree(self.keys / name, self.host / name)
+        self.environment = environment(self.host / "operator", insecure=False)
+
+    def agent(self, node: str, *more: str, cell: Path | None = None) -> None:
+        super().agent(node, "--keys", str(self.host / node), *more, cell=cell)
+
+    def controller(self) -> None:
+        self.start(
+            "controller", "controller", "--cell", self.file, "--out", self.folder / "runs",
+            "--keys", self.host / "controller",
+        )  # fmt: skip
+
+    def as_(self, name: str, *words: str) -> tuple[int, str]:
+        code, stdout, stderr = invoke(*words, "--cell", self.file, "--keys", self.host / name)
+        return code, stdout + stderr
+
+    @property
+    def logs(self) -> str:
+        found = [*self.folder.glob("*.log"), *self.folder.glob("state/*/*.log")]
+        return "\n".join(path.read_text() for path in found)
+
+
+# ------------------------------------------------------------------------ before the start
+
+
+@pytest.fixture(scope="module")
+def abroad(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example's cell, with E on another computer."""
+    folder = tmp_path_factory.mktemp("abroad")
+    shutil.copytree(EXAMPLE, folder, dirs_exist_ok=True)
+    file = folder / "cell.yaml"
+    text = file.read_text()
+    assert "E: {address: 127.0.0.1" in text
+    file.write_text(text.replace("E: {address: 127.0.0.1", "E: {address: 10.255.0.9"))
+    code, _, error = invoke("keys", "init", file, "--out", folder / "keys", "--days", "20")
+    assert code == 0, error
+    return file
+
+
+BEYOND = "live.hosts.E.address: 10.255.0.9 is beyond this computer, and without keys"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("agent", "--node", "R1", "--cell"),
+        ("controller", "--cell"),
+        ("live", "status", "--cell"),
+        ("check", "--node", "R1"),
+    ],
+)
+def test_without_keys_nothing_starts_that_leaves_this_computer(
+    abroad: Path, words: tuple[str, ...]
+) -> None:
+    code, _, told = invoke(*words, abroad)
+    assert code in (1, 2)
+    assert BEYOND in told
+    assert "--insecure" in told
+    assert "Traceback" not in told
+
+
+def test_check_looks_at_the_keys(abroad: Path) -> None:
+    keys = abroad.parent / "keys"
+    code, stdout, told = invoke("check", "--node", "R1", "--keys", keys / "R1", abroad)
+    assert code == 0, told
+    assert "R1 has all that it needs" in stdout
+    assert "warning: the certificate of R1.1 ends on " in told
+    code, _, told = invoke("check", "--node", "R1", "--keys", keys / "E", abroad)
+    assert code == 2
+    assert "agent@R1 takes those of node R1" in told
+    code, _, told = invoke("check", "--node", "R1", "--insecure", abroad)
+    assert code == 0
+    assert "INSECURE: no keys; whoever reaches the ports at 10.255.0.9 can move" in told
+
+
+def test_an_agent_without_keys_says_so_loudly(abroad: Path) -> None:
+    """Where it may leave all the same; what it says goes to its log before anything else."""
+    stopped = threading.Event()
+    stopped.set()
+    told: list[str] = []
+    security = Security.of(dwell.load(abroad), Role("agent@R1", "R1", "agent"), {INSECURE: "1"})
+    security.remind(told.append, stopped)
+    assert [line.split(":")[0] for line in told] == ["INSECURE"]
+
+
+# -------------------------------------------------------------------------- a whole cell
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureCell]:
+    made = SecureCell(tmp_path_factory.mktemp("secure"))
+    try:
+        made.controller()
+        for node in ("R2", "E", "R1"):
+            made.agent(node)
+        made.until(lambda status: not status["silent"] and status["window"])
+        yield made
+    finally:
+        made.close()
+
+
+def test_a_cell_with_keys_actuates_and_moves(cell: SecureCell) -> None:
+    assert cell.as_("operator", *PIN)[0] == 0
+    cell.until(lambda status: status["placement"] == "SO")
+    before = cell.until(lambda status: status["window"])["window"]["number"]
+    status = cell.until(lambda status: status["window"]["number"] >= before + 2)
+    assert not status["complaints"]
+    assert not status["guard_moves"]
+    assert "turn" in cell.log("R2", "sink.control@R2")
+
+
+def test_an_observer_looks_and_no_more(cell: SecureCell) -> None:
+    code, told = cell.as_("watcher", "live", "status")
+    assert (code, told.splitlines()[0].partition(";")[0]) == (0, "light-follower: SO")
+    code, told = cell.as_("watcher", "live", "pin", "LOC")
+    assert code == 2
+    assert "keys of an observer, who may look and no more" in told
+    status = cell.until(lambda status: status["pinned"])
+    assert status["pinned"] == "SO"
+
+
+def test_nodes_visit_nobody_and_without_keys_nobody_does(cell: SecureCell) -> None:
+    code, told = cell.as_("R1", "live", "status")
+    assert code == 2
+    assert "visiting takes those of an operator" in told
+    code, _, told = invoke("live", "status", "--cell", cell.file)
+    assert code == 1
+    assert "no controller of cell 'light-follower' answers" in told
+
+
+def test_an_agent_with_another_nodes_keys_does_not_start(cell: SecureCell) -> None:
+    words = ("agent", "--node", "R1", "--cell", cell.file, "--state", cell.state("none"))
+    code, _, told = invoke(*words, "--keys", cell.host / "E")
+    assert code == 2
+    assert "keys of E, a subject with the role node; agent@R1 takes those of node R1" in told
+    assert "Traceback" not in told
+
+
+def test_orders_of_others_move_nothing(cell: SecureCell) -> None:
+    """A robot's certificate does not get through; the controller's does, but nothing is signed."""
+    status = cell.until(lambda status: status["placement"] == "SO")
+    stamper = wire(cell.problem).entry("stamper@R1").listen["control"]
+    order = encode(Order(1 << 60, "me", status["run"], status["term"], "LOC"))
+    key = Keys(cell.problem.name).order()
+    for name, gets_through in (("R2", False), ("controller", True)):
+        with Intruder(stamper.port, tls(cell.host / name)) as intruder:
+            limit_s = time.monotonic() + PATIENCE_S
+            while not intruder.peers["control"] and time.monotonic() < limit_s:
+                time.sleep(0.02)
+            assert intruder.peers["control"] == 1
+            for _ in range(20):
+                # In the place of a signature stands none.
+                intruder.put(key, bytes(64) + order)
+                time.sleep(0.02)
+        assert ("order: not signed by controller" in cell.log("R1", "stamper@R1")) == gets_through
+    after = cell.until(lambda status: status["window"])
+    assert (after["term"], after["placement"]) == (status["term"], "SO")
+
+
+def test_the_run_is_a_run_and_no_log_has_a_secret(cell: SecureCell) -> None:
+    assert cell.end("controller") == 0
+    (folder,) = (cell.folder / "runs").iterdir()
+    assert dwell.open_run(folder).windows.height > 2
+    logs = cell.logs
+    assert "PRIVATE KEY" not in logs
+    for path in cell.host.glob("*/key.pem"):
+        secret = path.read_text().splitlines()[1]
+        assert secret[-20:] not in logs
+    assert "Traceback" not in logs
