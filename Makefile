@@ -12,7 +12,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench faults lock clean
+.PHONY: help env demo test check bench faults chaos lock clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-6s %s\n", $$1, $$2}' Makefile
@@ -41,8 +41,11 @@ $(VENV)/.installed: $(VENV)/.uv requirements/dev.txt pyproject.toml
 demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)
 	$(BIN)/python -m dwell demo $(if $(REAL),--real $(REAL))
 
+# Most tests run side by side; those that need the machine to themselves follow, one after another.
+# pytest ends with 5 where ARGS leave nothing to run.
 test: env ## Run the tests (ARGS="-k name" passes options to pytest)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not alone" $(ARGS) || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -m alone $(ARGS) || [ $$? -eq 5 ]
 
 check: env ## Lint, formatting, types and the borders between packages
 	$(BIN)/ruff check .
@@ -55,6 +58,9 @@ bench: env ## Run the benchmarks
 
 faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on where it was stopped
 	$(BIN)/python -m tests.live.faults $(ARGS)
+
+chaos: env ## Half an hour of chaos on a real cell, judged from the wire (ARGS="--minutes 2 --seed 7")
+	$(BIN)/python -m dwell live chaos --minutes 30 --faults 1000 $(ARGS)
 
 lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
 	$(COMPILE) --group uv --output-file requirements/uv.txt

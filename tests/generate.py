@@ -40,12 +40,14 @@ from dwell.model import (
     Uniform,
     Weights,
 )
+from dwell.model.objective import Tier
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
 __all__ = ["make_problem", "make_realisation", "random_problem", "random_stamps"]
 
 MS = 1_000_000
-Scheduler = Literal["fair", "fifo", "priority"]
+# Turns are those of threads on one core with a quota that is noticed at ticks.
+Scheduler = Literal["fair", "fifo", "priority", "turns"]
 
 
 # ------------------------------------------------------------------------------------ by hand
@@ -309,26 +311,35 @@ class _Maker:
 
     def node(self, name: str) -> Node:
         rng = self.rng
+        tiers: list[Tier] = ["robot", "edge", "cloud"]
+        tier = rng.choice(tiers)
+        # Fractions that floating point has exactly: the naive simulator computes with those.
+        background = rng.choice([0.0, 0.0, 0.0, 0.0625, 0.125, 0.25])
+        cores, scheduler = rng.choice([1, 1, 2, 2, 3, 4]), rng.choice(self.schedulers)
+        turns = scheduler == "turns"
         return Node(
             name,
-            rng.choice(["robot", "edge", "cloud"]),
-            # Fractions that floating point has exactly: the naive simulator computes with those.
-            background=rng.choice([0.0, 0.0, 0.0, 0.0625, 0.125, 0.25]),
-            cores=rng.choice([1, 1, 2, 2, 3, 4]),
-            scheduler=rng.choice(self.schedulers),
+            tier,
+            background=background,
+            cores=1 if turns else cores,
+            scheduler="fair" if scheduler == "turns" else scheduler,
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
             bursts=self.bursts(rng.randint(1, 4)),
-            quota=self.quota(),
+            quota=self.quota(turns),
         )
 
-    def quota(self) -> Quota | None:
+    def quota(self, ticks: bool) -> Quota | None:
         rng = self.rng
-        if rng.random() >= 0.2:
+        if not ticks and rng.random() >= 0.2:
             return None
         # Some ten of the quota's periods a cycle: the naive simulator looks at each.
         period_ms = max(1.0, min(1000.0, round(self.period * rng.choice([0.03, 0.1, 0.5]))))
         slack_ms = rng.choice([0.0, 0.0, 0.25, 1.0, 4.0])
-        return Quota(rng.choice([0.3, 0.5, 1, 1.7, 2.5]), period_ms, slack_ms)
+        cpu = rng.choice([0.3, 0.5, 1, 1.7, 2.5])
+        if not ticks:
+            return Quota(cpu, period_ms, slack_ms)
+        tick_ms = max(1.0, round(self.period * rng.choice([0.05, 0.1, 0.3])))
+        return Quota(cpu, period_ms, slack_ms, tick_ms)
 
     def task(self, name: str, load: float, *, source: bool) -> Task:
         rng = self.rng

@@ -49,6 +49,8 @@ ITSELF, SHADOW = 0, 1
 MASK = 2**64 - 1
 NEAR_NS = 1000
 STATE_TIMEOUT_MS = 200
+DRAWN_MS = 5
+LEAST_TURN_MS = 1.4
 # Behind all that an event does one after another.
 LATE = 10**9
 
@@ -228,6 +230,19 @@ class Job:
 
 
 @dataclass(eq=False)
+class Thread:
+    """What takes turns on a node: a job, or a foreign thread, and what it has received."""
+
+    job: Job | None
+    received: int
+
+    @property
+    def place(self) -> tuple[int, tuple[int, ...]]:
+        """Of those that have received the same, jobs go first."""
+        return self.received, self.job.readiness if self.job else (2**62,)
+
+
+@dataclass(eq=False)
 class Message:
     """What crosses a link: an output of a job, or the state of a task that moves.
 
@@ -310,6 +325,7 @@ class NodeState:
         self.work = {ITSELF: Fraction(0), SHADOW: Fraction(0)}
         self.since = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
+        self.tick = 0
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
             cpu = Fraction(node.quota.cpu)
@@ -317,13 +333,21 @@ class NodeState:
                 cpu = min(cpu, Fraction(node.cores)) - Fraction(node.background)
             self.quota = self.left = max(round(cpu * self.period), 1)
             self.slack = nanoseconds(node.quota.slack_ms)
-            if self.slack:
+            self.tick = nanoseconds(node.quota.tick_ms)
+            if self.slack or self.tick:
                 self.pool, self.left = self.quota, 0
+        self.turn: Thread | None = None
+        self.waiting: list[Thread] = []
+        self.had = 0
+        self.debt = self.touched = self.touched_by_change = False
+        self.period_ago = self.tick_ago = 0
         self.empty_at: int | None = None
 
     @property
     def stopped(self) -> bool:
-        """Whether the quota is used up."""
+        """Whether the quota is used up, as far as the kernel has noticed."""
+        if self.tick:
+            return self.debt
         return self.quota > 0 and self.left <= 0
 
     def renew(self) -> None:
@@ -337,7 +361,7 @@ class NodeState:
     def thirsty(self) -> bool:
         """Whether something runs that has used up what was drawn, and the pool is not empty."""
         busy = not self.down and self.threads + self.foreign > 0
-        return bool(self.slack) and busy and self.left <= 0 and self.pool > 0
+        return bool(self.slack and not self.tick) and busy and self.left <= 0 and self.pool > 0
 
     def draw(self) -> None:
         """Draw on the pool; only after all changes of this instant."""
@@ -347,9 +371,73 @@ class NodeState:
     def give_back(self) -> None:
         """Give back what an idle node has beyond the slack."""
         idle = self.down or self.threads + self.foreign == 0
-        if self.slack and idle and self.left > self.slack:
+        looked = self.touched if self.tick else bool(self.slack)
+        if looked and idle and self.left > self.slack:
             self.pool = min(self.pool + self.left - self.slack, self.quota)
             self.left = self.slack
+
+    @property
+    def average(self) -> int:
+        """What the threads have received in the mean, rounded down."""
+        threads = [*self.waiting, *([self.turn] if self.turn else [])]
+        return sum(thread.received for thread in threads) // max(len(threads), 1)
+
+    def line_up(self) -> None:
+        """Let threads that are new wait for their turn, and take those that are gone away."""
+        new_foreign = self.touched_by_change
+        average = self.average
+        if self.turn and self.turn.job and self.turn.job not in self.jobs:
+            self.end_turn()
+        there = [thread for thread in self.waiting if thread.job is None or thread.job in self.jobs]
+        self.touched = self.touched or there != self.waiting
+        self.waiting = there
+        if new_foreign:
+            if self.turn and self.turn.job is None:
+                self.end_turn()
+            self.waiting = [thread for thread in self.waiting if thread.job]
+            self.waiting += [Thread(None, average) for _ in range(self.foreign)]
+            self.touched_by_change = False
+        known = [thread.job for thread in (*self.waiting, self.turn) if thread]
+        for job in self.jobs:
+            if job not in known:
+                self.waiting.append(Thread(job, self.average))
+                self.touched = True
+
+    def end_turn(self) -> None:
+        self.turn, self.had, self.touched = None, 0, True
+
+    def pass_on(self, now: int) -> None:
+        """End a turn, at a tick, if it has lasted long enough."""
+        at_tick = (now + self.tick_ago) % self.tick == 0
+        self.touched = True
+        long = self.had >= nanoseconds(LEAST_TURN_MS)
+        if at_tick and not self.debt and long and self.turn:
+            self.waiting.append(self.turn)
+            self.end_turn()
+
+    def take_turns(self) -> None:
+        """Give the turn to the thread that has received least."""
+        if self.turn or self.debt or not self.waiting:
+            return
+        self.turn = min(self.waiting, key=lambda thread: thread.place)
+        self.waiting.remove(self.turn)
+
+    def notice(self) -> None:
+        """Let the kernel look whether the quota is used up: draw on the pool, or pay the debt."""
+        if self.left <= 0:
+            drawn = min(self.pool, (1 if self.debt else nanoseconds(DRAWN_MS)) - self.left)
+            self.pool -= drawn
+            self.left += drawn
+        self.debt = self.left <= 0
+
+    def next_look(self, now: int) -> int | None:
+        """When the kernel looks next if nothing changes."""
+        if self.down or not (self.turn or self.waiting):
+            return None
+        step, ago = self.tick, self.tick_ago
+        if self.debt:
+            step, ago = self.period, self.period_ago
+        return ((now + ago) // step + 1) * step - ago
 
     @property
     def rate(self) -> int:
@@ -360,6 +448,8 @@ class NodeState:
 
     @property
     def running(self) -> list[Job]:
+        if self.tick:
+            return [self.turn.job] if self.turn and self.turn.job else []
         if self.node.scheduler == "fair":
             return self.jobs
         return [job for job in self.jobs if job.cores > 0]
@@ -378,6 +468,9 @@ class NodeState:
         c, s = self.node.cores, self.foreign
         # Under a quota the background takes from the bucket, elsewhere from the cores.
         left = c - (Fraction(0) if self.quota else Fraction(self.node.background))
+        if self.tick:
+            job = self.turn.job if self.turn else None
+            return Fraction(1, job.execution.threads) if job else Fraction(0)
         if self.node.scheduler == "fair":
             return min(Fraction(1), left / max(1, self.threads + s))
         return left / (c + s)
@@ -407,8 +500,11 @@ class NodeState:
                 job.left -= elapsed * (job.cores > 0)
         self.busy += (rate + self.behind) * elapsed
         self.left -= rate * elapsed
-        if self.slack and now // self.period > self.periods:
-            self.periods, self.pool = now // self.period, self.quota
+        self.had += rate * elapsed
+        if self.turn:
+            self.turn.received += rate * elapsed
+        if (self.slack or self.tick) and (now + self.period_ago) // self.period > self.periods:
+            self.periods, self.pool = (now + self.period_ago) // self.period, self.quota
 
     @property
     def usage(self) -> Usage:
@@ -422,7 +518,14 @@ class NodeState:
     def give_out(self) -> None:
         """Give out the cores, and the places on the accelerators."""
         c = self.node.cores
-        if self.node.scheduler == "fair":
+        if self.tick:
+            self.line_up()
+            if self.touched:
+                self.notice()
+            self.take_turns()
+            for job in self.jobs:
+                job.cores = int(self.turn is not None and job is self.turn.job)
+        elif self.node.scheduler == "fair":
             for job in self.jobs:
                 job.cores = min(job.execution.threads, c)
         elif self.node.scheduler == "fifo":
@@ -517,6 +620,8 @@ class Simulation:
         self.heard_of: set[tuple[int, int]] = set()
 
         self.nodes = {name: NodeState(node) for name, node in problem.fabric.nodes.items()}
+        for name, (period_ago, tick_ago) in real.phases.items():
+            self.nodes[name].period_ago, self.nodes[name].tick_ago = period_ago, tick_ago
         self.pools = {
             (cell, name, node): Pool(task, execution.workers)
             for cell in range(len(self.reals))
@@ -576,6 +681,7 @@ class Simulation:
                 node.give_out()
                 node.give_back()
                 self.plan(node)
+                node.touched = False
 
         order = (((kind * 10 + cell) * 10**9 + cycle + 1) * 10**6 + task + 1) * 10**6 + flow
         At(self.env, time - self.now, order, happen)
@@ -606,11 +712,27 @@ class Simulation:
         empty_at = now + -(-node.left // node.rate) if node.quota and node.rate else None
         if node.thirsty:
             empty_at = now
+        if node.tick:
+            # A look at this instant that has yet to come is not passed over.
+            empty_at = node.next_look(now)
+            if empty_at is not None and node.empty_at == now:
+                empty_at = now
         if empty_at != node.empty_at:
             node.empty_at = empty_at
             if empty_at is not None:
                 # Nothing else happens then; every event looks anew at who runs, and how fast.
-                self.at(empty_at, DISTURBANCE, -1, LAST_CHANGE, node.draw)
+                look = self.looker(node, empty_at)
+                self.at(empty_at, DISTURBANCE, -1, LAST_CHANGE, look, fixed=bool(node.tick))
+
+    def looker(self, node: NodeState, time: int) -> Callable[[], None]:
+        def look() -> None:
+            if not node.tick:
+                node.draw()
+            elif time == node.empty_at:
+                node.empty_at = None
+                node.pass_on(time)
+
+        return look
 
     def renewer(self, node: NodeState) -> Callable[[], None]:
         return node.renew
@@ -637,7 +759,8 @@ class Simulation:
         for i, change in enumerate(self.reals[ITSELF].node_changes):
             self.at(change.at_ns, DISTURBANCE, -1, i, self.changer(change), fixed=True)
         for node in self.nodes.values():
-            for begin in range(node.period, self.end + 1, node.period) if node.quota else ():
+            own = node.quota and not node.tick
+            for begin in range(node.period, self.end + 1, node.period) if own else ():
                 self.at(begin, DISTURBANCE, -1, LAST_CHANGE, self.renewer(node), fixed=True)
         for k in range(self.number):
             self.at(self.release[k], RELEASE, k, -1, self.releaser(k), fixed=True)
@@ -1081,6 +1204,9 @@ class Simulation:
         job.end = self.now
         job.outcome = "done"
         self.nodes[job.node].runnable(job).remove(job)
+        pool = self.pools[job.cell, job.task.name, job.node]
+        pool.idle += 1
+        self.take(pool, job.node)
         for flow in self.pipeline.outputs(job.task.name):
             self.send_output(job.cell, flow, job)
         if job.cell == ITSELF and (SHADOW, job.cycle) in self.placed:
@@ -1089,9 +1215,6 @@ class Simulation:
             for flow in self.pipeline.outputs(job.task.name):
                 if job.task.name not in away and flow.target in away:
                     self.send_output(SHADOW, flow, job)
-        pool = self.pools[job.cell, job.task.name, job.node]
-        pool.idle += 1
-        self.take(pool, job.node)
         if job.cell == ITSELF and job.task.name in self.sinks:
             self.hear_back(ITSELF, job.cycle)
             self.hear_back(SHADOW, job.cycle)
@@ -1124,7 +1247,10 @@ class Simulation:
     def changer(self, change: NodeChange) -> Callable[[], None]:
         def happen() -> None:
             node = self.nodes[change.node]
+            gone = change.down and not node.down
+            node.touched_by_change = gone or node.foreign != change.threads
             node.foreign = change.threads
+            node.touched = True
             if change.down and not node.down:
                 self.hear()
                 node.down = True

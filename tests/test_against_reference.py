@@ -67,7 +67,7 @@ EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
 LONGER = int(os.environ.get("DWELL_EXAMPLES", "40"))
 FAIR_TOLERANCE_NS = NEAR_NS
 MOST_EXCLUDED = 0.1
-EVERY: tuple[Scheduler, ...] = ("fair", "fifo", "priority")
+EVERY: tuple[Scheduler, ...] = ("fair", "fifo", "priority", "turns")
 
 
 @pytest.fixture(autouse=True)
@@ -539,7 +539,7 @@ def compare(
 
 @pytest.mark.parametrize(
     "schedulers",
-    [("fifo",), ("priority",), ("fifo", "priority")],
+    [("fifo",), ("priority",), ("fifo", "priority"), ("turns",)],
     ids="-".join,
 )
 def test_equal_to_the_nanosecond_without_processor_sharing(
@@ -548,7 +548,9 @@ def test_equal_to_the_nanosecond_without_processor_sharing(
     compare(schedulers)
 
 
-@pytest.mark.parametrize("schedulers", [("fifo",), ("priority",)], ids=lambda names: names[0])
+@pytest.mark.parametrize(
+    "schedulers", [("fifo",), ("priority",), ("turns",)], ids=lambda names: names[0]
+)
 def test_equal_where_many_events_fall_on_the_same_instant(schedulers: Sequence[Scheduler]) -> None:
     compare(schedulers, whole_ms=True)
 

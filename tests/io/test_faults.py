@@ -92,6 +92,18 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
         ("4000", "from 1 to 1000"),
     ),
     (
+        ("nodes", "R1", "quota"),
+        {"cpu": 1, "period_ms": 4, "tick_ms": 1e-4},
+        "nodes.R1.quota.tick_ms",
+        ("0.0001", "0.001"),
+    ),
+    (
+        ("nodes", "R1"),
+        {"tier": "robot", "cores": 4, "quota": {"cpu": 1, "period_ms": 4, "tick_ms": 4}},
+        "nodes.R1.quota.tick_ms",
+        ("several cores",),
+    ),
+    (
         ("nodes", "R1", "bursts"),
         {"every_ms": 0, "for_ms": 1},
         "nodes.R1.bursts.every_ms",

@@ -39,6 +39,7 @@ from dwell.model import (
     Uniform,
     Weights,
 )
+from dwell.model.fabric import Scheduler
 from dwell.model.objective import TIERS
 from dwell.model.problem import ESTIMATORS, MIGRATIONS, POLICIES
 from dwell.model.servo import PLANTS
@@ -115,14 +116,19 @@ times = _reals(0, 1e9)
 
 @st.composite
 def _node(draw: st.DrawFn, name: str) -> Node:
+    schedulers: tuple[Scheduler, ...] = ("fair", "fifo", "priority")
+    cores, scheduler = draw(st.just(1) | _whole(1, 4096)), draw(st.sampled_from(schedulers))
+    times = [_reals(0.001, 4096), _reals(1, 1000), _reals(0, 1000)]
+    if cores == 1 and scheduler == "fair":
+        times.append(_reals(0.001, 1000))
     return Node(
         name,
         draw(st.sampled_from(TIERS)),
-        cores=draw(_whole(1, 4096)),
-        scheduler=draw(st.sampled_from(("fair", "fifo", "priority"))),
+        cores=cores,
+        scheduler=scheduler,
         accelerators=draw(st.dictionaries(st.sampled_from(("gpu", "npu")), _whole(1, 4096))),
         bursts=draw(st.none() | st.builds(Bursts, durations, durations, _whole(0, 1_000_000))),
-        quota=draw(st.none() | st.builds(Quota, _reals(0.001, 4096), _reals(1, 1000))),
+        quota=draw(st.none() | st.builds(Quota, *times)),
     )
 
 

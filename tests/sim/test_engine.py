@@ -593,6 +593,55 @@ def test_a_core_keeps_some_of_what_it_has_drawn() -> None:
     assert latency_ms == [13.0, *[12.0] * 19]
 
 
+def test_a_quota_is_noticed_at_ticks_and_its_overrun_paid_back() -> None:
+    # 2 ms in every 4; periods begin with the releases, and 3 ms after a tick.
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(0.5, 4.0, tick_ms=4.0))],
+        [Task("work", {"R": Execution(Constant(6.0))})],
+        period_ms=40.0,
+        window_cycles=10,
+    )
+    real = replace(
+        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": (0, 3 * MS)}
+    )
+    run = dwell.simulate_realisation(problem, real, policy="LOC")
+    # It runs from 0 to 5: 1 of 2 ms are left at the first tick, and 1 too many of 4 are used at the
+    # second. The refill at 8 pays that debt, and in the ms that it leaves the job ends.
+    assert set(run.cycles["latency_ns"].to_list()) == {9 * MS}
+
+
+def test_threads_take_turns_from_tick_to_tick() -> None:
+    stress = NodeDisturbance(node="R", at_s=0.0, stress_threads=1)
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(1.0, 4.0, tick_ms=4.0))],
+        [Task("work", {"R": Execution(Constant(6.0))})],
+        period_ms=40.0,
+        window_cycles=10,
+        scenario=[stress],
+    )
+    real = replace(
+        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": (0, 1 * MS)}
+    )
+    run = dwell.simulate_realisation(problem, real, policy="LOC", jobs=True)
+    assert run.jobs is not None
+    # The other thread has the core until the tick at 3, and from 7 to 11.
+    assert set((run.jobs["start_ns"] - run.jobs["ready_ns"]).to_list()) == {3 * MS}
+    assert set(run.cycles["latency_ns"].to_list()) == {13 * MS}
+
+
+def test_phases_are_drawn_where_ticks_are() -> None:
+    def drawn(tick_ms: float, seed: int) -> Mapping[str, tuple[int, int]]:
+        node = Node("R", "robot", 1, quota=Quota(0.5, 10.0, tick_ms=tick_ms))
+        problem = make_problem([node], [Task("work", {"R": Execution(Constant(1.0))})])
+        return dwell.draw(problem, scenario="disturbed", seed=seed, windows=1).phases
+
+    assert drawn(0.0, 1) == {}
+    assert drawn(4.0, 1) == drawn(4.0, 1) != drawn(4.0, 2)
+    period_ago, tick_ago = zip(*(drawn(4.0, seed)["R"] for seed in range(50)), strict=True)
+    assert 0 <= min(period_ago) < 2 * MS < 8 * MS < max(period_ago) < 10 * MS
+    assert 0 <= min(tick_ago) < MS < 3 * MS < max(tick_ago) < 4 * MS
+
+
 @pytest.mark.parametrize(
     ("quota", "exec_ms", "latency_ms", "used"),
     [

@@ -18,6 +18,7 @@ from dwell.io.entries import (
     NodeEntry,
     ObjectiveEntry,
     ProcessEntry,
+    QuotaEntry,
     ServoEntry,
     TaskEntry,
 )
@@ -191,7 +192,7 @@ class Assembly:
         if entry is None:
             return None
         path = f"nodes.{name}"
-        burst, quota = entry.bursts, entry.quota
+        burst = entry.bursts
         bursts = self._bursts(burst, f"{path}.bursts", threads=burst.threads) if burst else None
         return self.faults.attempt(
             path,
@@ -203,10 +204,16 @@ class Assembly:
                 scheduler=entry.scheduler,
                 accelerators=entry.accelerators,
                 bursts=bursts,
-                quota=Quota(quota.cpu, quota.period_ms, quota.slack_ms or 0.0) if quota else None,
+                quota=self._quota(path, entry.quota),
                 background=entry.background,
             ),
         )
+
+    def _quota(self, path: str, entry: QuotaEntry | None) -> Quota | None:
+        if entry is None:
+            return None
+        more = _given(slack_ms=entry.slack_ms, tick_ms=entry.tick_ms)
+        return self.faults.attempt(path, Quota, entry.cpu, entry.period_ms, **more)
 
     def _links(self) -> Iterator[tuple[str, Link]]:
         for index, entry in enumerate(self.entry.links or ()):

@@ -301,6 +301,11 @@ class QuotaEntry(Entry):
         description="Run time that is kept beyond the period when nothing runs, ms; default 0. "
         "Linux keeps 1.",
     )
+    tick_ms: Annotated[float, Number(bounds.QUOTA_TICK_MS)] | None = Field(
+        None,
+        description="Time between the ticks at which a used-up budget is noticed and threads take "
+        "turns, ms; default 0, at once. Linux: 1000 / HZ. One core, `fair`.",
+    )
 
 
 class BurstsEntry(Entry):

@@ -50,6 +50,7 @@ from dwell.kernels.layout import (
     FINISHED,
     FIRST,
     FLOW_0,
+    FOREIGN,
     GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
@@ -103,6 +104,7 @@ from dwell.kernels.layout import (
     RELEASE,
     RESTART,
     RETRY,
+    SCHEDULER,
     SERVER,
     SHADOW,
     SITE,
@@ -117,7 +119,9 @@ from dwell.kernels.layout import (
     TAKEN,
     TARGET,
     TASK_0,
+    TURNS,
     UNKNOWN,
+    USED,
     VIRTUAL,
     WAITED,
     WAITING,
@@ -130,7 +134,17 @@ from dwell.kernels.layout import (
     Tables,
 )
 from dwell.kernels.links import lose, send, slot_row
-from dwell.kernels.nodes import admit, draw_quota, job_row, key_row, leave, mark, set_speed, tick
+from dwell.kernels.nodes import (
+    admit,
+    draw_quota,
+    job_row,
+    key_row,
+    leave,
+    mark,
+    restress,
+    set_speed,
+    tick,
+)
 
 __all__ = ["advance"]
 
@@ -151,6 +165,8 @@ def _progress(s: Tables, server: int, at: int) -> tuple[int, float]:
     else:
         row = index(s.servers[server, BASE] + at - running)
         key, left = s.wait_key[row], s.wait_left[row]
+        if key == FOREIGN:
+            return FOREIGN, 0.0
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
     site = s.jobs[key_row(s.ring, s.stride, key), SITE]
     return key, s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
@@ -170,6 +186,8 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
         extra = s.own[shadow, node] if shadow >= 0 else 0.0
         for i in range(s.servers[server, N_RUN] + s.servers[server, N_WAIT]):
             key, received = _progress(s, server, i)
+            if key == FOREIGN:
+                continue
             whose = (key >> CELL_SHIFT) & CELL_MASK
             if whose == cell:
                 own += received
@@ -254,6 +272,8 @@ def _crash(s: Tables, server: int, now: int) -> None:
     """Lose what runs or waits for cores on a server whose node goes down."""
     for i in range(s.servers[server, N_RUN] + s.servers[server, N_WAIT]):
         key, received = _progress(s, server, i)
+        if key == FOREIGN:
+            continue
         if s.servers[server, IS_CPU] != 0:
             s.own[(key >> CELL_SHIFT) & CELL_MASK, s.servers[server, NODE_OF]] += received
         _lose_key(s, key, now)
@@ -261,6 +281,8 @@ def _crash(s: Tables, server: int, now: int) -> None:
         key = s.run_key[s.servers[server, BASE]]
         leave(s, server, index(s.jobs[key_row(s.ring, s.stride, key), SITE]), now)
     s.servers[server, N_WAIT] = 0
+    # Jobs that wait for their turn count, too.
+    s.servers[server, USED] = 0
 
 
 @phase
@@ -298,7 +320,11 @@ def _change(s: Tables, now: int) -> None:
             _crash(s, server, now)
         s.servers[server, DOWN] = down
         if s.servers[server, IS_CPU] != 0:
-            s.servers[server, STRESS] = s.changes[change, CHANGE_STRESS]
+            stress = s.changes[change, CHANGE_STRESS]
+            anew = stress != s.servers[server, STRESS] or (turned and down != 0)
+            if anew and s.servers[server, SCHEDULER] == TURNS:
+                restress(s, server, stress)
+            s.servers[server, STRESS] = stress
         set_speed(s, server)
         mark(s, server)
     if turned:

@@ -50,8 +50,8 @@ PAUSED, FINISHED, GROW_EVENTS, GROW_RING, STEP = range(5)
 IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = (_number(code) for code in range(5))
 FIRST, UNKNOWN = _number(0), _number(-1)
 
-# Schedulers.
-FAIR, FIFO, PRIORITY = range(3)
+# Schedulers. TURNS is that of a fair node whose quota is noticed at ticks.
+FAIR, FIFO, PRIORITY, TURNS = range(4)
 
 # clock: scalars that outlive a call.
 # END is the instant of the last close that any cell can have.
@@ -129,7 +129,13 @@ SOURCE, TARGET, N_FLOW = range(3)
     N_SITE,
 ) = range(15)
 
+# A foreign thread among those that wait for their turn, where jobs have their keys.
+FOREIGN = _number(-1)
+
 # servers
+# TICK_NS is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last tick
+# was TICK_AGO and the last begin of a period PERIOD_AGO ago. TURN says whether a thread has the
+# turn, TURN_V what it had received before, and TURN_NS what since.
 (
     SCHEDULER,
     CORES,
@@ -154,8 +160,14 @@ SOURCE, TARGET, N_FLOW = range(3)
     QUOTA_T,
     POOL_NS,
     SLACK_NS,
+    TICK_NS,
+    TICK_AGO,
+    PERIOD_AGO,
+    TURN,
+    TURN_V,
+    TURN_NS,
     N_SERVER,
-) = range(24)
+) = range(30)
 
 # servers, float64
 VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, N_SERVER_F = range(6)

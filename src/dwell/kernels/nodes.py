@@ -4,6 +4,9 @@ All running jobs of a server advance at one common speed, so a virtual clock tha
 speed turns processor sharing into a heap: a job that starts at virtual time v with c nanoseconds of
 work ends at virtual time v + c, whoever comes or goes meanwhile. The virtual clock is set back to 0
 whenever the server runs empty, which keeps its rounding error below a picosecond in practice.
+
+Where a quota is noticed at ticks, threads take turns instead. All but the one that has the turn are
+in the heap of those that wait, foreign threads too, by the core time that each has received.
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from dwell.kernels.layout import (
     FAIR,
     FIFO,
     FIRST,
+    FOREIGN,
     ITEM_MASK,
     KIND_SHIFT,
     LAST,
@@ -46,6 +50,7 @@ from dwell.kernels.layout import (
     NEXT_KEY,
     NEXT_T,
     PERIOD,
+    PERIOD_AGO,
     PERIOD_NS,
     POOL_NS,
     PRIORITY,
@@ -62,6 +67,12 @@ from dwell.kernels.layout import (
     STARTED,
     STRESS,
     THROTTLED,
+    TICK_AGO,
+    TICK_NS,
+    TURN,
+    TURN_NS,
+    TURN_V,
+    TURNS,
     UNKNOWN,
     USED,
     VIRTUAL,
@@ -74,6 +85,7 @@ __all__ = [
     "job_row",
     "leave",
     "mark",
+    "restress",
     "schedule",
     "set_speed",
     "tick",
@@ -81,6 +93,12 @@ __all__ = [
 
 # Work left below this many nanoseconds is rounding, not work.
 SLACK = 1e-3
+# What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
+# run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much).
+DRAWN_NS = 5_000_000
+LEAST_TURN_NS = 1_400_000
+# Of those that have received the same, jobs go first.
+LATE = 1 << 62
 
 
 @phase
@@ -121,6 +139,7 @@ def _account(s: Tables, server: int, now: int) -> int:
         if s.servers[server, THROTTLED] == 0:
             s.servers[server, BUSY] += spent
             s.servers[server, LEFT_NS] -= spent
+            s.servers[server, TURN_NS] += spent
     s.servers[server, LAST] = now
     return int(elapsed)
 
@@ -148,6 +167,9 @@ def draw_quota(s: Tables, server: int, now: int) -> None:
 
     Only after all changes of this instant: what ends now draws nothing.
     """
+    if s.servers[server, SCHEDULER] == TURNS:
+        _strike(s, server, now)
+        return
     refill(s, server, now)
     busy = s.servers[server, USED] + s.servers[server, STRESS]
     if s.servers[server, LEFT_NS] <= 0 and busy > 0 and s.servers[server, DOWN] == 0:
@@ -157,21 +179,80 @@ def draw_quota(s: Tables, server: int, now: int) -> None:
 
 
 @phase
+def _strike(s: Tables, server: int, now: int) -> None:
+    """Pass the turn on at a tick, if it has lasted long enough; the clock must be up to date."""
+    since = (now + s.servers[server, TICK_AGO]) % s.servers[server, TICK_NS]
+    short = s.servers[server, TURN_NS] < LEAST_TURN_NS
+    if since != 0 or short or s.servers[server, THROTTLED] != 0:
+        return
+    received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
+    if s.servers[server, N_RUN] == 0:
+        _queue_up(s, server, received, LATE, FOREIGN, 0.0)
+    else:
+        base = index(s.servers[server, BASE])
+        key = s.run_key[base]
+        left = max(s.run_v[base] - s.servers_f[server, VIRTUAL], 0.0)
+        row = key_row(s.ring, s.stride, key)
+        _queue_up(s, server, received, s.jobs[row, READY], key, left)
+        s.servers[server, N_RUN] = 0
+    _end_turn(s, server)
+
+
+@phase
+def _notice(s: Tables, server: int, now: int) -> None:
+    """Let the kernel look whether a quota is used up; the server's clock must be up to date.
+
+    What was overrun is a debt: a server that is stopped goes on when refills have paid it
+    (distribute_cfs_runtime); one that runs draws a slice (assign_cfs_rq_runtime), or stops.
+    """
+    period = (now + s.servers[server, PERIOD_AGO]) // s.servers[server, PERIOD_NS]
+    if period > s.servers[server, PERIOD]:
+        s.servers[server, PERIOD] = period
+        s.servers[server, POOL_NS] = s.servers[server, QUOTA_NS]
+    left = s.servers[server, LEFT_NS]
+    if left <= 0:
+        wanted = 1 if s.servers[server, THROTTLED] != 0 else DRAWN_NS
+        drawn = min(s.servers[server, POOL_NS], wanted - left)
+        s.servers[server, POOL_NS] -= drawn
+        s.servers[server, LEFT_NS] = left + drawn
+    s.servers[server, THROTTLED] = 1 if s.servers[server, LEFT_NS] <= 0 else 0
+    set_speed(s, server)
+
+
+@phase
+def _next_look(s: Tables, server: int, now: int) -> int:
+    """When the quota of a busy server is looked at next: a begin of a period, or a tick."""
+    if s.servers[server, THROTTLED] != 0:
+        begin = (s.servers[server, PERIOD] + 1) * s.servers[server, PERIOD_NS]
+        return int(begin - s.servers[server, PERIOD_AGO])
+    if s.servers[server, QUOTA_T] == now:
+        return now  # the tick of this instant has yet to come
+    tick_ns = s.servers[server, TICK_NS]
+    return int(now + tick_ns - (now + s.servers[server, TICK_AGO]) % tick_ns)
+
+
+@phase
 def _announce_quota(s: Tables, server: int, now: int) -> None:
     """Announce when a server's quota is used up or renewed; an older announcement goes stale."""
-    refill(s, server, now)
+    turns = s.servers[server, SCHEDULER] == TURNS
+    if turns:
+        _notice(s, server, now)
+    else:
+        refill(s, server, now)
     busy = s.servers[server, USED] + s.servers[server, STRESS]
     if busy == 0 or s.servers[server, DOWN] != 0:
         s.servers[server, QUOTA_T] = -1
         # Beyond the slack, what was drawn goes back.
         slack, quota = s.servers[server, SLACK_NS], s.servers[server, QUOTA_NS]
-        if slack > 0 and s.servers[server, LEFT_NS] > slack:
+        if (slack > 0 or turns) and s.servers[server, LEFT_NS] > slack:
             pool = s.servers[server, POOL_NS] + s.servers[server, LEFT_NS] - slack
             s.servers[server, POOL_NS] = min(pool, quota)
             s.servers[server, LEFT_NS] = slack
         return
     t = (s.servers[server, PERIOD] + 1) * s.servers[server, PERIOD_NS]
-    if s.servers[server, THROTTLED] == 0:
+    if turns:
+        t = _next_look(s, server, now)
+    elif s.servers[server, THROTTLED] == 0:
         rate = min(busy, s.servers[server, CORES])
         t = min(t, now + (s.servers[server, LEFT_NS] + rate - 1) // rate)
     elif s.servers[server, POOL_NS] > 0:
@@ -196,13 +277,18 @@ def set_speed(s: Tables, server: int) -> None:
     """Set the common speed after threads, stress or quota changed; the clock must be up to date.
 
     With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
-    c' / (c + s); any: 0 while the quota is used up.
+    c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: 0 while the
+    quota is used up.
     """
     spare = s.servers_f[server, SPARE]
     stress = s.servers[server, STRESS]
     if s.servers[server, SCHEDULER] == FAIR:
         load = s.servers[server, USED] + stress
         s.servers_f[server, SPEED] = 1.0 if load <= spare else spare / load
+    elif s.servers[server, SCHEDULER] == TURNS:
+        if s.servers[server, N_RUN] > 0:
+            row = key_row(s.ring, s.stride, s.run_key[index(s.servers[server, BASE])])
+            s.servers_f[server, SPEED] = 1.0 / s.sites[index(s.jobs[row, SITE]), NEED]
     else:
         s.servers_f[server, SPEED] = spare / (s.servers[server, CORES] + stress)
     if s.servers[server, THROTTLED] != 0:
@@ -223,10 +309,90 @@ def _start(s: Tables, server: int, site: int, key: int, row: int, left: float, n
 
 
 @phase
+def _queue_up(s: Tables, server: int, rank: int, ready: int, key: int, left: float) -> None:
+    """Add a job to those that wait for cores, or a thread to those that wait for their turn."""
+    base = s.servers[server, BASE]
+    n = s.servers[server, N_WAIT]
+    w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
+    push_waiting(w[0], w[1], w[2], w[3], base, n, rank, ready, key, left)
+    s.servers[server, N_WAIT] = n + 1
+
+
+@phase
+def _end_turn(s: Tables, server: int) -> None:
+    s.servers[server, TURN] = 0
+    s.servers[server, TURN_NS] = 0
+
+
+@phase
+def _average(s: Tables, server: int) -> int:
+    """Mean core time that the threads of a server have received: where a new one begins."""
+    base = s.servers[server, BASE]
+    n = s.servers[server, N_WAIT]
+    received = 0
+    for i in range(n):
+        received += s.wait_rank[index(base + i)]
+    if s.servers[server, TURN] != 0:
+        received += s.servers[server, TURN_V] + s.servers[server, TURN_NS]
+        n += 1
+    return int(received // n) if n > 0 else 0
+
+
+@phase
+def _take_turn(s: Tables, server: int, now: int) -> None:
+    """Give the turn, if nobody has it and the quota lets anybody, to who has received least."""
+    tick(s, server, now)
+    _notice(s, server, now)
+    n = s.servers[server, N_WAIT]
+    if n == 0 or s.servers[server, TURN] != 0 or s.servers[server, THROTTLED] != 0:
+        return
+    base = index(s.servers[server, BASE])
+    key, left = s.wait_key[base], s.wait_left[base]
+    s.servers[server, TURN] = 1
+    s.servers[server, TURN_V] = s.wait_rank[base]
+    pop_waiting(s.wait_rank, s.wait_ready, s.wait_key, s.wait_left, s.servers[server, BASE], n)
+    s.servers[server, N_WAIT] = n - 1
+    if key == FOREIGN:
+        return
+    s.servers_f[server, VIRTUAL] = 0.0
+    row = key_row(s.ring, s.stride, key)
+    if s.jobs[row, STARTED] < 0:
+        s.jobs[row, STARTED] = now
+    push_running(s.run_v, s.run_key, s.servers[server, BASE], 0, left, key)
+    s.servers[server, N_RUN] = 1
+    set_speed(s, server)
+
+
+@phase
+def restress(s: Tables, server: int, threads: int) -> None:
+    """Replace the foreign threads that take turns by so many new ones; the clock must be right."""
+    received = _average(s, server)
+    base, n = s.servers[server, BASE], s.servers[server, N_WAIT]
+    s.servers[server, N_WAIT] = 0
+    # The heap of the jobs grows no faster than that of all is read.
+    for i in range(n):
+        row = index(base + i)
+        if s.wait_key[row] != FOREIGN:
+            rank, ready, key = s.wait_rank[row], s.wait_ready[row], s.wait_key[row]
+            _queue_up(s, server, rank, ready, key, s.wait_left[row])
+    if s.servers[server, N_RUN] == 0:
+        _end_turn(s, server)
+    for _ in range(threads):
+        _queue_up(s, server, received, LATE, FOREIGN, 0.0)
+
+
+@phase
 def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None:
     """Make a job that a worker has taken runnable."""
     server = index(s.sites[site, SERVER])
     scheduler = s.servers[server, SCHEDULER]
+    if scheduler == TURNS:
+        tick(s, server, now)
+        received = _average(s, server)
+        _queue_up(s, server, received, s.jobs[row, READY], key, float(work))
+        s.servers[server, USED] += 1
+        mark(s, server)
+        return
     n = s.servers[server, N_WAIT]
     need = s.sites[site, NEED]
     # Where nobody else can want the cores now, the job needs no queue.
@@ -250,11 +416,7 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
         return
     mark(s, server)
     rank = 0 if scheduler == FIFO else s.sites[site, RANK]
-    base = s.servers[server, BASE]
-    ready = s.jobs[row, READY]
-    w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
-    push_waiting(w[0], w[1], w[2], w[3], base, n, rank, ready, key, float(work))
-    s.servers[server, N_WAIT] = n + 1
+    _queue_up(s, server, rank, s.jobs[row, READY], key, float(work))
 
 
 @phase
@@ -281,16 +443,16 @@ def _preempt(s: Tables, server: int) -> bool:
     pop_running(s.run_v, s.run_key, base, s.servers[server, N_RUN], worst)
     s.servers[server, N_RUN] -= 1
     s.servers[server, USED] -= s.sites[index(s.jobs[row, SITE]), NEED]
-    n = s.servers[server, N_WAIT]
-    w = s.wait_rank, s.wait_ready, s.wait_key, s.wait_left
-    push_waiting(w[0], w[1], w[2], w[3], base, n, rank, ready, key, max(left, 0.0))
-    s.servers[server, N_WAIT] = n + 1
+    _queue_up(s, server, rank, ready, key, max(left, 0.0))
     return True
 
 
 @phase
 def dispatch(s: Tables, server: int, now: int) -> None:
-    """Give out the cores of a fifo or priority server."""
+    """Give out the cores of a server that is not fair."""
+    if s.servers[server, SCHEDULER] == TURNS:
+        _take_turn(s, server, now)
+        return
     if s.servers[server, N_WAIT] == 0:
         return
     tick(s, server, now)
@@ -321,7 +483,11 @@ def leave(s: Tables, server: int, site: int, now: int) -> None:
         s.servers_f[server, VIRTUAL] += elapsed * s.servers_f[server, SPEED]
     pop_running(s.run_v, s.run_key, base, n, FIRST)
     s.servers[server, N_RUN] = n - 1
-    s.servers[server, USED] -= s.sites[site, NEED]
+    if s.servers[server, SCHEDULER] == TURNS:
+        s.servers[server, USED] -= 1
+        _end_turn(s, server)
+    else:
+        s.servers[server, USED] -= s.sites[site, NEED]
     s.servers[server, NEXT_KEY] = -1
     if n > 1 or s.servers[server, N_WAIT] > 0 or s.servers[server, QUOTA_NS] > 0:
         mark(s, server)

@@ -128,7 +128,7 @@ class _Layout:
 
     def arrays(self) -> Arrays:
         for index, (problem, real) in enumerate(self.cells):
-            self._add_nodes(index, problem)
+            self._add_nodes(index, problem, real)
             self._add_cell(index, problem, real)
         if self.shadows is not None:
             ((problem, _),) = self.cells
@@ -139,7 +139,7 @@ class _Layout:
     def _node_key(self, index: int, name: str) -> str:
         return name if self.single or name in self.shared else f"{index}/{name}"
 
-    def _add_nodes(self, index: int, problem: Problem) -> None:
+    def _add_nodes(self, index: int, problem: Problem, real: Realisation) -> None:
         for name, node in problem.fabric.nodes.items():
             key = self._node_key(index, name)
             if key in self.node_row:
@@ -156,7 +156,12 @@ class _Layout:
                 quota_ns = max(round(node.budget_ms * 1e6), 1)
                 cpu[k.PERIOD_NS], cpu[k.QUOTA_NS] = period_ns, quota_ns
                 cpu[k.SLACK_NS] = round(node.quota.slack_ms * 1e6)
-                cpu[k.POOL_NS if cpu[k.SLACK_NS] else k.LEFT_NS] = quota_ns
+                cpu[k.TICK_NS] = round(node.quota.tick_ms * 1e6)
+                pooled = cpu[k.SLACK_NS] or cpu[k.TICK_NS]
+                cpu[k.POOL_NS if pooled else k.LEFT_NS] = quota_ns
+                if cpu[k.TICK_NS]:
+                    cpu[k.SCHEDULER] = k.TURNS
+                    cpu[k.PERIOD_AGO], cpu[k.TICK_AGO] = real.phases.get(name, (0, 0))
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
 
@@ -262,7 +267,7 @@ class _Layout:
             execution = task.on[node_name]
             node = self._node_key(index, node_name)
             server = self.server_row[node, execution.accelerator]
-            fair = self.servers[server][k.SCHEDULER] == k.FAIR
+            fair = self.servers[server][k.SCHEDULER] in (k.FAIR, k.TURNS)
             cores = self.servers[server][k.CORES]
             row = [0] * k.N_SITE
             row[k.SITE_CELL], row[k.SITE_TASK] = index, names.index(task_name)
@@ -327,9 +332,19 @@ class _Layout:
             if number > limit:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
 
+    def _foreign(self, server: list[int], changes: k.Ints) -> int:
+        """Most foreign threads of a server among those that take turns."""
+        of = changes[changes[:, k.CHANGE_NODE] == server[k.NODE_OF], k.CHANGE_STRESS]
+        return int(of.max(initial=0)) if server[k.SCHEDULER] == k.TURNS else 0
+
     def _tables(self) -> k.Tables:
         cells, nodes, cycles = len(self.cell_rows), len(self.node_row), self.cycles
-        capacity = [max(workers, 1) for workers in self.server_workers]
+        changes = np.concatenate(self.changes)
+        changes = changes[np.argsort(changes[:, 0], kind="stable")]
+        capacity = [
+            max(workers, 1) + self._foreign(server, changes)
+            for server, workers in zip(self.servers, self.server_workers, strict=True)
+        ]
         base = np.concatenate(([0], np.cumsum(capacity)[:-1]))
         servers = _table(self.servers, k.N_SERVER)
         servers[:, k.BASE] = base
@@ -349,8 +364,6 @@ class _Layout:
             for real, row in zip(reals, self.cell_rows, strict=True)
         )
 
-        changes = np.concatenate(self.changes)
-        changes = changes[np.argsort(changes[:, 0], kind="stable")]
         stamps = np.zeros((cells, cycles), np.int16)
         stamps[[row[k.PARENT] >= 0 for row in self.cell_rows]] = -1
         tables = k.Tables(

@@ -156,7 +156,19 @@ class _Draw:
             extra_ns=extra_ns,
             node_changes=self._node_changes(),
             link_segments=self._link_segments(),
+            phases=self._phases(),
         )
+
+    def _phases(self) -> dict[str, tuple[int, int]]:
+        """Draw where periods and ticks are when the run begins, where a quota is bound to ticks."""
+        phases = {}
+        for name, node in self.problem.fabric.nodes.items():
+            if node.quota is not None and node.quota.tick_ms > 0:
+                rng = self._rng(f"phase/{name}")
+                period_ns = round(node.quota.period_ms * NS_PER_MS)
+                tick_ns = round(node.quota.tick_ms * NS_PER_MS)
+                phases[name] = (int(rng.integers(period_ns)), int(rng.integers(tick_ns)))
+        return phases
 
     def _rng(self, name: str) -> np.random.Generator:
         return _Generator(np.random.SFC64(self._stream(name)))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -167,6 +167,9 @@ class Realisation:
         Ascending in time; kept as `NodeChanges`.
     link_segments : sequence of LinkSegment
         Per link ascending in time; kept as `LinkSegments`.
+    phases : mapping of str to (int, int)
+        Of nodes whose quota is noticed at ticks: how long before time 0 a period of the quota had
+        begun, and how long before it the last tick was, ns. Both 0 where a node is left out.
     """
 
     scenario: str
@@ -182,6 +185,7 @@ class Realisation:
     extra_ns: NDArray[np.int64]
     node_changes: Sequence[NodeChange]
     link_segments: Sequence[LinkSegment]
+    phases: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))

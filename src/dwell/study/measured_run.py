@@ -210,8 +210,8 @@ def _other_cell(theirs: Document, own: Document) -> Iterator[str]:
     for name in own["nodes"].keys() & theirs.get("nodes", {}).keys():
         there, here = theirs["nodes"][name], own["nodes"][name]
         for field in NODE_FIELDS:
-            if there.get(field) != here.get(field):
-                was, now = there.get(field), here.get(field)
+            was, now = there.get(field), here.get(field)
+            if _allowance(was) != _allowance(now):
                 yield f"nodes.{name}.{field} was {was!r} in the run and is {now!r} in the cell"
     for name in own["tasks"].keys() & theirs.get("tasks", {}).keys():
         there, here = theirs["tasks"][name], own["tasks"][name]
@@ -221,6 +221,13 @@ def _other_cell(theirs: Document, own: Document) -> Iterator[str]:
     there, here = ({f"{one['from']}->{one['to']}" for one in doc["flows"]} for doc in (theirs, own))
     if there != here:
         yield f"it is a run of another cell: its flows are {_names(there)}, not {_names(here)}"
+
+
+def _allowance(value: Any) -> Any:
+    """Leave out of a quota how the kernel keeps to it, which is for the model to say."""
+    if not isinstance(value, Mapping):
+        return value
+    return {key: entry for key, entry in value.items() if key not in ("slack_ms", "tick_ms")}
 
 
 def _names(values: Any) -> str:

@@ -1,0 +1,384 @@
+"""Campaign: faults of a timeline befall a cell, one after the other, and are judged."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import yaml
+
+import dwell
+from dwell.chaos.disk import may_mount
+from dwell.chaos.faults import Fault, Means, bound_of, faults_of
+from dwell.chaos.ground import STARVING_THREADS, Ground, environment_of
+from dwell.chaos.light_cell import document, exec_ms
+from dwell.chaos.observer import Observer
+from dwell.chaos.stage import OnHosts, OnLoopback, Stage
+from dwell.chaos.stages import APPLY
+from dwell.chaos.stalls import StallDetector
+from dwell.chaos.strike import Outcome, strike
+from dwell.chaos.timeline import Planned, planned
+from dwell.demo.stageplay import on_this_machine
+from dwell.errors import DwellError, LiveError
+from dwell.model import FrozenDict, Problem
+from dwell.testbed.bed import Bed
+
+__all__ = ["Campaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]
+
+#: Takes the number of a cell among those of a campaign; returns where it runs, and its home.
+Staging: TypeAlias = Callable[[int], tuple[Stage, str | None]]
+
+LIGHT_HOME = "SO"
+#: What is on its way to an ear.
+HEARD_S = 0.15
+
+
+def on_loopback(cell: Path | None, out: Path, seed: int) -> Staging:
+    """Return what has cells run on this computer's loopback, each in a folder of its own.
+
+    Parameters
+    ----------
+    cell : Path, optional
+        Cell file; the light cell if left out.
+    out : Path
+    seed : int
+        Of delays and losses.
+    """
+
+    def stage(number: int) -> tuple[Stage, str | None]:
+        problem, folder, environment, home = _cell(cell, out, number, quotas=False)
+        problem = on_this_machine(problem)
+        return OnLoopback(problem, folder, seed=seed, environment=environment), home
+
+    return stage
+
+
+def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
+    """Return what gives every node a host of its own of a testbed; only root can.
+
+    Parameters
+    ----------
+    cell : Path, optional
+        Cell file; the light cell if left out.
+    out : Path
+    seed : int
+        Of delays and losses.
+    """
+
+    def stage(number: int) -> tuple[Stage, str | None]:
+        problem, folder, environment, home = _cell(cell, out, number, quotas=True)
+        beside = None if cell is None else cell.parent
+        bed = Bed(
+            *(problem, folder),
+            name=f"chaos{os.getpid() % 10_000}",
+            seed=seed,
+            beside=beside,
+            environment=environment,
+        )
+        return OnHosts(bed), home
+
+    return stage
+
+
+def _cell(
+    cell: Path | None, out: Path, number: int, *, quotas: bool
+) -> tuple[Problem, Path, dict[str, str], str | None]:
+    """Return a cell, its folder, the variables of its processes, and its home."""
+    folder = (out / f"cell-{number}").resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    if cell is None:
+        written = folder / "written.yaml"
+        written.write_text(yaml.safe_dump(document(LIGHT_HOME, quotas=quotas)), encoding="utf-8")
+        environment = environment_of(folder, exec_ms(LIGHT_HOME))
+        return dwell.load(written), folder, environment, LIGHT_HOME
+    problem, environment = _witnessed(dwell.load(cell), folder, cell.resolve().parent)
+    return problem, folder, environment, None
+
+
+def _witnessed(problem: Problem, folder: Path, beside: Path) -> tuple[Problem, dict[str, str]]:
+    """Return a cell whose actuators are written down before they are called."""
+    actuators = dict(problem.live.actuators)
+    if len(actuators) != 1:
+        raise LiveError("chaos needs a cell with one sink, whose actuator live.actuators names")
+    witnessed = FrozenDict(dict.fromkeys(actuators, "dwell.chaos.stages:Witnessed"))
+    environment = environment_of(folder, {}, actuators=actuators)
+    paths = [str(beside), os.environ.get("PYTHONPATH", "")]
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
+    return replace(problem, live=replace(problem.live, actuators=witnessed)), environment
+
+
+@dataclass(slots=True)
+class Result:
+    """What became of a campaign.
+
+    Parameters
+    ----------
+    seed : int
+    outcomes : list of (Planned, Outcome)
+    stalled : int
+        Faults in which a bound was missed, or a silence was too long, while the machine stalled.
+    wrong : list of str
+        Violations, each with the seed and the fault.
+    heard : dict of str to int
+        Messages, by their kind, that were held against the cell file.
+    actuated : int
+    seconds : float
+    means : dict of str to str
+        How what needs a right that not everybody has was brought about.
+    """
+
+    seed: int
+    outcomes: list[tuple[Planned, Outcome]] = field(default_factory=list)
+    stalled: int = 0
+    wrong: list[str] = field(default_factory=list)
+    heard: dict[str, int] = field(default_factory=dict)
+    actuated: int = 0
+    seconds: float = 0.0
+    means: dict[str, str] = field(default_factory=dict)
+
+    def counts(self) -> dict[str, int]:
+        """Return how many faults of each kind there were."""
+        found: dict[str, int] = {}
+        for one, _ in self.outcomes:
+            kind = one.fault.kind or one.fault.how
+            found[kind] = found.get(kind, 0) + 1
+        return dict(sorted(found.items()))
+
+    def document(self) -> dict[str, Any]:
+        """Return it ready for JSON."""
+        bounded = [o for _, o in self.outcomes if o.bound is not None]
+        return {
+            "seed": self.seed,
+            "faults": len(self.outcomes),
+            "kinds": self.counts(),
+            "bounded": len(bounded),
+            "most_lost_where_bounded": max((max(o.lost, o.lost_after) for o in bounded), default=0),
+            "slowest_recovery_ms": max((o.recovery_ms for _, o in self.outcomes), default=0.0),
+            "stalled": self.stalled,
+            "violations": self.wrong,
+            "heard": self.heard,
+            "actuated": self.actuated,
+            "seconds": round(self.seconds, 1),
+            "means": self.means,
+        }
+
+
+class Campaign:
+    """See the module.
+
+    Parameters
+    ----------
+    staging : callable
+    out : Path
+        For the cells' folders and ``faults.jsonl``.
+    seed : int
+    again : str
+        Command that repeats it; the number of a fault is added.
+    say : callable
+        Takes a line for each fault.
+    """
+
+    def __init__(
+        self, staging: Staging, out: Path, seed: int, again: str, say: Callable[[str], None]
+    ) -> None:
+        self._staging, self._out, self._seed = staging, out, seed
+        self._again, self._say = again, say
+        self._disks = may_mount()
+        self.result = Result(seed)
+        self.result.means = {
+            "full disk": "a tmpfs in place of each folder, made as small as what is on it"
+            if self._disks
+            else "RLIMIT_FSIZE of the controller; not root, so no disk of a node is filled",
+            "slow disk": "writers beside that wait for every write; the wait is measured",
+            "starving": f"{STARVING_THREADS} busy threads on the one CPU that the node has then",
+            "clocks": "an offset and a rate that the node's processes add to what they read",
+        }
+
+    def run(
+        self, *, until_s: float | None = None, faults: int | None = None, only: int | None = None
+    ) -> Result:
+        """Have faults befall cells, and judge what they do.
+
+        Parameters
+        ----------
+        until_s : float, optional
+            On `time.monotonic`: no fault begins later.
+        faults : int, optional
+            How many.
+        only : int, optional
+            Nothing but this fault of the timeline.
+
+        Raises
+        ------
+        LiveError
+            If a cell does not come up.
+        """
+        begin_s = time.monotonic()
+        number, waiting = 0, None
+        plan = self._plan(faults, only)
+        with StallDetector() as stalls:
+            while waiting is not None or number == 0:
+                number += 1
+                waiting = self._cell(number, plan, waiting, stalls, until_s)
+        self.result.seconds = time.monotonic() - begin_s
+        return self.result
+
+    def _plan(self, faults: int | None, only: int | None) -> Any:
+        stage, _ = self._staging(1)
+        found = planned(self._seed, list(faults_of(stage.problem, Means(disks=self._disks))))
+        if only is not None:
+            return islice(found, only - 1, only)
+        return iter(found) if faults is None else islice(found, faults)
+
+    def _cell(
+        self,
+        number: int,
+        plan: Any,
+        first: Planned | None,
+        stalls: StallDetector,
+        until_s: float | None,
+    ) -> Planned | None:
+        """Have one cell go through faults; returns the next fault where the cell is past help."""
+        stage, home = self._staging(number)
+        with ExitStack() as stack:
+            cell = stack.enter_context(Ground(stage, home=home, disks=self._disks))
+            observer = stack.enter_context(Observer(stage, stage.folder / "cell.yaml"))
+            while True:
+                one = first or next(plan, None)
+                first = None
+                if one is None or (until_s is not None and time.monotonic() > until_s):
+                    break
+                stalls.stalls.clear()
+                if not self._one(cell, observer, one, stalls):
+                    self._count(cell, observer)
+                    return next(plan, None)
+            self._count(cell, observer)
+            cell.stage.stop_controller()
+            self.result.wrong += [f"record: {wrong}" for wrong in _unread(cell)]
+        return None
+
+    def _one(self, cell: Ground, observer: Observer, one: Planned, stalls: StallDetector) -> bool:
+        """Have a fault befall a cell; returns whether the cell can go on."""
+        fault = one.fault
+        outcome = Outcome(fault.name, self._seed, one.phase)
+        usable = True
+        try:
+            cell.wait_for("the whole cell at home", cell.at_home, 60.0)
+            cell.wait_for("health", cell.healthy, 60.0)
+            time.sleep(one.rests_s)
+            outcome.wrong += observer.look()
+            judge = observer.judge
+            placement = judge.terms[max(judge.terms)].placement
+            lasts = max(round(one.lasts_s * 1e9 / cell.period_ns), 1)
+            strike(
+                *(cell, fault, stalls),
+                phase=one.phase,
+                seed=self._seed,
+                lasts=lasts,
+                bound=bound_of(cell.problem, fault, placement),
+                outcome=outcome,
+            )
+            time.sleep(HEARD_S)
+        except DwellError as error:
+            outcome.wrong.append(str(error))
+            outcome.stall_ms = stalls.worst_ms(outcome.begin_ns, time.monotonic_ns())
+            usable = False
+        outcome.wrong += observer.look()
+        if usable:
+            _recovered(observer, outcome)
+            outcome.late += _old(cell, observer, fault, outcome)
+        self._keep(cell, one, outcome)
+        return usable
+
+    def _keep(self, cell: Ground, one: Planned, outcome: Outcome) -> None:
+        wrong = list(outcome.wrong)
+        if outcome.stall_ms >= cell.problem.pipeline.period_ms and outcome.late:
+            self.result.stalled += 1
+        else:
+            wrong += outcome.late
+        again = f"{self._again} --only {one.number}"
+        self.result.wrong += [f"{one.fault.name}: {what}; again: {again}" for what in wrong]
+        self.result.outcomes.append((one, outcome))
+        with (self._out / "faults.jsonl").open("a", encoding="utf-8") as file:
+            about = {"number": one.number, "kind": one.fault.kind or one.fault.how}
+            file.write(json.dumps({**about, **asdict(outcome)}) + "\n")
+        self._say(_line(one, outcome))
+        for what in wrong:
+            self._say(f"    VIOLATION {what}; again: {again}")
+
+    def _count(self, cell: Ground, observer: Observer) -> None:
+        for kind, count in observer.judge.counts.items():
+            self.result.heard[kind] = self.result.heard.get(kind, 0) + count
+        self.result.actuated += len(cell.actuations.applied)
+
+
+def _recovered(observer: Observer, outcome: Outcome) -> None:
+    """Take the recovery from the wire: the first cycle that an order stands behind."""
+    at_ns = observer.judge.ordered_since(outcome.end_ns)
+    if at_ns is None:
+        outcome.wrong.append("no cycle was stamped by an order after it has ended")
+    else:
+        outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
+
+
+def _old(cell: Ground, observer: Observer, fault: Fault, outcome: Outcome) -> list[str]:
+    """Return commands that were applied too long after their stamp was heard."""
+    if fault.how in ("jump", "drift"):
+        return []
+    problem, stamped_ns = cell.problem, observer.judge.stamped_ns
+    max_age_ms = problem.live.max_age_ms or 2 * problem.pipeline.period_ms
+    # The gate looks a little before the actuator is called, which may be scheduled out between.
+    limit_ms = max_age_ms + problem.pipeline.period_ms
+    return [
+        f"cycle {seen.cycle} was actuated {age_ms:.0f} ms after it was stamped"
+        for seen in cell.actuations.since(outcome.begin_ns)
+        if seen.what == APPLY and seen.cycle in stamped_ns
+        for age_ms in [(seen.at_ns - stamped_ns[seen.cycle]) / 1e6]
+        if age_ms > limit_ms
+    ]
+
+
+def _unread(cell: Ground) -> Sequence[str]:
+    """Return which runs cannot be read."""
+    found = []
+    for folder in cell.runs:
+        try:
+            dwell.open_run(folder).cycles.height  # noqa: B018 - reads it
+        except DwellError as error:
+            found.append(str(error))
+    return found
+
+
+def _line(one: Planned, outcome: Outcome) -> str:
+    bound = "-" if outcome.bound is None else str(outcome.bound)
+    note = f"  {outcome.note}" if outcome.note else ""
+    return (
+        f"{one.number:4d} {outcome.fault:40} {one.lasts_s:4.1f} s  lost {outcome.lost:3d} "
+        f"{outcome.lost_after:3d} of {bound:>2}  gap {outcome.gap_ms:5.0f} "
+        f"{outcome.gap_after_ms:5.0f} ms  back {outcome.recovery_ms:6.0f} ms  "
+        f"stall {outcome.stall_ms:3.0f}  {outcome.moved}{note}"
+    )
+
+
+def summary(document: Mapping[str, Any]) -> list[str]:
+    """Return a result as lines of text."""
+    kinds = ", ".join(f"{count} {kind}" for kind, count in document["kinds"].items())
+    heard = ", ".join(f"{count} {word}" for word, count in sorted(document["heard"].items()))
+    lines = [
+        f"seed {document['seed']}: {document['faults']} faults in {document['seconds']:.0f} s "
+        f"({kinds})",
+        f"{document['bounded']} with a bound: at most {document['most_lost_where_bounded']} "
+        f"consecutive cycles lost; slowest recovery {document['slowest_recovery_ms'] / 1e3:.1f} s; "
+        f"{document['stalled']} in which the machine stalled for a period or more",
+        f"judged: {document['actuated']} actuations; heard {heard}",
+    ]
+    lines += [f"{what}: {how}" for what, how in document["means"].items()]
+    lines += [f"VIOLATION {wrong}" for wrong in document["violations"]]
+    return [*lines, "passed" if not document["violations"] else "failed"]

@@ -1,0 +1,166 @@
+"""Ear: a process that is no part of a cell and writes down what it hears on the wire.
+
+It has sessions of its own, sends nothing, and decodes nothing: a record is the instant on the true
+clock, the key, and the message; of a stage's message, its header.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from dwell.errors import DwellError
+from dwell.live.keys import Keys
+from dwell.live.transport.protocol import Sample
+from dwell.live.wiring import SESSIONS, Entry, Role, Session, Wiring
+from dwell.testbed.child import Child, Parent, Started
+
+__all__ = ["Ear", "Records", "entry_for", "heard"]
+
+_HEAD = struct.Struct("<QIII")
+
+
+def heard(keys: Keys) -> tuple[str, ...]:
+    """Return what is listened to."""
+    said = keys.stamped(), keys.order(), keys.accepted(), keys.done("*")
+    return (*said, keys.inputs("*", "*", "*"))
+
+
+def entry_for(wiring: Wiring, nodes: Sequence[str]) -> Entry:
+    """Return what has to be opened to hear all processes of some nodes, beside them."""
+    connect: dict[Session, list[Any]] = {}
+    for entry in wiring.entries.values():
+        if entry.role.node in nodes:
+            for session, end in entry.listen.items():
+                connect.setdefault(session, []).append(end)
+    role = Role(f"ear.{os.getpid()}", nodes[0], "visitor")
+    ends = {name: tuple(connect[name]) for name in SESSIONS if name in connect}
+    return Entry(role, {}, ends)
+
+
+class Ear(Started):
+    """The process, as its parent sees it; a context manager.
+
+    Parameters
+    ----------
+    cell : Path
+        Cell file.
+    nodes : sequence of str
+        Whose processes are listened to.
+    out : Path
+        File that it writes.
+    prefix : sequence of str
+        Words of a command that runs what follows where these nodes are reached.
+    """
+
+    def __init__(
+        self, cell: Path, nodes: Sequence[str], out: Path, prefix: Sequence[str] = ()
+    ) -> None:
+        self._settings: dict[str, object] = {
+            "cell": str(cell),
+            "nodes": list(nodes),
+            "out": str(out),
+        }
+        self._child = Child("dwell.chaos.ear", f"ear at {','.join(nodes)}", prefix=prefix)
+
+    def start(self) -> None:
+        """Start it.
+
+        Raises
+        ------
+        LiveError
+            If it does not start.
+        """
+        self._child.start(self._settings)
+
+    def stop(self) -> None:
+        """End it; safe to call twice."""
+        self._child.stop()
+
+    def peers(self) -> int:
+        """Return how many sessions it is connected to now."""
+        return cast("int", self._child.ask({})["peers"])
+
+
+class Records:
+    """What an ear has written, as far as it has been read.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._read = path, 0
+
+    def news(self) -> Iterator[tuple[int, str, bytes, bytes]]:
+        """Yield what is new: instant, key, message and header."""
+        if not self._path.exists():
+            return
+        with self._path.open("rb") as file:
+            file.seek(self._read)
+            data = file.read()
+        at = 0
+        while at + _HEAD.size <= len(data):
+            at_ns, key, payload, header = _HEAD.unpack_from(data, at)
+            end = at + _HEAD.size + key + payload + header
+            if end > len(data):
+                break
+            at += _HEAD.size
+            name = data[at : at + key].decode()
+            message = data[at + key : at + key + payload]
+            yield at_ns, name, message, data[at + key + payload : end]
+            at = end
+        self._read += at
+
+
+def main() -> None:
+    """Listen until the parent ends, or wants this to."""
+    import dwell
+    from dwell.live.security import INSECURE
+    from dwell.live.transport.zenoh import ZenohTransport
+    from dwell.live.wiring import wire
+
+    parent = Parent()
+    try:
+        settings = parent.receive()
+        os.environ[INSECURE] = "1"
+        try:
+            problem = dwell.load(cast("str", settings["cell"]))
+            entry = entry_for(wire(problem), cast("list[str]", settings["nodes"]))
+            transport = ZenohTransport(entry)
+        except DwellError as error:
+            parent.answer({"error": str(error)})
+            return
+        file = Path(cast("str", settings["out"])).open("ab", buffering=0)  # noqa: SIM115
+        lock = threading.Lock()
+        inputs = Keys(problem.name).inputs("", "", "").rstrip("/")
+
+        def write(sample: Sample) -> None:
+            at_ns = time.monotonic_ns()
+            payload = b"" if sample.key.startswith(inputs) else sample.payload
+            key = sample.key.encode()
+            lengths = len(key), len(payload), len(sample.header)
+            with lock:
+                file.write(_HEAD.pack(at_ns, *lengths) + key + payload + sample.header)
+
+        for key in heard(Keys(problem.name)):
+            transport.subscribe(key, write)
+        parent.answer({})
+        try:
+            while True:
+                parent.receive()
+                parent.answer({"peers": sum(transport.peers.values())})
+        finally:
+            transport.close()
+    except EOFError:
+        pass
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,168 @@
+"""Faults: what can befall a cell, and whether it promises a bound for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, TypeAlias
+
+from dwell.control.guard import parts_of
+from dwell.live.wiring import roles
+from dwell.model import Problem
+
+__all__ = ["Fault", "How", "Means", "bound_of", "faults_of", "hit_by"]
+
+How: TypeAlias = Literal["kill", "freeze", "cut", "jump", "drift", "starve", "fill", "hog"]
+
+#: What oscillators do, and what nobody's should.
+WITHIN_PPM, BEYOND_PPM = 80.0, 2_000.0
+JUMPS_MS = (200.0, 5_000.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something that befalls a cell.
+
+    Parameters
+    ----------
+    name : str
+    how : {"kill", "freeze", "cut", "jump", "drift", "starve", "fill", "hog"}
+    whom : tuple of str
+        Processes, ``*E`` for all of a node; directions of a cut, as ``R1->E``; nodes; ``runs`` for
+        the disk that the runs are kept on.
+    amount : float
+        Of a jump ms, of a drift parts per million.
+    bound : int, optional
+        Consecutive cycles that may be lost; None where no fallback can be whole.
+    kind : str
+        What it is one of; `how` if left out.
+    home : str
+        Where the cell has to be that it befalls; empty for anywhere.
+    """
+
+    name: str
+    how: How
+    whom: tuple[str, ...]
+    amount: float = 0.0
+    bound: int | None = None
+    kind: str = ""
+    home: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Means:
+    """What can be done to a cell here.
+
+    Parameters
+    ----------
+    clocks : bool
+        Whether its clocks can be made wrong.
+    disks : bool
+        Whether nodes have disks of their own that can be made full.
+    """
+
+    clocks: bool = True
+    disks: bool = True
+
+
+def faults_of(problem: Problem, means: Means) -> Iterator[Fault]:
+    """Yield every fault of a cell; `bound_of` says what is promised for it."""
+    everybody = roles(problem)
+    relay = problem.live.relay or problem.controller_node
+    nodes = list(problem.fabric.nodes)
+    for how in ("kill", "freeze"):
+        for role in everybody:
+            yield Fault(f"{how} {role.who}", how, (role.who,))
+        for role in everybody:
+            spare = f"{role.who}.1"
+            if role.kind == "worker" and any(other.who == spare for other in everybody):
+                both = role.who, spare
+                yield Fault(f"{how} {role.who} and its standby", how, both)
+        for node in nodes:
+            yield Fault(f"{how} all of {node}", how, (f"*{node}",), kind=f"{how} node")
+    yield Fault(f"lose relay agent@{relay}", "kill", (f"agent@{relay}",), kind="relay")
+    for one, other in combinations(nodes, 2):
+        if not {(one, other), (other, one)} & _linked(problem):
+            continue
+        yield Fault(f"cut {one}-{other}", "cut", (f"{one}->{other}", f"{other}->{one}"))
+        for a, b in ((one, other), (other, one)):
+            yield Fault(f"cut {a}->{b}", "cut", (f"{a}->{b}",), kind="cut one way")
+    if means.clocks:
+        yield from _clocks(nodes)
+    for node in nodes:
+        yield Fault(f"starve {node}", "starve", (node,))
+    yield Fault("fill the disk of the runs", "fill", ("runs",))
+    if means.disks:
+        for node in nodes:
+            yield Fault(f"fill the disk of {node}", "fill", (node,))
+    yield Fault("write to the same disk", "hog", ("runs",))
+
+
+def _linked(problem: Problem) -> set[tuple[str, str]]:
+    return {(link.source, link.target) for link in problem.fabric.links.values()}
+
+
+def _clocks(nodes: Sequence[str]) -> Iterator[Fault]:
+    for node in nodes:
+        for ms in (jump * sign for jump in JUMPS_MS for sign in (1, -1)):
+            yield Fault(f"jump {ms:+g} ms {node}", "jump", (node,), ms)
+        for ppm in (rate * sign for rate in (WITHIN_PPM, BEYOND_PPM) for sign in (1, -1)):
+            yield Fault(f"drift {ppm:+g} ppm {node}", "drift", (node,), ppm)
+
+
+def hit_by(problem: Problem, fault: Fault) -> frozenset[str] | None:
+    """Return the parts of placements that a fault takes away (see `parts_of`).
+
+    None where it takes away what no placement does without: the stamper, a sink, or their clocks.
+    """
+    everybody = {role.who: role for role in roles(problem)}
+    vital = {role.node for role in everybody.values() if role.kind in ("stamper", "sink")}
+    match fault.how:
+        case "cut":
+            return frozenset(fault.whom)
+        case "fill" | "hog":
+            return frozenset()
+        case "drift" if abs(fault.amount) <= WITHIN_PPM:
+            return frozenset()
+        case "jump" | "drift":
+            return None if vital & set(fault.whom) else frozenset()
+        case "starve":
+            return None if vital & set(fault.whom) else frozenset(fault.whom)
+    found = set()
+    for who in fault.whom:
+        if who.startswith("*"):
+            if who[1:] in vital:
+                return None
+            found.add(who[1:])
+            continue
+        role = everybody[who]
+        if role.kind in ("stamper", "sink"):
+            return None
+        spare = f"{who}.1"
+        covered = spare in everybody and spare not in fault.whom
+        if role.kind == "worker" and not covered:
+            found.add(who)
+    return frozenset(found)
+
+
+def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
+    """Return how many consecutive cycles a fault may cost; None where nothing is promised.
+
+    Parameters
+    ----------
+    problem : Problem
+    fault : Fault
+    placement : str
+        Candidate that holds when it strikes.
+    """
+    if fault.bound is not None:
+        return fault.bound
+    hit = hit_by(problem, fault)
+    if hit is None:
+        return None
+    bound = problem.controller.guard_cycles + 1
+    if not parts_of(problem, placement) & hit:
+        return bound
+    others = (name for name in problem.controller.fallbacks if name != placement)
+    return bound if any(not parts_of(problem, name) & hit for name in others) else None

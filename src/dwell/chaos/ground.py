@@ -1,0 +1,379 @@
+"""Ground: a cell that runs, with the means to harm it, and to tell when it has recovered."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from dwell.chaos.actuations import Actuations
+from dwell.chaos.disk import DiskHog, SmallDisk, limit_file_size
+from dwell.chaos.faults import Fault
+from dwell.chaos.stage import Stage
+from dwell.chaos.stages import APPLY, TOLD
+from dwell.errors import LiveError
+from dwell.live.clocks import CLOCKS, ClockFile
+from dwell.live.hosting import clock_of
+from dwell.model import Problem
+from dwell.testbed.burner import Burner
+from dwell.testbed.processes import expected
+
+__all__ = ["Ground", "environment_of", "pid_of"]
+
+OBSERVED, CLOCK_FILE = "observed", "clocks"
+#: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
+HEALTH_S = 5.0
+#: Busy threads beside the processes of a node that starves.
+STARVING_THREADS = 32
+
+
+def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) -> dict[str, str]:
+    """Return the variables that stages, actuator and clocks of a cell in a folder need."""
+    folder = folder.resolve()
+    told = {"observed": str(folder / OBSERVED), "exec_ms": exec_ms, **more}
+    return {TOLD: json.dumps(told), CLOCKS: str(folder / CLOCK_FILE)}
+
+
+def pid_of(mark: Path) -> int | None:
+    """Return the process that an agent's mark tells of, if it lives."""
+    try:
+        told = json.loads(mark.read_text())
+        process = psutil.Process(told["pid"])
+        same = abs(process.create_time() - told["started"]) < 0.05
+        return process.pid if same and process.status() != psutil.STATUS_ZOMBIE else None
+    except (OSError, ValueError, psutil.Error):
+        return None
+
+
+class Ground:
+    """See the module; a context manager.
+
+    Parameters
+    ----------
+    stage : Stage
+        With the variables of `environment_of` in its environment.
+    home : str, optional
+        Candidate that the controller wants; whatever it decides if left out.
+    disks : bool
+        Whether nodes, and the runs, get disks of their own, which can be made full.
+    """
+
+    def __init__(self, stage: Stage, *, home: str | None = None, disks: bool = False) -> None:
+        self.stage, self.home, self.disks = stage, home, disks
+        self.folder = stage.folder
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.actuations = Actuations(self.folder / OBSERVED)
+        self.starved_cpus: frozenset[int] = frozenset()
+        self._stack = ExitStack()
+        self._small: dict[str, SmallDisk] = {}
+        self._hog: DiskHog | None = None
+        self._burner: Burner | None = None
+        self._stressed = ""
+
+    @property
+    def problem(self) -> Problem:
+        """The cell."""
+        return self.stage.problem
+
+    @property
+    def period_ns(self) -> int:
+        """P."""
+        return round(self.problem.pipeline.period_ms * 1e6)
+
+    def __enter__(self) -> Ground:
+        """Start everything, and wait until the cell is at home."""
+        try:
+            nodes = list(self.problem.fabric.nodes)
+            if self.disks:
+                for name in ("runs", *nodes):
+                    small = SmallDisk(self.folder / name)
+                    self._stack.enter_context(small)
+                    self._small[name] = small
+            clocks = ClockFile(self.folder / CLOCK_FILE, nodes, clock_of(self.problem))
+            self._clocks = self._stack.enter_context(clocks)
+            self._stack.callback(self._end_all)
+            self.stage.begin()
+            self.wait_for("the whole cell at home", self.at_home, 60.0)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End everything."""
+        self.close()
+
+    def close(self) -> None:
+        """End everything, also what is frozen or has no parent any more; safe to call twice."""
+        self._stack.close()
+
+    def _end_all(self) -> None:
+        self._feed()
+        if self._hog is not None:
+            self._hog.__exit__()
+            self._hog = None
+        running = self.stage.processes.values()
+        for pid in [*self._marked(), *(p.pid for p in running if p.poll() is None)]:
+            _send(pid, signal.SIGCONT)
+        self.stage.close()
+        for pid in self._marked():
+            _send(pid, signal.SIGKILL)
+
+    # ---------------------------------------------------------------------- processes
+
+    @property
+    def runs(self) -> list[Path]:
+        """Folders of the runs."""
+        folder = self.folder / "runs"
+        return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+
+    def expected(self, node: str) -> list[str]:
+        """Return the processes of a node that its agent starts, and the agent."""
+        return expected(self.problem, node)
+
+    @property
+    def everybody(self) -> list[str]:
+        """All processes but the controller."""
+        return [who for node in self.problem.fabric.nodes for who in self.expected(node)]
+
+    def _marked(self) -> list[int]:
+        found = (pid_of(mark) for mark in self.folder.glob("*/*.pid"))
+        return [pid for pid in found if pid is not None]
+
+    def pid(self, who: str) -> int:
+        """Process id of one of the cell's processes."""
+        if who in self.stage.processes:
+            return self.stage.processes[who].pid
+        node = who.partition("@")[2].partition(".")[0]
+        pid = pid_of(self.folder / node / f"{who}.pid")
+        if pid is None:
+            raise LiveError(f"{who} does not run")
+        return pid
+
+    def signal(self, names: Sequence[str], number: int) -> None:
+        """Send a signal to processes, all at once."""
+        for pid in [self.pid(who) for who in names]:
+            _send(pid, number)
+
+    def start_again(self, who: str) -> None:
+        """Start an agent or the controller again, as an init system does."""
+        process = self.stage.processes.pop(who, None)
+        if process is not None:
+            process.wait(10)
+        kind, _, node = who.partition("@")
+        if kind == "agent":
+            self.stage.start_agent(node)
+        else:
+            self.stage.start_controller()
+
+    def stop_controller(self) -> None:
+        """End the controller and wait until it has written its run."""
+        self.stage.stop_controller()
+
+    def names(self, fault: Fault) -> list[str]:
+        """Return the processes that a fault strikes."""
+        found = []
+        for who in fault.whom:
+            if not who.startswith("*"):
+                found.append(who)
+                continue
+            node = who[1:]
+            # The agent first: it must not bring back what dies next.
+            found += sorted(self.expected(node), key=lambda one: not one.startswith("agent"))
+            if node == self.problem.controller_node:
+                found.append(f"controller@{node}")
+        return found
+
+    # ------------------------------------------------------------------------- clocks
+
+    def set_clock(self, node: str, *, jump_ms: float = 0.0, drift_ppm: float = 0.0) -> None:
+        """Have a node's clock jump, and drift from now on."""
+        self._clocks.set(node, jump_ns=round(jump_ms * 1e6), drift_ppb=round(drift_ppm * 1e3))
+
+    # --------------------------------------------------------------------------- CPUs
+
+    def starve(self, node: str) -> None:
+        """Have a node's processes share one CPU with busy threads, and keep the others off it.
+
+        Where nodes have CPUs of their own, the threads are there and nobody is moved. Where there
+        is one CPU only, all nodes starve.
+        """
+        if self.stage.stress(node, STARVING_THREADS):
+            self._stressed = node
+            return
+        cpus = sorted(os.sched_getaffinity(0))
+        self._burner = Burner(cpus[:1])
+        self._burner.start(STARVING_THREADS)
+        self.starved_cpus = frozenset(cpus[:1])
+        for other in self.problem.fabric.nodes:
+            self._pin(other, cpus[:1] if other == node else cpus[1:] or cpus)
+
+    def _feed(self) -> None:
+        if self._stressed:
+            self.stage.stress(self._stressed, 0)
+            self._stressed = ""
+        if self._burner is None:
+            return
+        self._burner.stop()
+        self._burner = None
+        for node in self.problem.fabric.nodes:
+            self._pin(node, sorted(os.sched_getaffinity(0)))
+        self.starved_cpus = frozenset()
+
+    def _pin(self, node: str, cpus: Sequence[int]) -> None:
+        names = [*self.expected(node)]
+        if node == self.problem.controller_node:
+            names.append(f"controller@{node}")
+        for who in names:
+            with suppress(LiveError, OSError):
+                for task in Path(f"/proc/{self.pid(who)}/task").iterdir():
+                    with suppress(ProcessLookupError):
+                        os.sched_setaffinity(int(task.name), cpus)
+
+    # -------------------------------------------------------------------------- disks
+
+    def _fill(self, what: str) -> None:
+        if what in self._small:
+            self._small[what].fill()
+        elif what == "runs":
+            longest = max((f.stat().st_size for f in self.folder.glob("runs/*/*")), default=0)
+            limit_file_size(self.pid(f"controller@{self.problem.controller_node}"), longest)
+        else:
+            raise LiveError(f"the disk of {what} cannot be made full without root")
+
+    def _clear(self, what: str) -> None:
+        if what in self._small:
+            self._small[what].clear()
+        else:
+            limit_file_size(self.pid(f"controller@{self.problem.controller_node}"), None)
+
+    # ------------------------------------------------------------------------- faults
+
+    def begin(self, fault: Fault, at_ns: int) -> int:
+        """Have a fault begin at an instant of the true clock; returns when it did."""
+        if fault.how == "cut":
+            ways = [way.split("->") for way in fault.whom]
+            return min(self.stage.cut(source, target, at_ns) for source, target in ways)
+        pids = [self.pid(who) for who in self.names(fault)] if fault.how in _SIGNALS else []
+        wait_s = (at_ns - time.monotonic_ns()) / 1e9 - 0.001
+        if wait_s > 0:
+            time.sleep(wait_s)
+        while time.monotonic_ns() < at_ns:
+            pass
+        begin_ns = time.monotonic_ns()
+        for pid in pids:
+            _send(pid, _SIGNALS[fault.how])
+        for what in fault.whom:
+            match fault.how:
+                case "jump":
+                    self.set_clock(what, jump_ms=fault.amount)
+                case "drift":
+                    self.set_clock(what, drift_ppm=fault.amount)
+                case "starve":
+                    self.starve(what)
+                case "fill":
+                    self._fill(what)
+                case "hog":
+                    self._hog = DiskHog(self.folder).__enter__()
+        return begin_ns
+
+    def end(self, fault: Fault) -> str:
+        """End a fault; returns what is to be said of it."""
+        match fault.how:
+            case "cut":
+                for way in fault.whom:
+                    self.stage.heal(*way.split("->"))
+            case "freeze":
+                self.signal(self.names(fault), signal.SIGCONT)
+            case "kill":
+                for who in self.names(fault):
+                    if who.startswith(("agent", "controller")):
+                        self.start_again(who)
+            case "drift":
+                for node in fault.whom:
+                    self.set_clock(node)
+            case "starve":
+                self._feed()
+            case "fill":
+                for what in fault.whom:
+                    self._clear(what)
+            case "hog" if self._hog is not None:
+                self._hog.__exit__()
+                hog, self._hog = self._hog, None
+                return f"a page took {hog.wait_ms:.1f} ms to the disk, {hog.usual_ms:.1f} before"
+        return ""
+
+    # ------------------------------------------------------------------------- events
+
+    def wait_for(self, what: str, event: Callable[[], str], patience_s: float) -> None:
+        """Wait for an event: until it returns nothing that is missing.
+
+        Raises
+        ------
+        LiveError
+            With what is missing after `patience_s`.
+        """
+        until = time.monotonic() + patience_s
+        while missing := event():
+            if time.monotonic() > until:
+                raise LiveError(f"waited {patience_s:g} s for {what}: {missing}")
+            time.sleep(0.002)
+
+    def status(self) -> Mapping[str, Any]:
+        """Return what the controller says; nothing where it does not answer."""
+        try:
+            return self.stage.ask(0.4)
+        except LiveError:
+            return {}
+
+    def at_home(self) -> str:
+        """Look whether all are well and the cell is where its controller wants it."""
+        now_ns = time.monotonic_ns()
+        seen = self.actuations.since(now_ns - 6 * self.period_ns)
+        lately = [one for one in seen if one.what == APPLY]
+        if len(lately) < 4:
+            return f"{len(lately)} actuations in six periods"
+        if self.home is not None and lately[-1].placement != self.home:
+            return f"it is at {lately[-1].placement}"
+        said = self.status()
+        if not said:
+            return "the controller does not answer"
+        wanted: dict[str, object] = {"fallback": False, "moving_to": None}
+        if self.home is not None:
+            wanted["placement"] = self.home
+        for key, value in wanted.items():
+            if said[key] != value:
+                return f"{key} is {said[key]}"
+        return "; ".join(self._unwell(said["processes"]))
+
+    def healthy(self) -> str:
+        """Look whether the guard takes the next fault for no relapse."""
+        ten = 11 * self.problem.window_cycles
+        needed = min(ten, round(HEALTH_S * 1e9 / self.period_ns))
+        count = self.actuations.healthy(self.home)
+        return "" if count >= needed else f"{count} of {needed} cycles"
+
+    def _unwell(self, processes: Mapping[str, Any]) -> Iterator[str]:
+        for who in self.everybody:
+            told = processes.get(who)
+            if told is None:
+                yield f"{who} has not been heard"
+            elif not told["ready"]:
+                yield f"{who} is not ready: {told['note']}"
+            elif told["age_ms"] > 15 * self.problem.pipeline.period_ms:
+                yield f"{who} was heard {told['age_ms']:.0f} ms ago"
+
+
+_SIGNALS = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}
+
+
+def _send(pid: int, number: int) -> None:
+    with suppress(ProcessLookupError):
+        os.kill(pid, number)

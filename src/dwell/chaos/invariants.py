@@ -1,0 +1,259 @@
+"""Invariants: what must never be, by what is heard on the wire.
+
+Nothing of a cell's own code decides anything here: its messages are decoded, and held against the
+cell file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from dwell.errors import LiveError
+from dwell.live.keys import MAIN, Keys
+from dwell.live.messages import (
+    MAX_HEADER_BYTES,
+    Accepted,
+    Completion,
+    Header,
+    Order,
+    Stamp,
+    Stamped,
+    decode,
+)
+from dwell.model import Problem
+
+__all__ = ["Judge", "Term"]
+
+#: Stamps and orders that are remembered.
+MEMORY = 10_000
+
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+@dataclass(slots=True)
+class Term:
+    """A term, as it was stamped first.
+
+    Parameters
+    ----------
+    term : int
+    placement : str
+    cycle : int
+        First that was heard to be stamped with it.
+    at_ns : int
+    ordered : bool, optional
+        Whether the controller holds it there, and not the guard; None until the stamper was heard
+        to say so.
+    moved : bool
+        Whether an order was heard to be accepted that brought it about.
+    """
+
+    term: int
+    placement: str
+    cycle: int
+    at_ns: int
+    ordered: bool | None = None
+    moved: bool = False
+
+
+@dataclass(slots=True)
+class Judge:
+    """Hears everything that is said, in the order in which it arrived, and finds what is wrong.
+
+    Parameters
+    ----------
+    problem : Problem
+
+    Attributes
+    ----------
+    counts : dict of str to int
+        Messages heard, by their kind.
+    terms : dict of int to Term
+    """
+
+    problem: Problem
+    counts: dict[str, int] = field(default_factory=dict)
+    terms: dict[int, Term] = field(default_factory=dict)
+    stamped_ns: dict[int, int] = field(default_factory=dict)
+    _stamps: list[tuple[int, int, int]] = field(default_factory=list)
+    _last: tuple[int, int, int] = (-1, -1, -1)
+    _orders: dict[tuple[str, int], Order] = field(default_factory=dict)
+    _early: dict[tuple[str, int], Accepted] = field(default_factory=dict)
+    _held: dict[int, bool] = field(default_factory=dict)
+    _moved: set[int] = field(default_factory=set)
+    _looked: int = -1
+
+    def hear(self, at_ns: int, key: str, payload: bytes, header: bytes) -> Iterable[str]:
+        """Take a message in; returns what is wrong with it."""
+        word = Keys(self.problem.name).word(key)
+        self.counts[word] = self.counts.get(word, 0) + 1
+        try:
+            match word:
+                case "stamped":
+                    return self._stamped(at_ns, decode(payload, Stamped))
+                case "order":
+                    return self._ordered(decode(payload, Order))
+                case "accepted":
+                    return self._accepted(decode(payload, Accepted))
+                case "in":
+                    said = decode(header, Header, limit=MAX_HEADER_BYTES)
+                    return list(self._routed(key, said))
+                case "done":
+                    return list(self._done(decode(payload, Completion)))
+        except LiveError as error:
+            return [f"{key}: {error}"]
+        return ()
+
+    # ------------------------------------------------------------------------- stamps
+
+    def _stamped(self, at_ns: int, stamp: Stamp) -> list[str]:
+        found = []
+        run, cycle, term = self._last
+        if run not in (-1, stamp.run):
+            found.append(f"cycle {stamp.cycle} is of run {stamp.run}, after {run}")
+        elif stamp.cycle <= cycle:
+            found.append(f"cycle {stamp.cycle} is stamped after {cycle}")
+        elif stamp.term < term:
+            found.append(f"cycle {stamp.cycle} has term {stamp.term}, after term {term}")
+        if stamp.placement not in self.problem.candidates:
+            found.append(f"cycle {stamp.cycle} is stamped {stamp.placement!r}, no candidate")
+        self._last = stamp.run, stamp.cycle, stamp.term
+        self._stamps.append(self._last)
+        del self._stamps[:-MEMORY]
+        _remember(self.stamped_ns, stamp.cycle, at_ns)
+        known = self.terms.get(stamp.term)
+        if known is None:
+            known = Term(stamp.term, stamp.placement, stamp.cycle, at_ns)
+            known.ordered = self._held.get(stamp.term)
+            known.moved = stamp.term in self._moved
+            self.terms[stamp.term] = known
+        elif known.placement != stamp.placement:
+            found.append(
+                f"term {stamp.term} has two placements: {known.placement}, {stamp.placement}"
+            )
+        return found
+
+    # ------------------------------------------------------------------------- orders
+
+    def _ordered(self, order: Order) -> list[str]:
+        who = order.controller, order.number
+        _remember(self._orders, who, order)
+        # They come through different connections: an answer may be heard before its order.
+        answer = self._early.pop(who, None)
+        return [] if answer is None else self._weigh(order, answer)
+
+    def _accepted(self, answer: Accepted) -> list[str]:
+        self._held[answer.term] = not answer.fallback
+        if answer.term in self.terms:
+            self.terms[answer.term].ordered = not answer.fallback
+        if answer.refused:
+            return []
+        who = answer.controller, answer.number
+        if who not in self._orders:
+            _remember(self._early, who, answer)
+            return []
+        return self._weigh(self._orders[who], answer)
+
+    def _weigh(self, order: Order, answer: Accepted) -> list[str]:
+        """Hold an answer against its order, and against what was stamped before it."""
+        if (order.run, order.term) == (0, 0):
+            return []
+        found = []
+        what = f"order {order.number} of term {order.term}"
+        if order.run != answer.run:
+            found.append(f"{what} and run {order.run} is accepted in run {answer.run}")
+        if answer.term not in (order.term, order.term + 1):
+            found.append(f"{what} is accepted in term {answer.term}")
+        later = [one for one in self._stamps if one[1] < answer.cycle and one[2] > order.term]
+        if later:
+            found.append(f"{what} is accepted after cycle {later[0][1]} of term {later[0][2]}")
+        if order.placement:
+            if order.placement != answer.placement:
+                found.append(f"{what} asks for {order.placement} and gets {answer.placement}")
+            if order.placement not in self.problem.candidates:
+                found.append(f"{what} to {order.placement!r}, no candidate, is accepted")
+        if answer.term == order.term + 1:
+            self._moved.add(answer.term)
+            if answer.term in self.terms:
+                self.terms[answer.term].moved = True
+        return found
+
+    def migrations(self) -> list[str]:
+        """Return the controller's migrations since the last call that came too early.
+
+        They are N_min + 1 windows apart; the guard's moves do not count.
+        """
+        apart = (self.problem.controller.min_dwell + 1) * self.problem.window_cycles
+        found = []
+        before: Term | None = None
+        previous: Term | None = None
+        for term in sorted(self.terms):
+            one = self.terms[term]
+            moved = one.moved and previous is not None and one.placement != previous.placement
+            if moved:
+                if before is not None and term > self._looked and one.cycle - before.cycle < apart:
+                    found.append(
+                        f"migrations at cycles {before.cycle} (to {before.placement}) and "
+                        f"{one.cycle} (to {one.placement}): fewer than {apart} cycles apart"
+                    )
+                before = one
+            previous = one
+        self._looked = max(self.terms, default=-1)
+        return found
+
+    def ordered_since(self, at_ns: int) -> int | None:
+        """Return the instant of the first stamp from `at_ns` on that an order stands behind.
+
+        The placement of a run's beginning counts as ordered. None where there was none yet.
+        """
+        instants = [
+            self.stamped_ns[cycle]
+            for _, cycle, term in self._stamps
+            if self.stamped_ns.get(cycle, -1) >= at_ns and self._held.get(term, term <= 1)
+        ]
+        return min(instants, default=None)
+
+    # ------------------------------------------------------------------------ routing
+
+    def _routed(self, key: str, header: Header) -> Iterable[str]:
+        task, node, kind = key.split("/")[-3:]
+        stamp = header.stamp
+        where = f"cycle {stamp.cycle} ({stamp.placement}, term {stamp.term}): {task} on {node}"
+        if not self._feasible(task, node):
+            yield f"{where}: infeasible"
+            return
+        if not stamp.term:
+            return
+        shadow = kind != MAIN
+        name = stamp.shadow if shadow else stamp.placement
+        candidate = self.problem.candidates.get(name)
+        if candidate is None:
+            yield f"{where}: {name!r} is no candidate"
+        elif candidate[task] != node and (shadow or (task, node) not in stamp.forks):
+            yield f"{where}: {name} has it on {candidate[task]}"
+
+    def _feasible(self, task: str, node: str) -> bool:
+        tasks: Mapping[str, object] = self.problem.pipeline.tasks
+        return task in tasks and node in self.problem.pipeline.tasks[task].on
+
+    def _done(self, done: Completion) -> Iterable[str]:
+        """Hold where the jobs of a cycle ran against its stamp."""
+        if done.outcome not in ("actuated", "behind", "stale"):
+            return
+        stamp = done.stamp
+        candidate = self.problem.candidates.get(stamp.placement)
+        for hop in done.hops:
+            where = f"cycle {stamp.cycle}: {hop.task} ran on {hop.node}"
+            if not self._feasible(hop.task, hop.node):
+                yield f"{where}: infeasible"
+            elif stamp.term and candidate is not None and candidate[hop.task] != hop.node:
+                yield f"{where}, not where {stamp.placement} has it"
+
+
+def _remember(known: dict[K, V], key: K, value: V) -> None:
+    known[key] = value
+    if len(known) > MEMORY:
+        del known[next(iter(known))]

@@ -1,0 +1,111 @@
+"""The cell that faults befall where no other is named: three nodes, light enough for two cores."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from dwell.chaos.stages import FRAME_BYTES, NODES
+
+__all__ = [
+    "CANDIDATES",
+    "GUARD_CYCLES",
+    "HOMES",
+    "MAX_AGE_MS",
+    "MIN_DWELL",
+    "PERIOD_MS",
+    "P_NS",
+    "WINDOW_CYCLES",
+    "document",
+    "exec_ms",
+]
+
+PERIOD_MS = 40
+P_NS = PERIOD_MS * 1_000_000
+GUARD_CYCLES = 3
+MAX_AGE_MS = 120
+MIN_DWELL = 2
+WINDOW_CYCLES = 3
+#: A window with lost cycles closes after the guard has looked: an order that comes of it, and that
+#: might be for what has just died, finds another term.
+GRACE_MS = GUARD_CYCLES * PERIOD_MS
+#: Where each cell's controller wants to be, and what makes it want that.
+HOMES = ("SO", "LOC")
+EXEC_MS = {
+    "SO": {"perception": {"R1": 8.0, "E": 3.0}, "planning": {"R2": 14.0, "E": 3.0}},
+    "LOC": {"perception": {"R1": 3.0, "E": 14.0}, "planning": {"R2": 3.0, "E": 8.0}},
+}
+DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 4}, "LOC": {"R1-E": 2, "E-R2": 2, "R1-R2": 1}}
+CANDIDATES = {
+    "LOC": {"perception": "R1", "planning": "R2"},
+    "SO": {"perception": "E", "planning": "E"},
+    "HYB": {"perception": "E", "planning": "R2"},
+}
+
+
+def exec_ms(home: str) -> dict[str, dict[str, float]]:
+    """Return how long each task takes on each node."""
+    return {"sensing": {"R1": 1.0}, **EXEC_MS[home], "control": {"R2": 0.5}}
+
+
+def _node(node: str, *, quotas: bool) -> dict[str, Any]:
+    tier = "edge" if node == "E" else "robot"
+    if not quotas:
+        return {"tier": tier, "cores": 2}
+    cpu = 0.8 if tier == "edge" else 0.4
+    return {"tier": tier, "cores": 1, "quota": {"cpu": cpu, "period_ms": 4}}
+
+
+def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[str, Any]:
+    """Return the cell file of a cell whose controller wants to be at `home`.
+
+    Parameters
+    ----------
+    home : str
+    standby : bool
+        Whether sensing and control have one.
+    quotas : bool
+        Whether nodes have a share of a CPU, as a testbed's have to.
+    """
+    tasks: dict[str, Any] = {}
+    for task, nodes in exec_ms(home).items():
+        spare = {"standby": 1} if standby and len(nodes) == 1 else {}
+        on = {node: {"exec_ms": ms, **spare} for node, ms in nodes.items()}
+        tasks[task] = {"run": f"dwell.chaos.stages:{task.capitalize()}", "on": on}
+    links = [
+        {"from": a, "to": b, "both_ways": True, "delay_ms": ms, "rate_mbps": 1000}
+        for pair, ms in DELAY_MS[home].items()
+        for a, b in [pair.split("-")]
+    ]
+    return {
+        "dwell": 1,
+        "name": f"chaos-{home}",
+        "period_ms": PERIOD_MS,
+        "deadline_ms": PERIOD_MS,
+        "window_cycles": WINDOW_CYCLES,
+        "warmup_windows": 0,
+        "nodes": {node: _node(node, quotas=quotas) for node in NODES},
+        "links": links,
+        "tasks": tasks,
+        "flows": [
+            {"from": "sensing", "to": "perception", "bytes": FRAME_BYTES},
+            {"from": "perception", "to": "planning", "bytes": 18},
+            {"from": "planning", "to": "control", "bytes": 18},
+        ],
+        "candidates": CANDIDATES,
+        "objective": {
+            "weights": {
+                "latency": 1.0, "violations": 0.5, "robot": 0.0, "edge": 0.0, "switching": 0.05,
+            },
+            "targets": {"latency_ms": PERIOD_MS / 2, "robot": 0.9, "edge": 0.9},
+            "caps": {"latency_ms": 3 * PERIOD_MS},
+        },
+        "controller": {
+            "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
+            "min_improvement": 0.4, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
+            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_MS,
+        },
+        "live": {
+            "max_age_ms": MAX_AGE_MS, "silence": "hold",
+            "actuators": {"control": "dwell.chaos.stages:Witness"},
+        },
+    }  # fmt: skip

@@ -1,0 +1,244 @@
+"""Stage: where a cell runs that faults befall; this computer's loopback, or hosts of a testbed."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from dwell.demo.stageplay import Stageplay
+from dwell.errors import LiveError
+from dwell.live.visiting import Visitor
+from dwell.model import Problem
+from dwell.testbed.bed import Bed
+
+__all__ = ["OnHosts", "OnLoopback", "Stage"]
+
+
+class Stage(Protocol):
+    """What a cell runs on, as far as faults need it; a context manager."""
+
+    @property
+    def problem(self) -> Problem:
+        """The cell, with its hosts."""
+        ...
+
+    @property
+    def folder(self) -> Path:
+        """Of cell file, states, logs and runs."""
+        ...
+
+    @property
+    def processes(self) -> dict[str, subprocess.Popen[bytes]]:
+        """Agents and controller, by name."""
+        ...
+
+    def begin(self) -> None:
+        """Start everything."""
+        ...
+
+    def start_agent(self, node: str) -> None:
+        """Start a node's agent again."""
+        ...
+
+    def start_controller(self) -> None:
+        """Start the controller again."""
+        ...
+
+    def stop_controller(self) -> None:
+        """End the controller and wait until it has written its run."""
+        ...
+
+    def cut(self, source: str, target: str, at_ns: int) -> int:
+        """Cut a direction of a link; returns when that was."""
+        ...
+
+    def heal(self, source: str, target: str) -> None:
+        """End that."""
+        ...
+
+    def stress(self, node: str, threads: int) -> bool:
+        """Have busy threads share a node's CPUs; False where nodes have none of their own."""
+        ...
+
+    def ask(self, patience_s: float) -> Mapping[str, Any]:
+        """Return what the controller says; a LiveError if it does not."""
+        ...
+
+    def ears(self) -> Mapping[str, Sequence[str]]:
+        """Return how to run a command that reaches nodes directly: by name, prefix of the words.
+
+        One name for each place that a listener is needed at; the nodes it is for are `heard_at`.
+        """
+        ...
+
+    def heard_at(self, ear: str) -> Sequence[str]:
+        """Return the nodes that are listened to from there."""
+        ...
+
+    def close(self) -> None:
+        """End everything."""
+        ...
+
+
+class OnLoopback:
+    """All nodes on this computer's loopback; links are proxies of TCP.
+
+    Parameters
+    ----------
+    problem : Problem
+        From `on_this_machine`.
+    folder : Path
+    seed : int
+        Of delays and losses.
+    environment : mapping of str to str
+        Of all processes.
+    """
+
+    def __init__(
+        self, problem: Problem, folder: Path, *, seed: int, environment: Mapping[str, str]
+    ) -> None:
+        self._problem, self._folder = problem, folder
+        self._play = Stageplay(problem, folder, {}, seed=seed, environment=environment)
+        self._visitor: Visitor | None = None
+
+    @property
+    def problem(self) -> Problem:
+        """The cell, with its hosts."""
+        return self._problem
+
+    @property
+    def folder(self) -> Path:
+        """Of cell file, states, logs and runs."""
+        return self._folder
+
+    @property
+    def processes(self) -> dict[str, subprocess.Popen[bytes]]:
+        """Agents and controller, by name."""
+        return self._play.processes
+
+    def begin(self) -> None:
+        """Start everything."""
+        self._play.__enter__()
+        self._visitor = Visitor(self.problem)
+
+    def start_agent(self, node: str) -> None:
+        """Start a node's agent again."""
+        self._play.start_agent(node)
+
+    def start_controller(self) -> None:
+        """Start the controller again."""
+        self._play.start_controller()
+
+    def stop_controller(self) -> None:
+        """End the controller and wait until it has written its run."""
+        self._play.stop_controller()
+
+    def cut(self, source: str, target: str, at_ns: int) -> int:
+        """Cut a direction of a link; returns when that was."""
+        return self._play.links[frozenset((source, target))].cut(source, at_ns=at_ns)
+
+    def heal(self, source: str, target: str) -> None:
+        """End that."""
+        self._play.links[frozenset((source, target))].heal(source)
+
+    def stress(self, node: str, threads: int) -> bool:
+        """Do nothing: all nodes share the CPUs."""
+        return False
+
+    def ask(self, patience_s: float) -> Mapping[str, Any]:
+        """Return what the controller says."""
+        if self._visitor is None:
+            raise LiveError("nobody has been asked yet")
+        return self._visitor.ask("status", patience_s=patience_s)
+
+    def ears(self) -> Mapping[str, Sequence[str]]:
+        """Return one place, from which all are reached."""
+        return {"loopback": ()}
+
+    def heard_at(self, ear: str) -> Sequence[str]:
+        """Return all nodes."""
+        return tuple(self.problem.fabric.nodes)
+
+    def close(self) -> None:
+        """End everything."""
+        if self._visitor is not None:
+            self._visitor.__exit__()
+            self._visitor = None
+        self._play.close()
+
+
+class OnHosts:
+    """Every node on a host of its own of a testbed on this machine.
+
+    Parameters
+    ----------
+    bed : Bed
+        Of one cell; not entered yet.
+    """
+
+    def __init__(self, bed: Bed) -> None:
+        self._bed = bed
+
+    @property
+    def folder(self) -> Path:
+        """Of cell file, states, logs and runs."""
+        return self._bed.folder
+
+    @property
+    def problem(self) -> Problem:
+        """The cell, with its hosts."""
+        return self._bed.problems[0]
+
+    @property
+    def processes(self) -> dict[str, subprocess.Popen[bytes]]:
+        """Agents and controller, by name."""
+        return self._bed.processes.running
+
+    def begin(self) -> None:
+        """Start everything."""
+        self._bed.__enter__()
+        self._bed.come_up()
+        self._bed.begin()
+
+    def start_agent(self, node: str) -> None:
+        """Start a node's agent again."""
+        self._bed.processes.start_agent(node)
+
+    def start_controller(self) -> None:
+        """Start the controller again."""
+        self._bed.processes.start_controllers()
+
+    def stop_controller(self) -> None:
+        """End the controller and wait until it has written its run."""
+        self._bed.stop_controllers()
+
+    def cut(self, source: str, target: str, at_ns: int) -> int:
+        """Cut a direction of a link; returns when that was."""
+        return self._bed.links[frozenset((source, target))].down(source, target, True, at_ns=at_ns)
+
+    def heal(self, source: str, target: str) -> None:
+        """End that."""
+        self._bed.links[frozenset((source, target))].down(source, target, False)
+
+    def stress(self, node: str, threads: int) -> bool:
+        """Have so many busy threads share a node's CPUs."""
+        self._bed.stress[node].set(threads)
+        return True
+
+    def ask(self, patience_s: float) -> Mapping[str, Any]:
+        """Return what the controller says."""
+        return self._bed.watchers[0].status(patience_s)
+
+    def ears(self) -> Mapping[str, Sequence[str]]:
+        """Return the hosts: what a node's processes say is listened to beside them."""
+        return {node: self._bed.beside(node) for node in self.problem.fabric.nodes}
+
+    def heard_at(self, ear: str) -> Sequence[str]:
+        """Return the node."""
+        return (ear,)
+
+    def close(self) -> None:
+        """End everything."""
+        self._bed.close()

@@ -1,0 +1,200 @@
+"""Strike: a fault befalls a cell, ends, and the cell recovers; what that has cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from dwell.chaos.actuations import out_of_order, unsafe
+from dwell.chaos.faults import Fault, hit_by
+from dwell.chaos.ground import Ground
+from dwell.chaos.stages import APPLY, HOLD, ZERO
+from dwell.chaos.stalls import StallDetector
+
+__all__ = ["Outcome", "strike"]
+
+#: Time in which a cell has to have recovered.
+RECOVERED_S = 60.0
+#: Longest time that a fault may take to be brought about, or to pass.
+PATIENCE_S = 30.0
+SOON_NS = 5_000_000
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a fault has cost.
+
+    Parameters
+    ----------
+    fault : str
+    seed : int
+    phase : float
+        Of the period, after a release, at which it began.
+    lost, lost_after : int
+        Most consecutive cycles without an actuation, by their numbers: from the fault to its end,
+        and from there to the recovery. A stamper that starts anew leaves numbers out: -1.
+    gap_ms, gap_after_ms : float
+        Longest time between two actuations, likewise.
+    recovery_ms : float
+        From the end of the fault until the cell was whole and at home.
+    silences : int
+        Times that the actuator was told that no command came.
+    moved : str
+        Placements that were actuated, in order, by the commands' own account.
+    stall_ms : float
+        Longest time that the machine kept a thread waiting meanwhile.
+    bound : int, optional
+        Consecutive cycles that may be lost.
+    begin_ns, end_ns, back_ns : int
+        When it began, ended, and the cell had recovered, on the true clock.
+    note : str
+    wrong : list of str
+        What should not be.
+    late : list of str
+        What should not be, and is the machine's doing where it stalled.
+    """
+
+    fault: str
+    seed: int
+    phase: float
+    lost: int = 0
+    lost_after: int = 0
+    gap_ms: float = 0.0
+    gap_after_ms: float = 0.0
+    recovery_ms: float = 0.0
+    silences: int = 0
+    moved: str = ""
+    stall_ms: float = 0.0
+    bound: int | None = None
+    begin_ns: int = 0
+    end_ns: int = 0
+    back_ns: int = 0
+    note: str = ""
+    wrong: list[str] = field(default_factory=list)
+    late: list[str] = field(default_factory=list)
+
+
+def strike(
+    cell: Ground,
+    fault: Fault,
+    stalls: StallDetector,
+    *,
+    phase: float,
+    seed: int,
+    lasts: int,
+    bound: int | None,
+    outcome: Outcome | None = None,
+) -> Outcome:
+    """Have a fault befall a cell, end it, and wait until the cell has recovered.
+
+    Parameters
+    ----------
+    cell : Ground
+        At home, and healthy where the fault makes it move.
+    fault : Fault
+    stalls : StallDetector
+    phase : float
+        Of the period, after a release.
+    seed : int
+        That `phase` and `lasts` were drawn with.
+    lasts : int
+        Periods until what is frozen or cut is so no more.
+    bound : int, optional
+        Consecutive cycles that may be lost.
+    outcome : Outcome, optional
+        Filled in; a new one if left out. It tells how far it came where something is waited for
+        in vain.
+
+    Raises
+    ------
+    LiveError
+        If an event that it waits for does not come.
+    """
+    found = Outcome(fault.name, seed, phase) if outcome is None else outcome
+    found.bound = bound
+    last = cell.actuations.last()
+    released_ns = 0 if last is None else last.released_ns
+    soon_ns = time.monotonic_ns() + SOON_NS
+    period_ns = cell.period_ns
+    wait_ns = (released_ns + round(phase * period_ns) - soon_ns) % period_ns
+    found.begin_ns = cell.begin(fault, soon_ns + wait_ns)
+    try:
+        cpus = cell.starved_cpus
+        _last(cell, fault, found.begin_ns, lasts, bound)
+        found.end_ns = time.monotonic_ns()
+    finally:
+        found.note = cell.end(fault)
+    if fault.how == "kill" and bound is None:
+        # Its end is the first cycle again.
+        since_ns = found.end_ns
+        cell.wait_for("a cycle after it", lambda: _few(cell, since_ns, 1), PATIENCE_S)
+        found.end_ns = time.monotonic_ns()
+    recovered = f"the whole cell at home after '{fault.name}'"
+    cell.wait_for(recovered, cell.at_home, RECOVERED_S)
+    found.back_ns = time.monotonic_ns()
+    # What is on its way when the cell is back is seen, too.
+    cell.wait_for("five more cycles", lambda: _few(cell, found.back_ns, 5), 5.0)
+    _weigh(cell, fault, stalls, found, cpus)
+    return found
+
+
+def _last(cell: Ground, fault: Fault, begin_ns: int, lasts: int, bound: int | None) -> None:
+    """Wait for the event that the fault's end waits for."""
+    over_ns = begin_ns + lasts * cell.period_ns
+    if bound is not None:
+        cell.wait_for(
+            f"ten cycles released after '{fault.name}'", lambda: _few(cell, begin_ns, 12), 20.0
+        )
+    elif fault.how == "kill":
+        return
+    cell.wait_for(
+        f"{lasts} periods of it",
+        lambda: "" if time.monotonic_ns() >= over_ns else "not yet",
+        PATIENCE_S,
+    )
+
+
+def _few(cell: Ground, since_ns: int, count: int) -> str:
+    found = sum(seen.what == APPLY for seen in cell.actuations.since(since_ns))
+    return "" if found >= count else f"{found} of {count} cycles actuated"
+
+
+def _weigh(
+    cell: Ground, fault: Fault, stalls: StallDetector, found: Outcome, cpus: Collection[int]
+) -> None:
+    begin_ns, period_ns, problem = found.begin_ns, cell.period_ns, cell.problem
+    seen = cell.actuations.since(begin_ns - 10 * period_ns)
+    applied = [one for one in seen if one.what == APPLY]
+    for before, later in pairwise(applied):
+        if later.at_ns < begin_ns:
+            continue
+        lost, gap_ms = later.cycle - before.cycle - 1, (later.at_ns - before.at_ns) / 1e6
+        if before.at_ns < found.end_ns:
+            found.lost, found.gap_ms = max(found.lost, lost), max(found.gap_ms, gap_ms)
+        else:
+            found.lost_after = max(found.lost_after, lost)
+            found.gap_after_ms = max(found.gap_after_ms, gap_ms)
+    found.recovery_ms = (found.back_ns - found.end_ns) / 1e6
+    found.silences = sum(one.what in (HOLD, ZERO) for one in seen if one.at_ns >= begin_ns)
+    steps = [one.placement for one in applied]
+    found.moved = " ".join(b for a, b in pairwise(["", *steps]) if a != b)
+    found.stall_ms = stalls.worst_ms(begin_ns - period_ns, found.back_ns, but=cpus)
+    stamper = f"*{problem.stamper_node}", f"stamper@{problem.stamper_node}"
+    if fault.how == "kill" and set(fault.whom) & set(stamper):
+        found.lost = -1
+    found.wrong += out_of_order(applied)
+    if hit_by(problem, fault) is not None or not _strikes_sink(fault):
+        during = [one for one in seen if one.at_ns >= begin_ns - period_ns]
+        max_age_ms = problem.live.max_age_ms or 2 * problem.pipeline.period_ms
+        found.late += unsafe(during, max_age_ms + problem.pipeline.period_ms + found.stall_ms)
+    if found.bound is not None:
+        for when, lost in (("by it", found.lost), ("after it", found.lost_after)):
+            if lost > found.bound:
+                found.late.append(f"{lost} consecutive cycles lost {when}, not {found.bound}")
+
+
+def _strikes_sink(fault: Fault) -> bool:
+    """Whether the process that tells the actuator that no command comes is struck itself."""
+    return fault.how == "starve" or any(who.startswith(("sink.", "*")) for who in fault.whom)
