@@ -22,7 +22,7 @@ from dwell.chaos.light_cell import (
 )
 from dwell.chaos.stage import OnLoopback
 from dwell.chaos.stalls import StallDetector
-from dwell.chaos.strike import Outcome
+from dwell.chaos.strike import Outcome, beyond
 from dwell.chaos.strike import strike as strike_by
 from dwell.demo.stageplay import on_this_machine
 
@@ -97,7 +97,7 @@ def strike(
     if moves(fault):
         cell.wait_for("health", cell.healthy, 30.0)
     found = strike_by(cell, fault, stalls, phase=phase, seed=seed, lasts=lasts, bound=fault.bound)
-    found.wrong += [*found.late, *cell.too_old()]
+    found.wrong += [*found.late, *beyond(found), *cell.too_old()]
     return found
 
 

@@ -23,7 +23,7 @@ from dwell.chaos.observer import Observer
 from dwell.chaos.stage import OnHosts, OnLoopback, Stage
 from dwell.chaos.stages import APPLY
 from dwell.chaos.stalls import StallDetector
-from dwell.chaos.strike import Outcome, strike
+from dwell.chaos.strike import Outcome, beyond, strike
 from dwell.chaos.timeline import Planned, planned
 from dwell.demo.stageplay import on_this_machine
 from dwell.errors import DwellError, LiveError
@@ -293,7 +293,8 @@ class Campaign:
         outcome.wrong += observer.look()
         if usable:
             _recovered(observer, outcome)
-            outcome.late += _old(cell, observer, fault, outcome)
+            _allow_for_orders(cell, observer, outcome)
+            outcome.late += [*beyond(outcome), *_old(cell, observer, fault, outcome)]
         self._keep(cell, one, outcome)
         return usable
 
@@ -326,6 +327,22 @@ def _recovered(observer: Observer, outcome: Outcome) -> None:
         outcome.wrong.append("no cycle was stamped by an order after it has ended")
     else:
         outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
+
+
+def _allow_for_orders(cell: Ground, observer: Observer, outcome: Outcome) -> None:
+    """Allow 2g + 1 cycles where an order took effect in the g periods that the guard waits.
+
+    A new placement has g periods to complete its first cycle; where the fault has broken that one,
+    too, they are lost (see `dwell.control.Guard`).
+    """
+    if outcome.bound is None:
+        return
+    patience = cell.problem.controller.guard_cycles
+    first_ns = outcome.begin_ns - cell.period_ns
+    last_ns = outcome.begin_ns + (patience + 1) * cell.period_ns
+    for term in observer.judge.ordered_between(first_ns, last_ns):
+        outcome.bound = 2 * patience + 1
+        outcome.note = f"{outcome.note}  an order to {term.placement} came in between".strip()
 
 
 def _old(cell: Ground, observer: Observer, fault: Fault, outcome: Outcome) -> list[str]:

@@ -13,7 +13,7 @@ from dwell.chaos.ground import Ground
 from dwell.chaos.stages import APPLY, HOLD, ZERO
 from dwell.chaos.stalls import StallDetector
 
-__all__ = ["Outcome", "strike"]
+__all__ = ["Outcome", "beyond", "strike"]
 
 #: Time in which a cell has to have recovered.
 RECOVERED_S = 60.0
@@ -140,6 +140,18 @@ def strike(
     return found
 
 
+def beyond(outcome: Outcome) -> list[str]:
+    """Return how a fault has cost more cycles than its bound."""
+    if outcome.bound is None:
+        return []
+    lost = ("by it", outcome.lost), ("after it", outcome.lost_after)
+    return [
+        f"{count} consecutive cycles lost {when}, not {outcome.bound}"
+        for when, count in lost
+        if count > outcome.bound
+    ]
+
+
 def _last(cell: Ground, fault: Fault, begin_ns: int, lasts: int, bound: int | None) -> None:
     """Wait for the event that the fault's end waits for."""
     over_ns = begin_ns + lasts * cell.period_ns
@@ -189,10 +201,6 @@ def _weigh(
         during = [one for one in seen if one.at_ns >= begin_ns - period_ns]
         max_age_ms = problem.live.max_age_ms or 2 * problem.pipeline.period_ms
         found.late += unsafe(during, max_age_ms + problem.pipeline.period_ms + found.stall_ms)
-    if found.bound is not None:
-        for when, lost in (("by it", found.lost), ("after it", found.lost_after)):
-            if lost > found.bound:
-                found.late.append(f"{lost} consecutive cycles lost {when}, not {found.bound}")
 
 
 def _strikes_sink(fault: Fault) -> bool:
