@@ -181,7 +181,7 @@ def test_execution_times_are_found(calibrated: Calibrated) -> None:
         assert found["stage_ms"] == pytest.approx(stage_ms, rel=0.02)
         assert found["messaging_ms"] == pytest.approx(MESSAGING_MS[task, node], rel=0.06)
         # What passes before the first job and after the last is its own messaging, no more.
-        assert found["ends_ms"] == pytest.approx(0.0, abs=0.05)
+        assert found["end_ms"] == pytest.approx(0.0, abs=0.05)
     assert calibrated.missing == ()
     # What is stressed says nothing of its node, and a link that is worse nothing of itself.
     assert "OFF-stress" not in about["find@E"]["of_runs"]

@@ -12,6 +12,8 @@ from dwell.errors import LiveError
 from dwell.live.visiting import Visitor
 from dwell.model import Problem
 from dwell.testbed.bed import Bed
+from dwell.testbed.processes import without_keys
+from dwell.testbed.processes import without_keys
 
 __all__ = ["OnHosts", "OnLoopback", "Stage"]
 
@@ -121,7 +123,7 @@ class OnLoopback:
     def begin(self) -> None:
         """Start everything."""
         self._play.__enter__()
-        self._visitor = Visitor(self.problem)
+        self._visitor = Visitor(self.problem, without_keys())
 
     def start_agent(self, node: str) -> None:
         """Start a node's agent again."""

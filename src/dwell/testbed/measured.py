@@ -175,8 +175,10 @@ class Site:
     ----------
     samples_ms : float64 array, shape (jobs,)
         What an undisturbed job takes of the node, its share of messaging included.
-    stage_ms, overhead_ms, ends_ms : float
-        Means of the stage alone, its worker's messaging, and the ends of the pipeline.
+    stage_ms, overhead_ms, end_ms : float
+        Means of the stage alone, its worker's messaging, and from a sink's job to the cycle's end.
+    begin_ms : float
+        From a release to the begin of a source's job, beyond its messaging: a wait, not core time.
     runs : tuple of str
         That they are from.
     """
@@ -184,7 +186,8 @@ class Site:
     samples_ms: Floats
     stage_ms: float
     overhead_ms: float
-    ends_ms: float
+    end_ms: float
+    begin_ms: float
     runs: tuple[str, ...]
 
 
@@ -372,17 +375,16 @@ def sites(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, Site
         over_ms = overhead_ms.get(site, 0.0)
         # What its worker has to do with a stamp or a command is part of its messaging.
         known_ms = over_ms * MESSAGE_BYTES / _message_bytes(problem, site[0])
-        ends_ms = float(
-            np.mean(
-                [
-                    sum(max(ends[site] - known_ms, 0.0) for ends in of_both if site in ends)
-                    for of_both in ((one.begins_ms, one.ends_ms) for one in of)
-                ]
+        begin_ms, end_ms = (
+            float(
+                np.mean([max(ends[site] - known_ms, 0.0) for ends in ways if site in ends] or 0.0)
             )
+            for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
         )
+        samples_ms = stage_ms + (over_ms + end_ms)
         names = tuple(one.name for one in of)
-        samples_ms = stage_ms + (over_ms + ends_ms)
-        found[site] = Site(samples_ms, float(stage_ms.mean()), over_ms, ends_ms, names)
+        mean_ms = float(stage_ms.mean())
+        found[site] = Site(samples_ms, mean_ms, over_ms, end_ms, begin_ms, names)
     return found
 
 
@@ -462,7 +464,7 @@ def _cores_ms(
     site = found.get(key[:2])
     if site is None:
         return one.spent_ms[key]
-    return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.ends_ms)
+    return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.end_ms)
 
 
 # ------------------------------------------------------------------------------------ links

@@ -23,8 +23,9 @@ from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.testbed.trace_names import move_traces
+from dwell.trust import KEYS
 
-__all__ = ["Inside", "Processes", "expected", "outright"]
+__all__ = ["Inside", "Processes", "expected", "outright", "without_keys"]
 
 #: Takes a node and the words of a command; returns those that run it there, in the same process.
 Inside: TypeAlias = Callable[[str, Sequence[str]], Sequence[str]]
@@ -38,6 +39,11 @@ KILL_S = 10.0
 def outright(node: str, words: Sequence[str]) -> Sequence[str]:
     """Return a command as it is: the node is this computer."""
     return words
+
+
+def without_keys() -> dict[str, str]:
+    """Return this process's environment but for the keyring, which is of a cell of its own."""
+    return {name: value for name, value in os.environ.items() if name != KEYS}
 
 
 def expected(problem: Problem, node: str) -> list[str]:
@@ -58,7 +64,8 @@ class Processes:
     inside : callable, optional
         Has a command run on a node; on this computer if left out.
     environment : mapping of str to str, optional
-        Variables that all processes get as well.
+        Variables that all processes get as well. A keyring that this process has is of another
+        cell, and not theirs.
     cpus : mapping of str to int, optional
         Of each node; one that is not there uses any.
     more : sequence of str
@@ -160,7 +167,7 @@ class Processes:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env={**os.environ, **self.environment},
+                env={**without_keys(), **self.environment},
                 process_group=0,
             )
 

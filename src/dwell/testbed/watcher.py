@@ -5,7 +5,6 @@ Whoever makes the testbed is on none of its hosts, and no link leads there.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -76,13 +75,14 @@ def main() -> None:
     import dwell
     from dwell.live.security import INSECURE
     from dwell.live.visiting import Visitor
+    from dwell.testbed.processes import without_keys
 
     parent = Parent()
     try:
         settings = parent.receive()
         try:
             # The testbed's hosts lead nowhere but to each other.
-            environment = {**os.environ, INSECURE: "1"}
+            environment = {**without_keys(), INSECURE: "1"}
             visitor = Visitor(dwell.load(cast("str", settings["cell"])), environment)
         except DwellError as error:
             parent.answer({"error": str(error)})
