@@ -171,16 +171,6 @@ def test_migrations_keep_their_distance(wire: Wire, apart: int) -> None:
     assert wire.judge.migrations() == []
 
 
-def test_what_an_order_brought_about_and_what_the_guard_did(wire: Wire) -> None:
-    wire.stamp(0, 1, "SO")
-    wire.accept(wire.order(1, "HYB"), 2, "HYB", 1)
-    wire.stamp(1, 2, "HYB")
-    ordered_ns = wire.now_ns
-    wire.stamp(4, 3, "LOC")
-    assert [term.term for term in wire.judge.ordered_between(0, wire.now_ns)] == [2]
-    assert wire.judge.ordered_between(ordered_ns + 1, wire.now_ns) == []
-
-
 def test_moves_of_the_guard_may_come_at_any_time(wire: Wire) -> None:
     wire.stamp(0, 1, "SO")
     wire.accept(wire.order(1, "LOC"), 2, "LOC", 10)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -183,11 +183,21 @@ class Campaign:
         Command that repeats it; the number of a fault is added.
     say : callable
         Takes a line for each fault.
+    leave_out : collection of str
+        Kinds of faults that do not come.
     """
 
     def __init__(
-        self, staging: Staging, out: Path, seed: int, again: str, say: Callable[[str], None]
+        self,
+        staging: Staging,
+        out: Path,
+        seed: int,
+        again: str,
+        say: Callable[[str], None],
+        *,
+        leave_out: Collection[str] = (),
     ) -> None:
+        self._leave_out = frozenset(leave_out)
         self._staging, self._out, self._seed = staging, out, seed
         self._again, self._say = again, say
         self._disks = may_mount()
@@ -232,7 +242,8 @@ class Campaign:
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
         stage, _ = self._staging(1)
-        found = planned(self._seed, list(faults_of(stage.problem, Means(disks=self._disks))))
+        there = faults_of(stage.problem, Means(disks=self._disks))
+        found = planned(self._seed, [one for one in there if one.kind not in self._leave_out])
         if only is not None:
             return islice(found, only - 1, only)
         return iter(found) if faults is None else islice(found, faults)
@@ -293,7 +304,6 @@ class Campaign:
         outcome.wrong += observer.look()
         if usable:
             _recovered(observer, outcome)
-            _allow_for_orders(cell, observer, outcome)
             outcome.late += [*beyond(outcome), *_old(cell, observer, fault, outcome)]
         self._keep(cell, one, outcome)
         return usable
@@ -327,22 +337,6 @@ def _recovered(observer: Observer, outcome: Outcome) -> None:
         outcome.wrong.append("no cycle was stamped by an order after it has ended")
     else:
         outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
-
-
-def _allow_for_orders(cell: Ground, observer: Observer, outcome: Outcome) -> None:
-    """Allow 2g + 1 cycles where an order took effect in the g periods that the guard waits.
-
-    A new placement has g periods to complete its first cycle; where the fault has broken that one,
-    too, they are lost (see `dwell.control.Guard`).
-    """
-    if outcome.bound is None:
-        return
-    patience = cell.problem.controller.guard_cycles
-    first_ns = outcome.begin_ns - cell.period_ns
-    last_ns = outcome.begin_ns + (patience + 1) * cell.period_ns
-    for term in observer.judge.ordered_between(first_ns, last_ns):
-        outcome.bound = 2 * patience + 1
-        outcome.note = f"{outcome.note}  an order to {term.placement} came in between".strip()
 
 
 def _old(cell: Ground, observer: Observer, fault: Fault, outcome: Outcome) -> list[str]:

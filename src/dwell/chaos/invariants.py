@@ -216,11 +216,6 @@ class Judge:
         ]
         return min(instants, default=None)
 
-    def ordered_between(self, first_ns: int, last_ns: int) -> list[Term]:
-        """Return the terms that an order brought about, and that were stamped first in a time."""
-        moved = (term for term in self.terms.values() if term.moved)
-        return [term for term in moved if first_ns <= term.at_ns <= last_ns]
-
     # ------------------------------------------------------------------------ routing
 
     def _routed(self, key: str, header: Header) -> Iterable[str]:

@@ -13,7 +13,6 @@ from dwell.live.visiting import Visitor
 from dwell.model import Problem
 from dwell.testbed.bed import Bed
 from dwell.testbed.processes import without_keys
-from dwell.testbed.processes import without_keys
 
 __all__ = ["OnHosts", "OnLoopback", "Stage"]
 
