@@ -320,13 +320,6 @@ def _put_in(
         document["tasks"][task]["on"][node]["exec_ms"] = replay(task_name(task, node))
         # The samples have what the task shares with others already.
         document["tasks"][task].pop("scale", None)
-    for task in dict.fromkeys(task for task, _ in found):
-        of = [site for (name, _), site in found.items() if name == task and site.begin_ms]
-        if of:
-            jobs = sum(len(site.samples_ms) for site in of)
-            begin_ms = sum(site.begin_ms * len(site.samples_ms) for site in of) / jobs
-            before_ms = document["tasks"][task].get("offset_ms") or 0.0
-            document["tasks"][task]["offset_ms"] = _short(before_ms + begin_ms)
     for node, cores in behind.items():
         document["nodes"][node]["background"] = _short(cores)
     links = []
@@ -436,8 +429,7 @@ def _told(report: Mapping[str, Any]) -> list[str]:
     for name, of in report["tasks"].items():
         lines.append(
             f"{name}: {of['mean_ms']:.3g} ms ({of['stage_ms']:.3g} stage, {of['messaging_ms']:.3g} "
-            f"messaging, {of['end_ms']:.3g} end), begins after {of['begin_ms']:.3g} ms, "
-            f"{of['jobs']} jobs"
+            f"messaging, {of['begin_ms'] + of['end_ms']:.3g} begin and end), {of['jobs']} jobs"
         )
     lines += [f"{name}: {of['mean_ms']:.3g} ms" for name, of in report["links"].items()]
     lines += [

@@ -49,7 +49,7 @@ SiteName: TypeAlias = tuple[str, str]
 #: Least number of jobs from which a task's execution times are taken.
 LEAST_JOBS = 100
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
-UNHINDERED = 0.25
+UNHINDERED = 0.05
 #: The same of a message's delay, where its link's own is compared with what was asked for.
 QUICK = 0.1
 #: Bytes that cost as much CPU as sending or receiving a message at all.
@@ -175,10 +175,9 @@ class Site:
     ----------
     samples_ms : float64 array, shape (jobs,)
         What an undisturbed job takes of the node, its share of messaging included.
-    stage_ms, overhead_ms, end_ms : float
-        Means of the stage alone, its worker's messaging, and from a sink's job to the cycle's end.
-    begin_ms : float
-        From a release to the begin of a source's job, beyond its messaging: a wait, not core time.
+    stage_ms, overhead_ms, begin_ms, end_ms : float
+        Means of the stage alone, its worker's messaging, from a release to the begin of a source's
+        job, and from the end of a sink's job to that of the cycle.
     runs : tuple of str
         That they are from.
     """
@@ -186,8 +185,8 @@ class Site:
     samples_ms: Floats
     stage_ms: float
     overhead_ms: float
-    end_ms: float
     begin_ms: float
+    end_ms: float
     runs: tuple[str, ...]
 
 
@@ -381,10 +380,10 @@ def sites(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, Site
             )
             for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
         )
-        samples_ms = stage_ms + (over_ms + end_ms)
+        samples_ms = stage_ms + (over_ms + begin_ms + end_ms)
         names = tuple(one.name for one in of)
         mean_ms = float(stage_ms.mean())
-        found[site] = Site(samples_ms, mean_ms, over_ms, end_ms, begin_ms, names)
+        found[site] = Site(samples_ms, mean_ms, over_ms, begin_ms, end_ms, names)
     return found
 
 
@@ -464,7 +463,7 @@ def _cores_ms(
     site = found.get(key[:2])
     if site is None:
         return one.spent_ms[key]
-    return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.end_ms)
+    return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.begin_ms + site.end_ms)
 
 
 # ------------------------------------------------------------------------------------ links
