@@ -12,7 +12,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench faults chaos lock clean
+.PHONY: help env demo test check bench faults chaos soak fuzz audit sbom lock clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-6s %s\n", $$1, $$2}' Makefile
@@ -62,13 +62,38 @@ faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on w
 chaos: env ## Half an hour of chaos on a real cell, judged from the wire (ARGS="--minutes 2 --seed 7")
 	$(BIN)/python -m dwell live chaos --minutes 30 --faults 1000 $(ARGS)
 
+soak: env ## An hour of a real cell at 25 Hz: memory, files, threads (ARGS="--minutes 10")
+	$(BIN)/python -m tests.live.soak $(ARGS)
+
+# Tools that are no part of the environment; each gets a folder of its own.
+$(VENV)/tools/%: requirements/%.txt $(VENV)/.installed
+	@rm -rf $@
+	$(UV) pip install --quiet --python $(BIN)/python --require-hashes --target $@ -r $<
+	@touch $@
+
+fuzz: $(VENV)/tools/fuzz ## Fuzz what reads from the network, guided by coverage (ARGS="--seconds 600")
+	PYTHONPATH=$< $(BIN)/python -m tests.fuzz $(ARGS)
+
+audit: $(VENV)/tools/release ## Look up known vulnerabilities of all that is pinned (needs pypi.org)
+	@for file in runtime dev; do \
+		PYTHONPATH=$< $(BIN)/python -m pip_audit --strict --disable-pip --require-hashes \
+			-r requirements/$$file.txt || exit 1; \
+	done
+
+sbom: $(VENV)/tools/release ## Write what is pinned to dist/sbom.json (CycloneDX)
+	@mkdir -p dist
+	PYTHONPATH=$< $(BIN)/python -m cyclonedx_py requirements --pyproject pyproject.toml \
+		--output-reproducible --output-format JSON --output-file dist/sbom.json requirements/dev.txt
+
 lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
 	$(COMPILE) --group uv --output-file requirements/uv.txt
 	$(COMPILE) pyproject.toml --output-file requirements/runtime.txt
 	$(COMPILE) pyproject.toml --all-extras --group dev --constraint requirements/runtime.txt \
 		--output-file requirements/dev.txt
+	$(COMPILE) --group fuzz --output-file requirements/fuzz.txt
+	$(COMPILE) --group release --output-file requirements/release.txt
 	@! grep -nE '://|^ *--(index|extra-index|find-links|trusted-host)' requirements/*.txt
 
 clean: ## Remove everything that make made
-	rm -rf $(VENV) build dist demo-out .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) build dist demo-out fuzz-corpus .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find $(CODE) -name __pycache__ -prune -exec rm -rf {} +

@@ -27,6 +27,7 @@ from dwell.model.document import to_document
 from dwell.report.phases import Disturbed, disturbed
 from dwell.testbed.playing import make_folder
 from dwell.testbed.timeline import Change, changes_of
+from dwell.trust import KEYS
 from tests.report.live_runs import PERIOD_NS, live_run
 
 SECONDS = 116.0
@@ -181,6 +182,8 @@ def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # It makes a cell of its own: keys of another one are not for it.
+        env={**os.environ, KEYS: str(tmp_path / "of another cell")},
     )
     assert one.stderr is not None
     try:

@@ -12,11 +12,14 @@ from pathlib import Path
 import pytest
 
 import dwell
-from dwell.errors import LiveError
+from dwell.errors import LiveError, TrustError
 from dwell.io import from_document
 from dwell.live.leash import OWNER
+from dwell.live.security import INSECURE, Security
+from dwell.live.wiring import Role
 from dwell.model import Problem
-from dwell.testbed.processes import Processes, expected
+from dwell.testbed.processes import Processes, expected, without_keys
+from dwell.trust import KEYS
 from tests.testbed.light_cell import document
 
 # Notes its words and its owner, and stays; it takes SIGTERM as it comes.
@@ -62,6 +65,29 @@ def test_each_runs_where_it_belongs_with_what_it_needs(problem: Problem, tmp_pat
         processes.stop()
     assert processes.running == {}
     assert all(one.poll() is not None for one in started)
+
+
+def test_the_keys_of_another_cell_are_not_theirs(
+    problem: Problem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def says(node: str, words: Sequence[str]) -> Sequence[str]:
+        return [sys.executable, "-c", f"import os; print(os.environ.get('{KEYS}'), flush=True)"]
+
+    monkeypatch.setenv(KEYS, str(tmp_path / "of another cell"))
+    processes = Processes([problem], tmp_path, inside=says)
+    given = Processes([problem], tmp_path, inside=says, environment={KEYS: "of this cell"})
+    try:
+        processes.start_agent("R1")
+        assert logged(tmp_path / "agent@R1.log") == "None\n"
+        given.start_agent("R2")
+        assert logged(tmp_path / "agent@R2.log") == "of this cell\n"
+    finally:
+        processes.stop()
+        given.stop()
+    role = Role("visitor", "R1", "visitor")
+    with pytest.raises(TrustError):
+        Security.of(problem, role)
+    assert Security.of(problem, role, {**without_keys(), INSECURE: "1"}).keyring is None
 
 
 def test_cells_that_share_a_node_have_an_agent_each_and_one_controller(

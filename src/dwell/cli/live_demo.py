@@ -39,6 +39,7 @@ from dwell.testbed.playing import (
     make_folder,
 )
 from dwell.testbed.playing import play as play_changes
+from dwell.testbed.processes import without_keys
 from dwell.testbed.timeline import Change, changes_of
 
 __all__ = ["play"]
@@ -141,7 +142,7 @@ def _watch_from_start(
 ) -> None:
     """Wait until everybody is there, and play the scenario."""
     awaited = [who for node in cell.problem.fabric.nodes for who in cell.expected(node)]
-    with Visitor(cell.problem) as visitor:
+    with Visitor(cell.problem, without_keys()) as visitor:
 
         def ask(patience_s: float) -> Mapping[str, Any]:
             return visitor.ask("status", patience_s=patience_s)

@@ -11,6 +11,7 @@ from dwell.cli.output import print_json, working, write_file
 from dwell.errors import RunError
 from dwell.record import open_run
 from dwell.report import run_html, trace_events
+from dwell.report.live_facts import recovery
 from dwell.testbed.execution import is_campaign
 
 __all__ = ["report_run"]
@@ -37,9 +38,14 @@ def report_run(folder: Path, page: Path, trace: Path | None, *, as_json: bool) -
         write_file(page, run_html(run))
     if trace is not None and events is not None:
         write_file(trace, json.dumps(events))
+    recovered = run.meta.get("recovered", {})
+    lost = list(recovery(recovered))
     if as_json:
-        print_json({"report": page, "trace": trace})
+        told = {"recovered": recovered, "lost": lost} if lost else {}
+        print_json({"report": page, "trace": trace, **told})
         return
     typer.echo(f"report: {page}")
+    for sentence in lost:
+        typer.echo(f"note: {sentence}")
     if trace is not None:
         typer.echo(f"trace: {trace} (open it at https://ui.perfetto.dev)")

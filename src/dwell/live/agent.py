@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
+from dwell.live.bundle import MOST_MESSAGES, Bundle
 from dwell.live.group import ControlGroup
 from dwell.live.messages import Carried, Load, encode
-from dwell.live.role import Place, Pulse
+from dwell.live.role import TWICE, Place, Pulse
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.protocol import Sample
 
@@ -27,8 +28,6 @@ LOAD_NS = 250_000_000
 TEND_NS = 1_000_000_000
 #: Age from which what a gauge showed counts no more.
 GAUGE_S = 2.0
-#: Messages that the detour carries on together at most; more within that time are dropped.
-MOST_CARRIED = 1_000
 #: Periods between two beats of an agent, and between two of anybody that the controller is told of.
 AGENT_BEAT = 5
 NEVER_NS = 1 << 62
@@ -140,10 +139,10 @@ class Agent:
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.relay
         self._look_ns = self._load_ns = self._tend_ns = 0
-        self._carried: list[tuple[str, bytes]] = []
+        self._carried = Bundle()
         self._carry_ns = NEVER_NS
-        self._gathered: list[tuple[str, bytes]] = []
-        self._beats: dict[str, bytes] = {}
+        self._gathered = Bundle(MOST_MESSAGES // 2)
+        self._beats = Bundle(MOST_MESSAGES // 2, newest=True)
         self._gather_ns = self._beats_ns = 0
         self._beat_prefix = place.keys.relay(place.keys.beat("", "").removesuffix("/"))
         self._relay_prefix = f"{place.keys.root}/relay/"
@@ -164,14 +163,12 @@ class Agent:
         if not (self._relays and sample.key.startswith(self._relay_prefix)):
             return None
         key = sample.key.removeprefix(self._relay_prefix)
-        if len(self._carried) < MOST_CARRIED:
-            self._carried.append((key, sample.payload))
+        if key.partition("/")[0] not in TWICE:
+            return None
+        if self._carried.add(key, sample.payload):
             self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
-        if sample.key.startswith(self._beat_prefix):
-            if key in self._beats or len(self._beats) < MOST_CARRIED // 2:
-                self._beats[key] = sample.payload
-        elif len(self._gathered) < MOST_CARRIED // 2:
-            self._gathered.append((key, sample.payload))
+        is_beat = sample.key.startswith(self._beat_prefix)
+        (self._beats if is_beat else self._gathered).add(key, sample.payload)
         return self._carry_ns
 
     def _state(self) -> tuple[bool, str]:
@@ -190,9 +187,8 @@ class Agent:
             self._report(now_ns)
             self._load_ns = now_ns + LOAD_NS
         if now_ns >= self._carry_ns:
-            carried, self._carried = self._carried, []
             self._carry_ns = NEVER_NS
-            self.place.transport.put(self.place.keys.carried(), encode(Carried(tuple(carried))))
+            self._put(self.place.keys.carried(), self._carried.taken())
         wakes = [self.pulse.wake(now_ns), self._look_ns, self._load_ns, self._carry_ns]
         if self._relays:
             if now_ns >= self._gather_ns:
@@ -203,13 +199,15 @@ class Agent:
 
     def _tell(self, now_ns: int) -> None:
         """Tell the controller what came over the detour: of beats the last, and now and then."""
-        told, self._gathered = self._gathered, []
+        told = self._gathered.taken()
         if now_ns >= self._beats_ns:
-            told += self._beats.items()
-            self._beats = {}
+            told += self._beats.taken()
             self._beats_ns = now_ns + AGENT_BEAT * self.place.period_ns
         if told:
-            self.place.transport.put(self.place.keys.gathered(), encode(Carried(tuple(told))))
+            self._put(self.place.keys.gathered(), told)
+
+    def _put(self, key: str, messages: list[tuple[str, bytes]]) -> None:
+        self.place.transport.put(key, encode(Carried(tuple(messages))))
 
     def _report(self, now_ns: int) -> None:
         place = self.place

@@ -172,7 +172,17 @@ class Cell:
             for heard in beat.heard:
                 self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
 
+    def _require_candidate(self, placement: str) -> None:
+        """Raise a LiveError unless the stamper can have said that a placement holds."""
+        known = self.place.problem.candidates
+        if placement not in known:
+            raise LiveError(
+                f"the stamper says {placement[:60]!r} holds, which is no candidate here "
+                f"({', '.join(known)}); the nodes' cell files differ"
+            )
+
     def _stamped(self, stamp: Stamped, now_ns: int) -> None:
+        self._require_candidate(stamp.placement)
         held = self.held
         if self.windows is not None:
             self.windows.stamped(stamp, now_ns)
@@ -222,6 +232,7 @@ class Cell:
     def _answered(self, answer: Accepted, now_ns: int) -> None:
         if answer.controller != self.name:
             return
+        self._require_candidate(answer.placement)
         # One that asked before had a clock that is ahead of this one.
         self._number = max(self._number, answer.newest)
         held = self.held

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 from typing import TypeAlias
 
@@ -18,6 +18,8 @@ Floats: TypeAlias = NDArray[np.float64]
 
 #: Reports remembered of a node.
 KEPT = 4_096
+#: Processes of a node that are remembered; more are none of the cell's.
+MOST_PROCESSES = 256
 
 
 class NodeLoad:
@@ -80,12 +82,18 @@ class ProcessLoads:
     def __init__(self) -> None:
         self._of: dict[tuple[str, str], tuple[deque[int], deque[int]]] = {}
         self._read: dict[tuple[str, str], int] = {}
+        self._count: Counter[str] = Counter()
 
     def report(self, node: str, at_ns: int, processes: Iterable[tuple[str, int]]) -> None:
         """Take in what processes of a node have taken since each was started."""
         for who, cpu_ns in processes:
             key = node, who
-            at, total = self._of.setdefault(key, (deque(maxlen=KEPT), deque(maxlen=KEPT)))
+            if key not in self._of:
+                if self._count[node] >= MOST_PROCESSES:
+                    continue
+                self._count[node] += 1
+                self._of[key] = deque(maxlen=KEPT), deque(maxlen=KEPT)
+            at, total = self._of[key]
             if at and at_ns < at[-1]:
                 # Its node's clock began anew.
                 at.clear()

@@ -8,6 +8,7 @@ A struct is MessagePack; it becomes the type that the stage declares, and plain 
 from __future__ import annotations
 
 import math
+import re
 from typing import Any, TypeAlias
 
 import msgspec
@@ -23,6 +24,9 @@ Payload: TypeAlias = "bytes | NDArray[Any] | msgspec.Struct | dict[str, Any] | l
 #: Kinds of numbers that arrays may hold: no objects, no records.
 NUMBERS = "biufc"
 MAX_DIMENSIONS = 8
+#: A description of an array as `write_payload` makes it. NumPy reads much more as a dtype, some of
+#: it as Python.
+ARRAY = re.compile(r"([<>|=]?[biufc][0-9]{1,2}|\?):((?:[0-9]{1,18}(?:x[0-9]{1,18})*)?)")
 
 
 def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
@@ -98,13 +102,17 @@ def read_payload(kind: str, data: bytes, expected: type | None = None) -> Payloa
 
 
 def _read_array(description: str, data: bytes) -> NDArray[Any]:
-    name, _, lengths = description.partition(":")
+    found = ARRAY.fullmatch(description)
     try:
-        dtype = np.dtype(name)
-        shape = tuple(int(length) for length in lengths.split("x")) if lengths else ()
-    except (TypeError, ValueError):
+        if found is None:
+            raise TypeError
+        dtype = np.dtype(found[1])
+    except TypeError:
         raise LiveError(f"no description of an array: {description[:60]!r}") from None
-    sane = dtype.kind in NUMBERS and len(shape) <= MAX_DIMENSIONS and min(shape, default=0) >= 0
-    if not sane or math.prod(shape) * dtype.itemsize != len(data):
-        raise LiveError(f"{len(data)} bytes are no array {description[:60]!r}")
-    return np.frombuffer(data, dtype).reshape(shape)
+    shape = tuple(int(length) for length in found[2].split("x")) if found[2] else ()
+    try:
+        if len(shape) > MAX_DIMENSIONS or math.prod(shape) * dtype.itemsize != len(data):
+            raise ValueError
+        return np.frombuffer(data, dtype).reshape(shape)
+    except ValueError:
+        raise LiveError(f"{len(data)} bytes are no array {description[:60]!r}") from None

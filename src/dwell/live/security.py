@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from dwell.errors import Fault, LiveError, TrustError
 from dwell.live.role import Place
 from dwell.live.transport.protocol import Transport
-from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
+from dwell.live.transport.zenoh import LONGEST_BYTES, ZenohSettings, ZenohTransport
 from dwell.live.wiring import Role, wire
 from dwell.model import FrozenDict, Problem
 from dwell.trust import KEYS
@@ -31,6 +31,8 @@ __all__ = ["INSECURE", "KEYS", "Security", "exposed"]
 INSECURE = "DWELL_INSECURE"
 #: A certificate that ends soon is spoken of once a day.
 REMIND_S = 86_400.0
+#: How much longer a message may be than the cell file says of its flow or state.
+SPARE = 4
 #: Of people, and of what runs where the controller does.
 VISITORS = ("operator", "observer", "controller")
 
@@ -163,9 +165,14 @@ class Security:
         return "tcp" if self.keyring is None else "tls"
 
     def _settings(self) -> ZenohSettings:
+        pipeline = self.problem.pipeline
+        said = [flow.payload_bytes for flow in pipeline.flows]
+        said += [task.state_bytes for task in pipeline.tasks.values()]
+        longest_bytes = max(LONGEST_BYTES, SPARE * max(said, default=0))
         if self.keyring is None:
-            return ZenohSettings()
-        return ZenohSettings(more=FrozenDict(_tls(self.problem, self.keyring)))
+            return ZenohSettings(longest_bytes=longest_bytes)
+        more = FrozenDict(_tls(self.problem, self.keyring))
+        return ZenohSettings(longest_bytes=longest_bytes, more=more)
 
 
 def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 from dwell.report.wording import listed, percent, write_number
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.report.facts import Facts
 
-__all__ = ["known"]
+__all__ = ["known", "recovery"]
 
 
 def known(run: Run, facts: Facts) -> Iterator[str]:
@@ -19,7 +19,7 @@ def known(run: Run, facts: Facts) -> Iterator[str]:
     yield _clocks(run, facts)
     yield from _unheard(run)
     yield from _lead(run)
-    yield from _recovered(facts)
+    yield from recovery(facts.recovered)
 
 
 def _clocks(run: Run, facts: Facts) -> str:
@@ -66,8 +66,14 @@ def _lead(run: Run) -> Iterator[str]:
         )
 
 
-def _recovered(facts: Facts) -> Iterator[str]:
-    told = facts.recovered
+def recovery(told: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on what is not in a run because something was killed or damaged.
+
+    Parameters
+    ----------
+    told : mapping
+        What its meta say under ``recovered``.
+    """
     opened = int(told.get("opened", 1))
     if opened > 1:
         yield f"The controller was started {opened} times while the run went on."
@@ -85,5 +91,5 @@ def _recovered(facts: Facts) -> Iterator[str]:
     if told and not told.get("sealed", True):
         yield (
             "The run was not closed: it goes on, or its controller was killed. This is what its "
-            "journal holds."
+            "journal holds; what came after its last window is not here."
         )

@@ -44,6 +44,21 @@ def authority(problem: Problem, tmp_path_factory: pytest.TempPathFactory) -> Aut
     return issued(problem, tmp_path_factory.mktemp("keys"))
 
 
+@pytest.fixture(autouse=True)
+def _no_secret_is_told(
+    tmp_path_factory: pytest.TempPathFactory,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> Iterator[None]:
+    """Whatever is attacked: nothing that is printed or logged has a part of a private key."""
+    yield
+    told = caplog.text + "".join(capfd.readouterr())
+    assert "PRIVATE KEY" not in told
+    for path in tmp_path_factory.getbasetemp().rglob("*key.pem"):
+        lines = path.read_text().splitlines()
+        assert not any(line[:20] in told for line in lines if not line.startswith("-----"))
+
+
 def issued(problem: Problem, folder: Path) -> Authority:
     made = Authority.create(folder, problem.name)
     for node in problem.fabric.nodes:

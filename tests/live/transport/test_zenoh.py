@@ -15,7 +15,7 @@ import pytest
 from dwell.errors import LiveError
 from dwell.live.transport.protocol import Lane, Sample, Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport, _Pool, _Sender, _Way
-from tests.live.transport.meshes import PATIENCE_S, Inbox, ZenohMesh
+from tests.live.transport.meshes import PATIENCE_S, Inbox, ZenohMesh, introduce
 from tests.live.transport.peer import digest
 
 ME, NEAR, FAR, WITNESS = "me@R1", "near@R1", "far@E", "witness@R1"
@@ -229,3 +229,25 @@ def test_the_killed_leave_no_shared_memory_behind(mesh: ZenohMesh) -> None:
 
 
 _POOL_FILE_BYTES = ZenohSettings().pool_bytes
+
+
+def test_a_message_that_is_too_long_is_dropped_on_arrival() -> None:
+    """And not put together first: a peer decides on the length of what it sends."""
+    mesh = ZenohMesh([ME, FAR], ZenohSettings(longest_bytes=1 << 20))
+    try:
+        sender, receiver = mesh.open(ME), mesh.open(FAR)
+        inbox, key = mesh.inbox(), "dwell/t/in/images/E"
+        receiver.subscribe(key, inbox)
+        introduce(mesh, sender, key, [inbox], lane="images")
+        mesh.joined(
+            lambda: any(len(payload) == 1 << 19 for payload in inbox.payloads),
+            lambda: sender.put(key, bytes(1 << 19), lane="images"),
+        )
+        for _ in range(5):
+            sender.put(key, bytes(3 << 20), lane="images")
+        mesh.joined(
+            lambda: b"after" in inbox.payloads, lambda: sender.put(key, b"after", lane="images")
+        )
+        assert max(len(payload) for payload in inbox.payloads) == 1 << 19
+    finally:
+        mesh.close()

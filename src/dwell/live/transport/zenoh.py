@@ -32,7 +32,10 @@ from dwell.model import FrozenDict
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["ZenohSettings", "ZenohTransport"]
+__all__ = ["LONGEST_BYTES", "ZenohSettings", "ZenohTransport"]
+
+#: Longest message that is put together from its fragments; Zenoh's own limit is 1 GiB.
+LONGEST_BYTES = 64 << 20
 
 _LOG = logging.getLogger(__name__)
 _SENT_BY = "zenoh/bytes;"
@@ -83,6 +86,9 @@ class ZenohSettings:
         Payloads from here on go through shared memory where they stay on the node.
     pool_bytes : int
         Shared memory for payloads under way from one process.
+    longest_bytes : int
+        Of a message that arrives in fragments; a longer one is dropped. A peer can have a process
+        keep that much, no more, for each connection and priority.
     more : mapping of str to object
         Further settings of Zenoh by path, as ``transport/link/tls/root_ca_certificate``.
     """
@@ -96,6 +102,7 @@ class ZenohSettings:
     patient_bytes: int = 150_000
     shared_bytes: int = 100_000
     pool_bytes: int = 16 << 20
+    longest_bytes: int = LONGEST_BYTES
     more: Mapping[str, object] = field(default_factory=FrozenDict)
 
 
@@ -450,6 +457,7 @@ def _configuration(entry: Entry, name: Session, settings: ZenohSettings) -> dict
         f"{queue}/congestion_control/drop/max_wait_before_drop_fragments": (
             settings.drop_fragments_after_us
         ),
+        "transport/link/rx/max_message_size": settings.longest_bytes,
         "transport/shared_memory/enabled": name == "local",
         # Payloads are put there by `_Pool`, with a plain copy where it is full.
         "transport/shared_memory/transport_optimization/enabled": False,

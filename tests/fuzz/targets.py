@@ -1,0 +1,284 @@
+"""Everything that reads bytes from the network, as functions of bytes: they return, or they fail.
+
+Hypothesis feeds them in `tests/live/test_fuzz.py`, and atheris, guided by coverage, in
+``python -m tests.fuzz``.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+import dwell
+from dwell.errors import LiveError, TrustError
+from dwell.live import messages
+from dwell.live.keys import Keys
+from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Completion, Header, Order, encode
+from dwell.live.payloads import read_payload
+from dwell.live.role import TWICE
+from dwell.live.stage import Message
+from dwell.live.transport.protocol import Sample
+from dwell.trust.authority import Authority
+from dwell.trust.keyring import Keyring
+from dwell.trust.roster import Roster
+from dwell.trust.signing import Seals
+from tests.live.small_world import Bench, Passing, World
+
+__all__ = ["KINDS", "NODES", "TARGETS", "ReachedError", "seeds"]
+
+NODES = ("R1", "E", "R2")
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+KINDS: tuple[type[msgspec.Struct], ...] = tuple(
+    found
+    for name in messages.__all__
+    if isinstance(found := getattr(messages, name), type) and issubclass(found, msgspec.Struct)
+)
+STAMP = messages.Stamp(1, 5, 1, "LOC", 0)
+HOP = messages.Hop("sensing", "R1", 1, 2, 3, (("stamper", 1),))
+
+
+class Plan(msgspec.Struct):
+    """What a stage may declare."""
+
+    name: str
+    points: list[tuple[float, float]]
+    more: dict[str, Any] = {}
+
+
+class ReachedError(AssertionError):
+    """Bytes that nobody has signed have come to a stage, or moved something."""
+
+
+class _Alarm(Passing):
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        raise ReachedError(f"{self.name} was called with {inputs}")
+
+
+# ----------------------------------------------------------------------------- the cell
+
+
+@cache
+def _folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="dwell-fuzz-"))
+
+
+@cache
+def _seals() -> dict[str, Seals]:
+    cell = dwell.load("examples/canonical.yaml").name
+    folder = _folder() / "keys"
+    authority = Authority.create(folder, cell)
+    for node in NODES:
+        authority.issue(node, "node")
+    authority.issue("controller", "controller")
+    return {name: Seals(Keyring.open(folder / name, cell=cell)) for name in (*NODES, "controller")}
+
+
+@cache
+def _world(*, keys: bool) -> World:
+    """A cell that has run for a while, and whose stages are not to be called any more."""
+    problem = dwell.load("examples/canonical.yaml")
+    stages: dict[str, Callable[[str], Passing]] = {}
+    found = World(
+        problem, exec_ms=EXEC_MS, policy="dtp", stages=stages, seals=_seals() if keys else None
+    )
+    found.run(300)
+    for role in found.roles.values():
+        if isinstance(role, Bench):
+            role.worker._jobs.clear()
+            role.worker.stage = _Alarm(role.worker.task)
+    return found
+
+
+@cache
+def _keys() -> tuple[str, ...]:
+    keys = Keys(dwell.load("examples/canonical.yaml").name)
+    plain = [
+        *(keys.inputs(task, node, kind) for task, node, kind in _inputs()),
+        *(keys.command("control"), keys.done("control"), keys.ended(), keys.stamped()),
+        *(keys.frame(), keys.order(), keys.accepted(), keys.load("E"), keys.restored()),
+        *(keys.beat("R1", "stamper@R1"), keys.beat("E", "agent@E"), keys.snapshot("planning", "E")),
+        *(keys.state("planning", "E"), keys.ask(), keys.look(), keys.carried(), keys.gathered()),
+    ]
+    return *plain, *(keys.detour(key) for key in plain), *(keys.relay(key) for key in plain)
+
+
+def _inputs() -> list[tuple[str, str, str]]:
+    return [
+        *(("sensing", "R1", "main"), ("perception", "E", "main"), ("perception", "R1", "shadow")),
+        *(("planning", "E", "main"), ("control", "R2", "main"), ("control", "R2", "shadow")),
+    ]
+
+
+# ---------------------------------------------------------------------------- the targets
+
+
+def read_message(data: bytes) -> None:
+    """The first byte chooses the kind."""
+    kind = KINDS[data[0] % len(KINDS)] if data else KINDS[0]
+    with suppress(LiveError):
+        found = messages.decode(data[1:], kind)
+        assert type(found) is kind
+        again = messages.decode(encode(found), kind)
+        assert encode(again) == encode(found)
+
+
+def read_header(data: bytes) -> None:
+    """As it comes beside a payload."""
+    with suppress(LiveError):
+        found = messages.decode(data, Header, limit=MAX_HEADER_BYTES)
+        assert len(data) <= MAX_HEADER_BYTES
+        assert len(found.hops) <= 64
+
+
+def read_any_payload(data: bytes) -> None:
+    """The first byte is the length of the kind, which follows."""
+    length = data[0] if data else 0
+    kind = data[1 : 1 + length].decode("utf-8", "replace")
+    for expected in (None, Plan):
+        with suppress(LiveError):
+            found = read_payload(kind, data[1 + length :], expected)
+            if isinstance(found, np.ndarray):
+                assert found.dtype.kind in "biufc"
+                assert found.nbytes == len(data[1 + length :])
+                assert not found.flags.writeable
+
+
+def read_bundle(data: bytes) -> None:
+    """As it comes over the detour."""
+    place = _world(keys=False).stamper.place
+    for sample in place.around(Sample(place.keys.carried(), data)):
+        assert place.keys.word(sample.key) in TWICE
+        assert len(sample.payload) <= len(data)
+
+
+def check_seal(data: bytes) -> None:
+    """Nobody has signed it."""
+    seals = _seals()["R2"]
+    for word, name in (("order", "controller"), ("done", "R2"), ("stamp", "nobody")):
+        try:
+            seals.require(word, name, data)
+        except TrustError:
+            continue
+        raise ReachedError(f"taken for {name}'s {word}")
+
+
+def read_roster(data: bytes) -> None:
+    """A file, but one that is copied from host to host."""
+    path = _folder() / "roster.json"
+    path.write_bytes(data)
+    try:
+        Roster.read(path, _AUTHORITY.public_key())
+    except TrustError:
+        return
+    raise ReachedError("a roster that nobody has signed")
+
+
+def reach_roles(data: bytes) -> None:
+    """Two bytes choose a key; two are the length of the header. No keys: nobody may fall over."""
+    _hear(_world(keys=False), data)
+
+
+def reach_sealed_roles(data: bytes) -> None:
+    """With keys nothing may move, either."""
+    world = _world(keys=True)
+    stamper = world.stamper
+    before = stamper.term, stamper.placement, stamper.cycle, stamper._newest, len(world.arm.applied)
+    _hear(world, data)
+    for role in world.roles.values():
+        if isinstance(role, Bench) and role.worker._jobs:
+            role.worker._jobs.clear()
+            raise ReachedError(f"{role.worker.place.who} would call its stage")
+    after = stamper.term, stamper.placement, stamper.cycle, stamper._newest, len(world.arm.applied)
+    if after != before:
+        raise ReachedError(f"{before} has become {after}")
+
+
+def _hear(world: World, data: bytes) -> None:
+    key = _keys()[int.from_bytes(data[:2], "big") % len(_keys())]
+    length = int.from_bytes(data[2:4], "big")
+    sample = Sample(key, data[4 + length :], data[4 : 4 + length])
+    for role in world.roles.values():
+        hears = role.worker if isinstance(role, Bench) else role
+        hears.receive(sample, world.network.now_ns)  # type: ignore[attr-defined]
+
+
+_AUTHORITY = Ed25519PrivateKey.generate()
+
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    "message": read_message,
+    "header": read_header,
+    "payload": read_any_payload,
+    "bundle": read_bundle,
+    "seal": check_seal,
+    "roster": read_roster,
+    "roles": reach_roles,
+    "sealed": reach_sealed_roles,
+}
+
+
+# --------------------------------------------------------------------------------- seeds
+
+
+def _wholes() -> list[msgspec.Struct]:
+    return [
+        *(STAMP, messages.Stamped(*STAMP.fields, ((4, 9),)), HOP),
+        Header(STAMP, "sensing", "R1", "bytes", (HOP,)),
+        Completion(STAMP, "control", 9, "actuated", (HOP,), "R2"),
+        messages.Heard("stamper@R1", "R1", 1, 2),
+        Beat("agent@E", "E", 1, 5, True, (messages.Heard("stamper@R1", "R1", 1, 2),), cell="x"),
+        Order(1, "me", 1, 1, "SO", 0.5, (("planning", "E"),)),
+        Carried((("beat/E/agent@E", b"b"), ("done/control", b"c"))),
+        messages.Ask("me", "pin", "SO"),
+        messages.Answer("me", "", {"a": [1, {"b": 2.5}]}),
+        messages.Load("E", 1, 2, 3, 4, 5, 0.5, (("planning@E", 7),)),
+        messages.Snapshot(1, "planning", "E", "R2", 1, 5),
+        messages.State(1, 5, "planning", "R2", 1),
+        messages.Restored(1, "planning", "E", 1, 5),
+        messages.Accepted(1, "me", "", 1, 1, "SO", 9),
+    ]
+
+
+def _whole_samples() -> list[bytes]:
+    """Whole messages, under every key."""
+    header = encode(Header(STAMP, "sensing", "R1", "bytes", (HOP,)))
+    length = len(header).to_bytes(2, "big")
+    return [
+        index.to_bytes(2, "big") + length + header + encode(whole)
+        for index in range(len(_keys()))
+        for whole in _wholes()[index % 5 :: 5]
+    ]
+
+
+def seeds(name: str) -> list[bytes]:
+    """Return valid inputs of a target, to begin from."""
+    wholes = _wholes()
+    if name == "message":
+        return [bytes([KINDS.index(type(one))]) + encode(one) for one in wholes]
+    if name == "header":
+        return [encode(one) for one in wholes if isinstance(one, Header)]
+    if name == "bundle":
+        return [encode(one) for one in wholes if isinstance(one, Carried)]
+    if name == "payload":
+        kinds = {
+            b"none": b"",
+            b"bytes": b"abc",
+            b"array:<f4:2x3": bytes(24),
+            b"array:|u1:5": bytes(5),
+            b"struct:Plan": msgspec.msgpack.encode(Plan("a", [(1.0, 2.0)])),
+        }
+        return [bytes([len(kind)]) + kind + data for kind, data in kinds.items()]
+    if name == "seal":
+        data = encode(Order(1, "me", 1, 1, "SO"))
+        return [bytes(64) + data, _seals()["E"].seal("order", data)]
+    if name == "roster":
+        roster = Roster("cell", 1, {})
+        return [roster.signed(Ed25519PrivateKey.generate()).encode()]
+    return _whole_samples()
