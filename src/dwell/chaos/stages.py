@@ -11,6 +11,7 @@ import os
 import struct
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 
 from dwell.live.stage import Actuator, Message, load_actuator
@@ -50,7 +51,7 @@ def _where() -> str:
     return sys.argv[sys.argv.index("--who") + 1]
 
 
-class _Timed:
+class _Timed(ABC):
     """A stage that takes as long as the cell file says, and leaves the CPU to others."""
 
     def __init__(self) -> None:
@@ -67,9 +68,9 @@ class _Timed:
         time.sleep(max(self.seconds - (time.monotonic() - begin), 0.0))
         return Message(output)
 
+    @abstractmethod
     def turn(self, message: Message) -> bytes:
         """Return the output."""
-        raise NotImplementedError
 
 
 class Sensing(_Timed):

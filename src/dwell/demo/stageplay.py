@@ -185,9 +185,7 @@ class Stageplay:
     def apply(self, change: Change) -> None:
         """Have links and CPUs do what begins or ends."""
         item, before = change.item, self._on
-        self._on = [other for other in before if other is not item]
-        if change.begins:
-            self._on.append(item)
+        self._on = change.made(before)
         if isinstance(item, NodeDisturbance):
             burner = self.burners[item.node]
             nodes = [node for node, its in self.burners.items() if its is burner]

@@ -387,9 +387,7 @@ class Bed:
     def apply(self, change: Change) -> None:
         """Have nodes and links do what begins or ends."""
         item, before = change.item, self._on
-        self._on = [other for other in before if other is not item]
-        if change.begins:
-            self._on.append(item)
+        self._on = change.made(before)
         if isinstance(item, NodeDisturbance):
             self._apply_to_node(item.node, before)
         else:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Idle", "Quiet", "Sample", "sample", "wait_until_idle"]
+__all__ = ["Idle", "Quiet", "Sample", "sample", "wait_until_idle", "waited_s"]
 
 STAT, PSI = Path("/proc/stat"), Path("/proc/pressure/cpu")
 #: Fields of the first line of /proc/stat in which a CPU had nothing to do: idle, iowait.
@@ -87,10 +87,10 @@ def sample() -> Sample:
     """Read the counters of this machine."""
     fields = [float(field) for field in STAT.read_text().splitlines()[0].split()[1 : COUNTED + 1]]
     resting = sum(fields[i] for i in RESTING)
-    return Sample(time.monotonic(), sum(fields) - resting, sum(fields), _waited_s())
+    return Sample(time.monotonic(), sum(fields) - resting, sum(fields), waited_s())
 
 
-def _waited_s() -> float | None:
+def waited_s() -> float | None:
     """Time of ``some`` in /proc/pressure/cpu."""
     try:
         line = PSI.read_text().splitlines()[0]

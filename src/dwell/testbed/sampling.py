@@ -12,6 +12,7 @@ from typing import Any, Self
 
 from dwell.errors import LiveError
 from dwell.testbed.forwarder import LATE_MS
+from dwell.testbed.idle import waited_s
 from dwell.testbed.link import Passed, TunLink
 from dwell.testbed.pressure import Rule, Sample
 from dwell.testbed.probe import Probe
@@ -19,7 +20,7 @@ from dwell.testbed.probe import Probe
 __all__ = ["EVERY_S", "Sampler", "cpu_times"]
 
 EVERY_S = 0.1
-STAT, PSI = Path("/proc/stat"), Path("/proc/pressure/cpu")
+STAT = Path("/proc/stat")
 # Fields of a CPU's line in /proc/stat.
 IDLE, IOWAIT, STEAL = 3, 4, 7
 
@@ -106,7 +107,7 @@ class Sampler:
             idle_s=idle_s,
             stolen_s=stolen_s,
             used_s=used_s,
-            waited_s=_waited_s(),
+            waited_s=waited_s(),
             probe_ms=probe_ms,
             packets={name: sum(one.packets for one in ways) for name, ways in passed.items()},
             late={
@@ -152,12 +153,3 @@ def cpu_times(cpus: Collection[int]) -> tuple[dict[int, float], dict[int, float]
             idle_s[wanted[name]] = (ticks[IDLE] + ticks[IOWAIT]) * tick_s
             stolen_s[wanted[name]] = ticks[STEAL] * tick_s if len(ticks) > STEAL else 0.0
     return idle_s, stolen_s
-
-
-def _waited_s() -> float | None:
-    """Time of ``some`` in /proc/pressure/cpu."""
-    try:
-        line = PSI.read_text().splitlines()[0]
-    except (OSError, IndexError):
-        return None
-    return float(line.rpartition("total=")[2]) / 1e6

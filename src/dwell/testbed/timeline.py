@@ -36,6 +36,11 @@ class Change:
     item: Disturbance
     begins: bool
 
+    def made(self, on: Iterable[Disturbance]) -> list[Disturbance]:
+        """Return what is on after it, of what was on before."""
+        rest = [other for other in on if other is not self.item]
+        return [*rest, self.item] if self.begins else rest
+
 
 def changes_of(problem: Problem, scenario: str, *, outages: bool = False) -> list[Change]:
     """Return what a scenario's disturbances do, in the order of time.
