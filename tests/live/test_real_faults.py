@@ -1,18 +1,15 @@
 """Faults of real processes over real Zenoh: each once, seeded, seen by an observer at the actuator.
 
-Two cells live through them side by side, one whose controller wants to be on the edge and one whose
-controller wants to be on the robots. `make faults` has many of each, and says what they cost.
+One cell at a time lives through them: first one whose controller wants to be on the edge, then one
+whose controller wants to be on the robots. `make faults` has many of each, and says what they cost.
 """
 
 from __future__ import annotations
 
 import os
 import random
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -31,40 +28,37 @@ from tests.live.real_cell import (
 
 pytestmark = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2,
-    reason="forty processes that must keep to a period of 40 ms need two CPUs",
+    reason="twenty processes that must keep to a period of 40 ms need two CPUs",
 )
 SEED = 1
 #: Without these the sink gets nothing, for longer than a command may be old.
 WITHOUT_COMMANDS = ("control@R2", "control@R2.1")
-ROUNDS = [
-    tuple(fault for fault in pair if fault is not None)
-    for pair in zip_longest(*(mixed(home) for home in HOMES))
-]
+IN_TURN = [fault for home in HOMES for fault in mixed(home)]
 
 
-class Cells:
-    """The cells that are up, one for each home; another one where one has failed."""
+class Standing:
+    """The cell that is up; another one where it has failed, or where another home is wanted."""
 
     def __init__(self, folder: Path, stalls: StallDetector) -> None:
         self.folder, self.stalls = folder, stalls
-        self.cells: dict[str, RealCell] = {}
+        self._cell: RealCell | None = None
         self._count = 0
-        # Two that start at once would take the same ports for free.
-        self._starts = threading.Lock()
 
     def at(self, home: str) -> RealCell:
         """Return the cell of a home, and start it where there is none."""
-        with self._starts:
-            if home not in self.cells:
-                self._count += 1
-                cell = RealCell(home, self.folder / f"{home}-{self._count}", seed=SEED)
-                cell.__enter__()
-                self.cells[home] = cell
-            return self.cells[home]
+        if self._cell is not None and self._cell.home != home:
+            wrong = self.close()
+            assert not wrong, wrong
+        if self._cell is None:
+            self._count += 1
+            cell = RealCell(home, self.folder / f"{home}-{self._count}", seed=SEED)
+            cell.__enter__()
+            self._cell = cell
+        return self._cell
 
-    def close(self, home: str) -> list[str]:
-        """End a cell; returns what is wrong with the record of its run."""
-        cell = self.cells.pop(home, None)
+    def close(self) -> list[str]:
+        """End the cell; returns what is wrong with the record of its run."""
+        cell, self._cell = self._cell, None
         if cell is None:
             return []
         cell.stop_controller()
@@ -92,7 +86,7 @@ class Cells:
             if not wrong:
                 break
             # What went wrong once may do so for the rest of the cell's life.
-            self.close(fault.home)
+            self.close()
             stall_ms = self.stalls.worst_ms(begin_ns, time.monotonic_ns())
             # A machine that has kept a thread that only sleeps from running for a whole period has
             # kept the cell's processes, too: no bound in cycles can hold, and it is tried again.
@@ -103,19 +97,19 @@ class Cells:
 
 
 @pytest.fixture(scope="module")
-def cells(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cells]:
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Standing]:
     with StallDetector() as stalls:
-        made = Cells(tmp_path_factory.mktemp("cells"), stalls)
+        made = Standing(tmp_path_factory.mktemp("cells"), stalls)
         yield made
-        assert not [wrong for home in HOMES for wrong in made.close(home)]
+        wrong = made.close()
+        assert not wrong, wrong
 
 
-@pytest.mark.parametrize("faults", ROUNDS, ids=lambda pair: ", ".join(f.name for f in pair))
-def test_cells_survive(faults: tuple[Fault, ...], cells: Cells) -> None:
-    with ThreadPoolExecutor(len(faults)) as side_by_side:
-        wrong = list(side_by_side.map(cells.survive, faults))
-    assert not any(wrong), "\n".join(filter(None, wrong))
+@pytest.mark.parametrize("fault", IN_TURN, ids=lambda fault: fault.name)
+def test_cell_survives(fault: Fault, standing: Standing) -> None:
+    wrong = standing.survive(fault)
+    assert not wrong, wrong
 
 
 def test_every_fault_has_its_turn() -> None:
-    assert {fault.name for pair in ROUNDS for fault in pair} == FAULTS.keys()
+    assert {fault.name for fault in IN_TURN} == FAULTS.keys()

@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
 from dwell.study.campaign import Measured
-from dwell.study.comparison import AIM
 from dwell.study.family import Family
 from dwell.study.intervals import CONFIDENCE
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paired import PairedDifference
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Outcome, Table
+from dwell.study.paper.concurrent import HEADINGS, MAIN
 from dwell.study.paper.contrasts import Contrast, contrast
 from dwell.study.paper.differences import centre, difference_table, shown_as
+from dwell.study.paper.rates import rates_figure
 from dwell.study.paper.reversion import links_finding
 from dwell.study.paper.sentences import counted, listed, number, points
 
@@ -44,24 +45,6 @@ METRICS = ("violation_rate", "l95_ms", "u_robot", "cost")
 TOGETHER, SINGLE = ("dtp", "cusum"), "atp"
 #: The placement with T2 on E and T3 on R2, and those that binary reversion knows.
 HYBRID, BINARY = "HYB", ("LOC", "SO")
-
-MAIN: Mapping[str, Unit] = {
-    "scenario": "text",
-    "policy": "text",
-    "violation_rate": "percent",
-    "l95_ms": "ms",
-    "u_robot": "percent",
-    "u_edge": "percent",
-    "cost": "cost",
-    "migrations": "number",
-}
-HEADINGS = {
-    "violation_rate": "V_D",
-    "l95_ms": "L95 (ms)",
-    "u_robot": "U_r",
-    "u_edge": "U_e",
-    "cost": "J",
-}
 
 
 def questions(measured: Measured) -> tuple[Chapter, ...]:
@@ -164,7 +147,7 @@ def _rq1(measured: Measured) -> Chapter | None:
                 note=SEEDS,
             ),
         ),
-        figures=(_rates_figure(main, "Missed deadlines under CPU stress"),),
+        figures=(rates_figure(main, "Missed deadlines under CPU stress"),),
     )
 
 
@@ -206,7 +189,7 @@ def _rq2(measured: Measured) -> Chapter | None:
                 note=SEEDS,
             ),
         ),
-        figures=(_rates_figure(main, "Missed deadlines under network faults"),),
+        figures=(rates_figure(main, "Missed deadlines under network faults"),),
     )
 
 
@@ -366,28 +349,4 @@ def main_table(runs: pl.DataFrame, slug: str, title: str) -> Table:
         units={**MAIN, "seeds": "count"},
         headings={**HEADINGS, "seeds": "runs"},
         note="Means over the runs with 95 % intervals.",
-    )
-
-
-def _rates_figure(main: Table, title: str) -> Figure:
-    return Figure(
-        slug=f"{main.slug}-rates",
-        title=title,
-        kind="intervals",
-        frame=main.frame.select(
-            "scenario",
-            "policy",
-            y="violation_rate",
-            y_low="violation_rate_low",
-            y_high="violation_rate_high",
-        ),
-        x="policy",
-        y="y",
-        series="policy",
-        facet="scenario",
-        y_label="V_D",
-        y_unit="percent",
-        line_at=AIM,
-        line_label=f"{number(100 * AIM, 0)} %",
-        note=main.note,
     )

@@ -16,7 +16,6 @@ import numpy as np
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.policies import ATP
 from dwell.policies.atp import Pair, find_pairs
-from dwell.study.comparison import AIM
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import over_seeds
@@ -24,8 +23,9 @@ from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, U
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
+from dwell.study.paper.rates import rates_figure
 from dwell.study.paper.running import Runner, Scale
-from dwell.study.paper.sentences import counted, listed, number, percent, points
+from dwell.study.paper.sentences import counted, listed, percent, points
 from dwell.study.paper.tuning import TUNING_SEEDS, best, scores, thinned
 from dwell.study.paper.variants import on_and_off, with_candidates, with_scenarios
 from dwell.study.study import Contender, Point, Study
@@ -33,7 +33,7 @@ from dwell.study.study import Contender, Point, Study
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Baselines", "chapter", "stress_scenarios", "verdict"]
+__all__ = ["HEADINGS", "MAIN", "Baselines", "chapter", "stress_scenarios", "verdict"]
 
 DTP, CUSUM = "dtp+corrected", "cusum+corrected"
 TUNED, BEST_HERE = "atp-tuned", "atp best here"
@@ -455,7 +455,10 @@ def written(
             ),
             tuning_table(tuning, baselines),
         ),
-        figures=(rates_figure(main), stages_figure(singles["violation_rate"], stages)),
+        figures=(
+            rates_figure(main, "Missed deadlines under CPU stress"),
+            stages_figure(singles["violation_rate"], stages),
+        ),
     )
 
 
@@ -605,32 +608,6 @@ def tuning_table(tuning: StudyResult, baselines: Baselines) -> Table:
         units={"setting": "text", "violation_rate": "percent", "chosen": "text"},
         headings={"setting": "stage, L95 over D, U_r, U_e, N_min", "violation_rate": "mean V_D"},
         note=f"{len(tuning.study.seeds)} seeds; mean over the scenarios. A threshold inf is none.",
-    )
-
-
-def rates_figure(main: Table) -> Figure:
-    """V_D with its interval, by policy and scenario."""
-    frame = main.frame.select(
-        "scenario",
-        "policy",
-        y="violation_rate",
-        y_low="violation_rate_low",
-        y_high="violation_rate_high",
-    )
-    return Figure(
-        slug="concurrent-rates",
-        title="Missed deadlines under CPU stress",
-        kind="intervals",
-        frame=frame,
-        x="policy",
-        y="y",
-        series="policy",
-        facet="scenario",
-        y_label="V_D",
-        y_unit="percent",
-        line_at=AIM,
-        line_label=f"{number(100 * AIM, 0)} %",
-        note=main.note,
     )
 
 

@@ -17,10 +17,11 @@ from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import under
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
+from dwell.study.paper.chapter import Answer, Chapter, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
+from dwell.study.paper.rates import rates_figure
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, number, percent
 from dwell.study.study import Contender, Point, Study
@@ -220,7 +221,7 @@ def written(results: Sequence[StudyResult]) -> Chapter:
                 found, slug="real-differences", title="Policies on the recorded traces"
             ),
         ),
-        figures=(rates_figure(main),),
+        figures=(rates_figure(main, "Missed deadlines on the recorded traces"),),
     )
 
 
@@ -291,29 +292,4 @@ def main_table(runs: pl.DataFrame, said: Mapping[tuple[str, str], str]) -> Table
         units=MAIN,
         headings=HEADINGS,
         note="Means over runs with 95 % intervals; under 5 % by the one-sided limit.",
-    )
-
-
-def rates_figure(main: Table) -> Figure:
-    """V_D with its interval, by policy and scenario."""
-    return Figure(
-        slug="real-rates",
-        title="Missed deadlines on the recorded traces",
-        kind="intervals",
-        frame=main.frame.select(
-            "scenario",
-            "policy",
-            y="violation_rate",
-            y_low="violation_rate_low",
-            y_high="violation_rate_high",
-        ),
-        x="policy",
-        y="y",
-        series="policy",
-        facet="scenario",
-        y_label="V_D",
-        y_unit="percent",
-        line_at=AIM,
-        line_label="5 %",
-        note=main.note,
     )

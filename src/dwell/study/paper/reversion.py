@@ -25,6 +25,7 @@ from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, U
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families, shown_as
+from dwell.study.paper.rates import rates_figure
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, points
 from dwell.study.paper.tuning import thinned
@@ -420,7 +421,10 @@ def written(whole: StudyResult, runs: pl.DataFrame, swept: StudyResult) -> Chapt
             links_table(problem),
             sweep,
         ),
-        figures=(rates_figure(main), *sweep_figures(sweep)),
+        figures=(
+            rates_figure(main, "Missed deadlines with network faults that come and go"),
+            *sweep_figures(sweep),
+        ),
     )
 
 
@@ -633,31 +637,6 @@ def sweep_table(swept: StudyResult) -> Table:
             "cost": HEADINGS["cost"],
         },
         note=(f"{len(swept.study.seeds)} seeds of {swept.study.windows} windows; 95 % intervals."),
-    )
-
-
-def rates_figure(main: Table) -> Figure:
-    """V_D with its interval, by policy and fault."""
-    return Figure(
-        slug="reversion-rates",
-        title="Missed deadlines with network faults that come and go",
-        kind="intervals",
-        frame=main.frame.select(
-            "scenario",
-            "policy",
-            y="violation_rate",
-            y_low="violation_rate_low",
-            y_high="violation_rate_high",
-        ),
-        x="policy",
-        y="y",
-        series="policy",
-        facet="scenario",
-        y_label="V_D",
-        y_unit="percent",
-        line_at=AIM,
-        line_label="5 %",
-        note=main.note,
     )
 
 
