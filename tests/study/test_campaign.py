@@ -12,6 +12,8 @@ import pytest
 import dwell
 from dwell import Run
 from dwell.errors import RunError
+from dwell.io import from_document
+from dwell.model.document import to_document
 from dwell.record import seal_run
 from dwell.study.campaign import Measured, read_measured, without_excluded
 from dwell.study.campaign_questions import (
@@ -221,3 +223,22 @@ def test_jobs_are_not_needed(folder: Path, tmp_path: Path) -> None:
     found = read_measured(tmp_path / "there")
     assert found.profiles.is_empty()
     assert found.links.is_empty()
+
+
+def test_a_campaign_is_read_without_the_files_that_its_cell_replays(tmp_path: Path) -> None:
+    file = tmp_path / "beside" / "times.csv"
+    file.parent.mkdir()
+    file.write_text("took\n4.0\n6.0\n")
+    document = to_document(PROBLEM)
+    replayed = {"trace": {"file": file.name, "column": "took", "wrap": True}}
+    document["tasks"]["perception"]["on"]["R1"]["exec_ms"] = replayed
+    problem = from_document(document, folder=file.parent)
+    seconds = campaign(1).seconds
+    asked = Campaign(
+        problem, ("baseline",), (entrant(problem, "LOC"),), 1, seconds, beside=file.parent
+    )
+    found = tmp_path / "there"
+    run_campaign(asked, found, SimulatedRuns(), tell=lambda line: None, wait=ALWAYS_IDLE)
+    file.unlink()
+    comparison = read_measured(found).comparison
+    assert comparison.problem.pipeline.tasks["perception"].on["R1"].exec_ms.expectation == 5.0

@@ -101,6 +101,7 @@ def run_campaign_file(request: Request, *, as_json: bool) -> bool:
         request.seconds,
         request.seed,
         where,
+        request.cell.resolve().parent,
     )
     state = _run(campaign, folder, play, request)
     if state.done:

@@ -20,14 +20,15 @@ What differs from a real link:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
 from dwell.demo.link_rate import Sharing
 from dwell.errors import LiveError
-from dwell.testbed.child import Child, Json, Started
-from dwell.testbed.conditions import Conditions, Cut, Scheduling, to_json
+from dwell.testbed.child import Json
+from dwell.testbed.conditions import Conditions, Cut
+from dwell.testbed.emulated_link import EmulatedLink
 
 __all__ = ["Forward", "LinkProcess", "Traffic"]
 
@@ -90,7 +91,7 @@ class Traffic:
     cpu_s: float
 
 
-class LinkProcess(Started):
+class LinkProcess(EmulatedLink):
     """The link between two nodes, as its parent sees it.
 
     Parameters
@@ -120,18 +121,14 @@ class LinkProcess(Started):
         sharing: Sharing = "fifo",
         cpus: Collection[int] | None = None,
     ) -> None:
-        self.nodes = nodes
-        self._child = Child("dwell.demo.link_loop", f"link {nodes[0]}-{nodes[1]}")
+        super().__init__("dwell.demo.link_loop", nodes)
         foreign = sorted({item.source for item in forwards} - set(nodes))
         if foreign or nodes[0] == nodes[1]:
-            raise LiveError(f"link {nodes[0]}-{nodes[1]} does not begin at {', '.join(foreign)}")
+            raise LiveError(f"{self.name} does not begin at {', '.join(foreign)}")
         self._settings: Json = {
             "nodes": nodes,
             "forwards": [(item.source, item.host, item.port, item.listen) for item in forwards],
-            "sets": [
-                self._change(source, target, _all_of(each))
-                for (source, target), each in (conditions or {}).items()
-            ],
+            "sets": self._usual(conditions or {}),
             "seed": seed,
             "queue_bytes": queue_bytes,
             "sharing": sharing,
@@ -139,13 +136,6 @@ class LinkProcess(Started):
         }
         #: Where to dial, by forward.
         self.ports: tuple[int, ...] = ()
-        #: How well it can keep its instants beside busy threads.
-        self.scheduling: Scheduling = "usual"
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._child.pid
 
     def start(self) -> None:
         """Start it; returns when it listens. `ports` are those of the forwards, in their order.
@@ -155,39 +145,8 @@ class LinkProcess(Started):
         LiveError
             If it cannot listen on a port, or a value of the conditions is out of its bounds.
         """
-        answer = self._child.start(self._settings)
+        answer = self._started(self._settings)
         self.ports = tuple(cast("list[int]", answer["ports"]))
-        self.scheduling = cast("Scheduling", answer["scheduling"])
-
-    def stop(self) -> None:
-        """End it, and with it the connections; safe to call twice."""
-        self._child.stop()
-
-    # ------------------------------------------------------------------------- conditions
-
-    def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
-        """Change some conditions of a direction for the messages that begin their way from then on.
-
-        Parameters
-        ----------
-        source, target : str
-        at_ns : int, optional
-            When, by the monotonic clock; at once if left out or past.
-        **changes
-            Fields of `Conditions`.
-
-        Returns
-        -------
-        int
-            The instant from which they hold, ns of the monotonic clock.
-
-        Raises
-        ------
-        LiveError
-            If there is no such direction or field, a value is out of its bounds, or the process has
-            ended.
-        """
-        return self._send([self._change(source, target, changes)], at_ns)
 
     def cut(
         self, source: str | None = None, *, kind: Cut = "drop", at_ns: int | None = None
@@ -205,23 +164,10 @@ class LinkProcess(Started):
         return self._send(self._cuts(source, None), at_ns)
 
     def _cuts(self, source: str | None, kind: Cut | None) -> list[Json]:
-        first, second = self.nodes
-        both = [(first, second), (second, first)]
-        asked = [pair for pair in both if source is None or pair[0] == source]
+        asked = [pair for pair in self.ways if source is None or pair[0] == source]
         if not asked:
-            raise LiveError(f"link {first}-{second} does not begin at {source}")
+            raise LiveError(f"{self.name} does not begin at {source}")
         return [self._change(*pair, {"cut": kind}) for pair in asked]
-
-    def _change(self, source: str, target: str, changes: Mapping[str, object]) -> Json:
-        if {source, target} != set(self.nodes):
-            raise LiveError(f"link {'-'.join(self.nodes)} does not go from {source} to {target}")
-        return {"source": source, "changes": to_json(changes)}
-
-    def _send(self, sets: Iterable[Json], at_ns: int | None) -> int:
-        answer = self._child.ask({"do": "set", "sets": list(sets), "at_ns": at_ns})
-        return cast("int", answer["at_ns"])
-
-    # ------------------------------------------------------------------------- statistics
 
     def stats(self, *, reset: bool = False) -> dict[tuple[str, str], Traffic]:
         """Return what has passed each direction since the start, or since the last reset.
@@ -233,12 +179,4 @@ class LinkProcess(Started):
         """
         answer = self._child.ask({"do": "stats", "reset": reset})
         counted = cast("dict[str, dict[str, float]]", answer["stats"])
-        first, second = self.nodes
-        return {
-            pair: Traffic(**cast("dict[str, int]", counted[pair[0]]))
-            for pair in ((first, second), (second, first))
-        }
-
-
-def _all_of(conditions: Conditions) -> dict[str, object]:
-    return {name: getattr(conditions, name) for name in Conditions.__slots__}
+        return {pair: Traffic(**cast("dict[str, int]", counted[pair[0]])) for pair in self.ways}

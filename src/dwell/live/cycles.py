@@ -282,11 +282,11 @@ class Ledger:
             ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
         who = cycle.row, hop.task, hop.node, ready_ns
         if hop.ended_ns == UNKNOWN:
-            return (*who, None, None, "replaced", shadow, None)
+            return (*who, None, None, "replaced", shadow, None, None)
         start_ns = max(self._since_origin(cycle, hop.node, hop.started_ns), ready_ns)
         end_ns = max(self._since_origin(cycle, hop.node, hop.ended_ns), start_ns)
-        cpu_ns = None if hop.cpu_ns == UNKNOWN else hop.cpu_ns
-        return (*who, start_ns, end_ns, "done", shadow, cpu_ns)
+        spent = (None if ns == UNKNOWN else ns for ns in (hop.cpu_ns, hop.others_ns))
+        return (*who, start_ns, end_ns, "done", shadow, *spent)
 
     # ----------------------------------------------------------------------- evidence
 

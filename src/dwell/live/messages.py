@@ -111,6 +111,9 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
         -1 otherwise.
     cpu_ns : int
         CPU time that the stage took (see `Worker.run`); -1 where it was not called.
+    others_ns : int
+        CPU time that other processes of the node's control group took meanwhile; -1 where that is
+        not known.
     """
 
     task: Name
@@ -121,6 +124,7 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     inputs: Annotated[tuple[tuple[Name, Instant], ...], msgspec.Meta(max_length=64)] = ()
     state_age: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
     cpu_ns: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
+    others_ns: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
 
 
 class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):

@@ -11,6 +11,7 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
+from dwell.live.group import own_group
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.messages import Header
@@ -111,6 +112,8 @@ def _work(
         shadow=role.kind == "shadow",
         stands_by=f"{role.task}@{role.node}" if role.kind == "standby" else "",
     )
+    group = own_group() if problem.fabric.nodes[role.node].quota is not None else None
+    worker.others_clock = None if group is None else group.others_ns
     inflight = InFlight(folder / f"{role.who}.inflight")
     _again(worker, folder / f"{role.who}.again")
 

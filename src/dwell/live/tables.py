@@ -38,9 +38,10 @@ closed_unix_ns      time of day of its close
 
 On request there are two more tables. ``jobs`` has a row of every job that is known of: a cycle that
 never reached a sink tells of none, unless a newer one took its place on the way. Its columns are a
-simulated run's and ``cpu_ns``, the CPU time of the stage's ``process()``; a job that was replaced
-has no instants but that of its readiness. ``processes`` has what every process of the cell took of
-its node's CPU in every window, from the release of its first cycle to its close.
+simulated run's, ``cpu_ns``, the CPU time of the stage's ``process()``, and ``others_ns``, that of
+all other processes of a node with a quota meanwhile; a job that was replaced has no instants but
+that of its readiness. ``processes`` has what every process of the cell took of its node's CPU in
+every window, from the release of its first cycle to its close.
 """
 
 from __future__ import annotations
@@ -155,6 +156,7 @@ def job_columns(problem: Problem) -> Columns:
             "outcome": list(OUTCOMES),
             "shadow": "Boolean",
             "cpu_ns": "Int64",
+            "others_ns": "Int64",
         },
         "processes": {
             "window": "Int64",

@@ -206,7 +206,9 @@ class Worker:
         #: threads is charged with all that its process does meanwhile.
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
         self.cpu_clock: Callable[[], int] = time.thread_time_ns if alone else time.process_time_ns
-        self._cpu_ns = UNKNOWN
+        #: CPU time that the other processes of the node have taken, where something counts it.
+        self.others_clock: Callable[[], int] | None = None
+        self._cpu_ns = self._others_ns = UNKNOWN
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
         self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
@@ -473,10 +475,11 @@ class Worker:
         """Call the stage; returns its output, None if it failed, and the state's age.
 
         The CPU time of the call goes into the job's hop: that of this thread, or of the whole
-        process where the cell gives the task several threads on this node.
+        process where the cell gives the task several threads on this node. So does what others of
+        the node took meanwhile, where something counts it.
         """
         stamp = job.header.stamp
-        self._cpu_ns = UNKNOWN
+        self._cpu_ns = self._others_ns = UNKNOWN
         state_age = self._recover(job) if self._stateful else UNKNOWN
         released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
         try:
@@ -492,6 +495,7 @@ class Worker:
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return None, state_age
+        others_ns = self._others()
         begun_ns = self.cpu_clock()
         try:
             output = self.stage.process(inputs)
@@ -499,11 +503,21 @@ class Worker:
             self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
             return None, state_age
         self._cpu_ns = max(self.cpu_clock() - begun_ns, 0)
+        if others_ns != UNKNOWN and (later_ns := self._others()) != UNKNOWN:
+            self._others_ns = max(later_ns - others_ns, 0)
         if not isinstance(output, Message):
             what = type(output).__name__
             self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")
             return None, state_age
         return output, state_age
+
+    def _others(self) -> int:
+        if self.others_clock is None:
+            return UNKNOWN
+        try:
+            return self.others_clock()
+        except LiveError:
+            return UNKNOWN
 
     def finish(
         self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1
@@ -522,7 +536,7 @@ class Worker:
             return
         self.trouble = ""
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
-        spent = state_age, self._cpu_ns
+        spent = state_age, self._cpu_ns, self._others_ns
         hop = Hop(self.task, place.node, job.arrived_ns, started_ns, ended_ns, inputs, *spent)
         seal, hops = job.header.seal, (*job.hops(), hop)
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)

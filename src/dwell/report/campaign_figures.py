@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = [
     "delays_figure",
     "failed_table",
-    "latency_figure",
     "links_table",
     "log_table",
     "measures_figure",
@@ -39,24 +38,6 @@ MEASURES: dict[str, tuple[str, Unit]] = {
 POINTS = 200
 #: An axis of latencies ends after so many deadlines.
 DEADLINES = 4
-
-
-def latency_figure(measured: Measured) -> Figure:
-    """Return the distributions of latency of all cycles, a panel a scenario."""
-    comparison = measured.comparison
-    return Figure(
-        slug="latencies",
-        title="Latency by scenario and policy",
-        kind="ecdf",
-        frame=comparison.latencies,
-        x="latency_ms",
-        y="share",
-        series="policy",
-        facet="scenario",
-        x_label="latency (ms)",
-        line_at=comparison.problem.pipeline.deadline_ms,
-        line_label="deadline",
-    )
 
 
 def measures_figure(measured: Measured, measure: str) -> Figure:

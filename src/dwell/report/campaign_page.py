@@ -3,41 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from html import escape
 
 from dwell.report import campaign_figures as shown
 from dwell.report import chapter_tables, figures
+from dwell.report.answers import answers, beginning
 from dwell.report.contenders import describe_contenders, palette_of
 from dwell.report.drawing import draw
 from dwell.report.look import Look
 from dwell.report.method import describe_cell, describe_scenario
 from dwell.report.page import (
-    Cell,
     definitions,
     document,
     figure,
     items,
-    marked,
     paragraph,
     section,
-    table,
 )
 from dwell.report.svg import inline
 from dwell.report.wording import listed, percent, shown_contender, shown_scenario, write_number
 from dwell.study.campaign import Measured
 from dwell.study.campaign_questions import is_steady, main_table, needed_pairs, questions
-from dwell.study.paper.chapter import Answer, Chapter, Figure
+from dwell.study.paper.chapter import Chapter, Figure
 
 __all__ = ["campaign_html", "counted_windows", "limits_of"]
 
 TITLE = "A campaign of measurements"
-TAGS: dict[Answer, tuple[str, str]] = {
-    "yes": ("yes", "good"),
-    "no": ("no", "bad"),
-    "in part": ("in part", "open"),
-    "not shown": ("not shown", "open"),
-    "none asked": ("", ""),
-}
 #: Runs that were simulated in the place of measured ones.
 SIMULATED = "Some of these runs, or all, were simulated in place of measurements."
 
@@ -62,7 +52,7 @@ def campaign_html(measured: Measured) -> str:
     body = [f"<h1>{TITLE}</h1>", paragraph(_subtitle(measured), "subtitle")]
     if measured.kinds != {"live"}:
         body.append(paragraph(SIMULATED, "bad"))
-    body += _answers(chapters, look)
+    body += answers(chapters, look)
     body.append(items(_told(measured, chapters)))
     body.append(section("Results", *_results(measured, look)))
     body.append(section("Distributions", *_distributions(measured, look)))
@@ -84,28 +74,6 @@ def _subtitle(measured: Measured) -> str:
         f"{write_number(measured.seconds, 0)} s, {measured.repetitions} complete "
         f"{'repetition' if measured.repetitions == 1 else 'repetitions'}"
     )
-
-
-def _answers(chapters: Sequence[Chapter], look: Look) -> Iterator[str]:
-    """Return every question with its answer."""
-    rows: list[tuple[str, Sequence[Cell]]] = [
-        (
-            "",
-            [
-                Cell(f'<a href="#{escape(one.slug)}">{marked(look.prose(one.title))}</a>'),
-                Cell(_tag(one.answer)),
-                Cell(marked(look.prose(one.verdict))),
-            ],
-        )
-        for one in chapters
-    ]
-    if rows:
-        yield table([Cell("question"), Cell("answer"), Cell("")], rows, kind="summary")
-
-
-def _tag(answer: Answer) -> str:
-    word, kind = TAGS[answer]
-    return f'<span class="{kind} nowrap answer">{word}</span>' if word else ""
 
 
 def _told(measured: Measured, chapters: Sequence[Chapter]) -> Iterator[str]:
@@ -195,7 +163,7 @@ def _caption(measure: str) -> str:
 
 def _distributions(measured: Measured, look: Look) -> Iterator[str]:
     yield _drawn(
-        shown.latency_figure(measured),
+        figures.latency_figure(measured.comparison),
         look,
         "Latency of all cycles after the warm-up, all repetitions together: one less the empirical "
         "distribution function, on a logarithmic scale. Where a curve crosses the dashed line one "
@@ -210,10 +178,8 @@ def _distributions(measured: Measured, look: Look) -> Iterator[str]:
 
 
 def _chapter(chapter: Chapter, look: Look) -> str:
-    word, kind = TAGS[chapter.answer]
     parts = [
-        f'<section id="{escape(chapter.slug)}">',
-        f'<h2>{marked(look.prose(chapter.title))}<span class="tag {kind}">{word}</span></h2>',
+        beginning(chapter, look),
         paragraph(look.prose(chapter.verdict), "question"),
         items(map(look.prose, chapter.evidence), "evidence"),
         paragraph(look.prose(chapter.design), "note"),

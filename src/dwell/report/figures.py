@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "distributions",
     "intervals",
+    "latency_figure",
     "latency_split",
     "node_use",
     "placement_shares",
@@ -171,7 +172,12 @@ def node_use(comparison: Comparison) -> str:
 
 def distributions(comparison: Comparison, look: Look) -> str:
     """Share of the cycles that took longer than a latency: one less the empirical distribution."""
-    figure = Figure(
+    return _drawn(comparison, look, latency_figure(comparison))
+
+
+def latency_figure(comparison: Comparison) -> Figure:
+    """Return the distributions of latency of all cycles, a panel a scenario."""
+    return Figure(
         slug="latencies",
         title="Distribution of latency by scenario and policy",
         kind="ecdf",
@@ -184,7 +190,6 @@ def distributions(comparison: Comparison, look: Look) -> str:
         line_at=comparison.problem.pipeline.deadline_ms,
         line_label="deadline",
     )
-    return _drawn(comparison, look, figure)
 
 
 def through_time(comparison: Comparison, look: Look, scenario: str, policy: str) -> str:

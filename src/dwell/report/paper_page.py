@@ -8,33 +8,25 @@ from typing import NamedTuple
 
 from dwell.model import Problem
 from dwell.report import chapter_tables
+from dwell.report.answers import answers, beginning
 from dwell.report.contenders import describe_contenders
 from dwell.report.look import Look
 from dwell.report.method import describe_cell, describe_scenario
 from dwell.report.page import (
-    Cell,
     definitions,
     document,
     items,
     marked,
     paragraph,
     section,
-    table,
 )
 from dwell.report.wording import listed, shown_scenario, write_number
-from dwell.study.paper.chapter import Answer, Chapter
+from dwell.study.paper.chapter import Chapter
 from dwell.study.paper.running import HELD_OUT, Scale
 
 __all__ = ["Made", "paper_html"]
 
 TITLE = "Which placement, when, and at what cost"
-TAGS: dict[Answer, tuple[str, str]] = {
-    "yes": ("yes", "good"),
-    "no": ("no", "bad"),
-    "in part": ("in part", "open"),
-    "not shown": ("not shown", "open"),
-    "none asked": ("", ""),
-}
 STATISTICS = (
     "The unit is the seed. One run gives one number, runs of different seeds are independent, and "
     "the windows and cycles of a run are not: no interval is taken over them. Contenders play the "
@@ -119,7 +111,9 @@ def paper_html(
         HTML without scripts, and without anything that is loaded from elsewhere.
     """
     body = [f"<h1>{TITLE}</h1>", paragraph(_subtitle(problem, made), "subtitle")]
-    body += _summary(chapters, look, made)
+    body += answers(chapters, look)
+    for name, why in made.failures.items():
+        body.append(paragraph(f"The chapter “{name}” is missing: {why}", "bad"))
     names = [*look.placements, *look.palette.policies]
     told = describe_contenders(problem, names)
     told |= {name: ADDED for name in look.placements if name not in problem.candidates}
@@ -158,43 +152,11 @@ def _lasted(seconds: float) -> str:
     return f"{write_number(seconds / 60, 0)} minutes"
 
 
-def _summary(chapters: Sequence[Chapter], look: Look, made: Made) -> Iterator[str]:
-    """Return every question with its answer."""
-    rows: list[tuple[str, Sequence[Cell]]] = [
-        (
-            "",
-            [
-                Cell(f'<a href="#{_anchor(chapter)}">{marked(look.prose(chapter.title))}</a>'),
-                Cell(_tag(chapter.answer)),
-                Cell(marked(look.prose(chapter.verdict))),
-            ],
-        )
-        for chapter in chapters
-    ]
-    if rows:
-        yield table([Cell("question"), Cell("answer"), Cell("")], rows, kind="summary")
-    for name, why in made.failures.items():
-        text = f"The chapter “{name}” is missing: {why}"
-        yield paragraph(text, "bad")
-
-
-def _tag(answer: Answer) -> str:
-    word, kind = TAGS[answer]
-    return f'<span class="{kind} nowrap answer">{word}</span>' if word else ""
-
-
-def _anchor(chapter: Chapter) -> str:
-    return f"chapter-{escape(chapter.slug)}"
-
-
 def _chapter(
     chapter: Chapter, look: Look, drawings: Mapping[str, str], files: Mapping[int, str]
 ) -> str:
-    word, kind = TAGS[chapter.answer]
-    tag = f'<span class="tag {kind}">{word}</span>' if word else ""
     parts = [
-        f'<section id="{_anchor(chapter)}">',
-        f"<h2>{marked(look.prose(chapter.title))}{tag}</h2>",
+        beginning(chapter, look),
         paragraph(look.prose(chapter.verdict), "question"),
         *([items(map(look.prose, chapter.evidence), "evidence")] if chapter.evidence else []),
         paragraph(_begun(look.prose(chapter.design)), "note"),

@@ -450,7 +450,8 @@ class Bed:
             "cpus": os.cpu_count(),
             "nodes": dict(self._node_facts()),
             "links": {
-                "-".join(link.pair): {"scheduling": link.scheduling} for link in self.links.values()
+                "-".join(link.nodes): {"scheduling": link.scheduling}
+                for link in self.links.values()
             },
         }
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +22,11 @@ from dwell.io.study_paths import with_settings
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.policies.registry import REGISTRY, by_name
+from dwell.testbed.trace_names import rename_traces
 
 __all__ = [
     "PAPERS_SCENARIOS",
+    "TRACES",
     "Campaign",
     "Entrant",
     "Planned",
@@ -35,6 +38,8 @@ __all__ = [
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
 #: Policies that estimate nothing: with the profile no shadow jobs load their nodes.
 BLIND = ("atp",)
+#: Folder of a campaign with the trace files of its cell.
+TRACES = "traces"
 #: Parts of this package that a measurement depends on.
 SOURCES = (*("control", "cost.py", "demo", "estimators", "live", "model", "policies", "testbed"),)
 
@@ -104,6 +109,8 @@ class Campaign:
         Of the order, and of what is drawn in the runs.
     where : str
         ``testbed``, or a digest of the inventory of real hosts.
+    beside : Path
+        Folder that the names of the cell's trace files are relative to.
 
     Raises
     ------
@@ -122,6 +129,7 @@ class Campaign:
     seconds: float
     seed: int = 1
     where: str = "testbed"
+    beside: Path = Path()
 
     def __post_init__(self) -> None:
         names = tuple(one.name for one in self.entrants)
@@ -160,6 +168,20 @@ class Campaign:
                 found.append(Planned(len(found) + 1, repetition, scenario, policy, seed))
         return tuple(found)
 
+    @property
+    def traces(self) -> dict[str, Path]:
+        """Trace files of the cell, by the names under which a campaign's folder has them."""
+        return {kept: self.beside / name for name, kept in self._cell()[1].items()}
+
+    def _cell(self) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return the cell as the folder has it, and its own names of the trace files there."""
+        document, names = to_document(self.problem), dict[str, str]()
+        rename_traces(
+            document,
+            lambda name: names.setdefault(name, f"{TRACES}/{len(names) + 1}-{Path(name).name}"),
+        )
+        return document, names
+
     def describe(self) -> dict[str, Any]:
         """Return all that the runs depend on, ready for JSON."""
         return {
@@ -173,7 +195,7 @@ class Campaign:
             "repetitions": self.repetitions,
             "seconds": self.seconds,
             "seed": self.seed,
-            "cell": to_document(self.problem),
+            "cell": self._cell()[0],
             "plan": [one._asdict() for one in self.plan()],
         }
 

@@ -1,8 +1,9 @@
 """Execution of a campaign: its runs, one after the other, whatever comes between.
 
-The folder holds ``campaign.json`` (what campaign it is), ``runs`` (a Run folder for every run that
-is done) and ``failed`` (all that attempts left which are not). Nothing else says what is done: a
-run's folder appears complete, in one step. So a campaign goes on wherever it was stopped.
+The folder holds ``campaign.json`` (what campaign it is), ``traces`` (files that its cell replays),
+``runs`` (a Run folder for every run that is done) and ``failed`` (all that attempts left which are
+not). Nothing else says what is done: a run's folder appears complete, in one step. So a campaign
+goes on wherever it was stopped.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dwell.errors import DwellError, LiveError, RunError
 from dwell.io.claimed import Claim, claimed, unwritable, write_whole
 from dwell.model import Problem
 from dwell.record import Run, open_run
-from dwell.testbed.campaign import Campaign, Entrant, Planned
+from dwell.testbed.campaign import TRACES, Campaign, Entrant, Planned
 from dwell.testbed.idle import Idle, Quiet, wait_until_idle
 
 __all__ = [
@@ -36,7 +37,7 @@ __all__ = [
 RUNS, FAILED, WORK = "runs", "failed", ".work"
 #: Beside the tables of a run: when it was made, and how the machine was.
 ATTEMPT = "attempt.json"
-CAMPAIGN = Claim("campaign", "campaign.json", 1, (RUNS, FAILED))
+CAMPAIGN = Claim("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
 #: How often a run that failed is repeated.
 REPEATS = 2
 #: So many attempts that end with an error before any does not: nothing works.
@@ -146,6 +147,7 @@ def run_campaign(
         If the first attempts all end with an error.
     """
     with claimed(folder, CAMPAIGN, campaign.describe()):
+        _keep_traces(campaign, folder)
         attempts = _Attempts(campaign, folder, partial(play, name=name), wait, quiet or Quiet())
         shutil.rmtree(folder / WORK, ignore_errors=True)
         begun_s, expected_s = clock(), campaign.seconds + AROUND_S
@@ -170,6 +172,16 @@ def run_campaign(
                 )
         shutil.rmtree(folder / WORK, ignore_errors=True)
         return attempts.state(repeats)
+
+
+def _keep_traces(campaign: Campaign, folder: Path) -> None:
+    """Copy the trace files that the cell replays: the folder is read without the cell's."""
+    for kept, file in campaign.traces.items():
+        if not (folder / kept).exists():
+            try:
+                write_whole(folder / kept, file.read_bytes())
+            except OSError as error:
+                raise unwritable(folder / kept, error) from None
 
 
 class _Attempts:

@@ -17,13 +17,14 @@ What differs from a real link:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import cast
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Child, Json, Started
-from dwell.testbed.conditions import Conditions, Scheduling, to_json
+from dwell.testbed.child import Json
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.emulated_link import EmulatedLink
 
 __all__ = ["GAP_MS", "LONGEST_MS", "Passed", "TunLink"]
 
@@ -77,13 +78,12 @@ class Passed:
     cpu_s: float
 
 
-class TunLink(Started):
+class TunLink(EmulatedLink):
     """The link between two hosts, as its parent sees it; a context manager.
 
     Parameters
     ----------
-    pair : pair of str
-        Nodes.
+    nodes : pair of str
     descriptors : mapping of str to int
         Of each node the TUN device that leads to the other, without packet information.
     usual : mapping of (source, target) to Conditions
@@ -100,12 +100,12 @@ class TunLink(Started):
     Raises
     ------
     LiveError
-        If a direction or descriptor is not of the pair, or conditions are none of such a link.
+        If a direction or descriptor is not of the nodes, or conditions are none of such a link.
     """
 
     def __init__(
         self,
-        pair: tuple[str, str],
+        nodes: tuple[str, str],
         descriptors: Mapping[str, int],
         usual: Mapping[tuple[str, str], Conditions] = NO_CONDITIONS,
         *,
@@ -115,33 +115,24 @@ class TunLink(Started):
         longest_ms: float = LONGEST_MS,
         cpus: Collection[int] | None = None,
     ) -> None:
-        self.pair = pair
-        self.name = f"link {pair[0]}-{pair[1]}"
-        if pair[0] == pair[1] or set(descriptors) != set(pair):
-            raise LiveError(f"{self.name}: needs one device each of two nodes")
-        files = [descriptors[node] for node in pair]
+        if nodes[0] == nodes[1] or set(descriptors) != set(nodes):
+            raise LiveError(f"link {'-'.join(nodes)}: needs one device each of two nodes")
+        files = [descriptors[node] for node in nodes]
+        super().__init__("dwell.testbed.forwarder", nodes, files)
         timeouts = dict(retransmit_ms or {})
         for source, target in timeouts:
             self._require(source, target)
         self._repeats = frozenset(source for source, _ in timeouts)
-        self._child = Child("dwell.testbed.forwarder", self.name, files)
         self._settings: Json = {
-            "nodes": pair,
+            "nodes": nodes,
             "descriptors": files,
-            "sets": [self._change(*way, _all_of(each)) for way, each in usual.items()],
+            "sets": self._usual(usual),
             "retransmit_ns": {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
             "gap_ns": round(gap_ms * 1e6),
             "longest_ns": round(longest_ms * 1e6),
             "seed": seed,
             "cpus": sorted(cpus) if cpus is not None else None,
         }
-        #: How well it can keep its instants beside busy threads.
-        self.scheduling: Scheduling = "usual"
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._child.pid
 
     def start(self) -> None:
         """Start it; returns when it forwards.
@@ -151,36 +142,7 @@ class TunLink(Started):
         LiveError
             If a value of the conditions is out of its bounds, or it does not start.
         """
-        answer = self._child.start(self._settings)
-        self.scheduling = cast("Scheduling", answer["scheduling"])
-
-    def stop(self) -> None:
-        """End it; what is on its way is lost. Safe to call twice."""
-        self._child.stop()
-
-    def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
-        """Change some conditions of a direction for what begins its way from then on.
-
-        Parameters
-        ----------
-        source, target : str
-        at_ns : int, optional
-            When, by the monotonic clock; at once if left out or past.
-        **changes
-            Fields of `Conditions`.
-
-        Returns
-        -------
-        int
-            The instant from which they hold, ns of the monotonic clock.
-
-        Raises
-        ------
-        LiveError
-            If there is no such direction or field, a value is out of its bounds or none that this
-            kind of link has, or the process has ended.
-        """
-        return self._send([self._change(source, target, changes)], at_ns)
+        self._started(self._settings)
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
         """Begin or end an outage of a direction; returns the instant, as `set`.
@@ -199,12 +161,7 @@ class TunLink(Started):
         """
         answer = self._child.ask({"do": "stats", "reset": reset})
         counted = cast("dict[str, Json]", answer["stats"])
-        first, second = self.pair
-        return {way: _passed(counted[way[0]]) for way in ((first, second), (second, first))}
-
-    def _require(self, source: str, target: str) -> None:
-        if {source, target} != set(self.pair):
-            raise LiveError(f"{self.name} does not go from {source} to {target}")
+        return {way: _passed(counted[way[0]]) for way in self.ways}
 
     def _change(self, source: str, target: str, changes: Mapping[str, object]) -> Json:
         self._require(source, target)
@@ -216,15 +173,7 @@ class TunLink(Started):
             )
         if changes.get("cut") == "hold":
             raise LiveError(f"{way}: what is sent while it is down vanishes (cut='drop')")
-        return {"source": source, "changes": to_json(changes)}
-
-    def _send(self, sets: Iterable[Json], at_ns: int | None) -> int:
-        answer = self._child.ask({"do": "set", "sets": list(sets), "at_ns": at_ns})
-        return cast("int", answer["at_ns"])
-
-
-def _all_of(conditions: Conditions) -> dict[str, object]:
-    return {item.name: getattr(conditions, item.name) for item in fields(conditions)}
+        return super()._change(source, target, changes)
 
 
 def _passed(counted: Json) -> Passed:

@@ -2,8 +2,9 @@
 
 A window counts if the machine gave every node what its quota says, when it asked. PSI cannot tell:
 processes of one node that wait for each other, or for what their own quota grants, wait for a CPU
-like any others, so that it is high wherever a node is stressed. It is recorded, and decides
-nothing. What decides, for the CPUs that nodes use (`Rule` has the numbers):
+like any others, so that it is high wherever a node is stressed. It is recorded, and so is how fast
+the CPUs were (``work_ms``); neither decides anything. What decides, for the CPUs that nodes use
+(`Rule` has the numbers):
 
 ``full``
     The CPU was never idle for a fifth of a second, in more than a tenth of the window. Nodes alone
@@ -26,6 +27,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
+from statistics import fmean
 from typing import Any
 
 __all__ = ["Rule", "Sample", "Span", "judged"]
@@ -82,6 +84,8 @@ class Sample:
         PSI: time in which something waited for a CPU; None where the kernel does not say.
     probe_ms : mapping of int to float
         Longest lateness of each CPU's probe since the sample before.
+    work_ms : mapping of int to float
+        CPU time that a fixed piece of work has taken on each CPU since the sample before.
     packets, late : mapping of str to int
         By link: those that have left, and of them those that were late, since the sample before.
     late_ms : mapping of str to float
@@ -94,6 +98,7 @@ class Sample:
     used_s: Mapping[str, float] = field(default_factory=dict)
     waited_s: float | None = None
     probe_ms: Mapping[int, float] = field(default_factory=dict)
+    work_ms: Mapping[int, float] = field(default_factory=dict)
     packets: Mapping[str, int] = field(default_factory=dict)
     late: Mapping[str, int] = field(default_factory=dict)
     late_ms: Mapping[str, float] = field(default_factory=dict)
@@ -178,6 +183,11 @@ def _row(inside: Sequence[Sample], span: Span, rule: Rule) -> dict[str, Any]:
         for cpu, stolen_s in first.stolen_s.items()
     }
     probe_ms = {str(cpu): max(one.probe_ms[cpu] for one in since) for cpu in last.probe_ms}
+    work_ms = {
+        str(cpu): fmean(took)
+        for cpu in last.probe_ms
+        if (took := [one.work_ms[cpu] for one in since if cpu in one.work_ms])
+    }
     used = {node: (last.used_s[node] - spent) / lasted_s for node, spent in first.used_s.items()}
     links = {}
     for name in last.packets:
@@ -209,6 +219,7 @@ def _row(inside: Sequence[Sample], span: Span, rule: Rule) -> dict[str, Any]:
         "full": _rounded(full),
         "stolen": _rounded(stolen),
         "probe_ms": _rounded(probe_ms),
+        "work_ms": _rounded(work_ms),
         "used": _rounded(used),
         "links": links,
     }

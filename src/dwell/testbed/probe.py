@@ -1,9 +1,10 @@
-"""Probe: how late a process that wants little of a CPU gets it.
+"""Probe: how late a process that wants little of a CPU gets it, and how fast it is then.
 
 It sleeps 5 ms, and notes how much later than that it runs again: at normal priority, in a group as
 weighty as the nodes' and without a quota. Nodes that use what their quotas grant make it late by
 less than one period of a quota; a machine that stands still, or has more to do than it can, makes
-it later.
+it later. Every 25 ms it does a fixed piece of work: what that takes of the CPU's time says how fast
+the CPU is, which on a machine that others share depends on them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import gc
 import os
 import select
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -22,6 +24,8 @@ from dwell.testbed.child import Child, Parent, Started
 __all__ = ["Lateness", "Probe"]
 
 SLEEP_NS = 5_000_000
+#: Wakes between two pieces of work, and turns of its loop: about 0.1 ms.
+WORK_EVERY, WORK_TURNS = 5, 2_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,11 +36,14 @@ class Lateness:
     ----------
     wakes : int
     mean_ms, max_ms : float
+    work_ms : float or None
+        CPU time of its piece of work, the mean; None where it has done none.
     """
 
     wakes: int
     mean_ms: float
     max_ms: float
+    work_ms: float | None
 
 
 class Probe(Started):
@@ -76,8 +83,13 @@ class Probe(Started):
             If it does not run.
         """
         found = cast("dict[str, float]", self._child.ask({}))
-        wakes = int(found["wakes"])
-        return Lateness(wakes, found["late_ns"] / max(wakes, 1) / 1e6, found["max_ns"] / 1e6)
+        wakes, works = int(found["wakes"]), int(found["works"])
+        return Lateness(
+            wakes=wakes,
+            mean_ms=found["late_ns"] / max(wakes, 1) / 1e6,
+            max_ms=found["max_ns"] / 1e6,
+            work_ms=found["work_ns"] / works / 1e6 if works else None,
+        )
 
 
 def main() -> None:
@@ -91,20 +103,35 @@ def main() -> None:
 
 
 def _measure(parent: Parent) -> None:
-    wakes = late_ns = max_ns = 0
+    counts = Counter[str]()
+    longest_ns, until_work = 0, WORK_EVERY
     due_ns = time.monotonic_ns() + SLEEP_NS
     while parent.alive:
         wait_s = max(due_ns - time.monotonic_ns(), 0) / 1e9
         asked, _, _ = select.select([parent], [], [], wait_s)
         now_ns = time.monotonic_ns()
         if now_ns >= due_ns:
-            late = now_ns - due_ns
-            wakes, late_ns, max_ns = wakes + 1, late_ns + late, max(max_ns, late)
-            due_ns = now_ns + SLEEP_NS
+            late_ns = now_ns - due_ns
+            counts.update(wakes=1, late_ns=late_ns)
+            longest_ns, until_work = max(longest_ns, late_ns), until_work - 1
+            if not until_work:
+                counts.update(works=1, work_ns=_work_ns())
+                until_work = WORK_EVERY
+            due_ns = time.monotonic_ns() + SLEEP_NS
         if asked:
             parent.receive()
-            parent.answer({"wakes": wakes, "late_ns": late_ns, "max_ns": max_ns})
-            wakes = late_ns = max_ns = 0
+            told = ("wakes", "late_ns", "works", "work_ns")
+            parent.answer({name: counts[name] for name in told} | {"max_ns": longest_ns})
+            counts.clear()
+            longest_ns = 0
+
+
+def _work_ns() -> int:
+    """Do the piece of work; returns the CPU time that it took."""
+    begun_ns, value = time.thread_time_ns(), 1
+    for _ in range(WORK_TURNS):
+        value = value * 5 & 0xFFFF | 1
+    return time.thread_time_ns() - begun_ns
 
 
 if __name__ == "__main__":

@@ -159,7 +159,7 @@ def _play(
 ) -> None:
     clock = clock_of(played.problem)
     (origin_ns,) = bed.begin()
-    links = {"-".join(link.pair): link for link in bed.links.values()}
+    links = {"-".join(link.nodes): link for link in bed.links.values()}
 
     def apply(change: Change) -> None:
         bed.apply(change)

@@ -95,7 +95,7 @@ class Sampler:
         idle_s, stolen_s = cpu_times(self._cpus)
         at_ns = self._clock()
         used_s = {node: read() / 1e9 for node, read in self._used_ns.items()}
-        probe_ms = {probe.cpu: probe.read().max_ms for probe in self._probes}
+        probed = {probe.cpu: probe.read() for probe in self._probes}
         passed: dict[str, list[Passed]] = {}
         for name, link in self._links.items():
             ways = link.read()
@@ -108,7 +108,8 @@ class Sampler:
             stolen_s=stolen_s,
             used_s=used_s,
             waited_s=waited_s(),
-            probe_ms=probe_ms,
+            probe_ms={cpu: one.max_ms for cpu, one in probed.items()},
+            work_ms={cpu: one.work_ms for cpu, one in probed.items() if one.work_ms is not None},
             packets={name: sum(one.packets for one in ways) for name, ways in passed.items()},
             late={
                 name: sum(sum(one.late[self._first_late :]) for one in ways)

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["move_traces"]
+__all__ = ["move_traces", "rename_traces"]
+
+
+def rename_traces(values: object, renamed: Callable[[str], str]) -> None:
+    """Give all trace files in a cell's plain values another name, in place."""
+    if isinstance(values, dict):
+        trace = values.get("trace")
+        if isinstance(trace, dict) and isinstance(trace.get("file"), str):
+            trace["file"] = renamed(trace["file"])
+        for value in values.values():
+            rename_traces(value, renamed)
+    elif isinstance(values, list):
+        for value in values:
+            rename_traces(value, renamed)
 
 
 def move_traces(values: object, folder: Path) -> None:
@@ -12,12 +26,4 @@ def move_traces(values: object, folder: Path) -> None:
 
     Names that are absolute stay as they are.
     """
-    if isinstance(values, dict):
-        trace = values.get("trace")
-        if isinstance(trace, dict) and isinstance(trace.get("file"), str):
-            trace["file"] = (folder / trace["file"]).as_posix()
-        for value in values.values():
-            move_traces(value, folder)
-    elif isinstance(values, list):
-        for value in values:
-            move_traces(value, folder)
+    rename_traces(values, lambda name: (folder / name).as_posix())
