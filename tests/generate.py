@@ -317,15 +317,18 @@ class _Maker:
         background = rng.choice([0.0, 0.0, 0.0, 0.0625, 0.125, 0.25])
         cores, scheduler = rng.choice([1, 1, 2, 2, 3, 4]), rng.choice(self.schedulers)
         turns = scheduler == "turns"
+        quota = self.quota(turns)
+        beside = rng.choice([None, 0.0, background / 2]) if quota is not None else None
         return Node(
             name,
             tier,
             background=background,
+            background_beside=beside,
             cores=1 if turns else cores,
             scheduler="fair" if scheduler == "turns" else scheduler,
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},
             bursts=self.bursts(rng.randint(1, 4)),
-            quota=self.quota(turns),
+            quota=quota,
         )
 
     def quota(self, ticks: bool) -> Quota | None:

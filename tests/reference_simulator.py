@@ -324,14 +324,18 @@ class NodeState:
         self.busy = Fraction(0)
         self.work = {ITSELF: Fraction(0), SHADOW: Fraction(0)}
         self.since = 0
+        self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
         self.tick = 0
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
             cpu = Fraction(node.quota.cpu)
-            if node.background:
-                cpu = min(cpu, Fraction(node.cores)) - Fraction(node.background)
-            self.quota = self.left = max(round(cpu * self.period), 1)
+            beside = node.background if node.background_beside is None else node.background_beside
+            self.quota, self.stressed = (
+                max(round(self.left_by(taken, cpu) * self.period), 1)
+                for taken in (Fraction(beside), Fraction(node.background))
+            )
+            self.left = self.quota
             self.slack = nanoseconds(node.quota.slack_ms)
             self.tick = nanoseconds(node.quota.tick_ms)
             if self.slack or self.tick:
@@ -355,7 +359,16 @@ class NodeState:
         if self.slack:
             self.draw()
         else:
-            self.left = self.quota
+            self.left = self.grant
+
+    def left_by(self, taken: Fraction, cpu: Fraction) -> Fraction:
+        """Cores' worth of a quota that others leave."""
+        return min(cpu, Fraction(self.node.cores)) - taken if taken else cpu
+
+    @property
+    def grant(self) -> int:
+        """What a period begins with."""
+        return self.stressed if self.foreign else self.quota
 
     @property
     def thirsty(self) -> bool:
@@ -504,7 +517,7 @@ class NodeState:
         if self.turn:
             self.turn.received += rate * elapsed
         if (self.slack or self.tick) and (now + self.period_ago) // self.period > self.periods:
-            self.periods, self.pool = (now + self.period_ago) // self.period, self.quota
+            self.periods, self.pool = (now + self.period_ago) // self.period, self.grant
 
     @property
     def usage(self) -> Usage:

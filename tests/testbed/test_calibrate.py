@@ -55,11 +55,14 @@ objective:
   caps: {latency_ms: 400}
 controller: {on: E, policy: LOC, initial: LOC, estimator: profile}
 """
-#: Of the stage alone, and of the messaging of a job's worker.
+#: Of the stage alone, and of the messaging of a job's worker that lies on the cycle's way.
 STAGE_MS = {("see", "R1"): 1.6, ("find", "R1"): 5.0, ("find", "E"): 4.5, ("act", "R1"): 0.2}
 MESSAGING_MS = {("see", "R1"): 0.5, ("find", "R1"): 0.7, ("find", "E"): 0.6, ("act", "R1"): 0.2}
+#: More of its worker's messaging, which delays nothing: background.
+OFF_WAY_MS = {("see", "R1"): 0.2}
 IDLE = 0.004
 BACKGROUND = {"R1": 0.06, "E": 0.1}
+BESIDE = {"R1": 0.04, "E": 0.05}
 ADDED_MS = 0.35
 WINDOWS = 60
 BASE = 20_000
@@ -91,7 +94,10 @@ def truth(nominal: Path) -> Problem:
     }
     fabric = replace(
         problem.fabric,
-        nodes={n: replace(of, background=BACKGROUND[n]) for n, of in problem.fabric.nodes.items()},
+        nodes={
+            node: replace(of, background=BACKGROUND[node], background_beside=BESIDE[node])
+            for node, of in problem.fabric.nodes.items()
+        },
         links={
             name: replace(link, delay_ms=replace(link.delay_ms, mean=0.7 + ADDED_MS))  # type: ignore[type-var]
             for name, link in problem.fabric.links.items()
@@ -128,6 +134,9 @@ def observed(truth: Problem, nominal: Path, placement: str, scenario: str = "bas
         end_ns=pl.col("end_ns") - pl.Series(wrote).cast(pl.Int64),
         cpu_ns=pl.Series(cpu_ns),
     )
+    beside = pl.col("node").cast(pl.String).replace_strict(BESIDE, return_dtype=pl.Float64)
+    took_ns = pl.col("end_ns") - pl.col("start_ns")
+    jobs = jobs.with_columns(others_ns=(beside * took_ns).cast(pl.Int64))
     document = to_document(dwell.load(nominal))
     meta = {**played.meta, "kind": "live", "scenario": scenario, "problem": document}
     tables: Mapping[str, Any] = {
@@ -149,7 +158,8 @@ def processes(truth: Problem, played: Run, jobs: pl.DataFrame) -> pl.DataFrame:
         inside = jobs.filter(pl.col("cycle").is_between(first, first + truth.window_cycles - 1))
         for task, node in STAGE_MS:
             of = inside.filter((pl.col("task") == task) & (pl.col("node") == node))
-            spent_ns = int(of["cpu_ns"].sum()) + of.height * MESSAGING_MS[task, node] * 1e6
+            each_ms = MESSAGING_MS[task, node] + OFF_WAY_MS.get((task, node), 0.0)
+            spent_ns = int(of["cpu_ns"].sum()) + of.height * each_ms * 1e6
             rows.append((window, f"{task}@{node}", node, round(spent_ns + IDLE * span_ns)))
         rows += [(window, f"agent@{node}", node, 10**6) for node in BACKGROUND]
     schema = {"window": pl.Int64, "process": pl.String, "node": pl.String, "cpu_ns": pl.Int64}
@@ -179,9 +189,12 @@ def test_execution_times_are_found(calibrated: Calibrated) -> None:
     for (task, node), stage_ms in STAGE_MS.items():
         found = about[f"{task}@{node}"]
         assert found["stage_ms"] == pytest.approx(stage_ms, rel=0.02)
-        assert found["messaging_ms"] == pytest.approx(MESSAGING_MS[task, node], rel=0.06)
-        # What passes before the first job and after the last is its own messaging, no more.
-        assert found["end_ms"] == pytest.approx(0.0, abs=0.05)
+    # What a message took of its sender and of its receiver is parted by their messaging in all.
+    for node in ("R1", "E"):
+        way = [("see", "R1"), ("find", node), ("act", "R1")]
+        of = [about[f"{task}@{where}"] for task, where in way]
+        besides_ms = sum(one["messaging_ms"] + one["begin_ms"] + one["end_ms"] for one in of)
+        assert besides_ms == pytest.approx(sum(MESSAGING_MS[site] for site in way), rel=0.08)
     assert calibrated.missing == ()
     # What is stressed says nothing of its node, and a link that is worse nothing of itself.
     assert "OFF-stress" not in about["find@E"]["of_runs"]
@@ -191,9 +204,11 @@ def test_execution_times_are_found(calibrated: Calibrated) -> None:
 def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
     for node, cores in BACKGROUND.items():
         assert calibrated.report["background"][node] == pytest.approx(cores, abs=0.006)
+        beside = calibrated.problem.fabric.nodes[node].background_beside
+        assert beside == pytest.approx(BESIDE[node], abs=0.001)
     assert calibrated.problem.fabric.nodes["R1"].quota == Quota(0.4, 4)
     for link in ("R1->E", "E->R1"):
-        assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.15)
+        assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.25)
 
 
 @pytest.mark.parametrize(
@@ -231,7 +246,7 @@ def test_links_that_nobody_emulates_have_their_own_delays(
     said: list[str] = []
     found = calibrate(lan, folders[:2], tmp_path / "out.yaml", emulated=False, say=said.append)
     # Under a quota a message also waits for its sender's and its receiver's next period.
-    assert 1.0 < found.report["links"]["R1->E"]["mean_ms"] < 3.5
+    assert 0.9 < found.report["links"]["R1->E"]["mean_ms"] < 3.5
     assert any(line.startswith("R1->E:") for line in said)
 
 

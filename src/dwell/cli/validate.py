@@ -44,13 +44,15 @@ def validate_runs(request: Request, *, as_json: bool) -> None:
     """
     problem = dwell.load(request.cell, traces=request.traces)
     runs = _open(request.runs)
-    used = [*_sidecar(request.cell), *(path.resolve().name for path in request.calibrated_from)]
+    ids, work_ms = _sidecar(request.cell)
+    used = [*ids, *(path.resolve().name for path in request.calibrated_from)]
     with progress("simulating") as show:
         validation = validate(
             runs,
             problem,
             seeds=request.seeds,
             calibrated_from=used,
+            work_ms=work_ms,
             processes=request.processes,
             progress=show,
         )
@@ -71,17 +73,18 @@ def sidecar_of(cell: Path) -> Path:
     return cell.with_name(f"{cell.stem}.calibration.json")
 
 
-def _sidecar(cell: Path) -> list[str]:
-    """Return the ids, or names, of the runs that a cell was calibrated from, where known."""
+def _sidecar(cell: Path) -> tuple[list[str], dict[str, float]]:
+    """Return the ids, or names, of the runs that a cell was calibrated from, and its speeds."""
     file = sidecar_of(cell)
     if not file.is_file():
-        return []
+        return [], {}
     try:
         told = json.loads(file.read_text(encoding="utf-8"))
+        speeds = {str(node): float(took) for node, took in told.get("work_ms", {}).items()}
         # Runs of two campaigns may have the same name; what their stamps carry differs.
         if told.get("ids"):
-            return [str(one) for one in told["ids"]]
-        return [Path(str(name)).name for name in told.get("runs", [])]
+            return [str(one) for one in told["ids"]], speeds
+        return [Path(str(name)).name for name in told.get("runs", [])], speeds
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise RunError(
             f"{file}: cannot be read ({error}); it says in `runs` from which runs the cell was "

@@ -206,6 +206,7 @@ class Assembly:
                 bursts=bursts,
                 quota=self._quota(path, entry.quota),
                 background=entry.background,
+                background_beside=entry.background_beside,
             ),
         )
 

@@ -353,6 +353,11 @@ class NodeEntry(Entry):
         None,
         description="Cores that others than the jobs always take, in small pieces; default 0.",
     )
+    background_beside: Annotated[float, Number(bounds.BACKGROUND)] | None = Field(
+        None,
+        description="What of `background` is taken while jobs run and no foreign thread does, on a "
+        "node with a quota; all of it by default.",
+    )
     bursts: NodeBurstsEntry | None = Field(None, description="Foreign work, in every scenario.")
 
 

@@ -141,6 +141,7 @@ from dwell.kernels.nodes import (
     key_row,
     leave,
     mark,
+    renew_before_stress,
     restress,
     set_speed,
     tick,
@@ -321,6 +322,7 @@ def _change(s: Tables, now: int) -> None:
         s.servers[server, DOWN] = down
         if s.servers[server, IS_CPU] != 0:
             stress = s.changes[change, CHANGE_STRESS]
+            renew_before_stress(s, server, now)
             anew = stress != s.servers[server, STRESS] or (turned and down != 0)
             if anew and s.servers[server, SCHEDULER] == TURNS:
                 restress(s, server, stress)

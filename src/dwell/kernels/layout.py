@@ -153,6 +153,7 @@ FOREIGN = _number(-1)
     DIRTY,
     IS_CPU,
     QUOTA_NS,
+    STRESSED_NS,
     PERIOD_NS,
     LEFT_NS,
     PERIOD,
@@ -167,7 +168,7 @@ FOREIGN = _number(-1)
     TURN_V,
     TURN_NS,
     N_SERVER,
-) = range(30)
+) = range(31)
 
 # servers, float64
 VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, N_SERVER_F = range(6)

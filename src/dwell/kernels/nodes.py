@@ -66,6 +66,7 @@ from dwell.kernels.layout import (
     SPEED,
     STARTED,
     STRESS,
+    STRESSED_NS,
     THROTTLED,
     TICK_AGO,
     TICK_NS,
@@ -145,6 +146,29 @@ def _account(s: Tables, server: int, now: int) -> int:
 
 
 @phase
+def renew_before_stress(s: Tables, server: int, now: int) -> None:
+    """Begin the periods that have begun before a server's foreign threads change.
+
+    Without a pool, what happens at the instant at which a period begins comes before it.
+    """
+    if s.servers[server, QUOTA_NS] > 0:
+        pooled = s.servers[server, SLACK_NS] > 0 or s.servers[server, SCHEDULER] == TURNS
+        _renew(s, server, now if pooled else now - 1)
+
+
+@phase
+def _renew(s: Tables, server: int, now: int) -> None:
+    """Fill a server's bucket, or the pool of its quota, if a period has begun."""
+    period = (now + s.servers[server, PERIOD_AGO]) // s.servers[server, PERIOD_NS]
+    if period > s.servers[server, PERIOD]:
+        s.servers[server, PERIOD] = period
+        pooled = s.servers[server, SLACK_NS] > 0 or s.servers[server, SCHEDULER] == TURNS
+        filled = POOL_NS if pooled else LEFT_NS
+        stressed = s.servers[server, STRESS] > 0
+        s.servers[server, filled] = s.servers[server, STRESSED_NS if stressed else QUOTA_NS]
+
+
+@phase
 def refill(s: Tables, server: int, now: int) -> None:
     """Open or shut a server by its quota; its clock must be up to date.
 
@@ -152,11 +176,7 @@ def refill(s: Tables, server: int, now: int) -> None:
     used up, so nothing that was spent belongs to two periods. With a slack the quota fills a pool,
     and what runs draws all of it whenever it has used up what it had.
     """
-    period = now // s.servers[server, PERIOD_NS]
-    filled = LEFT_NS if s.servers[server, SLACK_NS] == 0 else POOL_NS
-    if period > s.servers[server, PERIOD]:
-        s.servers[server, PERIOD] = period
-        s.servers[server, filled] = s.servers[server, QUOTA_NS]
+    _renew(s, server, now)
     s.servers[server, THROTTLED] = 1 if s.servers[server, LEFT_NS] <= 0 else 0
     set_speed(s, server)
 
@@ -205,10 +225,7 @@ def _notice(s: Tables, server: int, now: int) -> None:
     What was overrun is a debt: a server that is stopped goes on when refills have paid it
     (distribute_cfs_runtime); one that runs draws a slice (assign_cfs_rq_runtime), or stops.
     """
-    period = (now + s.servers[server, PERIOD_AGO]) // s.servers[server, PERIOD_NS]
-    if period > s.servers[server, PERIOD]:
-        s.servers[server, PERIOD] = period
-        s.servers[server, POOL_NS] = s.servers[server, QUOTA_NS]
+    _renew(s, server, now)
     left = s.servers[server, LEFT_NS]
     if left <= 0:
         wanted = 1 if s.servers[server, THROTTLED] != 0 else DRAWN_NS

@@ -159,6 +159,7 @@ def _node(node: Node) -> Document:
             "accelerators": dict(node.accelerators),
             "quota": _quota(quota) if quota else None,
             "background": node.background or None,
+            "background_beside": node.background_beside,
             "bursts": _bursts(
                 f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
             ),

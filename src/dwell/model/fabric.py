@@ -102,6 +102,9 @@ class Node:
     background : float
         Cores that are always taken, in small pieces, by others than the jobs; less than
         `capacity`.
+    background_beside : float, optional
+        What of it is taken while jobs run and no foreign thread does; all of it if left out. Only
+        of a node with a quota.
     """
 
     name: str
@@ -112,6 +115,7 @@ class Node:
     bursts: Bursts | None = None
     quota: Quota | None = None
     background: float = 0.0
+    background_beside: float | None = None
 
     def __post_init__(self) -> None:
         require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
@@ -126,6 +130,11 @@ class Node:
         BACKGROUND.check("background", self.background)
         bound = f"less than {self.capacity:g}, what the node can do"
         require(self.background < self.capacity, "background", self.background, bound)
+        if self.background_beside is not None:
+            beside, bound = self.background_beside, f"0 to {self.background:g}, the background"
+            require(0.0 <= beside <= self.background, "background_beside", beside, bound)
+            bound = "left out: only a quota gives others something to wait for"
+            require(self.quota is not None, "background_beside", beside, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
@@ -143,10 +152,19 @@ class Node:
 
     @property
     def budget_ms(self) -> float:
+        """Core time that jobs have in each of the quota's periods without foreign threads, ms."""
+        beside = self.background_beside
+        return self._budget_ms(self.background if beside is None else beside)
+
+    @property
+    def stressed_budget_ms(self) -> float:
         """Core time that jobs and foreign threads have in each of the quota's periods, ms."""
+        return self._budget_ms(self.background)
+
+    def _budget_ms(self, background: float) -> float:
         if self.quota is None:
             return math.inf
-        cpu = self.capacity - self.background if self.background else self.quota.cpu
+        cpu = self.capacity - background if background else self.quota.cpu
         return cpu * self.quota.period_ms
 
 

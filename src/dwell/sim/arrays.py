@@ -155,6 +155,7 @@ class _Layout:
                 period_ns = round(node.quota.period_ms * 1e6)
                 quota_ns = max(round(node.budget_ms * 1e6), 1)
                 cpu[k.PERIOD_NS], cpu[k.QUOTA_NS] = period_ns, quota_ns
+                cpu[k.STRESSED_NS] = max(round(node.stressed_budget_ms * 1e6), 1)
                 cpu[k.SLACK_NS] = round(node.quota.slack_ms * 1e6)
                 cpu[k.TICK_NS] = round(node.quota.tick_ms * 1e6)
                 pooled = cpu[k.SLACK_NS] or cpu[k.TICK_NS]

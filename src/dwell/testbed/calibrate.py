@@ -21,15 +21,19 @@ from numpy.typing import NDArray
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem, Trace
 from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
+from dwell.testbed.hops import OnTheWay, floors, hops, own_delays
 from dwell.testbed.measured import (
     Measured,
     Site,
     backgrounds,
-    floors,
+    beside_jobs,
     look_at,
-    own_delays,
+    messaging,
     sites,
+    usual_work_ms,
 )
+from dwell.testbed.paired import paired
+from dwell.testbed.speeds import at_speed_of
 from dwell.testbed.trace_names import move_traces
 
 __all__ = ["Calibrated", "calibrate", "make_runs"]
@@ -38,6 +42,8 @@ Floats: TypeAlias = NDArray[np.float64]
 
 #: Seed of the delays that stand for a link's own process, and of the cell's own check.
 SEED = 20_260_101
+#: Delays that are drawn of each link.
+ASKED = 20_000
 #: Least execution time written, ms: one of nothing is no execution time.
 LEAST_MS = 1e-3
 #: Windows that the check simulates of every run at most.
@@ -106,13 +112,20 @@ def calibrate(
         raise RunError(f"{out} is the cell itself; name another file")
     problem = dwell.load(cell)
     measured = _looked_at(runs, problem)
-    found = sites(measured, problem)
+    messaging_ms = messaging(measured, problem)
+    known = hops(measured, messaging_ms, problem, _asked(problem) if emulated else {})
+    found = sites(measured, messaging_ms, known, problem)
     behind = backgrounds(measured, found, problem)
-    added_ms, delays_ms = _links(measured, found, problem, emulated=emulated)
+    if not found:
+        raise RunError("no task has enough jobs in windows that can be used")
+    columns = paired({site: of.samples for site, of in found.items()})
+    rows = len(next(iter(columns.values())))
+    added_ms, delays_ms = _links(measured, known, problem, rows, emulated=emulated)
     document = _document(cell, out)
     samples = out.with_name(f"{out.stem}.samples.parquet")
-    _write_samples(samples, found, delays_ms, measured, added_ms)
-    _put_in(document, samples.name, found, delays_ms, behind)
+    _write_samples(samples, found, columns, delays_ms, measured, added_ms)
+    beside, usual_ms = beside_jobs(measured, behind), usual_work_ms(measured)
+    _put_in(document, samples.name, found, delays_ms, behind, beside)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
@@ -128,7 +141,9 @@ def calibrate(
             for link, values in delays_ms.items()
         },
         "background": {node: _short(value) for node, value in behind.items()},
-        "check": [row for one in measured if (row := _check(one, written)) is not None],
+        "work_ms": {node: _short(value) for node, value in usual_ms.items()},
+        "background_beside": {node: _short(value) for node, value in beside.items()},
+        "check": [row for one in measured if (row := _check(one, written, usual_ms)) is not None],
         "missing": list(missing),
     }
     sidecar = out.with_name(f"{out.stem}.calibration.json")
@@ -215,25 +230,30 @@ def _looked_at(runs: Sequence[Path], problem: Problem) -> list[Measured]:
     return measured
 
 
-def _links(
-    measured: Sequence[Measured],
-    found: Mapping[tuple[str, str], Site],
-    problem: Problem,
-    *,
-    emulated: bool,
-) -> tuple[dict[str, float], dict[str, Floats]]:
-    """What each link adds, and the delays of its messages, ms."""
-    if not emulated:
-        own = own_delays(measured, found, problem)
-        return {}, {link_name(*link): values for link, values in own.items()}
-    size = max((len(of.samples_ms) for of in found.values()), default=1)
+def _asked(problem: Problem) -> dict[tuple[str, str], Floats]:
+    """Delays that a cell asks of its links, but for those that are replayed."""
     rng = np.random.default_rng(SEED)
-    asked_ms = {
-        (link.source, link.target): link.delay_ms.marginal(rng, size)
+    return {
+        (link.source, link.target): link.delay_ms.marginal(rng, ASKED)
         for link in problem.fabric.links.values()
         if not isinstance(link.delay_ms, Trace)
     }
-    added_ms = floors(measured, found, problem, asked_ms)
+
+
+def _links(
+    measured: Sequence[Measured],
+    known: OnTheWay,
+    problem: Problem,
+    rows: int,
+    *,
+    emulated: bool,
+) -> tuple[dict[str, float], dict[str, Floats]]:
+    """What each link adds, and the delays of so many of its messages, ms."""
+    if not emulated:
+        own = own_delays(measured, known, problem)
+        return {}, {link_name(*link): np.resize(values, rows) for link, values in own.items()}
+    asked_ms = {link: np.resize(values, rows) for link, values in known.asked_ms.items()}
+    added_ms = floors(measured, known, problem)
     # One that no message took adds what the others do.
     usual_ms = float(np.mean(list(added_ms.values()))) if added_ms else 0.0
     added = {link_name(*link): added_ms.get(link, usual_ms) for link in asked_ms}
@@ -248,20 +268,17 @@ def _links(
 def _write_samples(
     path: Path,
     found: Mapping[tuple[str, str], Site],
+    columns: Mapping[tuple[str, str], Floats],
     delays_ms: Mapping[str, Floats],
     measured: Sequence[Measured],
     added_ms: Mapping[str, float],
 ) -> None:
-    """Write all columns with one number of rows: columns of one file share them in a replay."""
-    columns = {task_name(*site): of.samples_ms for site, of in found.items()}
-    if not columns:
-        raise RunError("no task has enough jobs in windows that can be used")
-    rows = min(len(values) for values in (*columns.values(), *delays_ms.values()))
+    """Write all columns; those of one file share their rows in a replay."""
     about = {"runs": [one.name for one in measured], **stamp()}
     measurements = [
         Measurement(
             task_name(*site),
-            {task_name(*site): np.maximum(_evenly(of.samples_ms, rows), LEAST_MS)},
+            {task_name(*site): np.maximum(columns[site], LEAST_MS)},
             {"kind": "task", "task": site[0], "node": site[1], **about, **_about(of)},
         )
         for site, of in found.items()
@@ -276,20 +293,8 @@ def _write_samples(
             **about,
         }
         of_link["added_ms"] = added_ms.get(link)
-        measurements.append(Measurement(link, {link: _evenly(values, rows)}, of_link))
+        measurements.append(Measurement(link, {link: values}, of_link))
     write_profile(path, measurements)
-
-
-def _evenly(values: Floats, rows: int) -> Floats:
-    """So many of the values: runs of neighbours, spread over the whole."""
-    if len(values) == rows:
-        return values
-    blocks = min(10, rows)
-    starts = np.linspace(0, len(values) - -(-rows // blocks), blocks).astype(int)
-    sizes = np.diff(np.linspace(0, rows, blocks + 1).astype(int))
-    return np.concatenate(
-        [values[start : start + size] for start, size in zip(starts, sizes, strict=True)]
-    )
 
 
 def _document(cell: Path, out: Path) -> dict[str, Any]:
@@ -312,6 +317,7 @@ def _put_in(
     found: Mapping[tuple[str, str], Site],
     delays_ms: Mapping[str, Floats],
     behind: Mapping[str, float],
+    beside: Mapping[str, float],
 ) -> None:
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
@@ -322,6 +328,9 @@ def _put_in(
         document["tasks"][task].pop("scale", None)
     for node, cores in behind.items():
         document["nodes"][node]["background"] = _short(cores)
+        document["nodes"][node].pop("background_beside", None)
+        if node in beside and document["nodes"][node].get("quota"):
+            document["nodes"][node]["background_beside"] = _short(beside[node])
     links = []
     for entry in document.get("links") or ():
         ways = [(entry["from"], entry["to"])]
@@ -379,7 +388,7 @@ def _about(of: Site) -> dict[str, Any]:
         "end_ms": _short(of.end_ms),
         "begin_ms": _short(of.begin_ms),
         "jobs": len(of.samples_ms),
-        "of_runs": list(of.runs),
+        "of_runs": list(of.samples),
     }
 
 
@@ -387,7 +396,7 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.5g}")
 
 
-def _check(one: Measured, problem: Problem) -> dict[str, Any] | None:
+def _check(one: Measured, problem: Problem, usual_ms: Mapping[str, float]) -> dict[str, Any] | None:
     """Set what the cell says of a run that it was made from beside what that one showed."""
     import polars as pl
 
@@ -397,7 +406,7 @@ def _check(one: Measured, problem: Problem) -> dict[str, Any] | None:
     scenario = "baseline" if scenario == "live" else scenario
     if one.placement not in problem.candidates or scenario not in problem.scenarios:
         return None
-    problem = replace(problem, warmup_windows=2)
+    problem = at_speed_of(one.run.meta, replace(problem, warmup_windows=2), usual_ms)
     windows = min(max(one.windows, 50), CHECK_WINDOWS)
     real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
     played = simulate_realisation(problem, real, policy=one.placement)
@@ -432,9 +441,10 @@ def _told(report: Mapping[str, Any]) -> list[str]:
             f"messaging, {of['begin_ms'] + of['end_ms']:.3g} begin and end), {of['jobs']} jobs"
         )
     lines += [f"{name}: {of['mean_ms']:.3g} ms" for name, of in report["links"].items()]
-    lines += [
-        f"{node}: background {value:.3g} cores" for node, value in report["background"].items()
-    ]
+    for node, value in report["background"].items():
+        beside = report["background_beside"].get(node)
+        more = "" if beside is None else f", {beside:.3g} while jobs run"
+        lines.append(f"{node}: background {value:.3g} cores{more}")
     for row in report["check"]:
         pairs = (
             f"{name} {_shown(row['measured'][name])} measured, {_shown(row['predicted'][name])} "

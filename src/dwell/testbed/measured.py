@@ -6,12 +6,15 @@ messages on one node, and of what they cost, is told so by way of the execution 
 
 - a worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. Runs in which it has jobs
   and runs in which it has none tell the two apart; a worker that always has jobs idles like others;
-- a source's job takes, besides, what passes between a release and its start, and a sink's what
-  passes between its end and the command's hand-over, as where the quota does not interfere.
+- of the overhead, what lies on the way of messages delays the cycle (`dwell.testbed.hops`);
+- a job takes, besides, what passes between its last input, or a source's release, and its start,
+  and a sink's what passes between its end and the command's hand-over, as where the quota does not
+  interfere.
 
-Everything else that a node does (agents, stampers, sinks, the controller, workers without jobs) is
-its background. A link adds to the delay that is asked of it what a message takes beyond that, its
-transmission and the CPU time of sender and receiver, which their jobs have already.
+Everything else that a node does (agents, stampers, sinks, the controller, workers without jobs and
+the messaging that delays nothing) is its background. A link adds to the delay that is asked of it
+what a message takes beyond that, its transmission and the CPU time of sender and receiver, which
+their jobs have already.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 from dwell.model import Problem
+from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
+from dwell.testbed.paired import Part
+from dwell.testbed.speeds import work_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -37,23 +43,18 @@ __all__ = [
     "Site",
     "Visit",
     "backgrounds",
-    "floors",
+    "beside_jobs",
     "look_at",
-    "own_delays",
+    "messaging",
     "sites",
+    "usual_work_ms",
 ]
 
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
-#: Least number of jobs from which a task's execution times are taken.
-LEAST_JOBS = 100
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
-#: The same of a message's delay, where its link's own is compared with what was asked for.
-QUICK = 0.1
-#: Bytes that cost as much CPU as sending or receiving a message at all.
-MESSAGE_BYTES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +112,12 @@ class Visit:
         CPU time of the stage, in the order of cycles; 0 of a task that an accelerator runs.
     stage_ms : float64 array, shape (jobs,)
         Time that the stage needs where nothing hinders it.
+    cycles : int64 array, shape (jobs,)
     """
 
     cpu_ms: Floats
     stage_ms: Floats
+    cycles: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,9 +145,14 @@ class Measured:
         Mean CPU time of their stage.
     used : dict of str to float
         Cores that were busy on each node.
+    work_ms : dict of str to float
+        CPU time of a fixed piece of work on every node (`dwell.testbed.speeds`).
     begins_ms, ends_ms : dict of (str, str) to float
-        Of sources: from a release to the start of the job. Of sinks: from the end of the job to
-        that of the cycle. Unhindered.
+        From the arrival of the last input, or a release, to the start of the job; of sinks, from
+        the end of the job to that of the cycle. Unhindered.
+    beside : dict of str to (float, float)
+        By node: CPU time of other processes while jobs ran, and how long these ran, seconds; of
+        nodes where something counts it.
     delays_ms : dict of (str, str, str, str) to float64 array
         By source, target, and the nodes of both: from the end of the job that sent a message to its
         arrival.
@@ -162,6 +170,8 @@ class Measured:
     starts: dict[tuple[str, str, bool], float]
     spent_ms: dict[tuple[str, str, bool], float]
     used: dict[str, float]
+    beside: dict[str, tuple[float, float]] = field(default_factory=dict)
+    work_ms: dict[str, float] = field(default_factory=dict)
     begins_ms: dict[SiteName, float] = field(default_factory=dict)
     ends_ms: dict[SiteName, float] = field(default_factory=dict)
     delays_ms: dict[tuple[str, str, str, str], Floats] = field(default_factory=dict)
@@ -173,21 +183,24 @@ class Site:
 
     Parameters
     ----------
-    samples_ms : float64 array, shape (jobs,)
-        What an undisturbed job takes of the node, its share of messaging included.
+    samples : dict of str to Part
+        What an undisturbed job takes of the node, its share of messaging included, by run.
     stage_ms, overhead_ms, begin_ms, end_ms : float
-        Means of the stage alone, its worker's messaging, from a release to the begin of a source's
-        job, and from the end of a sink's job to that of the cycle.
-    runs : tuple of str
-        That they are from.
+        Means of the stage alone, of its worker's messaging what lies on the way, from the arrival
+        of an input, or a release, to the begin of the job, and from the end of a sink's job to that
+        of the cycle.
     """
 
-    samples_ms: Floats
+    samples: dict[str, Part]
     stage_ms: float
     overhead_ms: float
     begin_ms: float
     end_ms: float
-    runs: tuple[str, ...]
+
+    @property
+    def samples_ms(self) -> Floats:
+        """Those of all runs, one after the other."""
+        return np.concatenate([part.times_ms for part in self.samples.values()])
 
 
 def look_at(name: str, run: Run, problem: Problem) -> Measured:
@@ -232,7 +245,8 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             execution = problem.pipeline.tasks[key[0]].on[key[1]]
             on_cpu = execution.accelerator is None
             stage_ms = cpu_ms / execution.threads if on_cpu else of["took"].to_numpy() / 1e6
-            visits[key[:2]] = Visit(cpu_ms, np.asarray(stage_ms, np.float64))
+            cycles = of["cycle"].to_numpy()
+            visits[key[:2]] = Visit(cpu_ms, np.asarray(stage_ms, np.float64), cycles)
     own = jobs.filter(~pl.col("shadow"))
     return Measured(
         name=name,
@@ -250,6 +264,8 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             node: float(windows[f"u_{node}"].to_numpy().mean()) * of.capacity
             for node, of in problem.fabric.nodes.items()
         },
+        beside=_beside(own),
+        work_ms=work_ms(run.meta),
         delays_ms=_delays(own, problem),
         begins_ms=_begins(own, run, problem),
         ends_ms=_ends(own, run, problem),
@@ -293,6 +309,20 @@ def _usable(run: Run) -> pl.DataFrame:
     return windows.filter(~pl.col("window").is_in([int(number) for number in out]))
 
 
+def _beside(own: pl.DataFrame) -> dict[str, tuple[float, float]]:
+    """CPU time of others while jobs ran, and how long these ran, by node."""
+    import polars as pl
+
+    if "others_ns" not in own.columns:
+        return {}
+    sums = (
+        own.filter(pl.col("others_ns").is_not_null())
+        .group_by("node")
+        .agg(pl.col("others_ns").sum() / 1e9, pl.col("took").sum() / 1e9)
+    )
+    return {node: (others_s, took_s) for node, others_s, took_s in sums.iter_rows()}
+
+
 def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str, str], float]:
     """Cores that each process took in the windows; each counts from its release to its close."""
     import polars as pl
@@ -329,10 +359,11 @@ def _begins(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, flo
     released = run.cycles.select(pl.col("cycle").cast(pl.Int64), "release_ns")
     found: dict[SiteName, float] = {}
     for task in problem.pipeline.tasks.values():
-        if problem.pipeline.inputs(task.name):
-            continue
-        of = own.filter(pl.col("task") == task.name).join(released, on="cycle")
-        wait_ms = (of["start_ns"] - of["release_ns"]).to_numpy() / 1e6 - task.offset_ms
+        of = own.filter(pl.col("task") == task.name)
+        since, offset_ms = "ready_ns", 0.0
+        if not problem.pipeline.inputs(task.name):
+            of, since, offset_ms = of.join(released, on="cycle"), "release_ns", task.offset_ms
+        wait_ms = (of["start_ns"] - of[since]).to_numpy() / 1e6 - offset_ms
         found |= _unhindered(task.name, of["node"].to_list(), wait_ms)
     return found
 
@@ -362,33 +393,78 @@ def _unhindered(task: str, nodes: Sequence[str], wait_ms: Floats) -> dict[SiteNa
 # ------------------------------------------------------------------------------------ tasks
 
 
-def sites(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, Site]:
-    """Execution times of every task on every node that was visited undisturbed."""
-    overhead_ms = _overheads(measured, problem)
+def sites(
+    measured: Sequence[Measured],
+    messaging_ms: Mapping[SiteName, float],
+    known: OnTheWay,
+    problem: Problem,
+) -> dict[SiteName, Site]:
+    """Execution times of every task on every node that was visited undisturbed.
+
+    Parameters
+    ----------
+    messaging_ms : mapping of (str, str) to float
+        CPU time that a worker takes for a job besides its stage (`messaging`).
+    known : OnTheWay
+        What of that lies on the way of messages.
+    """
     found: dict[SiteName, Site] = {}
+    usual_ms = usual_work_ms(measured)
     for site in sorted({site for one in measured for site in one.visits}):
         of = [one for one in measured if site in one.visits and site[1] not in one.disturbed.nodes]
         if sum(len(one.visits[site].stage_ms) for one in of) < LEAST_JOBS:
             continue
-        stage_ms = np.concatenate([one.visits[site].stage_ms for one in of])
-        over_ms = overhead_ms.get(site, 0.0)
-        # What its worker has to do with a stamp or a command is part of its messaging.
-        known_ms = over_ms * MESSAGE_BYTES / _message_bytes(problem, site[0])
+        # As long as it would have taken at the runs' mean speed.
+        stages_ms = {
+            one.name: one.visits[site].stage_ms
+            * (usual_ms[site[1]] / one.work_ms[site[1]] if site[1] in usual_ms else 1.0)
+            for one in of
+        }
         begin_ms, end_ms = (
-            float(
-                np.mean([max(ends[site] - known_ms, 0.0) for ends in ways if site in ends] or 0.0)
-            )
+            float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
             for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
         )
-        samples_ms = stage_ms + (over_ms + begin_ms + end_ms)
-        names = tuple(one.name for one in of)
-        mean_ms = float(stage_ms.mean())
-        found[site] = Site(samples_ms, mean_ms, over_ms, begin_ms, end_ms, names)
+        over_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
+        more_ms = over_ms + begin_ms + end_ms
+        samples = {
+            one.name: Part(one.visits[site].cycles, stages_ms[one.name] + more_ms) for one in of
+        }
+        stage_ms = float(np.concatenate(list(stages_ms.values())).mean())
+        found[site] = Site(samples, stage_ms, over_ms, begin_ms, end_ms)
     return found
 
 
-def _overheads(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
-    """CPU time, ms, that every worker takes for a job besides its stage's."""
+def usual_work_ms(measured: Sequence[Measured]) -> dict[str, float]:
+    """Mean CPU time of a fixed piece of work, by node; of nodes of which every run knows it."""
+    nodes = set.intersection(*(set(one.work_ms) for one in measured)) if measured else set()
+    return {node: float(np.mean([one.work_ms[node] for one in measured])) for node in sorted(nodes)}
+
+
+def _on_the_way_ms(site: SiteName, messaging_ms: float, known: OnTheWay, problem: Problem) -> float:
+    """CPU time of a worker that lies on the way of its job's messages; all of it if unknown."""
+    task, node = site
+    total = 0.0
+    for flow in problem.pipeline.inputs(task):
+        ways = [
+            hop.receiver_ms
+            for (source, target, _, to), hop in known.hops.items()
+            if (source, target, to) == (flow.source, task, node)
+        ]
+        whole_ms = messaging_ms * share(problem, task, flow.source, task)
+        total += float(np.mean(ways)) if ways else whole_ms
+    for flow in problem.pipeline.outputs(task):
+        ways = [
+            hop.sender_ms
+            for (source, target, at, _), hop in known.hops.items()
+            if (source, target, at) == (task, flow.target, node)
+        ]
+        whole_ms = messaging_ms * share(problem, task, task, flow.target)
+        total += float(np.mean(ways)) if ways else whole_ms
+    return total
+
+
+def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
+    """CPU time, ms, that every worker takes for a job besides its stage's, by task and node."""
     of: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
     for one in measured:
         for (node, process), rate in one.rates.items():
@@ -450,6 +526,25 @@ def backgrounds(
     return result
 
 
+def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> dict[str, float]:
+    """Cores of every node's background that were taken while its jobs ran, where it is known.
+
+    Parameters
+    ----------
+    behind : mapping of str to float
+        The backgrounds.
+    """
+    result = {}
+    for node, cores in behind.items():
+        of = [
+            one.beside[node] for one in measured if node in one.beside.keys() - one.disturbed.nodes
+        ]
+        took_s = sum(took for _, took in of)
+        if took_s > 0:
+            result[node] = min(sum(others for others, _ in of) / took_s, cores)
+    return result
+
+
 def _cores_ms(
     key: tuple[str, str, bool],
     one: Measured,
@@ -464,84 +559,3 @@ def _cores_ms(
     if site is None:
         return one.spent_ms[key]
     return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.begin_ms + site.end_ms)
-
-
-# ------------------------------------------------------------------------------------ links
-
-
-def floors(
-    measured: Sequence[Measured],
-    found: Mapping[SiteName, Site],
-    problem: Problem,
-    asked_ms: Mapping[tuple[str, str], Floats],
-) -> dict[tuple[str, str], float]:
-    """What the messages of every link take beyond what was asked of it, ms.
-
-    Parameters
-    ----------
-    asked_ms : mapping of (str, str) to float64 array
-        Delays that the cell asks of each link.
-    """
-    over: dict[tuple[str, str], list[float]] = {}
-    for one in measured:
-        for (source, target, node, to), delay_ms in one.delays_ms.items():
-            link = node, to
-            hindered = {node, to} & one.disturbed.nodes or link in one.disturbed.links
-            if link not in asked_ms or hindered or len(delay_ms) < LEAST_JOBS:
-                continue
-            known_ms = _sending_ms(source, target, node, to, found, problem)
-            quick_ms = float(np.quantile(delay_ms, QUICK) - np.quantile(asked_ms[link], QUICK))
-            over.setdefault(link, []).append(quick_ms - known_ms)
-    return {link: max(float(np.median(values)), 0.0) for link, values in over.items()}
-
-
-def own_delays(
-    measured: Sequence[Measured], found: Mapping[SiteName, Site], problem: Problem
-) -> dict[tuple[str, str], Floats]:
-    """Delays of every link as they were measured, ms, for links that nobody emulates."""
-    delays: dict[tuple[str, str], list[Floats]] = {}
-    for one in measured:
-        for (source, target, node, to), delay_ms in one.delays_ms.items():
-            link = node, to
-            hindered = {node, to} & one.disturbed.nodes or link in one.disturbed.links
-            if (
-                "->".join(link) in problem.fabric.links
-                and not hindered
-                and len(delay_ms) >= LEAST_JOBS
-            ):
-                known_ms = _sending_ms(source, target, node, to, found, problem)
-                delays.setdefault(link, []).append(np.maximum(delay_ms - known_ms, 0.0))
-    return {link: np.concatenate(values) for link, values in delays.items()}
-
-
-def _sending_ms(
-    source: str,
-    target: str,
-    node: str,
-    to: str,
-    found: Mapping[SiteName, Site],
-    problem: Problem,
-) -> float:
-    """Transmission time of a message, and the CPU time of its sender and its receiver."""
-    pipeline = problem.pipeline
-    (flow,) = (f for f in pipeline.flows if (f.source, f.target) == (source, target))
-    sending_ms = flow.payload_bytes * 8 / (problem.fabric.links[f"{node}->{to}"].rate_mbps * 1e3)
-    for task, where in ((source, node), (target, to)):
-        site = found.get((task, where))
-        if site is not None:
-            sending_ms += site.overhead_ms * _share(problem, task, source, target)
-    return sending_ms
-
-
-def _share(problem: Problem, task: str, source: str, target: str) -> float:
-    """Share of a task's messaging that one of its flows is, by messages and by bytes."""
-    (of,) = (f for f in problem.pipeline.flows if (f.source, f.target) == (source, target))
-    return (MESSAGE_BYTES + of.payload_bytes) / _message_bytes(problem, task)
-
-
-def _message_bytes(problem: Problem, task: str) -> int:
-    """Messages that a task's worker reads and writes for a job, each for so many bytes."""
-    inputs, outputs = problem.pipeline.inputs(task), problem.pipeline.outputs(task)
-    # A source hears a stamp, and a sink's command is heard by its actuator.
-    messages = max(len(inputs), 1) + max(len(outputs), 1)
-    return messages * MESSAGE_BYTES + sum(flow.payload_bytes for flow in (*inputs, *outputs))
