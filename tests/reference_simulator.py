@@ -478,6 +478,11 @@ class NodeState:
     def speed(self) -> Fraction:
         if self.stopped:
             return Fraction(0)
+        return self.share / (Fraction(self.node.interference) if self.foreign else 1)
+
+    @property
+    def share(self) -> Fraction:
+        """Cores that a thread has of those that there are."""
         c, s = self.node.cores, self.foreign
         # Under a quota the background takes from the bucket, elsewhere from the cores.
         left = c - (Fraction(0) if self.quota else Fraction(self.node.background))

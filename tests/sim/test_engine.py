@@ -666,6 +666,32 @@ def test_the_background_takes_of_the_quota_or_of_the_cores(
     assert run.windows["u_R"].to_list() == pytest.approx([used] * 2)
 
 
+def test_what_waits_while_jobs_run_takes_less_of_their_quota() -> None:
+    # 4.5 of the 5 ms in every period are left to the job, 4 while there are foreign threads: these
+    # have half of them. The job takes 1.25 times as long then.
+    node = Node(
+        *("R1", "robot", 1),
+        quota=Quota(0.5, 10.0),
+        background=0.1,
+        background_beside=0.05,
+        interference=1.25,
+    )
+    problem = make_problem(
+        [node],
+        [Task("work", {"R1": Execution(Constant(8.0))})],
+        period_ms=100.0,
+        window_cycles=5,
+        scenario=[NodeDisturbance("R1", stress_threads=1)],
+    )
+    calm = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=1, windows=2)
+    assert set(calm.cycles["latency_ns"].to_list()) == {round(13.5 * MS)}
+    assert calm.windows["u_R1"].to_list() == pytest.approx([0.36] * 2)
+    stressed = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=2)
+    # 1.6 ms of its 8 in every period.
+    assert stressed.cycles["latency_ns"][1] == 44 * MS
+    assert stressed.windows["u_R1"].to_list() == pytest.approx([1.0] * 2, abs=0.02)
+
+
 def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:
     run = dwell.simulate(canonical, policy=Script("SO", "LOC", "HYB"), seed=1, windows=6, jobs=True)
     placed = run.cycles.select("cycle", pl.col("placement").cast(str))

@@ -63,6 +63,8 @@ OFF_WAY_MS = {("see", "R1"): 0.2}
 IDLE = 0.004
 BACKGROUND = {"R1": 0.06, "E": 0.1}
 BESIDE = {"R1": 0.04, "E": 0.05}
+#: Of E, the only node that a run stresses.
+INTERFERENCE = 1.25
 ADDED_MS = 0.35
 WINDOWS = 60
 BASE = 20_000
@@ -95,7 +97,12 @@ def truth(nominal: Path) -> Problem:
     fabric = replace(
         problem.fabric,
         nodes={
-            node: replace(of, background=BACKGROUND[node], background_beside=BESIDE[node])
+            node: replace(
+                of,
+                background=BACKGROUND[node],
+                background_beside=BESIDE[node],
+                interference=INTERFERENCE if node == "E" else 1.0,
+            )
             for node, of in problem.fabric.nodes.items()
         },
         links={
@@ -119,8 +126,12 @@ def observed(truth: Problem, nominal: Path, placement: str, scenario: str = "bas
     jobs = played.jobs.filter(pl.col("end_ns").is_not_null())
     cycles, tasks, nodes = (jobs[name].to_list() for name in ("cycle", "task", "node"))
     sites = list(zip(tasks, nodes, strict=True))
+    slower = INTERFERENCE if scenario == "stress" else 1.0
+    took = [
+        exec_ns[s][c] * (slower if s[1] == "E" else 1.0) for s, c in zip(sites, cycles, strict=True)
+    ]
     over_ns = np.array([round(MESSAGING_MS[site] * 1e6) for site in sites])
-    cpu_ns = np.array([exec_ns[s][c] for s, c in zip(sites, cycles, strict=True)]) - over_ns
+    cpu_ns = np.array(took).round().astype(np.int64) - over_ns
     # A worker reads before its stage starts, and writes after it has ended.
     bytes_of = {"see": (0, 300_000), "find": (300_000, 1_000), "act": (1_000, 0)}
     of = np.array([2 * BASE + sum(bytes_of[task]) for task in tasks])
@@ -204,8 +215,9 @@ def test_execution_times_are_found(calibrated: Calibrated) -> None:
 def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
     for node, cores in BACKGROUND.items():
         assert calibrated.report["background"][node] == pytest.approx(cores, abs=0.006)
-        beside = calibrated.problem.fabric.nodes[node].background_beside
-        assert beside == pytest.approx(BESIDE[node], abs=0.001)
+        found = calibrated.problem.fabric.nodes[node]
+        assert found.interference == pytest.approx(INTERFERENCE if node == "E" else 1.0, rel=0.05)
+        assert found.background_beside == pytest.approx(BESIDE[node], abs=0.001)
     assert calibrated.problem.fabric.nodes["R1"].quota == Quota(0.4, 4)
     for link in ("R1->E", "E->R1"):
         assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.25)

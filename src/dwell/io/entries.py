@@ -358,6 +358,11 @@ class NodeEntry(Entry):
         description="What of `background` is taken while jobs run and no foreign thread does, on a "
         "node with a quota; all of it by default.",
     )
+    interference: Annotated[float, Number(bounds.INTERFERENCE)] | None = Field(
+        None,
+        description="How many times as much core time jobs take while foreign threads run; "
+        "default 1.",
+    )
     bursts: NodeBurstsEntry | None = Field(None, description="Foreign work, in every scenario.")
 
 

@@ -171,7 +171,7 @@ FOREIGN = _number(-1)
 ) = range(31)
 
 # servers, float64
-VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, N_SERVER_F = range(6)
+VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, N_SERVER_F = range(7)
 
 # hops
 LINK, PAYLOAD, N_HOP = range(3)

@@ -25,6 +25,7 @@ from dwell.kernels.layout import (
     BACKGROUND,
     BASE,
     BEHIND_NS,
+    BESIDE,
     BUSY,
     CELL_MASK,
     CELL_SHIFT,
@@ -294,8 +295,8 @@ def set_speed(s: Tables, server: int) -> None:
     """Set the common speed after threads, stress or quota changed; the clock must be up to date.
 
     With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
-    c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: 0 while the
-    quota is used up.
+    c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: less by
+    what foreign threads interfere, and 0 while the quota is used up.
     """
     spare = s.servers_f[server, SPARE]
     stress = s.servers[server, STRESS]
@@ -308,6 +309,8 @@ def set_speed(s: Tables, server: int) -> None:
             s.servers_f[server, SPEED] = 1.0 / s.sites[index(s.jobs[row, SITE]), NEED]
     else:
         s.servers_f[server, SPEED] = spare / (s.servers[server, CORES] + stress)
+    if stress > 0:
+        s.servers_f[server, SPEED] *= s.servers_f[server, BESIDE]
     if s.servers[server, THROTTLED] != 0:
         s.servers_f[server, SPEED] = 0.0
 

@@ -160,6 +160,7 @@ def _node(node: Node) -> Document:
             "quota": _quota(quota) if quota else None,
             "background": node.background or None,
             "background_beside": node.background_beside,
+            "interference": node.interference if node.interference > 1.0 else None,
             "bursts": _bursts(
                 f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
             ),

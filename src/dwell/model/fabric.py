@@ -13,6 +13,7 @@ from dwell.model.bounds import (
     BURST_MEAN,
     CORES,
     FOREIGN_THREADS,
+    INTERFERENCE,
     LOSS,
     QUOTA_CPU,
     QUOTA_PERIOD_MS,
@@ -105,6 +106,9 @@ class Node:
     background_beside : float, optional
         What of it is taken while jobs run and no foreign thread does; all of it if left out. Only
         of a node with a quota.
+    interference : float
+        How many times as much core time jobs take while foreign threads run, whose data take the
+        place of theirs in the caches; at least 1.
     """
 
     name: str
@@ -116,6 +120,7 @@ class Node:
     quota: Quota | None = None
     background: float = 0.0
     background_beside: float | None = None
+    interference: float = 1.0
 
     def __post_init__(self) -> None:
         require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
@@ -127,6 +132,7 @@ class Node:
         if self.bursts is not None and self.bursts.add_delay_ms != Constant(0.0):
             delay = self.bursts.add_delay_ms
             require(False, "bursts.add_delay_ms", delay, "left out: only a link adds a delay")
+        INTERFERENCE.check("interference", self.interference)
         BACKGROUND.check("background", self.background)
         bound = f"less than {self.capacity:g}, what the node can do"
         require(self.background < self.capacity, "background", self.background, bound)

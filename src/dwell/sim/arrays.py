@@ -149,6 +149,7 @@ class _Layout:
             cpu = self._add_server(key, None, scheduler, node.cores)
             of = self.servers_f[-1]
             of[k.SPARE], of[k.BACKGROUND] = node.spare, node.background
+            of[k.BESIDE] = 1.0 / node.interference
             of[k.SPEED] = 1.0 if node.scheduler == "fair" else node.spare / node.cores
             cpu[k.QUOTA_T] = -1
             if node.quota is not None:
@@ -173,6 +174,7 @@ class _Layout:
         self.server_row[node, kind] = len(self.servers)
         self.servers.append(row)
         self.servers_f.append([0.0] * k.N_SERVER_F)
+        self.servers_f[-1][k.BESIDE] = 1.0
         self.servers_f[-1][k.SPEED], self.servers_f[-1][k.SPARE] = 1.0, float(cores)
         self.server_workers.append(0)
         return row

@@ -27,6 +27,7 @@ from dwell.testbed.measured import (
     Site,
     backgrounds,
     beside_jobs,
+    interferences,
     look_at,
     messaging,
     sites,
@@ -125,7 +126,10 @@ def calibrate(
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
     beside, usual_ms = beside_jobs(measured, behind), usual_work_ms(measured)
+    more = interferences(measured, found)
     _put_in(document, samples.name, found, delays_ms, behind, beside)
+    for node, factor in more.items():
+        document["nodes"][node]["interference"] = _short(factor)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
@@ -141,6 +145,7 @@ def calibrate(
             for link, values in delays_ms.items()
         },
         "background": {node: _short(value) for node, value in behind.items()},
+        "interference": {node: _short(value) for node, value in more.items()},
         "work_ms": {node: _short(value) for node, value in usual_ms.items()},
         "background_beside": {node: _short(value) for node, value in beside.items()},
         "check": [row for one in measured if (row := _check(one, written, usual_ms)) is not None],
@@ -445,6 +450,8 @@ def _told(report: Mapping[str, Any]) -> list[str]:
         beside = report["background_beside"].get(node)
         more = "" if beside is None else f", {beside:.3g} while jobs run"
         lines.append(f"{node}: background {value:.3g} cores{more}")
+    for node, value in report["interference"].items():
+        lines.append(f"{node}: stages take {value:.3g} times as long beside foreign threads")
     for row in report["check"]:
         pairs = (
             f"{name} {_shown(row['measured'][name])} measured, {_shown(row['predicted'][name])} "

@@ -44,6 +44,7 @@ __all__ = [
     "Visit",
     "backgrounds",
     "beside_jobs",
+    "interferences",
     "look_at",
     "messaging",
     "sites",
@@ -53,6 +54,8 @@ __all__ = [
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
+#: What a disturbance has that is not there all the time.
+SOMETIMES = ("at_s", "for_s", "episodes", "ramp_s")
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
 
@@ -66,10 +69,13 @@ class Disturbed:
     nodes : frozenset of str
         With foreign threads, or down.
     links : frozenset of (str, str)
+    stressed : frozenset of str
+        Nodes that had foreign threads all the time.
     """
 
     nodes: frozenset[str]
     links: frozenset[tuple[str, str]]
+    stressed: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, meta: Mapping[str, Any]) -> Disturbed:
@@ -84,16 +90,18 @@ class Disturbed:
         scenarios = meta["problem"].get("scenarios") or {}
         if scenario not in scenarios and scenario not in ("baseline", "live"):
             raise RunError(f"scenario {scenario!r} is none of the cell's; what was it?")
-        nodes, links = set(), set()
+        nodes, links, stressed = set(), set(), set()
         for item in (*scenarios.get(scenario, ()), *_played(meta)):
             if "node" in item:
                 nodes.add(str(item["node"]))
+                if item.get("stress_threads") and not any(item.get(key) for key in SOMETIMES):
+                    stressed.add(str(item["node"]))
             if "link" in item:
                 source, _, target = str(item["link"]).partition("->")
                 links.add((source, target))
                 if item.get("both_ways"):
                     links.add((target, source))
-        return cls(frozenset(nodes), frozenset(links))
+        return cls(frozenset(nodes), frozenset(links), frozenset(stressed))
 
 
 def _played(meta: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
@@ -543,6 +551,26 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
         if took_s > 0:
             result[node] = min(sum(others for others, _ in of) / took_s, cores)
     return result
+
+
+def interferences(measured: Sequence[Measured], found: Mapping[SiteName, Site]) -> dict[str, float]:
+    """How many times as much core time stages took on nodes that were stressed all the time."""
+    usual_ms = usual_work_ms(measured)
+    sums: dict[str, list[float]] = {}
+    for one in measured:
+        for site, visit in one.visits.items():
+            node = site[1]
+            if node in one.disturbed.stressed and site in found:
+                speed = usual_ms[node] / one.work_ms[node] if node in usual_ms else 1.0
+                total = sums.setdefault(node, [0.0, 0.0, 0.0])
+                total[0] += float(visit.stage_ms.sum()) * speed
+                total[1] += len(visit.stage_ms) * found[site].stage_ms
+                total[2] += len(visit.stage_ms)
+    return {
+        node: max(took / alone, 1.0)
+        for node, (took, alone, jobs) in sums.items()
+        if jobs >= LEAST_JOBS
+    }
 
 
 def _cores_ms(
