@@ -348,9 +348,12 @@ class _Maker:
     def task(self, name: str, load: float, *, source: bool) -> Task:
         rng = self.rng
         feasible = rng.sample(self.nodes, min(len(self.nodes), rng.choice([1, 2, 2, 3])))
+        handed = [0.0, 0.0, self.duration(0, 0.3)]
         on = {
             node.name: Execution(
                 self.process(self.period * load * rng.uniform(0.3, 1.5)),
+                before_ms=rng.choice(handed),
+                after_ms=rng.choice(handed),
                 threads=rng.choice([1, 1, 1, 2, 3, 5]),
                 workers=rng.choice([1, 1, 1, 2, 3]),
                 accelerator="gpu" if node.accelerators and rng.random() < 0.5 else None,

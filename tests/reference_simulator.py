@@ -219,6 +219,15 @@ class Job:
     outcome: str = "in_flight"
     cores: int = 0
     due: int | None = None
+    rest: int = 0
+    owed: bool = False
+
+    def hand_on(self) -> None:
+        """Let the next thread of its worker do its part: the stage's own, or what follows."""
+        after = nanoseconds(self.execution.after_ms)
+        work = self.rest - after if self.rest > after else self.rest
+        self.owed = self.rest <= after
+        self.left, self.rest = Fraction(work), self.rest - work
 
     @property
     def readiness(self) -> tuple[int, int, int, int]:
@@ -413,8 +422,25 @@ class NodeState:
         known = [thread.job for thread in (*self.waiting, self.turn) if thread]
         for job in self.jobs:
             if job not in known:
-                self.waiting.append(Thread(job, self.average))
+                self.waiting.append(Thread(job, self.beginning(job)))
                 self.touched = True
+
+    def hand_over(self, job: Job) -> None:
+        """Let another thread, which is new, go on with a job."""
+        self.end_turn()
+        job.hand_on()
+        self.waiting.append(Thread(job, self.beginning(job)))
+
+    def beginning(self, job: Job) -> int:
+        """What a new thread of a job counts as having received."""
+        if job.owed:
+            there = [*self.waiting, *([self.turn] if self.turn else [])]
+            least = min((thread.received for thread in there), default=0)
+            if not self.debt and self.turn and self.had >= nanoseconds(LEAST_TURN_MS):
+                self.waiting.append(self.turn)
+                self.end_turn()
+            return least - 1
+        return self.average
 
     def end_turn(self) -> None:
         self.turn, self.had, self.touched = None, 0, True
@@ -1199,6 +1225,13 @@ class Simulation:
             senders=senders,
         )
         self.jobs[cell, cycle, name] = job
+        if self.nodes[node].tick and job.execution.accelerator is None:
+            work, before = int(job.left), nanoseconds(job.execution.before_ms)
+            if 0 < before < work:
+                job.left, job.rest, job.owed = Fraction(before), work - before, True
+            else:
+                job.rest = work
+                job.hand_on()
         return job
 
     def queue_up(self, job: Job) -> None:
@@ -1219,6 +1252,9 @@ class Simulation:
             self.nodes[node].runnable(job).append(job)
 
     def complete(self, job: Job) -> None:
+        if job.rest:
+            self.nodes[job.node].hand_over(job)
+            return
         job.end = self.now
         job.outcome = "done"
         self.nodes[job.node].runnable(job).remove(job)

@@ -692,6 +692,29 @@ def test_what_waits_while_jobs_run_takes_less_of_their_quota() -> None:
     assert stressed.windows["u_R1"].to_list() == pytest.approx([1.0] * 2, abs=0.02)
 
 
+def test_threads_that_hand_a_job_on_wait_for_their_turns() -> None:
+    # One core, nothing used up: a foreign thread, ticks every 4 ms. The job's reader comes first as
+    # soon as the foreign one has had its 1.4 ms, its worker waits as any new thread does.
+    def latencies(before_ms: float, after_ms: float) -> list[float]:
+        execution = Execution(Constant(4.0), before_ms=before_ms, after_ms=after_ms)
+        problem = make_problem(
+            [Node("R1", "robot", 1, quota=Quota(1.0, 1000.0, 0.0, 4.0))],
+            [Task("work", {"R1": execution})],
+            period_ms=101.0,
+            window_cycles=40,
+            scenario=[NodeDisturbance("R1", stress_threads=1)],
+        )
+        run = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=3, windows=1)
+        return [ns / MS for ns in run.cycles["latency_ns"].to_list()]
+
+    one, three = latencies(0.0, 0.0), latencies(1.0, 1.0)
+    # One thread waits for the end of the foreign one's turn, at a tick.
+    assert min(one) > 4.9
+    # Of three the first takes the turn at once where it has lasted 1.4 ms, and the last goes first.
+    assert three.count(4.0) >= 18
+    assert all(some <= other for some, other in zip(three, one, strict=True))
+
+
 def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:
     run = dwell.simulate(canonical, policy=Script("SO", "LOC", "HYB"), seed=1, windows=6, jobs=True)
     placed = run.cycles.select("cycle", pl.col("placement").cast(str))

@@ -204,7 +204,7 @@ def test_execution_times_are_found(calibrated: Calibrated) -> None:
     for node in ("R1", "E"):
         way = [("see", "R1"), ("find", node), ("act", "R1")]
         of = [about[f"{task}@{where}"] for task, where in way]
-        besides_ms = sum(one["messaging_ms"] + one["begin_ms"] + one["end_ms"] for one in of)
+        besides_ms = sum(one["before_ms"] + one["after_ms"] for one in of)
         assert besides_ms == pytest.approx(sum(MESSAGING_MS[site] for site in way), rel=0.08)
     assert calibrated.missing == ()
     # What is stressed says nothing of its node, and a link that is worse nothing of itself.

@@ -281,6 +281,8 @@ class Assembly:
                 workers=entry.workers if entry.workers is not None else task.workers,
                 accelerator=entry.accelerator,
                 standby=entry.standby,
+                before_ms=entry.before_ms,
+                after_ms=entry.after_ms,
             ),
         )
 

@@ -442,6 +442,14 @@ class ExecutionEntry(Entry):
         description="Further workers that a live node keeps, to take over when the first is "
         "silent; default 0.",
     )
+    before_ms: Annotated[float, Number(bounds.HANDED_MS)] | None = Field(
+        None,
+        description="What of `exec_ms` another thread of its worker does before it; default 0.",
+    )
+    after_ms: Annotated[float, Number(bounds.HANDED_MS)] | None = Field(
+        None,
+        description="What of `exec_ms` another thread of its worker does after it; default 0.",
+    )
 
 
 class InputEntry(Entry):

@@ -102,6 +102,7 @@ from dwell.kernels.layout import (
     QUOTA_T,
     READY_AT,
     RELEASE,
+    REST,
     RESTART,
     RETRY,
     SCHEDULER,
@@ -141,6 +142,7 @@ from dwell.kernels.nodes import (
     key_row,
     leave,
     mark,
+    next_thread,
     renew_before_stress,
     restress,
     set_speed,
@@ -169,8 +171,10 @@ def _progress(s: Tables, server: int, at: int) -> tuple[int, float]:
         if key == FOREIGN:
             return FOREIGN, 0.0
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
-    site = s.jobs[key_row(s.ring, s.stride, key), SITE]
-    return key, s.sites[site, NEED] * (s.exec_ns[site, cycle] - max(left, 0.0))
+    job = key_row(s.ring, s.stride, key)
+    site = s.jobs[job, SITE]
+    left = max(left, 0.0) + s.jobs[job, REST]
+    return key, s.sites[site, NEED] * (s.exec_ns[site, cycle] - left)
 
 
 @phase
@@ -401,6 +405,8 @@ def _completion(s: Tables, cell: int, cycle: int, local: int, key: int, now: int
     site = index(s.jobs[row, SITE])
     server = index(s.sites[site, SERVER])
     if s.servers[server, NEXT_KEY] != key or s.servers[server, NEXT_T] != now:
+        return
+    if next_thread(s, server, site, row, key, now):
         return
     complete(s, server, site, cell, cycle, local, row, now)
     free_worker(s, cell, local, site)

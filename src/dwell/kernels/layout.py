@@ -126,8 +126,10 @@ SOURCE, TARGET, N_FLOW = range(3)
     START_NS,
     DEPTH,
     RANK,
+    BEFORE_NS,
+    AFTER_NS,
     N_SITE,
-) = range(15)
+) = range(17)
 
 # A foreign thread among those that wait for their turn, where jobs have their keys.
 FOREIGN = _number(-1)
@@ -188,7 +190,8 @@ CHANGE_AT, CHANGE_NODE, CHANGE_STRESS, CHANGE_DOWN, N_CHANGE = range(5)
 
 # jobs in the ring
 # MISSING counts the inputs that have not arrived.
-READY, STARTED, COMPUTE, NETWORK, SITE, NEXT, MISSING, N_JOB = range(8)
+# REST is the work of the threads that the one at work hands its job over to.
+READY, STARTED, COMPUTE, NETWORK, SITE, NEXT, MISSING, REST, N_JOB = range(9)
 
 # cycles in the ring
 # LIVE counts the jobs and messages of the cycle that are still under way; PAIR is the row of

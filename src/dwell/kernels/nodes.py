@@ -22,8 +22,10 @@ from dwell.kernels.heaps import (
     push_waiting,
 )
 from dwell.kernels.layout import (
+    AFTER_NS,
     BACKGROUND,
     BASE,
+    BEFORE_NS,
     BEHIND_NS,
     BESIDE,
     BUSY,
@@ -59,6 +61,7 @@ from dwell.kernels.layout import (
     QUOTA_T,
     RANK,
     READY,
+    REST,
     SCHEDULER,
     SERVER,
     SITE,
@@ -202,9 +205,14 @@ def draw_quota(s: Tables, server: int, now: int) -> None:
 @phase
 def _strike(s: Tables, server: int, now: int) -> None:
     """Pass the turn on at a tick, if it has lasted long enough; the clock must be up to date."""
-    since = (now + s.servers[server, TICK_AGO]) % s.servers[server, TICK_NS]
-    short = s.servers[server, TURN_NS] < LEAST_TURN_NS
-    if since != 0 or short or s.servers[server, THROTTLED] != 0:
+    if (now + s.servers[server, TICK_AGO]) % s.servers[server, TICK_NS] == 0:
+        _pass_on(s, server)
+
+
+@phase
+def _pass_on(s: Tables, server: int) -> None:
+    """Pass the turn on, if it has lasted long enough; the clock must be up to date."""
+    if s.servers[server, TURN_NS] < LEAST_TURN_NS or s.servers[server, THROTTLED] != 0:
         return
     received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
     if s.servers[server, N_RUN] == 0:
@@ -359,6 +367,17 @@ def _average(s: Tables, server: int) -> int:
 
 
 @phase
+def _least(s: Tables, server: int) -> int:
+    """Least core time that a thread of a server has received: where one begins that is owed."""
+    n = s.servers[server, N_WAIT]
+    waiting = s.wait_rank[index(s.servers[server, BASE])] if n > 0 else 0
+    if s.servers[server, TURN] == 0:
+        return int(waiting)
+    received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
+    return int(min(waiting, received) if n > 0 else received)
+
+
+@phase
 def _take_turn(s: Tables, server: int, now: int) -> None:
     """Give the turn, if nobody has it and the quota lets anybody, to who has received least."""
     tick(s, server, now)
@@ -402,17 +421,50 @@ def restress(s: Tables, server: int, threads: int) -> None:
 
 
 @phase
+def _line_up(s: Tables, server: int, site: int, row: int, key: int, work: int) -> None:
+    """Let the next thread of a job wait for its turn: one before the stage, its own, one after.
+
+    The stage's, which has worked for long when it sleeps, begins with the mean of the others. One
+    that does little whenever it wakes is owed: it goes before all of them, and takes the turn of
+    one that has had it for long enough.
+    """
+    rest, after = s.jobs[row, REST], s.sites[site, AFTER_NS]
+    if work == 0 and rest > after:
+        work = rest - after
+        received = _average(s, server)
+    else:
+        if work == 0:
+            work = rest
+        received = _least(s, server) - 1
+        _pass_on(s, server)
+    s.jobs[row, REST] = rest - work
+    _queue_up(s, server, received, s.jobs[row, READY], key, float(work))
+    s.servers[server, USED] += 1
+    mark(s, server)
+
+
+@phase
+def next_thread(s: Tables, server: int, site: int, row: int, key: int, now: int) -> bool:
+    """Let the next thread of a job line up, if there is one, where its thread has done its part."""
+    if s.jobs[row, REST] == 0:
+        return False
+    leave(s, server, site, now)
+    _line_up(s, server, site, row, key, 0)
+    return True
+
+
+@phase
 def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None:
     """Make a job that a worker has taken runnable."""
     server = index(s.sites[site, SERVER])
     scheduler = s.servers[server, SCHEDULER]
     if scheduler == TURNS:
         tick(s, server, now)
-        received = _average(s, server)
-        _queue_up(s, server, received, s.jobs[row, READY], key, float(work))
-        s.servers[server, USED] += 1
-        mark(s, server)
+        before = s.sites[site, BEFORE_NS]
+        s.jobs[row, REST] = work
+        _line_up(s, server, site, row, key, before if before < work else 0)
         return
+    s.jobs[row, REST] = 0
     n = s.servers[server, N_WAIT]
     need = s.sites[site, NEED]
     # Where nobody else can want the cores now, the job needs no queue.

@@ -142,6 +142,7 @@ PORT = Bound(1024, 65_000, whole=True)
 AGE_MS = Bound(0, LARGEST, above=True)
 CHECKPOINT_CYCLES = Bound(0, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
+HANDED_MS = Bound(0, 1e6)
 
 # Controller and windows.
 WINDOW_CYCLES = Bound(1, MAX_COUNT, whole=True)

@@ -210,6 +210,8 @@ def _execution(task: Task, node: str, execution: Execution) -> Document:
             "workers": execution.workers,
             "accelerator": execution.accelerator,
             "standby": execution.standby or None,
+            "before_ms": execution.before_ms or None,
+            "after_ms": execution.after_ms or None,
         }
     )
 

@@ -9,6 +9,7 @@ from dwell.model.bounds import (
     BYTES,
     DEADLINE_MS,
     DEPTH,
+    HANDED_MS,
     PERIOD_MS,
     PRIORITY,
     STANDBY,
@@ -41,6 +42,9 @@ class Execution:
         Kind of accelerator the job runs on instead of the CPU.
     standby : int
         Further workers that a live node keeps, to take over when the first is silent.
+    before_ms, after_ms : float
+        What of `exec_ms` other threads of its worker do before and after its own. Only where
+        threads take turns (`Quota.tick_ms`) does it matter: each of them waits for its own.
     """
 
     exec_ms: Process
@@ -48,8 +52,12 @@ class Execution:
     workers: int = 1
     accelerator: str | None = None
     standby: int = 0
+    before_ms: float = 0.0
+    after_ms: float = 0.0
 
     def __post_init__(self) -> None:
+        HANDED_MS.check("before_ms", self.before_ms)
+        HANDED_MS.check("after_ms", self.after_ms)
         STANDBY.check("standby", self.standby)
         THREADS.check("threads", self.threads)
         WORKERS.check("workers", self.workers)

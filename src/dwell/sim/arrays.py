@@ -283,6 +283,8 @@ class _Layout:
             else:
                 row[k.NEED] = execution.threads if fair else min(execution.threads, cores)
             row[k.START_NS] = round(task.start_ms * 1e6)
+            row[k.BEFORE_NS] = round(execution.before_ms * 1e6)
+            row[k.AFTER_NS] = round(execution.after_ms * 1e6)
             self.server_workers[server] += execution.workers
             rows[task_name, node_name] = len(self.sites)
             self.sites.append(row)

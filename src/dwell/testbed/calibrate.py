@@ -327,8 +327,10 @@ def _put_in(
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
 
-    for task, node in found:
-        document["tasks"][task]["on"][node]["exec_ms"] = replay(task_name(task, node))
+    for (task, node), of in found.items():
+        on = document["tasks"][task]["on"][node]
+        on["exec_ms"] = replay(task_name(task, node))
+        on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
         # The samples have what the task shares with others already.
         document["tasks"][task].pop("scale", None)
     for node, cores in behind.items():
@@ -389,9 +391,9 @@ def _about(of: Site) -> dict[str, Any]:
         "mean_ms": _short(of.samples_ms.mean()),
         "std_ms": _short(of.samples_ms.std()),
         "stage_ms": _short(of.stage_ms),
-        "messaging_ms": _short(of.overhead_ms),
-        "end_ms": _short(of.end_ms),
-        "begin_ms": _short(of.begin_ms),
+        "messaging_ms": _short(of.messaging_ms),
+        "before_ms": _short(of.before_ms),
+        "after_ms": _short(of.after_ms),
         "jobs": len(of.samples_ms),
         "of_runs": list(of.samples),
     }
@@ -442,8 +444,9 @@ def _told(report: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, of in report["tasks"].items():
         lines.append(
-            f"{name}: {of['mean_ms']:.3g} ms ({of['stage_ms']:.3g} stage, {of['messaging_ms']:.3g} "
-            f"messaging, {of['begin_ms'] + of['end_ms']:.3g} begin and end), {of['jobs']} jobs"
+            f"{name}: {of['mean_ms']:.3g} ms ({of['before_ms']:.3g} before, {of['stage_ms']:.3g} "
+            f"stage, {of['after_ms']:.3g} after; {of['messaging_ms']:.3g} of it messaging), "
+            f"{of['jobs']} jobs"
         )
     lines += [f"{name}: {of['mean_ms']:.3g} ms" for name, of in report["links"].items()]
     for node, value in report["background"].items():

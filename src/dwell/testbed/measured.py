@@ -193,17 +193,18 @@ class Site:
     ----------
     samples : dict of str to Part
         What an undisturbed job takes of the node, its share of messaging included, by run.
-    stage_ms, overhead_ms, begin_ms, end_ms : float
-        Means of the stage alone, of its worker's messaging what lies on the way, from the arrival
-        of an input, or a release, to the begin of the job, and from the end of a sink's job to that
-        of the cycle.
+    stage_ms, messaging_ms : float
+        Means of the stage alone, and of its worker's messaging what lies on the way.
+    before_ms, after_ms : float
+        Means of what other threads do before the stage (input or release, messaging) and after it
+        (messaging, the end of the cycle).
     """
 
     samples: dict[str, Part]
     stage_ms: float
-    overhead_ms: float
-    begin_ms: float
-    end_ms: float
+    messaging_ms: float
+    before_ms: float
+    after_ms: float
 
     @property
     def samples_ms(self) -> Floats:
@@ -432,13 +433,14 @@ def sites(
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
             for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
         )
-        over_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
-        more_ms = over_ms + begin_ms + end_ms
+        read_ms, write_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
+        before_ms, after_ms = begin_ms + read_ms, write_ms + end_ms
         samples = {
-            one.name: Part(one.visits[site].cycles, stages_ms[one.name] + more_ms) for one in of
+            one.name: Part(one.visits[site].cycles, stages_ms[one.name] + (before_ms + after_ms))
+            for one in of
         }
         stage_ms = float(np.concatenate(list(stages_ms.values())).mean())
-        found[site] = Site(samples, stage_ms, over_ms, begin_ms, end_ms)
+        found[site] = Site(samples, stage_ms, read_ms + write_ms, before_ms, after_ms)
     return found
 
 
@@ -448,10 +450,12 @@ def usual_work_ms(measured: Sequence[Measured]) -> dict[str, float]:
     return {node: float(np.mean([one.work_ms[node] for one in measured])) for node in sorted(nodes)}
 
 
-def _on_the_way_ms(site: SiteName, messaging_ms: float, known: OnTheWay, problem: Problem) -> float:
-    """CPU time of a worker that lies on the way of its job's messages; all of it if unknown."""
+def _on_the_way_ms(
+    site: SiteName, messaging_ms: float, known: OnTheWay, problem: Problem
+) -> tuple[float, float]:
+    """CPU time of a worker on the way of its job's inputs, and outputs; all of it if unknown."""
     task, node = site
-    total = 0.0
+    read_ms = write_ms = 0.0
     for flow in problem.pipeline.inputs(task):
         ways = [
             hop.receiver_ms
@@ -459,7 +463,7 @@ def _on_the_way_ms(site: SiteName, messaging_ms: float, known: OnTheWay, problem
             if (source, target, to) == (flow.source, task, node)
         ]
         whole_ms = messaging_ms * share(problem, task, flow.source, task)
-        total += float(np.mean(ways)) if ways else whole_ms
+        read_ms += float(np.mean(ways)) if ways else whole_ms
     for flow in problem.pipeline.outputs(task):
         ways = [
             hop.sender_ms
@@ -467,8 +471,8 @@ def _on_the_way_ms(site: SiteName, messaging_ms: float, known: OnTheWay, problem
             if (source, target, at) == (task, flow.target, node)
         ]
         whole_ms = messaging_ms * share(problem, task, task, flow.target)
-        total += float(np.mean(ways)) if ways else whole_ms
-    return total
+        write_ms += float(np.mean(ways)) if ways else whole_ms
+    return read_ms, write_ms
 
 
 def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
@@ -586,4 +590,4 @@ def _cores_ms(
     site = found.get(key[:2])
     if site is None:
         return one.spent_ms[key]
-    return one.spent_ms[key] + execution.threads * (site.overhead_ms + site.begin_ms + site.end_ms)
+    return one.spent_ms[key] + execution.threads * (site.before_ms + site.after_ms)
