@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import dwell
 from dwell.live.agent import CpuCount
 from dwell.live.cell import Cell
-from dwell.live.group import own_group
+from dwell.live.group import ControlGroup, own_group
 from dwell.live.loads import ProcessLoads
 from dwell.live.recording import RunRecorder
 from dwell.live.tables import columns_of, job_columns
@@ -22,6 +23,7 @@ from tests.live.small_world import MS, MemoryRecorder, World
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 CPU_NS = 1_234_567
+OTHERS_NS = 70_000
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +47,11 @@ class JobRecorder(MemoryRecorder):
 class Spent:
     """A clock of CPU time that goes on by a fixed time between two looks."""
 
-    def __init__(self) -> None:
-        self.at_ns = 0
+    def __init__(self, each_ns: int = CPU_NS) -> None:
+        self.at_ns, self.each_ns = 0, each_ns
 
     def __call__(self) -> int:
-        self.at_ns += CPU_NS
+        self.at_ns += self.each_ns
         return self.at_ns
 
 
@@ -77,10 +79,11 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
         worker = getattr(role, "worker", None)
         if worker is not None:
             worker.cpu_clock = Spent()
+            worker.others_clock = Spent(OTHERS_NS) if worker.place.node == "R2" else None
     world.run(4_000)
     jobs = frames(problem, world.recorder.rows)
     simulated = dwell.simulate(problem, policy="LOC", seed=1, windows=2, jobs=True).jobs
-    assert jobs.columns == [*simulated.columns, "shadow", "cpu_ns"]
+    assert jobs.columns == [*simulated.columns, "shadow", "cpu_ns", "others_ns"]
 
     nodes = {"sensing": "R1", "perception": "R1", "planning": "R2", "control": "R2"}
     cycles = sorted(set(jobs["cycle"]))
@@ -95,6 +98,9 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
     assert set(settled["outcome"]) == {"done"}
     assert not settled["shadow"].any()
     assert settled["cpu_ns"].unique().to_list() == [CPU_NS]
+    # Only where something counts them.
+    others = {node: of["others_ns"].unique().to_list() for (node,), of in settled.group_by("node")}
+    assert others == {"R1": [None], "R2": [OTHERS_NS]}
     took = settled.with_columns(took=pl.col("end_ns") - pl.col("start_ns"))
     for task, exec_ms in EXEC_MS.items():
         assert took.filter(pl.col("task") == task)["took"].unique().to_list() == [exec_ms * MS]
@@ -221,6 +227,14 @@ def test_a_group_of_version_1_counts_nanoseconds(tmp_path: Path) -> None:
     assert group is not None
     assert group.used_ns() == 123_456_789
     assert CpuCount(group=group).busy_ns() == 123_456_789
+
+
+def test_others_of_a_group_are_all_but_the_process_that_asks(tmp_path: Path) -> None:
+    counter = tmp_path / "cpuacct.usage"
+    counter.write_text("1000000000000\n")
+    before_ns = time.process_time_ns()
+    others_ns = ControlGroup(counter).others_ns()
+    assert before_ns <= 10**12 - others_ns <= time.process_time_ns()
 
 
 def test_a_group_of_version_2_counts_microseconds(tmp_path: Path) -> None:
