@@ -258,7 +258,13 @@ def remove_namespace(namespace: str) -> None:
 def _ip(*words: str, given: str = "") -> str:
     if shutil.which("ip") is None:
         raise LiveError("network namespaces need the command ip: apt-get install iproute2")
-    done = subprocess.run(["ip", *words], input=given, capture_output=True, text=True, check=False)  # noqa: S603, S607
+    done = subprocess.run(  # noqa: S603 - no shell
+        ["ip", *words],  # noqa: S607 - wherever iproute2 is
+        input=given,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         said = done.stderr.strip() or f"status {done.returncode}"
         raise LiveError(f"ip {' '.join(words)}: {said}")
