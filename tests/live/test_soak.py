@@ -39,6 +39,18 @@ def test_what_is_steady_passes() -> None:
     assert wrong(rows_of(CONTROLLER_MB / 2, minutes=60, who="controller@E"), 60) == []
 
 
+def test_files_that_leak_are_found_and_a_step_is_none() -> None:
+    rows = rows_of(0.0, minutes=60)
+    (seen,) = rows.values()
+    for at_s, found in seen:
+        found["fds"] += at_s > 2_000
+    assert wrong(rows, 60) == []
+    for at_s, found in seen:
+        found["fds"] += at_s // 900
+    (line,) = wrong(rows, 60)
+    assert line.startswith("| planning@E | fds |")
+
+
 def test_what_an_hour_does_not_show_is_not_passed() -> None:
     rows = rows_of(BOUNDS["rss_mb"] - 0.01, minutes=60)
     (line,) = wrong(rows, 60)
