@@ -14,7 +14,14 @@ import pytest
 
 from dwell.errors import LiveError
 from dwell.live.transport.protocol import Lane, Sample, Transport
-from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport, _Pool, _Sender, _Way
+from dwell.live.transport.zenoh import (
+    ZenohSettings,
+    ZenohTransport,
+    _mark,
+    _Pool,
+    _Sender,
+    _Way,
+)
 from tests.live.transport.meshes import PATIENCE_S, Inbox, ZenohMesh, introduce
 from tests.live.transport.peer import digest
 
@@ -249,5 +256,31 @@ def test_a_message_that_is_too_long_is_dropped_on_arrival() -> None:
             lambda: b"after" in inbox.payloads, lambda: sender.put(key, b"after", lane="images")
         )
         assert max(len(payload) for payload in inbox.payloads) == 1 << 19
+    finally:
+        mesh.close()
+
+
+def test_what_was_put_under_another_key_is_not_heard() -> None:
+    """Zenoh has delivered messages under keys of the session before, when it began anew."""
+    mesh = ZenohMesh([ME, FAR])
+    try:
+        sender, receiver = mesh.open(ME), mesh.open(FAR)
+        assert isinstance(sender, ZenohTransport)
+        assert isinstance(receiver, ZenohTransport)
+        inbox, key = mesh.inbox(), "dwell/t/stamped"
+        receiver.subscribe(key, inbox)
+        introduce(mesh, sender, key, [inbox])
+        way = sender._ways[key, "control"]
+        own, way.mark = way.mark, _mark("dwell/t/order")
+        sender.put(key, b"misled", b"header")
+        # What carries no mark is of others, who may put what they may put.
+        way.mark = b""
+        sender.put(key, b"unmarked")
+        way.mark = own
+        mesh.joined(lambda: b"after" in inbox.payloads, lambda: sender.put(key, b"after", b"head"))
+        assert b"misled" not in inbox.payloads
+        assert b"unmarked" in inbox.payloads
+        assert receiver.misled == 1
+        assert {one.header for one in inbox.samples if one.payload == b"after"} == {b"head"}
     finally:
         mesh.close()

@@ -17,9 +17,11 @@ import json
 import logging
 import os
 import threading
+import zlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError
@@ -36,6 +38,10 @@ __all__ = ["LONGEST_BYTES", "ZenohSettings", "ZenohTransport"]
 
 #: Longest message that is put together from its fragments; Zenoh's own limit is 1 GiB.
 LONGEST_BYTES = 64 << 20
+#: Begins an attachment that says which key it was put under. No header does: MessagePack never
+#: uses this byte.
+MARK = b"\xc1"
+MARKED_BYTES = 5
 
 _LOG = logging.getLogger(__name__)
 _SENT_BY = "zenoh/bytes;"
@@ -57,6 +63,16 @@ _PRIORITIES = (
 
 
 _Put: TypeAlias = Callable[..., None]
+
+
+@lru_cache(maxsize=1_024)
+def _mark(key: str) -> bytes:
+    """What a message has with it that was put under a key.
+
+    Zenoh sends a number for a key that was declared in a session. Where sessions end and begin
+    anew, a message may be read with the numbers of another one, and be delivered under another key.
+    """
+    return MARK + zlib.crc32(key.encode()).to_bytes(MARKED_BYTES - 1, "little")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +158,8 @@ class ZenohTransport:
         self._zenoh = zenoh
         self._losses = losses or Losses.of(entry.role.who, entry.role.node)
         self._closed = False
+        #: Messages that arrived under another key than they were put under.
+        self.misled = 0
         # Read and filled without a lock: a publisher too many does no harm.
         self._ways: dict[tuple[str, Lane], _Way] = {}
         self._locks: dict[Lane, threading.RLock] = {
@@ -257,7 +275,7 @@ class ZenohTransport:
             raise
         pool = self._pool if name == "local" else None
         lost = None if self._losses is None else self._losses.sending(key)
-        way = _Way(publisher.put, pool, self.settings.shared_bytes, lost)
+        way = _Way(publisher.put, pool, self.settings.shared_bytes, lost, mark=_mark(key))
         while len(self._ways) >= _PUBLISHERS:
             dropped = self._ways.pop(next(iter(self._ways)), None)
             if dropped is not None and dropped.sender is not None:
@@ -276,7 +294,7 @@ class ZenohTransport:
 
     def _send(self, way: _Way, content: Any, header: bytes) -> None:
         try:
-            way.put(content, attachment=header or None)
+            way.put(content, attachment=way.mark + header)
         except self._zenoh.ZError:
             if not self._closed:
                 raise
@@ -286,12 +304,14 @@ class ZenohTransport:
 
         def deliver(sample: zenoh.Sample) -> None:
             _keep_thread_state()
-            attachment = sample.attachment
-            message = Sample(
-                str(sample.key_expr),
-                sample.payload.to_bytes(),
-                b"" if attachment is None else attachment.to_bytes(),
-            )
+            attachment, key = sample.attachment, str(sample.key_expr)
+            header = b"" if attachment is None else attachment.to_bytes()
+            if header.startswith(MARK):
+                if not header.startswith(_mark(key)):
+                    self._misled(key)
+                    return
+                header = header[MARKED_BYTES:]
+            message = Sample(key, sample.payload.to_bytes(), header)
             with lock:
                 if self._closed:
                     return
@@ -301,6 +321,11 @@ class ZenohTransport:
                     _LOG.exception("%s: a receiver of %s failed", self.entry.role.who, message.key)
 
         return deliver
+
+    def _misled(self, key: str) -> None:
+        self.misled += 1
+        if self.misled == 1:
+            _LOG.warning("%s: heard under %s what was put elsewhere", self.entry.role.who, key)
 
     def _encoding(self) -> zenoh.Encoding | None:
         """Return what tells receivers the node that sent a message, where some are to be lost."""
@@ -343,6 +368,7 @@ class _Way:
     lost: Callable[[], bool] | None = None
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
+    mark: bytes = b""
 
     def content(self, data: bytes) -> Any:
         """Return a payload as Zenoh is handed it: in shared memory, or as it is."""
