@@ -127,9 +127,7 @@ def calibrate(
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
     beside, usual_ms = beside_jobs(measured, behind), usual_work_ms(measured)
     more = interferences(measured, found)
-    _put_in(document, samples.name, found, delays_ms, behind, beside)
-    for node, factor in more.items():
-        document["nodes"][node]["interference"] = _short(factor)
+    _put_in(document, samples.name, found, delays_ms, behind, beside, more)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
@@ -323,6 +321,7 @@ def _put_in(
     delays_ms: Mapping[str, Floats],
     behind: Mapping[str, float],
     beside: Mapping[str, float],
+    more: Mapping[str, float],
 ) -> None:
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
@@ -338,6 +337,8 @@ def _put_in(
         document["nodes"][node].pop("background_beside", None)
         if node in beside and document["nodes"][node].get("quota"):
             document["nodes"][node]["background_beside"] = _short(beside[node])
+    for node, factor in more.items():
+        document["nodes"][node]["interference"] = _short(factor)
     links = []
     for entry in document.get("links") or ():
         ways = [(entry["from"], entry["to"])]

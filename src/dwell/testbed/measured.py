@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import RunError
-from dwell.model import Problem
+from dwell.model import Flow, Problem
 from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
 from dwell.testbed.speeds import work_ms
@@ -56,6 +56,8 @@ SiteName: TypeAlias = tuple[str, str]
 
 #: What a disturbance has that is not there all the time.
 SOMETIMES = ("at_s", "for_s", "episodes", "ramp_s")
+#: Sides of a hop, in its times and, behind source and target, in its name.
+SENDER, RECEIVER = range(2)
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
 
@@ -425,9 +427,7 @@ def sites(
             continue
         # As long as it would have taken at the runs' mean speed.
         stages_ms = {
-            one.name: one.visits[site].stage_ms
-            * (usual_ms[site[1]] / one.work_ms[site[1]] if site[1] in usual_ms else 1.0)
-            for one in of
+            one.name: one.visits[site].stage_ms * _to_usual(one, site[1], usual_ms) for one in of
         }
         begin_ms, end_ms = (
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
@@ -450,29 +450,31 @@ def usual_work_ms(measured: Sequence[Measured]) -> dict[str, float]:
     return {node: float(np.mean([one.work_ms[node] for one in measured])) for node in sorted(nodes)}
 
 
+def _to_usual(one: Measured, node: str, usual_ms: Mapping[str, float]) -> float:
+    """What times of a run have to be multiplied by, for CPUs as fast as usual."""
+    return usual_ms[node] / one.work_ms[node] if node in usual_ms else 1.0
+
+
 def _on_the_way_ms(
     site: SiteName, messaging_ms: float, known: OnTheWay, problem: Problem
 ) -> tuple[float, float]:
     """CPU time of a worker on the way of its job's inputs, and outputs; all of it if unknown."""
     task, node = site
-    read_ms = write_ms = 0.0
-    for flow in problem.pipeline.inputs(task):
+
+    def part_ms(flow: Flow, side: int) -> float:
+        ends = flow.source, flow.target
         ways = [
-            hop.receiver_ms
-            for (source, target, _, to), hop in known.hops.items()
-            if (source, target, to) == (flow.source, task, node)
+            hop[side]
+            for name, hop in known.hops.items()
+            if name[:2] == ends and name[2 + side] == node
         ]
-        whole_ms = messaging_ms * share(problem, task, flow.source, task)
-        read_ms += float(np.mean(ways)) if ways else whole_ms
-    for flow in problem.pipeline.outputs(task):
-        ways = [
-            hop.sender_ms
-            for (source, target, at, _), hop in known.hops.items()
-            if (source, target, at) == (task, flow.target, node)
-        ]
-        whole_ms = messaging_ms * share(problem, task, task, flow.target)
-        write_ms += float(np.mean(ways)) if ways else whole_ms
-    return read_ms, write_ms
+        return float(np.mean(ways)) if ways else messaging_ms * share(problem, task, *ends)
+
+    pipeline = problem.pipeline
+    return (
+        sum(part_ms(flow, RECEIVER) for flow in pipeline.inputs(task)),
+        sum(part_ms(flow, SENDER) for flow in pipeline.outputs(task)),
+    )
 
 
 def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
@@ -565,9 +567,8 @@ def interferences(measured: Sequence[Measured], found: Mapping[SiteName, Site]) 
         for site, visit in one.visits.items():
             node = site[1]
             if node in one.disturbed.stressed and site in found:
-                speed = usual_ms[node] / one.work_ms[node] if node in usual_ms else 1.0
                 total = sums.setdefault(node, [0.0, 0.0, 0.0])
-                total[0] += float(visit.stage_ms.sum()) * speed
+                total[0] += float(visit.stage_ms.sum()) * _to_usual(one, node, usual_ms)
                 total[1] += len(visit.stage_ms) * found[site].stage_ms
                 total[2] += len(visit.stage_ms)
     return {

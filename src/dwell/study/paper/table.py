@@ -8,6 +8,7 @@ rule, change about them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from dwell.model import FrozenDict, Problem
 from dwell.study.comparison import AIM, Comparison
@@ -20,6 +21,7 @@ from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, U
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import difference_table, families, shown_as
+from dwell.study.paper.rates import rates_figure
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, number, percent
 from dwell.study.predictions import PAPER, Prediction, applies, judge_claim, judge_placement
@@ -496,27 +498,9 @@ def _over(result: StudyResult) -> str:
 
 def violations_figure(main: Table) -> Figure:
     """V_D with its interval, by policy and scenario."""
-    columns = ["violation_rate", "violation_rate_low", "violation_rate_high"]
-    return Figure(
+    return replace(
+        rates_figure(main, "Missed deadlines in the steady scenarios"),
         slug="table-violations",
-        title="Missed deadlines in the steady scenarios",
-        kind="intervals",
-        frame=main.frame.select(
-            "scenario",
-            "policy",
-            *(
-                main.frame[name].alias(f"y{name.removeprefix('violation_rate')}")
-                for name in columns
-            ),
-        ),
-        x="policy",
-        y="y",
-        series="policy",
-        facet="scenario",
-        y_label="V_D",
-        y_unit="percent",
-        line_at=AIM,
-        line_label="5 %",
         log_y=True,
         note=f"{main.note} Against the aim counts the one-sided limit, which the table has.",
     )
