@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import pytest
 
 import dwell
 from dwell.live.transport.memory import Clock
 from dwell.model import Problem
-from tests.live.small_world import MS, World
+from tests.live.small_world import MS, Counting, World
 
 EXEC_MS = {
     "overview_camera": 3.0,
@@ -26,9 +28,11 @@ def problem() -> Problem:
     return dwell.load("examples/fan-in.yaml")
 
 
-def world_of(problem: Problem, clocks: dict[str, Clock] | None = None) -> World:
+def world_of(
+    problem: Problem, clocks: dict[str, Clock] | None = None, **more: Any
+) -> World:
     exec_ms = {name: EXEC_MS.get(name, 0.5) for name in problem.pipeline.tasks}
-    return World(problem, exec_ms=exec_ms, clocks=clocks)
+    return World(problem, exec_ms=exec_ms, clocks=clocks, **more)
 
 
 @pytest.mark.parametrize("offset_s", [0, 777])
@@ -82,3 +86,21 @@ def test_a_move_of_the_guard_reaches_all_sources(problem: Problem) -> None:
     assert world.stamper.placement == other
     cycles = world.cycles
     assert all(later - earlier == 1 for earlier, later in pairwise(cycles[5:]))
+
+
+def test_a_state_moves_whole_although_stamps_are_drawn_early(problem: Problem) -> None:
+    tasks = dict(problem.pipeline.tasks)
+    tasks["plan"] = replace(tasks["plan"], state_bytes=100)
+    pipeline, live = replace(problem.pipeline, tasks=tasks), replace(problem.live, max_age_ms=1e4)
+    controller = replace(problem.controller, fallbacks=())
+    cell = replace(problem, pipeline=pipeline, live=live, controller=controller)
+    world = world_of(cell, stages={"plan": Counting}, policy="LOC", delay_ms=20)
+    for ms in (2_000, 2_010, 2_020, 2_030, 2_040):
+        world.run(ms)
+        candidate = "LOC" if world.stamper.placement == "EDGE" else "EDGE"
+        world.pin(candidate)
+        world.run(1_000)
+        assert world.stamper.placement == candidate
+    counts = world.arms["act"].counts
+    first = counts[0][0] - counts[0][1]
+    assert [cycle - count for cycle, count in counts] == [first] * len(counts)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
-from dwell.live.messages import Order
+from dwell.live.messages import Order, State, encode
 from dwell.live.transport.memory import Clock
+from dwell.live.transport.protocol import Sample
 from dwell.model import Problem
 from tests.live.small_world import MS, Counting, World
 
@@ -289,10 +292,18 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     require_ordered(world)
 
 
-def counting(problem: Problem, candidate: str) -> World:
+def counting(problem: Problem, candidate: str, **more: Any) -> World:
     """A world whose planning counts its cycles, and whose cell file says that it has a state."""
     cell = on(stateful(problem, "planning", 100), candidate)
-    return World(cell, exec_ms=EXEC_MS, stages={"planning": Counting}, policy=candidate)
+    return World(cell, exec_ms=EXEC_MS, stages={"planning": Counting}, policy=candidate, **more)
+
+
+def far_apart(problem: Problem, delay_ms: float) -> World:
+    """A world in which a migration takes longer than its controller is silent."""
+    controller = replace(problem.controller, fallbacks=())
+    live = replace(problem.live, max_age_ms=10_000.0)
+    slow = replace(problem, controller=controller, live=live)
+    return counting(slow, "LOC", delay_ms=delay_ms)
 
 
 def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
@@ -302,8 +313,61 @@ def test_rule_8_a_state_moves_without_losing_a_cycle(problem: Problem) -> None:
     world.run(2_000)
     assert world.stamper.placement == "SO"
     assert lost(world) == 0
-    # What the commands say is how many cycles the planner has seen: none is missing or twice.
+    require_whole(world)
+
+
+def require_whole(world: World) -> None:
+    """What the commands say is how many cycles the planner has seen: none is missing or twice."""
+    assert len(world.arm.counts) > 50
     assert [count for _, count in world.arm.counts] == [cycle + 1 for cycle in world.cycles]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rule_8_a_state_is_whole_wherever_it_is_sent_to_and_fro(
+    problem: Problem, seed: int
+) -> None:
+    """Migrations that take longer than the controller is silent, some of them given up."""
+    rng = random.Random(seed)
+    world = far_apart(problem, rng.uniform(20, 80))
+    world.run(2_000)
+    seen = set()
+    for _ in range(16):
+        world.pin(rng.choice(["LOC", "SO"]))
+        world.run(rng.uniform(100, 3_000))
+        seen.add(world.stamper.placement)
+    assert seen == {"LOC", "SO"}
+    require_whole(world)
+
+
+def test_rule_8_a_state_is_whole_after_a_migration_that_was_given_up(problem: Problem) -> None:
+    world = far_apart(problem, 60)
+    world.run(1_000)
+    world.pin("SO")
+    target = world.worker("planning@E")
+    while target.state_at < (0, 0):
+        world.run(1)
+    # It has the state, and follows; who would order the placement is gone.
+    world.kill("controller@E")
+    world.run(1_000)
+    world.start("controller@E")
+    world.run(2_000)
+    assert world.stamper.placement == "LOC"
+    world.pin("SO")
+    world.run(2_000)
+    assert world.stamper.placement == "SO"
+    require_whole(world)
+
+
+def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -> None:
+    world = counting(problem, "SO")
+    world.run(1_000)
+    worker = world.worker("planning@E")
+    run, cycle = worker.state_at
+    late = State(run, cycle - 5, "planning", "R2", number=7)
+    key = world.stamper.place.keys.state("planning", "E")
+    worker.receive(Sample(key, b"3", encode(late)), world.network.now_ns)
+    world.run(1_000)
+    require_whole(world)
 
 
 @pytest.mark.parametrize("state_bytes", [100, 100_000])
@@ -317,7 +381,7 @@ def test_rule_8_a_state_finds_its_way_beside_images(
     world.pin(there)
     world.run(3_000)
     assert world.stamper.placement == there
-    assert [count for _, count in world.arm.counts] == [cycle + 1 for cycle in world.cycles]
+    require_whole(world)
 
 
 def test_rule_8_a_checkpoint_survives_its_node(problem: Problem) -> None:

@@ -267,11 +267,13 @@ class Cell:
         self._number += 1
         return self._number
 
-    def _order(self, placement: str, forks: tuple[tuple[str, str], ...] = ()) -> Order:
+    def _order(self, placement: str) -> Order:
+        """Return an order; whatever it is for, it says what a migration under way forks."""
         held = self.held
         run, term = (held.run, held.term) if held is not None else (0, 0)
         want = self.controller.wanted or ""
         fraction = self.controller.shadow_fraction
+        forks = self._move.forks if self._move is not None else ()
         return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
 
     def _begin(self, name: str, now_ns: int, *, decided: bool = False) -> None:
@@ -299,10 +301,10 @@ class Cell:
             return
         if move.order is None:
             placement = move.name if move.phase == "order" else ""
-            move.order = self._order(placement, move.forks)
+            move.order = self._order(placement)
         elif self.refused:
             # An order that was refused for now is asked for anew; one without answer, again.
-            move.order = self._order(move.order.placement, move.forks)
+            move.order = self._order(move.order.placement)
             self.refused = ""
         self._send(move.order)
 

@@ -419,13 +419,13 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     controller : str
         Whose order it answers.
     refused : str
-        Empty where it was accepted; else ``stale term``, ``stale run``, ``infeasible``,
-        ``not ready``, ``not proven`` (probes are missing), ``another controller``, with details.
+        Empty where it was accepted; else ``stale term``, ``stale run``, ``stale order``,
+        ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``, with details.
     run, term : int
     placement : str
         What holds now.
     cycle : int
-        The next one that will be stamped.
+        The next one that will be stamped, with what was ordered.
     fallback : bool
         Whether the guard's placement holds.
     proven : str

@@ -339,7 +339,7 @@ class Pulse:
         self._digest = fingerprint(place.problem)
         self._nodes = frozenset(place.problem.fabric.nodes)
         self._known = {role.who: role.node for role in roles(place.problem)}
-        self._next_ns = -(1 << 62)
+        self._next_ns = self._sent_ns = -(1 << 62)
         #: Who is not heard because of its cell file or version: why, and when it beat last.
         self.strangers: dict[str, tuple[str, int]] = {}
         self._rivals: dict[str, int] = {}
@@ -454,9 +454,14 @@ class Pulse:
             self._next_ns = (now_ns if late or back else self._next_ns) + self._every_ns
         return self._next_ns
 
+    def put_off(self, due_ns: int) -> None:
+        """Send the next beat at an instant instead, but half an interval late at most."""
+        self._next_ns = min(due_ns, self._sent_ns + self._every_ns * 3 // 2)
+
     def send(self, now_ns: int) -> None:
         """Send a beat."""
         place = self.place
+        self._sent_ns = now_ns
         ready, note = self._state()
         note = note or self._repeated(now_ns)
         term, placement = self._holds() if self._holds is not None else (0, "")

@@ -234,13 +234,18 @@ class Stamper:
                 self.run,
                 self.term,
                 self.placement,
-                self.cycle,
+                self._next,
                 self.guard.on_fallback,
                 self._proven(now_ns),
                 self._newest,
             )
             self._answered = order.controller, order.number, answer
         self.place.put_twice(self.place.keys.accepted(), answer)
+
+    @property
+    def _next(self) -> int:
+        """The next cycle to be stamped: one that other nodes know already is."""
+        return self.cycle + (self._ahead is not None)
 
     def _proven(self, now_ns: int) -> str:
         wanted = self.probation.wanted if self.guard.on_fallback else None
@@ -264,6 +269,8 @@ class Stamper:
             return f"infeasible: {order.placement!r} is no candidate ({', '.join(self._names)})"
         if order.placement == self.placement:
             return ""
+        if order.number < self._newest:
+            return f"stale order: {order.number}, after {self._newest}"
         missing = self.presence.missing(order.placement, now_ns)
         if missing:
             return f"not ready: {', '.join(sorted(missing))} not heard"
@@ -298,12 +305,13 @@ class Stamper:
     def _move(self, placement: str, *, by_guard: bool) -> None:
         """Change the placement: a new term, known to the book before any cycle has it."""
         was_fallback = self.guard.on_fallback
-        self.moves.append((self.cycle, placement, "guard" if by_guard else "order"))
+        if by_guard:
+            self._ahead = None
+        self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
         self.term += 1
         self.placement = placement
         self._partial.clear()
-        self._ahead = None
         self._write(on_fallback=by_guard)
         self.guard.adopt(placement, fallback=by_guard)
         if by_guard:
@@ -370,6 +378,8 @@ class Stamper:
             if len(self._probes) > MAX_PARTIAL:
                 self._probes.discard(min(self._probes))
         self._send(stamp, here=True, elsewhere=early is None)
+        # A beat wakes every process, and would take the source's turn.
+        self.pulse.put_off(released_ns + self.place.period_ns // 2)
         told = Stamped(*stamp.fields, self.intervals.news())
         self.place.transport.put(self.place.keys.stamped(), encode(told))
         if self._early and self.timer:

@@ -216,10 +216,13 @@ class Worker:
         self._asked: Snapshot | None = None
         self._checkpoint: tuple[State, bytes] | None = None
         self._restoring: tuple[State, bytes] | None = None
-        self._forked: list[Job] = []
-        self._replayed: State | None = None
+        # What came because the state comes here, too; of that, what is to be worked on.
+        self._forked: deque[Job] = deque(maxlen=MAX_JOINS)
+        self._replay: deque[Job] = deque(maxlen=MAX_JOINS)
+        self._follows = False
         self._restored: Restored | None = None
-        self.state_at: tuple[int, int] = (-1, -1)
+        # Run and cycle: the last in the state, in one taken over, worked on by order.
+        self.state_at = self._restored_at = self._worked_at = (-1, -1)
         self.started = False
         self.trouble = ""
         self.busy_since_ns: int | None = None
@@ -286,9 +289,10 @@ class Worker:
         if self.is_sink and job.shadow:
             # A shadow ends where the sink begins.
             self._end(job, "shadow")
-        elif self._replaying(job):
+        elif self._is_forked(job):
             self._forked.append(job)
-            del self._forked[:-MAX_JOINS]
+            if self._follows:
+                self._replay.append(job)
         else:
             self._jobs.append(job)
             if len(self._jobs) > (self._depth or 10 * MAX_JOINS):
@@ -310,11 +314,10 @@ class Worker:
 
     # -------------------------------------------------------------------------- state
 
-    def _replaying(self, job: Job) -> bool:
-        """Whether a job is here only because the state is on its way."""
-        stamp = job.header.stamp
-        mine = self.routes.runs(self.task, self.place.node, stamp)
-        return self._stateful and not mine and not job.shadow and self._replayed is None
+    def _is_forked(self, job: Job) -> bool:
+        """Whether a job is here only because the state comes here."""
+        mine = self.routes.runs(self.task, self.place.node, job.header.stamp)
+        return self._stateful and not mine and not job.shadow
 
     def _about_state(self, sample: Sample) -> None:
         if "/snapshot/" in sample.key:
@@ -348,13 +351,18 @@ class Worker:
             self._send_state(chore.to, chore.number)
             return
         state, data = chore
-        failed = self._take_over(state, data)
+        if (state.run, state.cycle) < self._worked_at:
+            failed = f"{self.task}: a state of cycle {state.cycle} came after {self._worked_at[1]}"
+        else:
+            failed = self._take_over(state, data)
         who = state.number, self.task, self.place.node
         self._restored = Restored(*who, state.run, state.cycle, failed)
         if failed:
             self._say_restored()
         else:
-            self._replayed = state
+            self._follows = True
+            self._replay.clear()
+            self._replay.extend(job for job in self._forked if job.order > self.state_at)
 
     def _say_restored(self) -> None:
         if self._restored is not None:
@@ -383,7 +391,7 @@ class Worker:
         except Exception as error:  # the user's code
             self._failed(f"restore() failed ({type(error).__name__}: {error})")
             return self.trouble
-        self.state_at = state.run, state.cycle
+        self.state_at = self._restored_at = state.run, state.cycle
         return ""
 
     def _recover(self, job: Job) -> int:
@@ -434,6 +442,8 @@ class Worker:
         """Whether there may be something for `next_chore` or `next_job`."""
         waits = (
             self._jobs
+            or self._replay
+            or self._restored is not None
             or self._source is not None
             or self._asked is not None
             or self._restoring is not None
@@ -447,12 +457,12 @@ class Worker:
             return None
         if self._source is not None and (job := self._source.due(now_ns)) is not None:
             self._jobs.append(job)
-        if self._replayed is not None:
-            # Inputs that came while the state was on its way, but for those that are in it.
-            self._jobs.extend(job for job in self._forked if job.order > self.state_at)
-            self._forked.clear()
-            if not self._jobs:
-                self._say_restored()
+        if self._replay:
+            return self._taken(self._replay.popleft(), now_ns)
+        self._say_restored()
+        while self._jobs and not self._jobs[0].shadow and self._jobs[0].order <= self._restored_at:
+            # It is in the state that was taken over.
+            self._replace(self._jobs.popleft())
         if not self.active:
             horizon_ns = now_ns - 2 * self.place.period_ns
             while self._jobs and self._jobs[0].arrived_ns < horizon_ns:
@@ -460,8 +470,10 @@ class Worker:
             return None
         if not self._jobs:
             return None
+        return self._taken(self._jobs.popleft(), now_ns)
+
+    def _taken(self, job: Job, now_ns: int) -> Job:
         self.busy_since_ns = now_ns
-        job = self._jobs.popleft()
         self._busy_cycle = job.header.stamp.cycle
         return job
 
@@ -525,9 +537,14 @@ class Worker:
         """Send a job's output where its stamp says."""
         self.busy_since_ns = None
         self.state_at = max(self.state_at, job.order)
+        place, stamp = self.place, job.header.stamp
+        mine = self.routes.runs(self.task, place.node, stamp)
+        if mine and self._stateful:
+            self._worked_at = max(self._worked_at, job.order)
+            self._follows = False
+            self._forked.clear()
         if output is None:
             return
-        place, stamp = self.place, job.header.stamp
         try:
             kind, data = write_payload(output.payload)
             destinations = self.routes.destinations(self.task, stamp, shadow=job.shadow)
@@ -542,14 +559,13 @@ class Worker:
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)
         if self.is_sink:
-            place.transport.put(place.keys.command(self.task), data, head)
-        elif job.shadow or self.routes.runs(self.task, place.node, stamp):
+            if mine or not self._stateful:
+                place.transport.put(place.keys.command(self.task), data, head)
+        elif job.shadow or mine:
             for target, node, to in destinations:
                 key = place.keys.inputs(target, node, to)
                 place.transport.put(key, data, head, lane=self._lanes[target])
             self._checkpoint_due(job)
-        if self._replayed is not None and self.routes.runs(self.task, place.node, stamp):
-            self._replayed = None
 
     def framed(self, now_ns: int) -> None:
         """Ask the stamper for a cycle: the source has a frame."""
