@@ -28,9 +28,7 @@ def problem() -> Problem:
     return dwell.load("examples/fan-in.yaml")
 
 
-def world_of(
-    problem: Problem, clocks: dict[str, Clock] | None = None, **more: Any
-) -> World:
+def world_of(problem: Problem, clocks: dict[str, Clock] | None = None, **more: Any) -> World:
     exec_ms = {name: EXEC_MS.get(name, 0.5) for name in problem.pipeline.tasks}
     return World(problem, exec_ms=exec_ms, clocks=clocks, **more)
 

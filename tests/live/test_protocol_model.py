@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import dwell
-from docs.protocol import gate, orders
+from docs.protocol import gate, orders, states
 from docs.protocol.checker import Rules, Step, ViolationError, explore, stuck
 from dwell.model import Problem
 from tests.live.small_world import World
@@ -30,8 +30,9 @@ STEPS = 24
         (orders, orders.LIMITS),
         # One that changes its mind, too.
         (orders, orders.Limits(fires=1, crashes=1, lapses=0, whims=1)),
+        *((states, limits) for limits in states.CASES),
     ],
-    ids=["gate", "orders", "whims"],
+    ids=["gate", "orders", "whims", *(f"states {i}" for i, _ in enumerate(states.CASES))],
 )
 def test_nothing_goes_wrong_and_there_is_always_a_way_back(model: ModuleType, limits: Any) -> None:
     successors: Callable[[Any], Iterator[Step[Any]]] = partial(model.successors, limits=limits)
@@ -52,6 +53,14 @@ def test_every_rule_is_needed(name: str, rule: str) -> None:
         return
     with pytest.raises(ViolationError):
         explore(model.initial(), successors)
+
+
+@pytest.mark.parametrize("rule", states.RULES)
+def test_every_rule_of_states_is_needed(rule: str) -> None:
+    rules = Rules(frozenset({rule}))
+    with pytest.raises(ViolationError):
+        for limits in states.CASES:
+            explore(states.initial(), partial(states.successors, rules=rules, limits=limits))
 
 
 # --------------------------------------------------------------------------- model and code

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -187,6 +188,26 @@ def test_two_processes_of_one_name_are_noticed(problem: Problem) -> None:
     assert place.last_complaint == (
         "two processes say that they are agent@E; end one: its agent runs twice?"
     )
+
+
+def test_the_stamper_beats_between_two_releases(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(problem, exec_ms=EXEC_MS)
+    stamper, period_ns = world.stamper, problem.pipeline.period_ms * MS
+    beats: list[int] = []
+    send = stamper.pulse.send
+
+    def noted(now_ns: int) -> None:
+        beats.append(now_ns)
+        send(now_ns)
+
+    monkeypatch.setattr(stamper.pulse, "send", noted)
+    world.run(3_000)
+    assert stamper.cycle > 50
+    since = [(at_ns - stamper._next_ns) % period_ns / period_ns for at_ns in beats[10:]]
+    assert since == pytest.approx([0.5] * len(since), abs=0.01)
+    assert max(b - a for a, b in pairwise(beats)) <= 1.5 * period_ns
 
 
 # ------------------------------------------------------------------------------- frames

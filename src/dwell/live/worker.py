@@ -351,18 +351,20 @@ class Worker:
             self._send_state(chore.to, chore.number)
             return
         state, data = chore
-        if (state.run, state.cycle) < self._worked_at:
-            failed = f"{self.task}: a state of cycle {state.cycle} came after {self._worked_at[1]}"
-        else:
+        order, failed = (state.run, state.cycle), ""
+        if order < self._worked_at:
+            cycle = self._worked_at[1]
+            failed = f"{self.task}: a state of cycle {state.cycle} came after one of {cycle}"
+        elif order >= self._restored_at:
             failed = self._take_over(state, data)
+            if not failed:
+                self._follows = True
+                self._replay.clear()
+                self._replay.extend(job for job in self._forked if job.order > self.state_at)
         who = state.number, self.task, self.place.node
         self._restored = Restored(*who, state.run, state.cycle, failed)
         if failed:
             self._say_restored()
-        else:
-            self._follows = True
-            self._replay.clear()
-            self._replay.extend(job for job in self._forked if job.order > self.state_at)
 
     def _say_restored(self) -> None:
         if self._restored is not None:
