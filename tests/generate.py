@@ -325,6 +325,7 @@ class _Maker:
             background=background,
             background_beside=beside,
             interference=rng.choice([1.0, 1.0, 2.0]),
+            contention=rng.choice([0.0, 0.0, 0.5]) if quota is not None else 0.0,
             cores=1 if turns else cores,
             scheduler="fair" if scheduler == "turns" else scheduler,
             accelerators={"gpu": rng.randint(1, 2)} if rng.random() < 0.3 else {},

@@ -341,11 +341,11 @@ class NodeState:
             cpu = Fraction(node.quota.cpu)
             beside = node.background if node.background_beside is None else node.background_beside
             self.quota, self.stressed = (
-                max(round(self.left_by(taken, cpu) * self.period), 1)
+                max(round(self.left_by(taken, cpu) * self.period / self.pace), 1)
                 for taken in (Fraction(beside), Fraction(node.background))
             )
             self.left = self.quota
-            self.slack = nanoseconds(node.quota.slack_ms)
+            self.slack = self.in_time(node.quota.slack_ms)
             self.tick = nanoseconds(node.quota.tick_ms)
             if self.slack or self.tick:
                 self.pool, self.left = self.quota, 0
@@ -355,6 +355,15 @@ class NodeState:
         self.debt = self.touched = self.touched_by_change = False
         self.period_ago = self.tick_ago = 0
         self.empty_at: int | None = None
+
+    @property
+    def pace(self) -> Fraction:
+        """Core time that what runs receives of the time that it has a core."""
+        return 1 - Fraction(self.node.contention)
+
+    def in_time(self, ms: float) -> int:
+        """How long a core has to be had for so much core time."""
+        return round(nanoseconds(ms) / self.pace)
 
     @property
     def stopped(self) -> bool:
@@ -436,7 +445,7 @@ class NodeState:
         if job.owed:
             there = [*self.waiting, *([self.turn] if self.turn else [])]
             least = min((thread.received for thread in there), default=0)
-            if not self.debt and self.turn and self.had >= nanoseconds(LEAST_TURN_MS):
+            if not self.debt and self.turn and self.had >= self.in_time(LEAST_TURN_MS):
                 self.waiting.append(self.turn)
                 self.end_turn()
             return least - 1
@@ -449,7 +458,7 @@ class NodeState:
         """End a turn, at a tick, if it has lasted long enough."""
         at_tick = (now + self.tick_ago) % self.tick == 0
         self.touched = True
-        long = self.had >= nanoseconds(LEAST_TURN_MS)
+        long = self.had >= self.in_time(LEAST_TURN_MS)
         if at_tick and not self.debt and long and self.turn:
             self.waiting.append(self.turn)
             self.end_turn()
@@ -464,7 +473,7 @@ class NodeState:
     def notice(self) -> None:
         """Let the kernel look whether the quota is used up: draw on the pool, or pay the debt."""
         if self.left <= 0:
-            drawn = min(self.pool, (1 if self.debt else nanoseconds(DRAWN_MS)) - self.left)
+            drawn = min(self.pool, (1 if self.debt else self.in_time(DRAWN_MS)) - self.left)
             self.pool -= drawn
             self.left += drawn
         self.debt = self.left <= 0
@@ -504,7 +513,8 @@ class NodeState:
     def speed(self) -> Fraction:
         if self.stopped:
             return Fraction(0)
-        return self.share / (Fraction(self.node.interference) if self.foreign else 1)
+        share = self.share * self.pace
+        return share / (Fraction(self.node.interference) if self.foreign else 1)
 
     @property
     def share(self) -> Fraction:
@@ -542,7 +552,7 @@ class NodeState:
         for jobs in self.served.values():
             for job in jobs:
                 job.left -= elapsed * (job.cores > 0)
-        self.busy += (rate + self.behind) * elapsed
+        self.busy += (rate * self.pace + self.behind) * elapsed
         self.left -= rate * elapsed
         self.had += rate * elapsed
         if self.turn:

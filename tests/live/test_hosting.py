@@ -94,6 +94,24 @@ def test_roles_of_one_thread_take_turns_the_one_due_first_before_the_others() ->
     assert log == ["a", "b", "b", "b", "a", "a", "b", "c"]
 
 
+@pytest.mark.parametrize("back_ms", [50, 150, 5_000])
+def test_a_clock_that_is_set_back_keeps_nobody_asleep(back_ms: int) -> None:
+    now_ns = 10**10
+    role = Due("a", [], now_ns + 40_000_000)
+    hosted = Hosted(role, Network().transport("a", "E"), lambda: now_ns)
+    hosted.wake()
+    assert hosted.rest_ns() == 40_000_000
+    now_ns += 10_000_000
+    assert hosted.rest_ns() == 30_000_000
+    now_ns -= back_ms * 1_000_000
+    # Whoever asks first: it stays due until it has been woken.
+    assert hosted.rest_ns() <= 0
+    assert hosted.rest_ns() <= 0
+    hosted.wake()
+    assert role.log == ["a", "a"]
+    assert 0 < hosted.rest_ns() <= 200_000_000
+
+
 def test_a_role_that_fails_stops_all() -> None:
     class Failing(Due):
         def wake(self, now_ns: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ import pytest
 import dwell
 from dwell.live.agent import CpuCount
 from dwell.live.cell import Cell
-from dwell.live.group import ControlGroup, own_group
+from dwell.live.group import ControlGroup, Counts, own_group
 from dwell.live.loads import ProcessLoads
 from dwell.live.recording import RunRecorder
 from dwell.live.tables import columns_of, job_columns
@@ -74,16 +75,23 @@ def frames(problem: Problem, rows: Rows | dict[str, list[tuple[object, ...]]]) -
 
 
 def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
-    world = world_of(problem, "LOC")
+    world, group = world_of(problem, "LOC"), Spent(OTHERS_NS)
+
+    def counted() -> Counts:
+        at_ns = group()
+        return Counts(at_ns, 2 * at_ns, at_ns)
+
     for role in world.roles.values():
         worker = getattr(role, "worker", None)
         if worker is not None:
             worker.cpu_clock = Spent()
-            worker.others_clock = Spent(OTHERS_NS) if worker.place.node == "R2" else None
+            if worker.place.node == "R2":
+                worker.group_clock = counted
     world.run(4_000)
     jobs = frames(problem, world.recorder.rows)
     simulated = dwell.simulate(problem, policy="LOC", seed=1, windows=2, jobs=True).jobs
-    assert jobs.columns == [*simulated.columns, "shadow", "cpu_ns", "others_ns"]
+    spent = ["cpu_ns", "others_ns", "outside_ns", "handover_ns"]
+    assert jobs.columns == [*simulated.columns, "shadow", *spent]
 
     nodes = {"sensing": "R1", "perception": "R1", "planning": "R2", "control": "R2"}
     cycles = sorted(set(jobs["cycle"]))
@@ -99,8 +107,13 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
     assert not settled["shadow"].any()
     assert settled["cpu_ns"].unique().to_list() == [CPU_NS]
     # Only where something counts them.
-    others = {node: of["others_ns"].unique().to_list() for (node,), of in settled.group_by("node")}
-    assert others == {"R1": [None], "R2": [OTHERS_NS]}
+    assert settled.select("node", "others_ns", "outside_ns").unique().sort("node").rows() == [
+        ("R1", None, None),
+        ("R2", OTHERS_NS, 2 * OTHERS_NS),
+    ]
+    # From the end of a job to the start of the next on the same node; the stamper's has no count.
+    handed = settled.select("task", "handover_ns").unique(maintain_order=True).rows()
+    assert dict(handed) == {**dict.fromkeys(nodes), "control": OTHERS_NS}
     took = settled.with_columns(took=pl.col("end_ns") - pl.col("start_ns"))
     for task, exec_ms in EXEC_MS.items():
         assert took.filter(pl.col("task") == task)["took"].unique().to_list() == [exec_ms * MS]
@@ -233,8 +246,20 @@ def test_others_of_a_group_are_all_but_the_process_that_asks(tmp_path: Path) -> 
     counter = tmp_path / "cpuacct.usage"
     counter.write_text("1000000000000\n")
     before_ns = time.process_time_ns()
-    others_ns = ControlGroup(counter).others_ns()
-    assert before_ns <= 10**12 - others_ns <= time.process_time_ns()
+    found = ControlGroup(counter, tmp_path / "nowhere").counts()
+    assert before_ns <= 10**12 - found.others_ns <= time.process_time_ns()
+    assert (found.group_ns, found.outside_ns) == (10**12, -1)
+
+
+def test_version_1_counts_who_else_is_on_the_same_cpus(tmp_path: Path) -> None:
+    (tmp_path / "node").mkdir()
+    counter = tmp_path / "node" / "cpuacct.usage"
+    counter.write_text("7\n")
+    cpus = max(os.sched_getaffinity(0)) + 1
+    (tmp_path / "cpuacct.usage_percpu").write_text("100 " * cpus + "1000\n")
+    (tmp_path / "node" / "cpuacct.usage_percpu").write_text("30 " * cpus + "500\n")
+    group = ControlGroup(counter, tmp_path)
+    assert group.counts().outside_ns == 70 * len(os.sched_getaffinity(0))
 
 
 def test_a_group_of_version_2_counts_microseconds(tmp_path: Path) -> None:

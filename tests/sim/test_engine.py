@@ -692,6 +692,27 @@ def test_what_waits_while_jobs_run_takes_less_of_their_quota() -> None:
     assert stressed.windows["u_R1"].to_list() == pytest.approx([1.0] * 2, abs=0.02)
 
 
+def test_what_no_quota_counts_makes_the_core_slower_and_the_quota_last() -> None:
+    # Others have half of the core's time: the job has used up its 2.5 ms of every 10 after 5, and
+    # after three such periods it takes another millisecond for the last half of one.
+    node = Node("R1", "robot", 1, quota=Quota(0.25, 10.0), contention=0.5)
+    problem = make_problem(
+        [node],
+        [Task("work", {"R1": Execution(Constant(8.0))})],
+        period_ms=100.0,
+        window_cycles=5,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    assert set(run.cycles["latency_ns"].to_list()) == {31 * MS}
+    assert run.windows["u_R1"].to_list() == pytest.approx([8.0 / 25.0] * 2)
+    ticking = replace(node, quota=Quota(0.25, 10.0, slack_ms=1.0, tick_ms=4.0))
+    fabric = replace(problem.fabric, nodes={"R1": ticking})
+    run = dwell.simulate(replace(problem, fabric=fabric), policy="LOC", seed=1, windows=20)
+    assert run.windows["u_R1"].mean() == pytest.approx(8.0 / 25.0, rel=0.01)
+    # What ticks notice late is made up for later; faster than its pace the job never is.
+    assert run.cycles["latency_ns"].min() >= 16 * MS
+
+
 def test_threads_that_hand_a_job_on_wait_for_their_turns() -> None:
     # One core, nothing used up: a foreign thread, ticks every 4 ms. The job's reader comes first as
     # soon as the foreign one has had its 1.4 ms, its worker waits as any new thread does.

@@ -65,6 +65,7 @@ BACKGROUND = {"R1": 0.06, "E": 0.1}
 BESIDE = {"R1": 0.04, "E": 0.05}
 #: Of E, the only node that a run stresses.
 INTERFERENCE = 1.25
+CONTENTION = {"R1": 0.15, "E": 0.1}
 ADDED_MS = 0.35
 WINDOWS = 60
 BASE = 20_000
@@ -102,6 +103,7 @@ def truth(nominal: Path) -> Problem:
                 background=BACKGROUND[node],
                 background_beside=BESIDE[node],
                 interference=INTERFERENCE if node == "E" else 1.0,
+                contention=CONTENTION[node],
             )
             for node, of in problem.fabric.nodes.items()
         },
@@ -147,7 +149,10 @@ def observed(truth: Problem, nominal: Path, placement: str, scenario: str = "bas
     )
     beside = pl.col("node").cast(pl.String).replace_strict(BESIDE, return_dtype=pl.Float64)
     took_ns = pl.col("end_ns") - pl.col("start_ns")
-    jobs = jobs.with_columns(others_ns=(beside * took_ns).cast(pl.Int64))
+    outside = pl.col("node").cast(pl.String).replace_strict(CONTENTION, return_dtype=pl.Float64)
+    jobs = jobs.with_columns(
+        others_ns=(beside * took_ns).cast(pl.Int64), outside_ns=(outside * took_ns).cast(pl.Int64)
+    )
     document = to_document(dwell.load(nominal))
     meta = {**played.meta, "kind": "live", "scenario": scenario, "problem": document}
     tables: Mapping[str, Any] = {
@@ -218,6 +223,7 @@ def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
         found = calibrated.problem.fabric.nodes[node]
         assert found.interference == pytest.approx(INTERFERENCE if node == "E" else 1.0, rel=0.05)
         assert found.background_beside == pytest.approx(BESIDE[node], abs=0.001)
+        assert found.contention == pytest.approx(CONTENTION[node], abs=0.001)
     assert calibrated.problem.fabric.nodes["R1"].quota == Quota(0.4, 4)
     for link in ("R1->E", "E->R1"):
         assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.25)

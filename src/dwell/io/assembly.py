@@ -208,6 +208,7 @@ class Assembly:
                 background=entry.background,
                 background_beside=entry.background_beside,
                 interference=entry.interference,
+                contention=entry.contention,
             ),
         )
 

@@ -363,6 +363,11 @@ class NodeEntry(Entry):
         description="How many times as much core time jobs take while foreign threads run; "
         "default 1.",
     )
+    contention: Annotated[float, Number(bounds.CONTENTION)] | None = Field(
+        None,
+        description="Share of a CPU's time that others take from what runs there, and that the "
+        "node's quota does not count; default 0.",
+    )
     bursts: NodeBurstsEntry | None = Field(None, description="Foreign work, in every scenario.")
 
 

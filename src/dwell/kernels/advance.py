@@ -96,6 +96,7 @@ from dwell.kernels.layout import (
     NODE_DOWN,
     NODE_OF,
     OUT_0,
+    PACE,
     PARENT,
     PAUSE,
     PAUSED,
@@ -198,7 +199,8 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
                 own += received
             elif whose == shadow:
                 extra += received
-        out[cell, row, 0, node] = s.servers[server, BUSY] + s.servers_f[server, BEHIND_NS]
+        busy = s.servers[server, BUSY] * s.servers_f[server, PACE]
+        out[cell, row, 0, node] = busy + s.servers_f[server, BEHIND_NS]
         out[cell, row, 1, node] = own
         out[cell, row, 2, node] = extra
 

@@ -137,7 +137,9 @@ FOREIGN = _number(-1)
 # servers
 # TICK_NS is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last tick
 # was TICK_AGO and the last begin of a period PERIOD_AGO ago. TURN says whether a thread has the
-# turn, TURN_V what it had received before, and TURN_NS what since.
+# turn, TURN_V what it had received before, and TURN_NS what since; a turn lasts LEAST_NS at least.
+# DRAWN_NS is what is drawn on a pool at a time. All that a quota counts is in time of the core: of
+# that, what runs receives the share PACE.
 (
     SCHEDULER,
     CORES,
@@ -169,11 +171,13 @@ FOREIGN = _number(-1)
     TURN,
     TURN_V,
     TURN_NS,
+    LEAST_NS,
+    DRAWN_NS,
     N_SERVER,
-) = range(31)
+) = range(33)
 
 # servers, float64
-VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, N_SERVER_F = range(7)
+VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, PACE, N_SERVER_F = range(8)
 
 # hops
 LINK, PAYLOAD, N_HOP = range(3)

@@ -37,6 +37,7 @@ from dwell.kernels.layout import (
     CYCLE_SHIFT,
     DIRTY,
     DOWN,
+    DRAWN_NS,
     FAIR,
     FIFO,
     FIRST,
@@ -44,6 +45,7 @@ from dwell.kernels.layout import (
     ITEM_MASK,
     KIND_SHIFT,
     LAST,
+    LEAST_NS,
     LEFT_NS,
     N_DIRTY,
     N_READY,
@@ -52,6 +54,7 @@ from dwell.kernels.layout import (
     NEED,
     NEXT_KEY,
     NEXT_T,
+    PACE,
     PERIOD,
     PERIOD_AGO,
     PERIOD_NS,
@@ -98,10 +101,6 @@ __all__ = [
 
 # Work left below this many nanoseconds is rounding, not work.
 SLACK = 1e-3
-# What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
-# run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much).
-DRAWN_NS = 5_000_000
-LEAST_TURN_NS = 1_400_000
 # Of those that have received the same, jobs go first.
 LATE = 1 << 62
 
@@ -212,7 +211,8 @@ def _strike(s: Tables, server: int, now: int) -> None:
 @phase
 def _pass_on(s: Tables, server: int) -> None:
     """Pass the turn on, if it has lasted long enough; the clock must be up to date."""
-    if s.servers[server, TURN_NS] < LEAST_TURN_NS or s.servers[server, THROTTLED] != 0:
+    short = s.servers[server, TURN_NS] < s.servers[server, LEAST_NS]
+    if short or s.servers[server, THROTTLED] != 0:
         return
     received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
     if s.servers[server, N_RUN] == 0:
@@ -237,7 +237,7 @@ def _notice(s: Tables, server: int, now: int) -> None:
     _renew(s, server, now)
     left = s.servers[server, LEFT_NS]
     if left <= 0:
-        wanted = 1 if s.servers[server, THROTTLED] != 0 else DRAWN_NS
+        wanted = 1 if s.servers[server, THROTTLED] != 0 else s.servers[server, DRAWN_NS]
         drawn = min(s.servers[server, POOL_NS], wanted - left)
         s.servers[server, POOL_NS] -= drawn
         s.servers[server, LEFT_NS] = left + drawn
@@ -304,7 +304,7 @@ def set_speed(s: Tables, server: int) -> None:
 
     With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
     c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: less by
-    what foreign threads interfere, and 0 while the quota is used up.
+    what others contend for and foreign threads interfere, and 0 while the quota is used up.
     """
     spare = s.servers_f[server, SPARE]
     stress = s.servers[server, STRESS]
@@ -312,11 +312,14 @@ def set_speed(s: Tables, server: int) -> None:
         load = s.servers[server, USED] + stress
         s.servers_f[server, SPEED] = 1.0 if load <= spare else spare / load
     elif s.servers[server, SCHEDULER] == TURNS:
+        need = 1
         if s.servers[server, N_RUN] > 0:
             row = key_row(s.ring, s.stride, s.run_key[index(s.servers[server, BASE])])
-            s.servers_f[server, SPEED] = 1.0 / s.sites[index(s.jobs[row, SITE]), NEED]
+            need = s.sites[index(s.jobs[row, SITE]), NEED]
+        s.servers_f[server, SPEED] = 1.0 / need
     else:
         s.servers_f[server, SPEED] = spare / (s.servers[server, CORES] + stress)
+    s.servers_f[server, SPEED] *= s.servers_f[server, PACE]
     if stress > 0:
         s.servers_f[server, SPEED] *= s.servers_f[server, BESIDE]
     if s.servers[server, THROTTLED] != 0:

@@ -7,7 +7,7 @@ another node of which nothing is known is taken to have been lost.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 import msgspec
@@ -60,6 +60,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     ----------
     stamped_ns : int or None
         When its stamp was heard, on the controller's clock.
+    group_ns : int
+        CPU time that the control group of the stamper's node had taken when it was released.
     reports : dict of str to Completion
         By sink.
     heard_ns : dict of str to int
@@ -92,6 +94,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     origin_ns: int
     heard: bool
     stamped_ns: int | None = None
+    group_ns: int = UNKNOWN
     reports: dict[str, Completion] = {}
     heard_ns: dict[str, int] = {}
     shadows: tuple[Completion, ...] = ()
@@ -172,6 +175,7 @@ class Ledger:
         pipeline = problem.pipeline
         self.sinks = frozenset(name for name in pipeline.tasks if not pipeline.outputs(name))
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
+        self._stamper_node = problem.stamper_node
         self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
         self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
         self._codes = {name: code for code, name in enumerate(problem.candidates)}
@@ -269,10 +273,33 @@ class Ledger:
             if known is None or known.ended_ns == UNKNOWN:
                 found[shadow, hop.task, hop.node] = hop
         order = sorted(found, key=lambda key: (key[0], self._tasks[key[1]]))
-        rows = [self._job_row(cycle, found[key], shadow=key[0]) for key in order]
+        rows = []
+        for key in order:
+            hop = found[key]
+            handover_ns = self._handover_ns(cycle, hop, found, shadow=key[0])
+            rows.append(self._job_row(cycle, hop, handover_ns, shadow=key[0]))
         return [row for row in rows if row is not None]
 
-    def _job_row(self, cycle: LiveCycle, hop: Hop, *, shadow: bool) -> Row | None:
+    def _handover_ns(
+        self,
+        cycle: LiveCycle,
+        hop: Hop,
+        found: Mapping[tuple[bool, str, str], Hop],
+        *,
+        shadow: bool,
+    ) -> int:
+        """CPU time that a node took between a release, or its job before, and a job of it."""
+        flows = self._pipeline.inputs(hop.task)
+        before_ns = UNKNOWN
+        if not flows and hop.node == self._stamper_node:
+            before_ns = cycle.group_ns
+        elif len(flows) == 1 and (shadow, flows[0].source, hop.node) in found:
+            before_ns = found[shadow, flows[0].source, hop.node].group_ns[1]
+        begun_ns = hop.group_ns[0]
+        known = UNKNOWN not in (before_ns, begun_ns) and begun_ns >= before_ns
+        return begun_ns - before_ns if known else UNKNOWN
+
+    def _job_row(self, cycle: LiveCycle, hop: Hop, handover_ns: int, *, shadow: bool) -> Row | None:
         ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
         if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
             return None
@@ -282,10 +309,11 @@ class Ledger:
             ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
         who = cycle.row, hop.task, hop.node, ready_ns
         if hop.ended_ns == UNKNOWN:
-            return (*who, None, None, "replaced", shadow, None, None)
+            return (*who, None, None, "replaced", shadow, None, None, None, None)
         start_ns = max(self._since_origin(cycle, hop.node, hop.started_ns), ready_ns)
         end_ns = max(self._since_origin(cycle, hop.node, hop.ended_ns), start_ns)
-        spent = (None if ns == UNKNOWN else ns for ns in (hop.cpu_ns, hop.others_ns))
+        counts = hop.cpu_ns, hop.others_ns, hop.outside_ns, handover_ns
+        spent = (None if ns == UNKNOWN else ns for ns in counts)
         return (*who, start_ns, end_ns, "done", shadow, *spent)
 
     # ----------------------------------------------------------------------- evidence

@@ -2,18 +2,49 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from dwell.errors import LiveError
 
-__all__ = ["ControlGroup", "own_group"]
+__all__ = ["ControlGroup", "Counts", "own_group"]
 
+UNKNOWN = -1
 PROCESS = Path("/proc/self")
 #: What counts CPU time in a group's folder: of version 1 and 2.
 COUNTERS = {"cgroup": "cpuacct.usage", "cgroup2": "cpu.stat"}
+#: Version 1 also counts by CPU.
+BY_CPU = "cpuacct.usage_percpu"
+
+
+class Counts(NamedTuple):
+    """CPU time that others than a process have taken, ns; `UNKNOWN` where that is not counted.
+
+    Parameters
+    ----------
+    others_ns : int
+        The other processes of its group.
+    outside_ns : int
+        Those of no such group, on the CPUs that it may run on; version 2 does not count it.
+    group_ns : int
+        Its group, itself included.
+    """
+
+    others_ns: int = UNKNOWN
+    outside_ns: int = UNKNOWN
+    group_ns: int = UNKNOWN
+
+    def since(self, before: Counts) -> tuple[int, int]:
+        """Return what others of the group, and those outside of it, have taken since."""
+        others_ns, outside_ns = (
+            UNKNOWN if UNKNOWN in (then, now) else max(now - then, 0)
+            for then, now in zip(before[:2], self[:2], strict=True)
+        )
+        return others_ns, outside_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +55,12 @@ class ControlGroup:
     ----------
     counter : Path
         ``cpuacct.usage`` (version 1, nanoseconds) or ``cpu.stat`` (version 2, microseconds).
+    root : Path
+        Folder of the group that all are in.
     """
 
     counter: Path
+    root: Path = Path()
 
     def used_ns(self) -> int:
         """CPU time that its processes have taken, those that have ended included.
@@ -36,6 +70,8 @@ class ControlGroup:
         LiveError
             If that cannot be read.
         """
+        # This clock brings the group's counter up to date with the thread that asks.
+        time.process_time_ns()
         try:
             text = self.counter.read_text()
             if self.counter.name == COUNTERS["cgroup"]:
@@ -44,17 +80,27 @@ class ControlGroup:
         except (OSError, ValueError, KeyError) as error:
             raise LiveError(f"{self.counter}: cannot be read ({error})") from None
 
-    def others_ns(self) -> int:
-        """CPU time that its processes but this one have taken.
+    def counts(self) -> Counts:
+        """What has been taken by now.
 
         Raises
         ------
         LiveError
             If that cannot be read.
         """
-        # This clock brings the group's counter up to date with the thread that asks.
         own_ns = time.process_time_ns()
-        return self.used_ns() - own_ns
+        group_ns = self.used_ns()
+        return Counts(group_ns - own_ns, self._outside_ns(), group_ns)
+
+    def _outside_ns(self) -> int:
+        taken = []
+        for folder in (self.root, self.counter.parent):
+            try:
+                by_cpu = (folder / BY_CPU).read_text().split()
+                taken.append(sum(int(by_cpu[cpu]) for cpu in os.sched_getaffinity(0)))
+            except (OSError, ValueError, IndexError):
+                return UNKNOWN
+        return taken[0] - taken[1]
 
 
 def own_group(process: Path = PROCESS) -> ControlGroup | None:
@@ -77,7 +123,7 @@ def own_group(process: Path = PROCESS) -> ControlGroup | None:
             continue
         counter = folder / group.removeprefix(root).lstrip("/") / COUNTERS[kind]
         if group != root and counter.is_file():
-            return ControlGroup(counter)
+            return ControlGroup(counter, folder)
     return None
 
 

@@ -74,7 +74,7 @@ class Hosted:
         self.hurry = hurry or threading.Event()
         self._heard = heard
         self.news = threading.Semaphore(0)
-        self._due_ns = 0
+        self._due_ns = self._seen_ns = 0
         for key in role.subscriptions():
             transport.subscribe(key, self._receive)
 
@@ -93,9 +93,12 @@ class Hosted:
 
     def rest_ns(self) -> int:
         """Time until the role is due; negative where it is late."""
-        rest_ns = self._due_ns - self.clock()
-        # Nobody is left alone for longer: where it is more, the clock has been set back.
-        return rest_ns if rest_ns <= LONGEST_SLEEP_S * 1e9 else 0
+        now_ns = self.clock()
+        if now_ns < self._seen_ns:
+            # The clock has been set back, and what is due with it: nobody knows for how long.
+            self._due_ns = now_ns
+        self._seen_ns = now_ns
+        return self._due_ns - now_ns
 
     def wake(self) -> None:
         """Have the role do what is due."""

@@ -42,6 +42,8 @@ MAX_CONTROL_BYTES = 262_144
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+#: CPU time; -1 where it is not known.
+Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)]
 Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-(1 << 62), lt=1 << 62)]
 Forks: TypeAlias = Annotated[tuple[tuple[Name, Name], ...], msgspec.Meta(max_length=16)]
 Words: TypeAlias = Annotated[str, msgspec.Meta(max_length=2_000)]
@@ -90,9 +92,13 @@ class Stamped(Stamp, array_like=True, frozen=True, gc=False):
     intervals : tuple of (int, int)
         Earlier cycles of the run, and how long they took by the stamper's clock alone, ns (see
         `dwell.live.intervals`). Each is told once.
+    group_ns : int
+        CPU time that the control group of the stamper's node had taken at the release; -1 where
+        that is not known.
     """
 
     intervals: Annotated[tuple[tuple[Count, Count], ...], msgspec.Meta(max_length=64)] = ()
+    group_ns: Spent = -1
 
 
 class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -111,9 +117,11 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
         -1 otherwise.
     cpu_ns : int
         CPU time that the stage took (see `Worker.run`); -1 where it was not called.
-    others_ns : int
-        CPU time that other processes of the node's control group took meanwhile; -1 where that is
-        not known.
+    others_ns, outside_ns : int
+        CPU time that other processes of the node's control group took meanwhile, and on its CPUs
+        those of no such group; -1 where that is not known.
+    group_ns : tuple of int
+        CPU time that the group had taken when the stage was called, and when it returned.
     """
 
     task: Name
@@ -123,8 +131,10 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     ended_ns: Instant
     inputs: Annotated[tuple[tuple[Name, Instant], ...], msgspec.Meta(max_length=64)] = ()
     state_age: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
-    cpu_ns: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
-    others_ns: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
+    cpu_ns: Spent = -1
+    others_ns: Spent = -1
+    outside_ns: Spent = -1
+    group_ns: tuple[Spent, Spent] = (-1, -1)
 
 
 class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
@@ -420,7 +430,8 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Whose order it answers.
     refused : str
         Empty where it was accepted; else ``stale term``, ``stale run``, ``stale order``,
-        ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``, with details.
+        ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``,
+        with details.
     run, term : int
     placement : str
         What holds now.

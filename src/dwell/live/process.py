@@ -11,7 +11,7 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
-from dwell.live.group import own_group
+from dwell.live.group import ControlGroup, own_group
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.messages import Header
@@ -66,6 +66,8 @@ def _run(
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
         stamper = Stamper(place, book, time.time_ns(), clock_of(problem, role.node)())
+        group = _group(problem, role.node)
+        stamper.group_clock = None if group is None else group.used_ns
         _host(stamper, place, stopped)
     elif role.kind == "sink":
         actuator = _actuator(problem, role.task)
@@ -74,6 +76,11 @@ def _run(
         _host(Sink(place, role.task, actuator, highest, expected), place, stopped)
     else:
         _work(problem, role, place, folder, stopped)
+
+
+def _group(problem: Problem, node: str) -> ControlGroup | None:
+    """What counts the CPU time of a node with a quota."""
+    return own_group() if problem.fabric.nodes[node].quota is not None else None
 
 
 def _host(role: Role, place: Place, stopped: threading.Event) -> None:
@@ -112,8 +119,9 @@ def _work(
         shadow=role.kind == "shadow",
         stands_by=f"{role.task}@{role.node}" if role.kind == "standby" else "",
     )
-    group = own_group() if problem.fabric.nodes[role.node].quota is not None else None
-    worker.others_clock = None if group is None else group.others_ns
+    group = _group(problem, role.node)
+    if group is not None:
+        worker.group_clock = group.counts
     inflight = InFlight(folder / f"{role.who}.inflight")
     _again(worker, folder / f"{role.who}.again")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -126,6 +126,8 @@ class Stamper:
         #: Highest number of an order that was carried out; numbers grow from controller to
         #: controller, as they begin with the time of day.
         self._newest = 0
+        #: CPU time that the node's control group has taken, where something counts it.
+        self.group_clock: Callable[[], int] | None = None
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
 
@@ -365,6 +367,7 @@ class Stamper:
 
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""
+        group_ns = self._group_ns()
         if self.cycle + 1 >= self._reserved:
             self._reserved = self.cycle + RESERVED
             self._write(on_fallback=self.guard.on_fallback)
@@ -380,11 +383,17 @@ class Stamper:
         self._send(stamp, here=True, elsewhere=early is None)
         # A beat wakes every process, and would take the source's turn.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)
-        told = Stamped(*stamp.fields, self.intervals.news())
+        told = Stamped(*stamp.fields, self.intervals.news(), group_ns)
         self.place.transport.put(self.place.keys.stamped(), encode(told))
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
             self._send(self._ahead, here=False, elsewhere=True)
+
+    def _group_ns(self) -> int:
+        try:
+            return -1 if self.group_clock is None else self.group_clock()
+        except LiveError:
+            return -1
 
     def _sources(self) -> Iterator[Destination]:
         """Source tasks wherever some candidate has them."""

@@ -28,7 +28,7 @@ from dwell.control import ClosedWindow, Controller, final_l95_ms
 from dwell.errors import LiveError
 from dwell.live.cycles import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
-from dwell.live.messages import Completion, Load, Stamp
+from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.tables import Row, cycle_row, decision_rows, sends_shadows, window_row
 from dwell.model import Problem
@@ -184,12 +184,15 @@ class LiveWindows:
         Parameters
         ----------
         stamp : Stamp
+            A `Stamped` says more of it.
         at_ns : int, optional
             When this was heard, on the controller's clock.
         """
         cycle = self._note(stamp, at_ns)
         if cycle is not None and cycle.stamped_ns is None:
             cycle.stamped_ns = at_ns
+            if isinstance(stamp, Stamped):
+                cycle.group_ns = stamp.group_ns
 
     def completed(self, completion: Completion, at_ns: int | None = None) -> None:
         """A sink has had a cycle's command, or a cycle or its shadow has ended before that.

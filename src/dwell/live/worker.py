@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from dwell.errors import LiveError
+from dwell.live.group import Counts
 from dwell.live.keys import CONTROLLER, MAIN, SHADOW
 from dwell.live.messages import (
     Completion,
@@ -36,6 +37,7 @@ MAX_JOINS = 64
 SHADOW_BEAT = 10
 UNKNOWN = -1
 NEVER_NS = 1 << 62
+NOT_COUNTED = Counts(), UNKNOWN, Counts()
 
 
 @dataclass(slots=True)
@@ -206,9 +208,9 @@ class Worker:
         #: threads is charged with all that its process does meanwhile.
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
         self.cpu_clock: Callable[[], int] = time.thread_time_ns if alone else time.process_time_ns
-        #: CPU time that the other processes of the node have taken, where something counts it.
-        self.others_clock: Callable[[], int] | None = None
-        self._cpu_ns = self._others_ns = UNKNOWN
+        #: What others have taken of the node, where something counts it.
+        self.group_clock: Callable[[], Counts] | None = None
+        self._counted: tuple[Counts, int, Counts] = NOT_COUNTED
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
         self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
@@ -493,7 +495,7 @@ class Worker:
         the node took meanwhile, where something counts it.
         """
         stamp = job.header.stamp
-        self._cpu_ns = self._others_ns = UNKNOWN
+        self._counted = NOT_COUNTED
         state_age = self._recover(job) if self._stateful else UNKNOWN
         released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
         try:
@@ -509,29 +511,28 @@ class Worker:
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return None, state_age
-        others_ns = self._others()
+        before = self._counts()
         begun_ns = self.cpu_clock()
         try:
             output = self.stage.process(inputs)
         except Exception as error:  # the user's code
             self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
             return None, state_age
-        self._cpu_ns = max(self.cpu_clock() - begun_ns, 0)
-        if others_ns != UNKNOWN and (later_ns := self._others()) != UNKNOWN:
-            self._others_ns = max(later_ns - others_ns, 0)
+        cpu_ns = max(self.cpu_clock() - begun_ns, 0)
+        self._counted = before, cpu_ns, self._counts()
         if not isinstance(output, Message):
             what = type(output).__name__
             self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")
             return None, state_age
         return output, state_age
 
-    def _others(self) -> int:
-        if self.others_clock is None:
-            return UNKNOWN
+    def _counts(self) -> Counts:
+        if self.group_clock is None:
+            return Counts()
         try:
-            return self.others_clock()
+            return self.group_clock()
         except LiveError:
-            return UNKNOWN
+            return Counts()
 
     def finish(
         self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1
@@ -555,8 +556,11 @@ class Worker:
             return
         self.trouble = ""
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
-        spent = state_age, self._cpu_ns, self._others_ns
-        hop = Hop(self.task, place.node, job.arrived_ns, started_ns, ended_ns, inputs, *spent)
+        times = job.arrived_ns, started_ns, ended_ns
+        before, cpu_ns, after = self._counted
+        spent = cpu_ns, *after.since(before)
+        group_ns = before.group_ns, after.group_ns
+        hop = Hop(self.task, place.node, *times, inputs, state_age, *spent, group_ns)
         seal, hops = job.header.seal, (*job.hops(), hop)
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)

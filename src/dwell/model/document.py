@@ -161,6 +161,7 @@ def _node(node: Node) -> Document:
             "background": node.background or None,
             "background_beside": node.background_beside,
             "interference": node.interference if node.interference > 1.0 else None,
+            "contention": node.contention or None,
             "bursts": _bursts(
                 f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
             ),

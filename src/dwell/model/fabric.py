@@ -11,6 +11,7 @@ from dwell.model.bounds import (
     ACCELERATORS,
     BACKGROUND,
     BURST_MEAN,
+    CONTENTION,
     CORES,
     FOREIGN_THREADS,
     INTERFERENCE,
@@ -109,6 +110,9 @@ class Node:
     interference : float
         How many times as much core time jobs take while foreign threads run, whose data take the
         place of theirs in the caches; at least 1.
+    contention : float
+        Share of a CPU's time that others take from what runs there, and that no quota counts: what
+        else a machine does whose CPUs the node has not for itself. Only of a node with a quota.
     """
 
     name: str
@@ -121,6 +125,7 @@ class Node:
     background: float = 0.0
     background_beside: float | None = None
     interference: float = 1.0
+    contention: float = 0.0
 
     def __post_init__(self) -> None:
         require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
@@ -141,6 +146,10 @@ class Node:
             require(0.0 <= beside <= self.background, "background_beside", beside, bound)
             bound = "left out: only a quota gives others something to wait for"
             require(self.quota is not None, "background_beside", beside, bound)
+        CONTENTION.check("contention", self.contention)
+        if self.contention > 0.0:
+            bound = "0 where there is no quota; elsewhere it is `background`"
+            require(self.quota is not None, "contention", self.contention, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
@@ -155,6 +164,15 @@ class Node:
     def spare(self) -> float:
         """Cores that jobs and foreign threads share; a quota is what the background takes from."""
         return float(self.cores) if self.quota is not None else self.cores - self.background
+
+    @property
+    def pace(self) -> float:
+        """Core time that what runs on a core receives of its time."""
+        return 1.0 - self.contention
+
+    def wall_ns(self, core_ms: float) -> int:
+        """Time in which what runs on a core receives so much core time."""
+        return round(core_ms * 1e6 / self.pace)
 
     @property
     def budget_ms(self) -> float:

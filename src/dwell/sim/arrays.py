@@ -17,6 +17,9 @@ __all__ = ["Arrays", "lay_out"]
 
 SCHEDULER_CODE = {"fair": k.FAIR, "fifo": k.FIFO, "priority": k.PRIORITY}
 RING_START = 64
+#: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
+#: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
+DRAWN_MS, LEAST_MS = 5.0, 1.4
 
 
 class Arrays:
@@ -149,15 +152,16 @@ class _Layout:
             cpu = self._add_server(key, None, scheduler, node.cores)
             of = self.servers_f[-1]
             of[k.SPARE], of[k.BACKGROUND] = node.spare, node.background
-            of[k.BESIDE] = 1.0 / node.interference
-            of[k.SPEED] = 1.0 if node.scheduler == "fair" else node.spare / node.cores
+            of[k.BESIDE], of[k.PACE] = 1.0 / node.interference, node.pace
+            of[k.SPEED] = node.pace * (1.0 if node.scheduler == "fair" else node.spare / node.cores)
             cpu[k.QUOTA_T] = -1
             if node.quota is not None:
                 period_ns = round(node.quota.period_ms * 1e6)
-                quota_ns = max(round(node.budget_ms * 1e6), 1)
+                quota_ns = max(node.wall_ns(node.budget_ms), 1)
                 cpu[k.PERIOD_NS], cpu[k.QUOTA_NS] = period_ns, quota_ns
-                cpu[k.STRESSED_NS] = max(round(node.stressed_budget_ms * 1e6), 1)
-                cpu[k.SLACK_NS] = round(node.quota.slack_ms * 1e6)
+                cpu[k.STRESSED_NS] = max(node.wall_ns(node.stressed_budget_ms), 1)
+                cpu[k.SLACK_NS] = node.wall_ns(node.quota.slack_ms)
+                cpu[k.LEAST_NS], cpu[k.DRAWN_NS] = node.wall_ns(LEAST_MS), node.wall_ns(DRAWN_MS)
                 cpu[k.TICK_NS] = round(node.quota.tick_ms * 1e6)
                 pooled = cpu[k.SLACK_NS] or cpu[k.TICK_NS]
                 cpu[k.POOL_NS if pooled else k.LEFT_NS] = quota_ns
@@ -174,7 +178,7 @@ class _Layout:
         self.server_row[node, kind] = len(self.servers)
         self.servers.append(row)
         self.servers_f.append([0.0] * k.N_SERVER_F)
-        self.servers_f[-1][k.BESIDE] = 1.0
+        self.servers_f[-1][k.BESIDE] = self.servers_f[-1][k.PACE] = 1.0
         self.servers_f[-1][k.SPEED], self.servers_f[-1][k.SPARE] = 1.0, float(cores)
         self.server_workers.append(0)
         return row

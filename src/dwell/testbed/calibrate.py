@@ -27,6 +27,7 @@ from dwell.testbed.measured import (
     Site,
     backgrounds,
     beside_jobs,
+    contentions,
     interferences,
     look_at,
     messaging,
@@ -126,8 +127,11 @@ def calibrate(
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
     beside, usual_ms = beside_jobs(measured, behind), usual_work_ms(measured)
-    more = interferences(measured, found)
-    _put_in(document, samples.name, found, delays_ms, behind, beside, more)
+    more, others = interferences(measured, found), contentions(measured)
+    _put_in(document, samples.name, found, delays_ms, behind, beside)
+    for name, of_nodes in (("interference", more), ("contention", others)):
+        for node, value in of_nodes.items():
+            document["nodes"][node][name] = _short(value)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
@@ -144,6 +148,7 @@ def calibrate(
         },
         "background": {node: _short(value) for node, value in behind.items()},
         "interference": {node: _short(value) for node, value in more.items()},
+        "contention": {node: _short(value) for node, value in others.items()},
         "work_ms": {node: _short(value) for node, value in usual_ms.items()},
         "background_beside": {node: _short(value) for node, value in beside.items()},
         "check": [row for one in measured if (row := _check(one, written, usual_ms)) is not None],
@@ -321,7 +326,6 @@ def _put_in(
     delays_ms: Mapping[str, Floats],
     behind: Mapping[str, float],
     beside: Mapping[str, float],
-    more: Mapping[str, float],
 ) -> None:
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
@@ -337,8 +341,6 @@ def _put_in(
         document["nodes"][node].pop("background_beside", None)
         if node in beside and document["nodes"][node].get("quota"):
             document["nodes"][node]["background_beside"] = _short(beside[node])
-    for node, factor in more.items():
-        document["nodes"][node]["interference"] = _short(factor)
     links = []
     for entry in document.get("links") or ():
         ways = [(entry["from"], entry["to"])]
@@ -454,6 +456,8 @@ def _told(report: Mapping[str, Any]) -> list[str]:
         beside = report["background_beside"].get(node)
         more = "" if beside is None else f", {beside:.3g} while jobs run"
         lines.append(f"{node}: background {value:.3g} cores{more}")
+    for node, value in report["contention"].items():
+        lines.append(f"{node}: others have {value:.3g} of its CPUs while jobs run")
     for node, value in report["interference"].items():
         lines.append(f"{node}: stages take {value:.3g} times as long beside foreign threads")
     for row in report["check"]:

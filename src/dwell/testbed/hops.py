@@ -84,7 +84,7 @@ def hops(
     for hop, gap_ms in gaps_ms.items():
         source, target, node, to = hop
         if node == to and sum(whole[hop]) > 0:
-            part = min(gap_ms / sum(whole[hop]), 1.0)
+            part = gap_ms / sum(whole[hop])
             parts.setdefault((source, node), []).append(part)
             parts.setdefault((target, to), []).append(part)
     found = {}
@@ -106,14 +106,20 @@ def hops(
 def _gaps(
     measured: Sequence[Measured], problem: Problem, asked_ms: Mapping[Link, Floats]
 ) -> dict[HopName, float]:
-    """Time of the quickest messages beyond their link's delay and transmission, ms."""
+    """Time of the quickest messages beyond their link's delay and transmission, ms.
+
+    On one node it is what the node took meanwhile, where something counts it.
+    """
     gaps: dict[HopName, list[float]] = {}
-    for hop, delay_ms in _undisturbed(measured):
-        own_ms = 0.0
+    for one, hop, delay_ms in _undisturbed(measured):
+        own_ms, end = 0.0, (hop[1], hop[3])
         if hop[2] != hop[3]:
             asked = asked_ms.get(hop[2:])
             own_ms = -math.inf if asked is None else float(np.quantile(asked, QUICK))
         gap_ms = float(np.quantile(delay_ms, QUICK)) - own_ms - _transmission_ms(hop, problem)
+        if hop[2] == hop[3] and end in one.handovers_ms:
+            # The start of the next job is that job's own.
+            gap_ms = one.handovers_ms[end] - one.begins_ms.get(end, 0.0)
         gaps.setdefault(hop, []).append(gap_ms)
     return {hop: max(float(np.median(seen)), 0.0) for hop, seen in gaps.items()}
 
@@ -144,7 +150,7 @@ def share(problem: Problem, task: str, source: str, target: str) -> float:
 def floors(measured: Sequence[Measured], known: OnTheWay, problem: Problem) -> dict[Link, float]:
     """What the messages of every emulated link take beyond what was asked of it, ms."""
     over: dict[Link, list[float]] = {}
-    for hop, delay_ms in _undisturbed(measured):
+    for _, hop, delay_ms in _undisturbed(measured):
         asked = known.asked_ms.get(hop[2:])
         if asked is not None:
             quick_ms = float(np.quantile(delay_ms, QUICK) - np.quantile(asked, QUICK))
@@ -157,19 +163,19 @@ def own_delays(
 ) -> dict[Link, Floats]:
     """Delays of every link as they were measured, ms, for links that nobody emulates."""
     delays: dict[Link, list[Floats]] = {}
-    for hop, delay_ms in _undisturbed(measured):
+    for _, hop, delay_ms in _undisturbed(measured):
         if "->".join(hop[2:]) in problem.fabric.links:
             own_ms = delay_ms - known.known_ms(hop, problem)
             delays.setdefault(hop[2:], []).append(np.maximum(own_ms, 0.0))
     return {link: np.concatenate(values) for link, values in delays.items()}
 
 
-def _undisturbed(measured: Sequence[Measured]) -> Iterator[tuple[HopName, Floats]]:
+def _undisturbed(measured: Sequence[Measured]) -> Iterator[tuple[Measured, HopName, Floats]]:
     for one in measured:
         for hop, delay_ms in one.delays_ms.items():
             hindered = set(hop[2:]) & one.disturbed.nodes or hop[2:] in one.disturbed.links
             if not hindered and len(delay_ms) >= LEAST_JOBS:
-                yield hop, delay_ms
+                yield one, hop, delay_ms
 
 
 def _transmission_ms(hop: HopName, problem: Problem) -> float:

@@ -7,9 +7,10 @@ messages on one node, and of what they cost, is told so by way of the execution 
 - a worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. Runs in which it has jobs
   and runs in which it has none tell the two apart; a worker that always has jobs idles like others;
 - of the overhead, what lies on the way of messages delays the cycle (`dwell.testbed.hops`);
-- a job takes, besides, what passes between its last input, or a source's release, and its start,
-  and a sink's what passes between its end and the command's hand-over, as where the quota does not
-  interfere.
+- a job takes, besides, what passes between its last input and its start, and a sink's what passes
+  between its end and the command's hand-over, as where the quota does not interfere;
+- where something counts what a node takes between a release and its source's start, or between two
+  jobs of a cycle that both run on it, the job takes that: whoever takes it, the job waits for it.
 
 Everything else that a node does (agents, stampers, sinks, the controller, workers without jobs and
 the messaging that delays nothing) is its background. A link adds to the delay that is asked of it
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 from dwell.model import Flow, Problem
+from dwell.model.bounds import CONTENTION
 from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
 from dwell.testbed.speeds import work_ms
@@ -44,6 +46,7 @@ __all__ = [
     "Visit",
     "backgrounds",
     "beside_jobs",
+    "contentions",
     "interferences",
     "look_at",
     "messaging",
@@ -160,9 +163,14 @@ class Measured:
     begins_ms, ends_ms : dict of (str, str) to float
         From the arrival of the last input, or a release, to the start of the job; of sinks, from
         the end of the job to that of the cycle. Unhindered.
+    handovers_ms : dict of (str, str) to float
+        By task and node: CPU time that the node took between a release, or the job before on the
+        same node, and the job; where something counts it.
     beside : dict of str to (float, float)
         By node: CPU time of other processes while jobs ran, and how long these ran, seconds; of
         nodes where something counts it.
+    outside : dict of str to (float, float)
+        The same of everybody else on the node's CPUs.
     delays_ms : dict of (str, str, str, str) to float64 array
         By source, target, and the nodes of both: from the end of the job that sent a message to its
         arrival.
@@ -180,7 +188,9 @@ class Measured:
     starts: dict[tuple[str, str, bool], float]
     spent_ms: dict[tuple[str, str, bool], float]
     used: dict[str, float]
+    handovers_ms: dict[SiteName, float] = field(default_factory=dict)
     beside: dict[str, tuple[float, float]] = field(default_factory=dict)
+    outside: dict[str, tuple[float, float]] = field(default_factory=dict)
     work_ms: dict[str, float] = field(default_factory=dict)
     begins_ms: dict[SiteName, float] = field(default_factory=dict)
     ends_ms: dict[SiteName, float] = field(default_factory=dict)
@@ -275,7 +285,9 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             node: float(windows[f"u_{node}"].to_numpy().mean()) * of.capacity
             for node, of in problem.fabric.nodes.items()
         },
-        beside=_beside(own),
+        handovers_ms=_handovers(own),
+        beside=_while_jobs_ran(own, "others_ns"),
+        outside=_while_jobs_ran(own, "outside_ns"),
         work_ms=work_ms(run.meta),
         delays_ms=_delays(own, problem),
         begins_ms=_begins(own, run, problem),
@@ -320,18 +332,32 @@ def _usable(run: Run) -> pl.DataFrame:
     return windows.filter(~pl.col("window").is_in([int(number) for number in out]))
 
 
-def _beside(own: pl.DataFrame) -> dict[str, tuple[float, float]]:
-    """CPU time of others while jobs ran, and how long these ran, by node."""
+def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, float]]:
+    """CPU time that somebody took while jobs ran, and how long these ran, by node."""
     import polars as pl
 
-    if "others_ns" not in own.columns:
+    if column not in own.columns:
         return {}
     sums = (
-        own.filter(pl.col("others_ns").is_not_null())
+        own.filter(pl.col(column).is_not_null())
         .group_by("node")
-        .agg(pl.col("others_ns").sum() / 1e9, pl.col("took").sum() / 1e9)
+        .agg(pl.col(column).sum() / 1e9, pl.col("took").sum() / 1e9)
     )
-    return {node: (others_s, took_s) for node, others_s, took_s in sums.iter_rows()}
+    return {node: (taken_s, took_s) for node, taken_s, took_s in sums.iter_rows()}
+
+
+def _handovers(own: pl.DataFrame) -> dict[SiteName, float]:
+    import polars as pl
+
+    if "handover_ns" not in own.columns:
+        return {}
+    found = (
+        own.filter(pl.col("handover_ns").is_not_null())
+        .group_by("task", "node")
+        .agg(pl.col("handover_ns").mean() / 1e6, jobs=pl.len())
+        .filter(pl.col("jobs") >= LEAST_JOBS)
+    )
+    return {(task, node): mean_ms for task, node, mean_ms, _ in found.iter_rows()}
 
 
 def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str, str], float]:
@@ -429,9 +455,12 @@ def sites(
         stages_ms = {
             one.name: one.visits[site].stage_ms * _to_usual(one, site[1], usual_ms) for one in of
         }
+        begins_ms = [one.begins_ms for one in of]
+        if not problem.pipeline.inputs(site[0]) and any(site in one.handovers_ms for one in of):
+            begins_ms = [one.handovers_ms for one in of]
         begin_ms, end_ms = (
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
-            for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
+            for ways in (begins_ms, [one.ends_ms for one in of])
         )
         read_ms, write_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
         before_ms, after_ms = begin_ms + read_ms, write_ms + end_ms
@@ -556,6 +585,21 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
         took_s = sum(took for _, took in of)
         if took_s > 0:
             result[node] = min(sum(others for others, _ in of) / took_s, cores)
+    return result
+
+
+def contentions(measured: Sequence[Measured]) -> dict[str, float]:
+    """Share of the time of every node's jobs in which its CPUs did what is outside of it."""
+    result = {}
+    for node in sorted({node for one in measured for node in one.outside}):
+        of = [
+            one.outside[node]
+            for one in measured
+            if node in one.outside.keys() - one.disturbed.nodes
+        ]
+        took_s = sum(took for _, took in of)
+        if took_s > 0:
+            result[node] = min(sum(taken for taken, _ in of) / took_s, CONTENTION.high)
     return result
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dwell.model import Problem, Trace
+from dwell.model.bounds import CONTENTION
 from dwell.model.process import TraceTable
 
 if TYPE_CHECKING:
@@ -74,8 +75,8 @@ def slowed(problem: Problem, factors: Mapping[str, float]) -> Problem:
     ----------
     problem : Problem
     factors : mapping of str to float
-        By node. What was measured takes longer (execution times that are replayed, backgrounds);
-        what was not stays as it is.
+        By node. What was measured takes longer (execution times that are replayed, backgrounds,
+        what others take); what was not stays as it is.
     """
     if not factors:
         return problem
@@ -102,6 +103,7 @@ def slowed(problem: Problem, factors: Mapping[str, float]) -> Problem:
             node,
             background=node.background * factor,
             background_beside=None if beside is None else beside * factor,
+            contention=min(node.contention * factor, CONTENTION.high),
         )
     links = {
         name: replace(link, delay_ms=moved(link.delay_ms))
