@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -183,8 +183,6 @@ class Campaign:
         Command that repeats it; the number of a fault is added.
     say : callable
         Takes a line for each fault.
-    leave_out : collection of str
-        Kinds of faults that do not come.
     """
 
     def __init__(
@@ -194,10 +192,7 @@ class Campaign:
         seed: int,
         again: str,
         say: Callable[[str], None],
-        *,
-        leave_out: Collection[str] = (),
     ) -> None:
-        self._leave_out = frozenset(leave_out)
         self._staging, self._out, self._seed = staging, out, seed
         self._again, self._say = again, say
         self._disks = may_mount()
@@ -243,7 +238,7 @@ class Campaign:
     def _plan(self, faults: int | None, only: int | None) -> Any:
         stage, _ = self._staging(1)
         there = faults_of(stage.problem, Means(disks=self._disks))
-        found = planned(self._seed, [one for one in there if one.kind not in self._leave_out])
+        found = planned(self._seed, there)
         if only is not None:
             return islice(found, only - 1, only)
         return iter(found) if faults is None else islice(found, faults)

@@ -589,14 +589,14 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
 
 
 def contentions(measured: Sequence[Measured]) -> dict[str, float]:
-    """Share of the time of every node's jobs in which its CPUs did what is outside of it."""
+    """Share of the time of every node's jobs in which its CPUs did what is outside of it.
+
+    From runs without any stress: nodes may share CPUs, and one that is stressed takes more of them.
+    """
     result = {}
-    for node in sorted({node for one in measured for node in one.outside}):
-        of = [
-            one.outside[node]
-            for one in measured
-            if node in one.outside.keys() - one.disturbed.nodes
-        ]
+    calm = [one for one in measured if not one.disturbed.nodes]
+    for node in sorted({node for one in calm for node in one.outside}):
+        of = [one.outside[node] for one in calm if node in one.outside]
         took_s = sum(took for _, took in of)
         if took_s > 0:
             result[node] = min(sum(taken for taken, _ in of) / took_s, CONTENTION.high)
