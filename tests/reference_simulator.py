@@ -476,7 +476,11 @@ class NodeState:
             drawn = min(self.pool, (1 if self.debt else self.in_time(DRAWN_MS)) - self.left)
             self.pool -= drawn
             self.left += drawn
-        self.debt = self.left <= 0
+        stops = self.left <= 0
+        if stops and not self.debt and self.turn:
+            self.waiting.append(self.turn)
+            self.end_turn()
+        self.debt = stops
 
     def next_look(self, now: int) -> int | None:
         """When the kernel looks next if nothing changes."""

@@ -212,8 +212,13 @@ def _strike(s: Tables, server: int, now: int) -> None:
 def _pass_on(s: Tables, server: int) -> None:
     """Pass the turn on, if it has lasted long enough; the clock must be up to date."""
     short = s.servers[server, TURN_NS] < s.servers[server, LEAST_NS]
-    if short or s.servers[server, THROTTLED] != 0:
-        return
+    if not short and s.servers[server, THROTTLED] == 0:
+        _put_back(s, server)
+
+
+@phase
+def _put_back(s: Tables, server: int) -> None:
+    """Have the thread that has the turn wait for another; the clock must be up to date."""
     received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
     if s.servers[server, N_RUN] == 0:
         _queue_up(s, server, received, LATE, FOREIGN, 0.0)
@@ -241,7 +246,10 @@ def _notice(s: Tables, server: int, now: int) -> None:
         drawn = min(s.servers[server, POOL_NS], wanted - left)
         s.servers[server, POOL_NS] -= drawn
         s.servers[server, LEFT_NS] = left + drawn
-    s.servers[server, THROTTLED] = 1 if s.servers[server, LEFT_NS] <= 0 else 0
+    stopped = 1 if s.servers[server, LEFT_NS] <= 0 else 0
+    if stopped > s.servers[server, THROTTLED] and s.servers[server, TURN] != 0:
+        _put_back(s, server)
+    s.servers[server, THROTTLED] = stopped
     set_speed(s, server)
 
 
