@@ -590,7 +590,9 @@ class NodeState:
             hold_in_order(sorted(self.jobs, key=lambda job: job.readiness), c)
         else:
             for job in self.jobs:
-                job.cores = 0
+                # Reading: one that has all its work keeps its cores until it completes.
+                if job.start is None or job.left > 0:
+                    job.cores = 0
             # Reading: as under fifo, the first that does not fit ends the round.
             by_priority = sorted(self.jobs, key=lambda job: (-job.task.priority, job.readiness))
             hold_in_order(by_priority, c)

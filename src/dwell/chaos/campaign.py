@@ -237,7 +237,7 @@ class Campaign:
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
         stage, _ = self._staging(1)
-        there = faults_of(stage.problem, Means(disks=self._disks))
+        there = list(faults_of(stage.problem, Means(disks=self._disks)))
         found = planned(self._seed, there)
         if only is not None:
             return islice(found, only - 1, only)
