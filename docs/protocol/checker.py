@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
-__all__ = ["Explored", "Rules", "Step", "ViolationError", "explore", "report", "stuck"]
+__all__ = ["Explored", "Rules", "Step", "ViolationError", "explore", "report", "stuck", "without"]
 
 State = TypeVar("State", bound=Hashable)
 
@@ -134,21 +134,30 @@ def stuck(explored: Explored[State], good: Callable[[State], bool]) -> list[Stat
     return [state for state in explored.steps if state not in saved]
 
 
+def without(
+    rule: str, initial: State, cases: Iterable[Callable[..., Iterator[Step[State]]]]
+) -> ViolationError | None:
+    """Return what goes wrong in any case of a model without one of its rules."""
+    for successors in cases:
+        try:
+            explore(initial, partial(successors, rules=Rules(frozenset({rule}))))
+        except ViolationError as violation:
+            return violation
+    return None
+
+
 def report(
     initial: State,
-    successors: Callable[..., Iterator[Step[State]]],
+    cases: Sequence[Callable[..., Iterator[Step[State]]]],
     good: Callable[[State], bool],
     rules: Mapping[str, str],
 ) -> None:
-    """Print what a model can do, and what goes wrong without each of its rules."""
-    found = explore(initial, successors)
-    lost = len(stuck(found, good))
-    print(f"{len(found.steps)} states, {found.depth} steps deep; from {lost} no way back")
+    """Print what a model can do in each of its cases, and what goes wrong without each rule."""
+    for successors in cases:
+        found = explore(initial, successors)
+        lost = len(stuck(found, good))
+        print(f"{len(found.steps)} states, {found.depth} steps deep; from {lost} no way back")
     for rule, text in rules.items():
-        left = Rules(frozenset({rule}))
-        try:
-            explore(initial, partial(successors, rules=left))
-        except ViolationError as violation:
-            print(f"\nwithout {rule!r} ({text}): {violation}")
-        else:
-            print(f"\nwithout {rule!r} ({text}): nothing goes wrong")
+        print(
+            f"\nwithout {rule!r} ({text}): {without(rule, initial, cases) or 'nothing goes wrong'}"
+        )

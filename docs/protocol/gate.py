@@ -175,4 +175,4 @@ def _apply(state: State, rules: Rules, limits: Limits) -> Step[State]:
 
 
 if __name__ == "__main__":
-    report(initial(), successors, good, RULES)
+    report(initial(), [successors], good, RULES)

@@ -228,4 +228,4 @@ def _controller(state: State, limits: Limits, index: int, name: str) -> Iterator
 
 
 if __name__ == "__main__":
-    report(initial(), successors, good, RULES)
+    report(initial(), [successors], good, RULES)

@@ -413,6 +413,4 @@ def _controller(state: State, rules: Rules, limits: Limits) -> Iterator[Step[Sta
 
 
 if __name__ == "__main__":
-    for limits in CASES:
-        print(limits)
-        report(initial(), partial(successors, limits=limits), good, RULES)
+    report(initial(), [partial(successors, limits=limits) for limits in CASES], good, RULES)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from dwell.errors import LiveError
 
-__all__ = ["ControlGroup", "Counts", "own_group"]
+__all__ = ["UNKNOWN", "ControlGroup", "Counts", "own_group"]
 
 UNKNOWN = -1
 PROCESS = Path("/proc/self")
@@ -80,24 +80,27 @@ class ControlGroup:
         except (OSError, ValueError, KeyError) as error:
             raise LiveError(f"{self.counter}: cannot be read ({error})") from None
 
-    def counts(self) -> Counts:
-        """What has been taken by now.
+    def taken_ns(self) -> int:
+        """As `used_ns`; `UNKNOWN` where that cannot be read."""
+        try:
+            return self.used_ns()
+        except LiveError:
+            return UNKNOWN
 
-        Raises
-        ------
-        LiveError
-            If that cannot be read.
-        """
+    def counts(self) -> Counts:
+        """What has been taken by now."""
         own_ns = time.process_time_ns()
-        group_ns = self.used_ns()
+        group_ns = self.taken_ns()
+        if group_ns == UNKNOWN:
+            return Counts()
         return Counts(group_ns - own_ns, self._outside_ns(), group_ns)
 
     def _outside_ns(self) -> int:
-        taken = []
+        taken, cpus = [], os.sched_getaffinity(0)
         for folder in (self.root, self.counter.parent):
             try:
                 by_cpu = (folder / BY_CPU).read_text().split()
-                taken.append(sum(int(by_cpu[cpu]) for cpu in os.sched_getaffinity(0)))
+                taken.append(sum(int(by_cpu[cpu]) for cpu in cpus))
             except (OSError, ValueError, IndexError):
                 return UNKNOWN
         return taken[0] - taken[1]

@@ -67,7 +67,8 @@ def _run(
         book = BookFile(folder / f"{role.who}.book")
         stamper = Stamper(place, book, time.time_ns(), clock_of(problem, role.node)())
         group = _group(problem, role.node)
-        stamper.group_clock = None if group is None else group.used_ns
+        if group is not None:
+            stamper.group_clock = group.taken_ns
         _host(stamper, place, stopped)
     elif role.kind == "sink":
         actuator = _actuator(problem, role.task)

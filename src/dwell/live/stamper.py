@@ -9,6 +9,7 @@ from typing import Protocol
 from dwell.control import shadow_stamps
 from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
+from dwell.live.group import UNKNOWN
 from dwell.live.intervals import Intervals
 from dwell.live.keys import CONTROLLER
 from dwell.live.messages import (
@@ -127,7 +128,7 @@ class Stamper:
         #: controller, as they begin with the time of day.
         self._newest = 0
         #: CPU time that the node's control group has taken, where something counts it.
-        self.group_clock: Callable[[], int] | None = None
+        self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
 
@@ -367,7 +368,7 @@ class Stamper:
 
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""
-        group_ns = self._group_ns()
+        group_ns = self.group_clock()
         if self.cycle + 1 >= self._reserved:
             self._reserved = self.cycle + RESERVED
             self._write(on_fallback=self.guard.on_fallback)
@@ -388,12 +389,6 @@ class Stamper:
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
             self._send(self._ahead, here=False, elsewhere=True)
-
-    def _group_ns(self) -> int:
-        try:
-            return -1 if self.group_clock is None else self.group_clock()
-        except LiveError:
-            return -1
 
     def _sources(self) -> Iterator[Destination]:
         """Source tasks wherever some candidate has them."""

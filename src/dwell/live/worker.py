@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from dwell.errors import LiveError
-from dwell.live.group import Counts
+from dwell.live.group import UNKNOWN, Counts
 from dwell.live.keys import CONTROLLER, MAIN, SHADOW
 from dwell.live.messages import (
     Completion,
@@ -35,7 +35,6 @@ __all__ = ["Job", "Worker"]
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
-UNKNOWN = -1
 NEVER_NS = 1 << 62
 NOT_COUNTED = Counts(), UNKNOWN, Counts()
 
@@ -209,7 +208,7 @@ class Worker:
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
         self.cpu_clock: Callable[[], int] = time.thread_time_ns if alone else time.process_time_ns
         #: What others have taken of the node, where something counts it.
-        self.group_clock: Callable[[], Counts] | None = None
+        self.group_clock: Callable[[], Counts] = Counts
         self._counted: tuple[Counts, int, Counts] = NOT_COUNTED
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
@@ -511,7 +510,7 @@ class Worker:
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return None, state_age
-        before = self._counts()
+        before = self.group_clock()
         begun_ns = self.cpu_clock()
         try:
             output = self.stage.process(inputs)
@@ -519,20 +518,12 @@ class Worker:
             self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
             return None, state_age
         cpu_ns = max(self.cpu_clock() - begun_ns, 0)
-        self._counted = before, cpu_ns, self._counts()
+        self._counted = before, cpu_ns, self.group_clock()
         if not isinstance(output, Message):
             what = type(output).__name__
             self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")
             return None, state_age
         return output, state_age
-
-    def _counts(self) -> Counts:
-        if self.group_clock is None:
-            return Counts()
-        try:
-            return self.group_clock()
-        except LiveError:
-            return Counts()
 
     def finish(
         self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1

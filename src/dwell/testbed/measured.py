@@ -162,7 +162,8 @@ class Measured:
         CPU time of a fixed piece of work on every node (`dwell.testbed.speeds`).
     begins_ms, ends_ms : dict of (str, str) to float
         From the arrival of the last input, or a release, to the start of the job; of sinks, from
-        the end of the job to that of the cycle. Unhindered.
+        the end of the job to that of the cycle. Unhindered, but for sources: what the node took
+        since the release, where something counts it.
     handovers_ms : dict of (str, str) to float
         By task and node: CPU time that the node took between a release, or the job before on the
         same node, and the job; where something counts it.
@@ -269,6 +270,10 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             cycles = of["cycle"].to_numpy()
             visits[key[:2]] = Visit(cpu_ms, np.asarray(stage_ms, np.float64), cycles)
     own = jobs.filter(~pl.col("shadow"))
+    handovers_ms = _handovers(own)
+    sources = {
+        site: ms for site, ms in handovers_ms.items() if not problem.pipeline.inputs(site[0])
+    }
     return Measured(
         name=name,
         run=run,
@@ -285,12 +290,12 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             node: float(windows[f"u_{node}"].to_numpy().mean()) * of.capacity
             for node, of in problem.fabric.nodes.items()
         },
-        handovers_ms=_handovers(own),
+        handovers_ms=handovers_ms,
         beside=_while_jobs_ran(own, "others_ns"),
         outside=_while_jobs_ran(own, "outside_ns"),
         work_ms=work_ms(run.meta),
         delays_ms=_delays(own, problem),
-        begins_ms=_begins(own, run, problem),
+        begins_ms=_begins(own, run, problem) | sources,
         ends_ms=_ends(own, run, problem),
     )
 
@@ -455,12 +460,9 @@ def sites(
         stages_ms = {
             one.name: one.visits[site].stage_ms * _to_usual(one, site[1], usual_ms) for one in of
         }
-        begins_ms = [one.begins_ms for one in of]
-        if not problem.pipeline.inputs(site[0]) and any(site in one.handovers_ms for one in of):
-            begins_ms = [one.handovers_ms for one in of]
         begin_ms, end_ms = (
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
-            for ways in (begins_ms, [one.ends_ms for one in of])
+            for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
         )
         read_ms, write_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
         before_ms, after_ms = begin_ms + read_ms, write_ms + end_ms
@@ -582,10 +584,15 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
         of = [
             one.beside[node] for one in measured if node in one.beside.keys() - one.disturbed.nodes
         ]
-        took_s = sum(took for _, took in of)
-        if took_s > 0:
-            result[node] = min(sum(others for others, _ in of) / took_s, cores)
+        if (taken := _cores(of)) is not None:
+            result[node] = min(taken, cores)
     return result
+
+
+def _cores(of: Sequence[tuple[float, float]]) -> float | None:
+    """What somebody took while jobs ran, over how long these ran; None where none did."""
+    took_s = sum(took for _, took in of)
+    return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
 
 
 def contentions(measured: Sequence[Measured]) -> dict[str, float]:
@@ -597,9 +604,8 @@ def contentions(measured: Sequence[Measured]) -> dict[str, float]:
     calm = [one for one in measured if not one.disturbed.nodes]
     for node in sorted({node for one in calm for node in one.outside}):
         of = [one.outside[node] for one in calm if node in one.outside]
-        took_s = sum(took for _, took in of)
-        if took_s > 0:
-            result[node] = min(sum(taken for taken, _ in of) / took_s, CONTENTION.high)
+        if (taken := _cores(of)) is not None:
+            result[node] = min(taken, CONTENTION.high)
     return result
 
 
