@@ -292,6 +292,18 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     require_ordered(world)
 
 
+def test_rule_2_an_order_moves_nothing_after_a_later_one(problem: Problem) -> None:
+    world = running(problem, "LOC")
+    world.number = 7
+    assert world.order("") == ""
+    world.number = 3
+    assert world.order("SO") == "stale order: 4, after 8"
+    assert world.stamper.placement == "LOC"
+    world.number = 8
+    assert world.order("SO") == ""
+    assert world.stamper.placement == "SO"
+
+
 def counting(problem: Problem, candidate: str, **more: Any) -> World:
     """A world whose planning counts its cycles, and whose cell file says that it has a state."""
     cell = on(stateful(problem, "planning", 100), candidate)
