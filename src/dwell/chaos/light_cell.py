@@ -30,11 +30,13 @@ WINDOW_CYCLES = 3
 GRACE_MS = GUARD_CYCLES * PERIOD_MS
 #: Where each cell's controller wants to be, and what makes it want that.
 HOMES = ("SO", "LOC")
+#: Links, which cost no CPU, tell the placements apart; the stages leave one CPU room enough, and a
+#: quota of half of one.
 EXEC_MS = {
-    "SO": {"perception": {"R1": 8.0, "E": 3.0}, "planning": {"R2": 14.0, "E": 3.0}},
-    "LOC": {"perception": {"R1": 3.0, "E": 14.0}, "planning": {"R2": 3.0, "E": 8.0}},
+    "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 4.0, "E": 2.0}},
+    "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},
 }
-DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 4}, "LOC": {"R1-E": 2, "E-R2": 2, "R1-R2": 1}}
+DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 10}, "LOC": {"R1-E": 5, "E-R2": 5, "R1-R2": 1}}
 CANDIDATES = {
     "LOC": {"perception": "R1", "planning": "R2"},
     "SO": {"perception": "E", "planning": "E"},

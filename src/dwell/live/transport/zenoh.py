@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.transport.expressions import require_expression, require_key
+from dwell.live.transport.lingering import waits_for_nobody
 from dwell.live.transport.losses import Losses
 from dwell.live.transport.protocol import Lane, Receive, Sample
 from dwell.live.wiring import Entry, Session, session_of
@@ -240,7 +241,7 @@ class ZenohTransport:
         for path, value in _configuration(self.entry, name, self.settings).items():
             config.insert_json5(path, json.dumps(value))
         try:
-            return self._zenoh.open(config)
+            session = self._zenoh.open(config)
         except self._zenoh.ZError as error:
             where = self.entry.listen.get(name)
             raise LiveError(
@@ -248,6 +249,15 @@ class ZenohTransport:
                 f"{f' on {where}' if where else ''}: {error}; is the port taken, by an older "
                 "process or another cell?"
             ) from None
+
+        def connected(_: zenoh.LinkEvent) -> None:
+            waits_for_nobody()
+
+        # It goes on without being held, as all that call back do.
+        session.info.declare_link_events_listener(
+            self._zenoh.handlers.Callback(connected, indirect=False), history=True
+        )
+        return session
 
     def _way(self, key: str, lane: Lane) -> _Way | None:
         """Declare a publisher in the session that a key and a lane belong to."""
