@@ -36,7 +36,7 @@ EXEC_MS = {
     "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 4.0, "E": 2.0}},
     "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},
 }
-DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 10}, "LOC": {"R1-E": 5, "E-R2": 5, "R1-R2": 1}}
+DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 15}, "LOC": {"R1-E": 5, "E-R2": 5, "R1-R2": 1}}
 CANDIDATES = {
     "LOC": {"perception": "R1", "planning": "R2"},
     "SO": {"perception": "E", "planning": "E"},
@@ -103,7 +103,7 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
         },
         "controller": {
             "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
-            "min_improvement": 0.4, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
+            "min_improvement": 0.6, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
             "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_MS,
         },
         "live": {
