@@ -27,7 +27,7 @@ MIN_DWELL = 2
 WINDOW_CYCLES = 3
 #: A window with lost cycles closes after the guard has looked: an order that comes of it, and that
 #: might be for what has just died, finds another term.
-GRACE_MS = GUARD_CYCLES * PERIOD_MS
+GRACE_CYCLES = GUARD_CYCLES
 #: Where each cell's controller wants to be, and what makes it want that.
 HOMES = ("SO", "LOC")
 #: Links, which cost no CPU, tell the placements apart; the stages leave one CPU room enough, and a
@@ -36,7 +36,12 @@ EXEC_MS = {
     "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 4.0, "E": 2.0}},
     "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},
 }
-DELAY_MS = {"SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 15}, "LOC": {"R1-E": 5, "E-R2": 5, "R1-R2": 1}}
+DELAY_MS = {
+    "SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 25},
+    "LOC": {"R1-E": 10, "E-R2": 10, "R1-R2": 1},
+}
+#: A node with 0.4 of a CPU has twice the time for a cycle.
+SLOWER = 2
 CANDIDATES = {
     "LOC": {"perception": "R1", "planning": "R2"},
     "SO": {"perception": "E", "planning": "E"},
@@ -66,8 +71,10 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
     standby : bool
         Whether sensing and control have one.
     quotas : bool
-        Whether nodes have a share of a CPU, as a testbed's have to.
+        Whether nodes have a share of a CPU, as a testbed's have to; the period is longer then.
     """
+    slower = SLOWER if quotas else 1
+    period_ms = slower * PERIOD_MS
     tasks: dict[str, Any] = {}
     for task, nodes in exec_ms(home).items():
         spare = {"standby": 1} if standby and len(nodes) == 1 else {}
@@ -81,8 +88,8 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
     return {
         "dwell": 1,
         "name": f"chaos-{home}",
-        "period_ms": PERIOD_MS,
-        "deadline_ms": PERIOD_MS,
+        "period_ms": period_ms,
+        "deadline_ms": period_ms,
         "window_cycles": WINDOW_CYCLES,
         "warmup_windows": 0,
         "nodes": {node: _node(node, quotas=quotas) for node in NODES},
@@ -99,15 +106,15 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
                 "latency": 1.0, "violations": 0.5, "robot": 0.0, "edge": 0.0, "switching": 0.05,
             },
             "targets": {"latency_ms": PERIOD_MS / 2, "robot": 0.9, "edge": 0.9},
-            "caps": {"latency_ms": 3 * PERIOD_MS},
+            "caps": {"latency_ms": 3 * period_ms},
         },
         "controller": {
             "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
-            "min_improvement": 0.6, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
-            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_MS,
+            "min_improvement": 1.0, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
+            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_CYCLES * period_ms,
         },
         "live": {
-            "max_age_ms": MAX_AGE_MS, "silence": "hold",
+            "max_age_ms": slower * MAX_AGE_MS, "silence": "hold",
             "actuators": {"control": "dwell.chaos.stages:Witness"},
         },
     }  # fmt: skip

@@ -134,8 +134,8 @@ def strike(
     recovered = f"the whole cell at home after '{fault.name}'"
     cell.wait_for(recovered, cell.at_home, RECOVERED_S)
     found.back_ns = time.monotonic_ns()
-    # What is on its way when the cell is back is seen, too. Processes that still start beside have a
-    # node with a small quota wait.
+    # What is on its way when the cell is back is seen, too. A node with a small quota waits for
+    # processes that still start.
     cell.wait_for("five more cycles", lambda: _few(cell, found.back_ns, 5), PATIENCE_S)
     _weigh(cell, fault, stalls, found, cpus)
     return found
