@@ -209,6 +209,23 @@ def test_a_controller_cut_off_holds(problem: Problem) -> None:
     assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
 
 
+def test_a_controller_that_hears_no_sink_goes_by_what_the_stamper_hears(problem: Problem) -> None:
+    world = World(problem, exec_ms=EXEC_MS, policy="dtp", delay_ms=0.2)
+    world.run(6_000)
+    term, placement = world.stamper.term, world.stamper.placement
+    before = len(columns(world, "cycles", "cycle"))
+    rule = world.network.cut("R2", "E")
+    world.run(6_000)
+    # Nothing is wrong with the cycles, and nothing is done about them.
+    assert (world.stamper.term, world.stamper.placement) == (term, placement)
+    during = columns(world, "cycles", "outcome", "latency_ns", "missed")[before:-5]
+    assert len(during) > 80
+    assert {(outcome, missed) for outcome, _, missed in during} == {("done", False)}
+    earlier = [ns for (ns,) in columns(world, "cycles", "latency_ns")[before - 50 : before]]
+    assert max(ns for _, ns, _ in during) == pytest.approx(max(earlier), abs=1_000_000)
+    world.network.heal(rule)
+
+
 def test_a_pinned_cell_stays_and_an_unpinned_one_goes_on(problem: Problem) -> None:
     world = alternating(problem)
     world.run(2_000)

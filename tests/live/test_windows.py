@@ -671,6 +671,24 @@ def test_what_is_lost_is_told_from_what_is_under_way() -> None:
     assert hand.column("windows", "seen_violation_rate") == [0.6]
 
 
+def test_what_the_stamper_heard_is_done_until_the_sink_says_when() -> None:
+    hand = Hand()
+    hand.release(range(W + 2))
+    hand.done(0)
+    hand.windows.measured(1, [(1, 13 * MS), (2, 17 * MS)])
+    hand.close()
+    # Not yet said when the window closed.
+    hand.windows.measured(1, [(3, 19 * MS)])
+    hand.record()
+    assert hand.column("cycles", "outcome") == ["done"] * 4 + ["in_flight"]
+    assert hand.column("cycles", "latency_ns")[1:4] == [13 * MS, 17 * MS, 19 * MS]
+    assert hand.column("windows", "seen_violation_rate") == [0.4]
+    assert hand.column("windows", "violation_rate") == [0.2]
+    hand.done(2, ms=16)
+    hand.record()
+    assert hand.column("cycles", "latency_ns")[1:4] == [13 * MS, 16 * MS, 19 * MS]
+
+
 def test_a_restarted_controller_starts_at_the_first_stamp_it_hears() -> None:
     before = Hand()
     before.release(range(8))

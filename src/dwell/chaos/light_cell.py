@@ -33,7 +33,7 @@ HOMES = ("SO", "LOC")
 #: Links, which cost no CPU, tell the placements apart; the stages leave one CPU room enough, and a
 #: quota of half of one.
 EXEC_MS = {
-    "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 4.0, "E": 2.0}},
+    "SO": {"perception": {"R1": 4.0, "E": 2.0}, "planning": {"R2": 8.0, "E": 2.0}},
     "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},
 }
 DELAY_MS = {
@@ -110,7 +110,7 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
         },
         "controller": {
             "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
-            "min_improvement": 1.0, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
+            "min_improvement": 0.35, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
             "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_CYCLES * period_ms,
         },
         "live": {

@@ -79,6 +79,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         From its stamp to its last completion, as both arrived at the controller.
     stamper_interval_ns : int or None
         From its release to its last completion, by the stamper's clock alone.
+    told : bool
+        Whether its latency is that, because its sinks' own words have not come here.
     row : int
         In the record; -1 while it is in no closed window.
     close_ns : int or None
@@ -104,6 +106,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     bound_ns: int = 0
     interval_ns: int | None = None
     stamper_interval_ns: int | None = None
+    told: bool = False
     row: int = -1
     window: int | None = None
     close_ns: int | None = None
@@ -198,14 +201,22 @@ class Ledger:
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
         """Work out latency and parts of a cycle that is complete.
 
+        Completions have a second way to the controller: the stamper hears them, and says so. What
+        the sinks say themselves counts more, whenever it comes.
+
         Parameters
         ----------
         cycle : LiveCycle
         most_ns : int, optional
             Leave it for later where the clocks' bound is above that; the bound may tighten.
         """
-        if cycle.latency_ns < NEVER_NS or not self.complete(cycle):
+        if not self.complete(cycle):
+            if cycle.stamper_interval_ns is not None and most_ns is None:
+                cycle.latency_ns, cycle.told = cycle.stamper_interval_ns, True
             return
+        if cycle.latency_ns < NEVER_NS and not cycle.told:
+            return
+        cycle.told = False
         reports = cycle.reports.values()
         ends = [(self._since_origin(cycle, done.node, done.done_ns), done) for done in reports]
         done_ns, last = max(ends, key=lambda pair: pair[0])
@@ -343,7 +354,7 @@ class Ledger:
                     self._enter(known, row, cycle, report.hops, self._every - apart)
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._enter(known, row, cycle, report.hops, self._every)
-            if cycle.heard and not cycle.reports and not cycle.replaced:
+            if cycle.heard and not (cycle.reports or cycle.replaced or cycle.told):
                 self._blame(known, row, cycle)
         for found in (known, of_shadows):
             for instants in (found.ready_ns, found.end_ns, found.arrived_ns):

@@ -229,8 +229,10 @@ class LiveWindows:
             cycle = self._by_key.get((run, number))
             if cycle is not None:
                 cycle.stamper_interval_ns = interval_ns
+                self._newest_done = max(self._newest_done, cycle.key)
                 if cycle.row >= 0:
-                    self._changed[cycle.row] = cycle
+                    self._ledger.settle(cycle)
+                    self._touch(cycle)
 
     def loaded(self, load: Load) -> None:
         """A node's agent has read its counters."""
@@ -574,7 +576,7 @@ class LiveWindows:
             self._changed_windows.add(cycle.window)
 
     def _outcome(self, cycle: LiveCycle) -> str:
-        if self._ledger.complete(cycle):
+        if self._ledger.complete(cycle) or cycle.told:
             return "done"
         if cycle.replaced:
             return "replaced"
