@@ -436,9 +436,10 @@ class NodeState:
 
     def hand_over(self, job: Job) -> None:
         """Let another thread, which is new, go on with a job."""
+        average = self.average  # over the one that wakes it, too
         self.end_turn()
         job.hand_on()
-        self.waiting.append(Thread(job, self.beginning(job)))
+        self.waiting.append(Thread(job, self.beginning(job) if job.owed else average))
 
     def beginning(self, job: Job) -> int:
         """What a new thread of a job counts as having received."""

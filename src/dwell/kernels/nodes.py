@@ -219,7 +219,7 @@ def _pass_on(s: Tables, server: int) -> None:
 @phase
 def _put_back(s: Tables, server: int) -> None:
     """Have the thread that has the turn wait for another; the clock must be up to date."""
-    received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
+    received = _by_turn(s, server)
     if s.servers[server, N_RUN] == 0:
         _queue_up(s, server, received, LATE, FOREIGN, 0.0)
     else:
@@ -372,9 +372,15 @@ def _average(s: Tables, server: int) -> int:
     for i in range(n):
         received += s.wait_rank[index(base + i)]
     if s.servers[server, TURN] != 0:
-        received += s.servers[server, TURN_V] + s.servers[server, TURN_NS]
+        received += _by_turn(s, server)
         n += 1
     return int(received // n) if n > 0 else 0
+
+
+@phase
+def _by_turn(s: Tables, server: int) -> int:
+    """Core time that the thread that has the turn has received; the clock must be up to date."""
+    return int(s.servers[server, TURN_V] + s.servers[server, TURN_NS])
 
 
 @phase
@@ -384,7 +390,7 @@ def _least(s: Tables, server: int) -> int:
     waiting = s.wait_rank[index(s.servers[server, BASE])] if n > 0 else 0
     if s.servers[server, TURN] == 0:
         return int(waiting)
-    received = s.servers[server, TURN_V] + s.servers[server, TURN_NS]
+    received = _by_turn(s, server)
     return int(min(waiting, received) if n > 0 else received)
 
 
@@ -432,23 +438,9 @@ def restress(s: Tables, server: int, threads: int) -> None:
 
 
 @phase
-def _line_up(s: Tables, server: int, site: int, row: int, key: int, work: int) -> None:
-    """Let the next thread of a job wait for its turn: one before the stage, its own, one after.
-
-    The stage's, which has worked for long when it sleeps, begins with the mean of the others. One
-    that does little whenever it wakes is owed: it goes before all of them, and takes the turn of
-    one that has had it for long enough.
-    """
-    rest, after = s.jobs[row, REST], s.sites[site, AFTER_NS]
-    if work == 0 and rest > after:
-        work = rest - after
-        received = _average(s, server)
-    else:
-        if work == 0:
-            work = rest
-        received = _least(s, server) - 1
-        _pass_on(s, server)
-    s.jobs[row, REST] = rest - work
+def _line_up(s: Tables, server: int, row: int, key: int, received: int, work: int) -> None:
+    """Let a thread of a job wait for its turn, that has so much of it to do."""
+    s.jobs[row, REST] -= work
     _queue_up(s, server, received, s.jobs[row, READY], key, float(work))
     s.servers[server, USED] += 1
     mark(s, server)
@@ -456,11 +448,20 @@ def _line_up(s: Tables, server: int, site: int, row: int, key: int, work: int) -
 
 @phase
 def next_thread(s: Tables, server: int, site: int, row: int, key: int, now: int) -> bool:
-    """Let the next thread of a job line up, if there is one, where its thread has done its part."""
-    if s.jobs[row, REST] == 0:
+    """Let the next thread of a job line up, if there is one, where its thread has done its part.
+
+    It is woken by the one that then sleeps, so that the mean that it begins with is over both.
+    """
+    rest, after = s.jobs[row, REST], s.sites[site, AFTER_NS]
+    if rest == 0:
         return False
+    tick(s, server, now)
+    received = _average(s, server)
     leave(s, server, site, now)
-    _line_up(s, server, site, row, key, 0)
+    if rest > after:
+        _line_up(s, server, row, key, received, rest - after)
+    else:
+        _line_up(s, server, row, key, _least(s, server) - 1, rest)
     return True
 
 
@@ -470,10 +471,19 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
     server = index(s.sites[site, SERVER])
     scheduler = s.servers[server, SCHEDULER]
     if scheduler == TURNS:
+        # A stage's thread, which has worked for long when it sleeps, begins with the mean. One that
+        # does little whenever it wakes is owed: it goes before all others, and takes the turn of one
+        # that has had it for long enough.
         tick(s, server, now)
-        before = s.sites[site, BEFORE_NS]
+        before, after = s.sites[site, BEFORE_NS], s.sites[site, AFTER_NS]
         s.jobs[row, REST] = work
-        _line_up(s, server, site, row, key, before if before < work else 0)
+        first = before if before < work else 0
+        if first == 0 and work > after:
+            _line_up(s, server, row, key, _average(s, server), work - after)
+            return
+        received = _least(s, server) - 1
+        _pass_on(s, server)
+        _line_up(s, server, row, key, received, first if first > 0 else work)
         return
     s.jobs[row, REST] = 0
     n = s.servers[server, N_WAIT]
