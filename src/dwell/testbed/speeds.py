@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from statistics import fmean
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +26,7 @@ __all__ = ["at_speed_of", "slowed", "work_ms"]
 
 
 def work_ms(meta: Mapping[str, Any]) -> dict[str, float]:
-    """CPU time of a probe's piece of work on every node's CPUs, the mean of the windows that count.
+    """CPU time of a probe's piece of work on every node's CPUs, the median of windows that count.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def work_ms(meta: Mapping[str, Any]) -> dict[str, float]:
     for node, about in testbed.get("nodes", {}).items():
         took = [row[str(cpu)] for row in rows for cpu in about["cpus"] if str(cpu) in row]
         if took:
-            found[node] = fmean(took)
+            found[node] = median(took)
     return found
 
 
