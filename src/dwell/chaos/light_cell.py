@@ -37,7 +37,7 @@ EXEC_MS = {
     "LOC": {"perception": {"R1": 2.0, "E": 6.0}, "planning": {"R2": 2.0, "E": 5.0}},
 }
 DELAY_MS = {
-    "SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 25},
+    "SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 8},
     "LOC": {"R1-E": 10, "E-R2": 10, "R1-R2": 1},
 }
 #: A node with 0.4 of a CPU has twice the time for a cycle.

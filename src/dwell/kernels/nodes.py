@@ -471,9 +471,9 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
     server = index(s.sites[site, SERVER])
     scheduler = s.servers[server, SCHEDULER]
     if scheduler == TURNS:
-        # A stage's thread, which has worked for long when it sleeps, begins with the mean. One that
-        # does little whenever it wakes is owed: it goes before all others, and takes the turn of one
-        # that has had it for long enough.
+        # A stage's thread, which has worked for long when it sleeps, begins with the mean. One
+        # that does little whenever it wakes is owed: it goes before all others, and takes the
+        # turn of one that has had it for long enough.
         tick(s, server, now)
         before, after = s.sites[site, BEFORE_NS], s.sites[site, AFTER_NS]
         s.jobs[row, REST] = work

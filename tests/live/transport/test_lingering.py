@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 import struct
 from pathlib import Path
 
-from dwell.live.transport.lingering import waits_for_nobody
+from dwell.live.transport.lingering import Connections
 from dwell.live.transport.zenoh import ZenohTransport
 from tests.live.transport.meshes import ZenohMesh
 
@@ -15,15 +16,16 @@ TEN_SECONDS = struct.pack("ii", 1, 10)
 
 
 def lingering(number: int) -> bool:
-    """Whether closing a TCP connection of this process may have to wait."""
+    """Whether closing a connection of this process may have to wait."""
     try:
-        with socket.socket(fileno=os.dup(number)) as connection:
-            asked, _ = struct.unpack(
-                "ii", connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8)
-            )
-            return bool(asked)
+        if not stat.S_ISSOCK(os.fstat(number).st_mode):
+            return False
+        copy = os.dup(number)
     except OSError:
         return False
+    with socket.socket(fileno=copy) as connection:
+        asked = connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(TEN_SECONDS))
+    return bool(struct.unpack("ii", asked)[0])
 
 
 def test_a_connection_that_would_wait_does_not() -> None:
@@ -33,7 +35,7 @@ def test_a_connection_that_would_wait_does_not() -> None:
         with near, far:
             near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, TEN_SECONDS)
             assert lingering(near.fileno())
-            assert waits_for_nobody() >= 1
+            Connections().wait_for_nobody()
             assert not lingering(near.fileno())
             near.sendall(b"it is open still")
             assert far.recv(100) == b"it is open still"
@@ -43,7 +45,7 @@ def test_files_and_other_sockets_are_left_alone(tmp_path: Path) -> None:
     here, there = socket.socketpair()
     with (tmp_path / "a").open("wb") as file, here, there:
         here.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, TEN_SECONDS)
-        waits_for_nobody()
+        Connections().wait_for_nobody()
         assert lingering(here.fileno())
         file.write(b"open")
 

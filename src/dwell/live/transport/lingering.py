@@ -10,36 +10,67 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 import struct
+import threading
 
-__all__ = ["waits_for_nobody"]
+__all__ = ["Connections"]
 
 #: Open files of this process, by number.
 _OPEN = "/dev/fd"
 _OFF = struct.pack("ii", 0, 0)
+#: A connection is given up after a session's lease of silence, which is longer. Looking whenever
+#: Zenoh reports one cost several cycles when E came back after a freeze, and all were made at once.
+EVERY_S = 0.5
 
 
-def waits_for_nobody() -> int:
-    """Have no connection of this process wait when it is closed; returns how many would have."""
-    return sum(_released(int(number)) for number in os.listdir(_OPEN))
+class Connections:
+    """Has no connection of this process wait when it is closed, from soon after it is there."""
+
+    def __init__(self) -> None:
+        self._known: set[int] = set()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="dwell-lingering", daemon=True)
+
+    def start(self) -> None:
+        """Look after them from now on."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no more."""
+        self._stopped.set()
+
+    def _run(self) -> None:
+        while not self._stopped.wait(EVERY_S):
+            self.wait_for_nobody()
+
+    def wait_for_nobody(self) -> None:
+        """Have none of those that there are now wait."""
+        known = set()
+        for number in map(int, os.listdir(_OPEN)):
+            try:
+                about = os.fstat(number)
+            except OSError:
+                continue
+            if stat.S_ISSOCK(about.st_mode):
+                known.add(about.st_ino)
+                if about.st_ino not in self._known:
+                    _release(number)
+        self._known = known
 
 
-def _released(number: int) -> bool:
+def _release(number: int) -> None:
     try:
         # A number of our own: the other may be closed at any time, and mean something else then.
         copy = os.dup(number)
     except OSError:
-        return False
+        return
     try:
         connection = socket.socket(fileno=copy)
     except OSError:
         os.close(copy)
-        return False
+        return
     with connection:
-        if connection.family not in {socket.AF_INET, socket.AF_INET6}:
-            return False
-        if connection.type != socket.SOCK_STREAM:
-            return False
-        lingers = connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(_OFF)) != _OFF
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _OFF)
-        return lingers
+        internet = connection.family in {socket.AF_INET, socket.AF_INET6}
+        if internet and connection.type == socket.SOCK_STREAM:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _OFF)

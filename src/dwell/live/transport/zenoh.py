@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.transport.expressions import require_expression, require_key
-from dwell.live.transport.lingering import waits_for_nobody
+from dwell.live.transport.lingering import Connections
 from dwell.live.transport.losses import Losses
 from dwell.live.transport.protocol import Lane, Receive, Sample
 from dwell.live.wiring import Entry, Session, session_of
@@ -159,6 +159,7 @@ class ZenohTransport:
         self._zenoh = zenoh
         self._losses = losses or Losses.of(entry.role.who, entry.role.node)
         self._closed = False
+        self._connections = Connections()
         #: Messages that arrived under another key than they were put under.
         self.misled = 0
         # Read and filled without a lock: a publisher too many does no harm.
@@ -176,6 +177,7 @@ class ZenohTransport:
         except BaseException:
             self.close()
             raise
+        self._connections.start()
         if "local" in self._sessions:
             self._pool = _Pool.of(self.settings)
 
@@ -215,6 +217,7 @@ class ZenohTransport:
         # With both locks no callback is running, unless it is this thread's own.
         with self._locks["control"], self._locks["images"]:
             self._closed = True
+            self._connections.stop()
             sessions, self._sessions = self._sessions, {}
             ways, self._ways = self._ways, {}
         with self._growing:
@@ -241,7 +244,7 @@ class ZenohTransport:
         for path, value in _configuration(self.entry, name, self.settings).items():
             config.insert_json5(path, json.dumps(value))
         try:
-            session = self._zenoh.open(config)
+            return self._zenoh.open(config)
         except self._zenoh.ZError as error:
             where = self.entry.listen.get(name)
             raise LiveError(
@@ -249,15 +252,6 @@ class ZenohTransport:
                 f"{f' on {where}' if where else ''}: {error}; is the port taken, by an older "
                 "process or another cell?"
             ) from None
-
-        def connected(_: zenoh.LinkEvent) -> None:
-            waits_for_nobody()
-
-        # It goes on without being held, as all that call back do.
-        session.info.declare_link_events_listener(
-            self._zenoh.handlers.Callback(connected, indirect=False), history=True
-        )
-        return session
 
     def _way(self, key: str, lane: Lane) -> _Way | None:
         """Declare a publisher in the session that a key and a lane belong to."""
