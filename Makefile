@@ -74,7 +74,7 @@ $(VENV)/tools/%: requirements/%.txt $(VENV)/.installed
 fuzz: $(VENV)/tools/fuzz ## Fuzz what reads from the network, guided by coverage (ARGS="--seconds 600")
 	PYTHONPATH=$< $(BIN)/python -m tests.fuzz $(ARGS)
 
-audit: $(VENV)/tools/release ## Look up known vulnerabilities of all that is pinned (needs pypi.org)
+audit: $(VENV)/tools/release ## Look up known vulnerabilities of all that is pinned (needs a package index that knows them)
 	@for file in runtime dev; do \
 		PYTHONPATH=$< $(BIN)/python -m pip_audit --strict --disable-pip --require-hashes \
 			-r requirements/$$file.txt || exit 1; \
