@@ -25,9 +25,6 @@ GUARD_CYCLES = 3
 MAX_AGE_MS = 120
 MIN_DWELL = 2
 WINDOW_CYCLES = 3
-#: A window with lost cycles closes after the guard has looked: an order that comes of it, and that
-#: might be for what has just died, finds another term.
-GRACE_CYCLES = GUARD_CYCLES
 #: Where each cell's controller wants to be, and what makes it want that.
 HOMES = ("SO", "LOC")
 #: Links, which cost no CPU, tell the placements apart; the stages leave one CPU room enough, and a
@@ -73,6 +70,8 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
     quotas : bool
         Whether nodes have a share of a CPU, as a testbed's have to; the period is longer then.
     """
+    # A window with lost cycles closes after the guard has looked (`close_grace_ms`): an order that
+    # comes of it, and that might be for what has just died, finds another term.
     slower = SLOWER if quotas else 1
     period_ms = slower * PERIOD_MS
     tasks: dict[str, Any] = {}
@@ -111,7 +110,7 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
         "controller": {
             "on": "E", "policy": "dtp", "initial": home, "min_dwell": MIN_DWELL,
             "min_improvement": 0.35, "estimator": "profile", "guard_cycles": GUARD_CYCLES,
-            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GRACE_CYCLES * period_ms,
+            "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GUARD_CYCLES * period_ms,
         },
         "live": {
             "max_age_ms": slower * MAX_AGE_MS, "silence": "hold",

@@ -438,9 +438,22 @@ def restress(s: Tables, server: int, threads: int) -> None:
 
 
 @phase
-def _line_up(s: Tables, server: int, row: int, key: int, received: int, work: int) -> None:
-    """Let a thread of a job wait for its turn, that has so much of it to do."""
-    s.jobs[row, REST] -= work
+def _line_up(s: Tables, server: int, site: int, row: int, key: int, work: int, mean: int) -> None:
+    """Let the next thread of a job wait for its turn: one before the stage, its own, one after.
+
+    The stage's, which has worked for long when it sleeps, begins with the mean. One that does
+    little whenever it wakes is owed: it goes before all others, and takes the turn of one that has
+    had it for long enough.
+    """
+    rest, after = s.jobs[row, REST], s.sites[site, AFTER_NS]
+    if work == 0 and rest > after:
+        work, received = rest - after, mean
+    else:
+        if work == 0:
+            work = rest
+        received = _least(s, server) - 1
+        _pass_on(s, server)
+    s.jobs[row, REST] = rest - work
     _queue_up(s, server, received, s.jobs[row, READY], key, float(work))
     s.servers[server, USED] += 1
     mark(s, server)
@@ -452,16 +465,12 @@ def next_thread(s: Tables, server: int, site: int, row: int, key: int, now: int)
 
     It is woken by the one that then sleeps, so that the mean that it begins with is over both.
     """
-    rest, after = s.jobs[row, REST], s.sites[site, AFTER_NS]
-    if rest == 0:
+    if s.jobs[row, REST] == 0:
         return False
     tick(s, server, now)
-    received = _average(s, server)
+    mean = _average(s, server)
     leave(s, server, site, now)
-    if rest > after:
-        _line_up(s, server, row, key, received, rest - after)
-    else:
-        _line_up(s, server, row, key, _least(s, server) - 1, rest)
+    _line_up(s, server, site, row, key, 0, mean)
     return True
 
 
@@ -471,19 +480,11 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
     server = index(s.sites[site, SERVER])
     scheduler = s.servers[server, SCHEDULER]
     if scheduler == TURNS:
-        # A stage's thread, which has worked for long when it sleeps, begins with the mean. One
-        # that does little whenever it wakes is owed: it goes before all others, and takes the
-        # turn of one that has had it for long enough.
         tick(s, server, now)
-        before, after = s.sites[site, BEFORE_NS], s.sites[site, AFTER_NS]
+        before = s.sites[site, BEFORE_NS]
         s.jobs[row, REST] = work
         first = before if before < work else 0
-        if first == 0 and work > after:
-            _line_up(s, server, row, key, _average(s, server), work - after)
-            return
-        received = _least(s, server) - 1
-        _pass_on(s, server)
-        _line_up(s, server, row, key, received, first if first > 0 else work)
+        _line_up(s, server, site, row, key, first, _average(s, server))
         return
     s.jobs[row, REST] = 0
     n = s.servers[server, N_WAIT]

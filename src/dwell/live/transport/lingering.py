@@ -13,6 +13,7 @@ import socket
 import stat
 import struct
 import threading
+from contextlib import suppress
 
 __all__ = ["Connections"]
 
@@ -42,7 +43,9 @@ class Connections:
 
     def _run(self) -> None:
         while not self._stopped.wait(EVERY_S):
-            self.wait_for_nobody()
+            # To look takes a file of its own, and there may be none left for a moment.
+            with suppress(OSError):
+                self.wait_for_nobody()
 
     def wait_for_nobody(self) -> None:
         """Have none of those that there are now wait."""
