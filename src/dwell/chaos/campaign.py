@@ -18,7 +18,7 @@ import dwell
 from dwell.chaos.disk import may_mount
 from dwell.chaos.faults import Fault, Means, bound_of, faults_of
 from dwell.chaos.ground import STARVING_THREADS, Ground, environment_of
-from dwell.chaos.light_cell import document, exec_ms
+from dwell.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.chaos.observer import Observer
 from dwell.chaos.stage import OnHosts, OnLoopback, Stage
 from dwell.chaos.stages import APPLY
@@ -95,7 +95,8 @@ def _cell(
     folder.mkdir(parents=True, exist_ok=True)
     if cell is None:
         written = folder / "written.yaml"
-        written.write_text(yaml.safe_dump(document(LIGHT_HOME, quotas=quotas)), encoding="utf-8")
+        light = document(LIGHT_HOME, period_ms=PATIENT_MS, quotas=quotas)
+        written.write_text(yaml.safe_dump(light), encoding="utf-8")
         environment = environment_of(folder, exec_ms(LIGHT_HOME))
         return dwell.load(written), folder, environment, LIGHT_HOME
     problem, environment = _witnessed(dwell.load(cell), folder, cell.resolve().parent)

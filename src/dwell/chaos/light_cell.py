@@ -12,6 +12,7 @@ __all__ = [
     "HOMES",
     "MAX_AGE_MS",
     "MIN_DWELL",
+    "PATIENT_MS",
     "PERIOD_MS",
     "P_NS",
     "WINDOW_CYCLES",
@@ -37,8 +38,8 @@ DELAY_MS = {
     "SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 8},
     "LOC": {"R1-E": 10, "E-R2": 10, "R1-R2": 1},
 }
-#: A node with 0.4 of a CPU has twice the time for a cycle.
-SLOWER = 2
+#: Of a campaign: enough for nodes with 0.4 of a CPU, and for a machine shared with others.
+PATIENT_MS = 80
 CANDIDATES = {
     "LOC": {"perception": "R1", "planning": "R2"},
     "SO": {"perception": "E", "planning": "E"},
@@ -59,21 +60,22 @@ def _node(node: str, *, quotas: bool) -> dict[str, Any]:
     return {"tier": tier, "cores": 1, "quota": {"cpu": cpu, "period_ms": 4}}
 
 
-def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[str, Any]:
+def document(
+    home: str, *, period_ms: int = PERIOD_MS, standby: bool = True, quotas: bool = False
+) -> dict[str, Any]:
     """Return the cell file of a cell whose controller wants to be at `home`.
 
     Parameters
     ----------
     home : str
+    period_ms : int
     standby : bool
         Whether sensing and control have one.
     quotas : bool
-        Whether nodes have a share of a CPU, as a testbed's have to; the period is longer then.
+        Whether nodes have a share of a CPU, as a testbed's have to.
     """
     # A window with lost cycles closes after the guard has looked (`close_grace_ms`): an order that
     # comes of it, and that might be for what has just died, finds another term.
-    slower = SLOWER if quotas else 1
-    period_ms = slower * PERIOD_MS
     tasks: dict[str, Any] = {}
     for task, nodes in exec_ms(home).items():
         spare = {"standby": 1} if standby and len(nodes) == 1 else {}
@@ -113,7 +115,7 @@ def document(home: str, *, standby: bool = True, quotas: bool = False) -> dict[s
             "fallbacks": ["LOC", "HYB", "SO"], "close_grace_ms": GUARD_CYCLES * period_ms,
         },
         "live": {
-            "max_age_ms": slower * MAX_AGE_MS, "silence": "hold",
+            "max_age_ms": period_ms * MAX_AGE_MS // PERIOD_MS, "silence": "hold",
             "actuators": {"control": "dwell.chaos.stages:Witness"},
         },
     }  # fmt: skip
