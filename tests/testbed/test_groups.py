@@ -60,6 +60,24 @@ def test_a_group_uses_no_more_than_its_quota(groups: Groups) -> None:
 
 
 @here
+def test_quotas_hold_again_after_they_were_lifted(groups: Groups, name: str) -> None:
+    stat = find_cgroups().folders["cpu"] / group_name(name) / "A" / "cpu.stat"
+
+    def throttled() -> int:
+        counts = stat.read_text().split()
+        return int(counts[counts.index("nr_throttled") + 1])
+
+    with subprocess.Popen(groups.inside("A", BUSY)):
+        with groups.unlimited():
+            before = throttled()
+            use_ns(groups, "A", groups.used_ns("A") + 200_000_000)
+            assert throttled() <= before + 1
+        use_ns(groups, "A", groups.used_ns("A") + 100_000_000)
+        assert throttled() > before + 1
+        groups.kill("A")
+
+
+@here
 def test_a_group_without_quota_has_its_time_counted_too(groups: Groups) -> None:
     with subprocess.Popen(groups.inside("B", BUSY)):
         use_ns(groups, "B", 50_000_000)

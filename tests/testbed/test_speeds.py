@@ -11,7 +11,7 @@ import dwell
 from dwell.io import from_document
 from dwell.model import Problem, Trace
 from dwell.model.document import to_document
-from dwell.testbed.speeds import at_speed_of, slowed, work_ms
+from dwell.testbed.speeds import Usual, at_speed_of, slowed, window_work_ms, work_ms
 from tests.study.cell import make_problem
 
 META = {
@@ -49,10 +49,11 @@ def test_windows_that_do_not_count_say_nothing_of_the_speed() -> None:
     assert work_ms(META) == pytest.approx({"R1": 0.15, "E": 0.2, "R2": 0.15})
     assert work_ms({"pressure": META["pressure"]}) == {}
     assert work_ms({}) == {}
+    assert window_work_ms(META)["R2"] == {1: 0.1, 3: 0.2}
 
 
 def test_what_was_measured_takes_longer_and_keeps_its_rows(replayed: Problem) -> None:
-    slow = at_speed_of(META, replayed, {"R1": 0.1, "X": 1.0})
+    slow = at_speed_of(META, replayed, Usual({"R1": 0.1, "X": 1.0}))
     on = slow.pipeline.tasks["perception"].on
     robot, edge = on["R1"].exec_ms, on["E"].exec_ms
     link = next(iter(slow.fabric.links.values())).delay_ms
@@ -66,6 +67,25 @@ def test_what_was_measured_takes_longer_and_keeps_its_rows(replayed: Problem) ->
     assert robot.table is edge.table is link.table
     assert slow.fabric.nodes["R1"].background == pytest.approx(0.3)
     assert slow.pipeline.tasks["sensing"] == replayed.pipeline.tasks["sensing"]
+
+
+def test_a_stage_follows_the_speed_as_much_as_it_was_seen_to(replayed: Problem) -> None:
+    usual = Usual({"R1": 0.1, "E": 0.1}, {("perception", "R1"): 2.0, ("perception", "E"): 0.0})
+    on = at_speed_of(META, replayed, usual).pipeline.tasks["perception"].on
+    robot, edge = on["R1"].exec_ms, on["E"].exec_ms
+    assert isinstance(robot, Trace)
+    assert isinstance(edge, Trace)
+    assert robot.values.tolist() == pytest.approx([9.0, 13.5])
+    assert edge.values.tolist() == [2.0, 3.0]
+    assert usual.factor({"R1": 0.3}, "perception", "R1") == pytest.approx(9.0)
+    assert usual.factor({"R1": 0.3}, "sensing", "R1") == pytest.approx(3.0)
+    assert usual.factor({}, "sensing", "R1") == 1.0
+    told = {
+        "work_ms": {"R1": 0.1, "E": 0.1},
+        "sensitivity": {"perception@R1": 2, "perception@E": 0},
+    }
+    assert Usual.of(told) == usual
+    assert Usual.of({}) == Usual()
 
 
 def test_a_slower_cell_is_slower(replayed: Problem) -> None:

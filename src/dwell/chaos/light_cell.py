@@ -38,6 +38,9 @@ DELAY_MS = {
     "SO": {"R1-E": 1, "E-R2": 1, "R1-R2": 8},
     "LOC": {"R1-E": 10, "E-R2": 10, "R1-R2": 1},
 }
+#: Away from home the cell file has stages take so many times as long: the controller goes home, and
+#: stays there, whatever the machine does to the latencies of three cycles.
+WARY = 3
 #: Of a campaign: enough for nodes with 0.4 of a CPU, and for a machine shared with others.
 PATIENT_MS = 80
 CANDIDATES = {
@@ -79,7 +82,11 @@ def document(
     tasks: dict[str, Any] = {}
     for task, nodes in exec_ms(home).items():
         spare = {"standby": 1} if standby and len(nodes) == 1 else {}
-        on = {node: {"exec_ms": ms, **spare} for node, ms in nodes.items()}
+        at_home = CANDIDATES[home].get(task)
+        on = {
+            node: {"exec_ms": ms * (1 if at_home in (None, node) else WARY), **spare}
+            for node, ms in nodes.items()
+        }
         tasks[task] = {"run": f"dwell.chaos.stages:{task.capitalize()}", "on": on}
     links = [
         {"from": a, "to": b, "both_ways": True, "delay_ms": ms, "rate_mbps": 1000}

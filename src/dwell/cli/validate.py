@@ -17,6 +17,7 @@ from dwell.record import Run, open_run
 from dwell.report.validation_page import validation_html
 from dwell.report.validation_text import validation_text
 from dwell.study.validation import GOALS, Validation, validate
+from dwell.testbed.speeds import Usual
 
 __all__ = ["Request", "sidecar_of", "validate_runs"]
 
@@ -44,7 +45,7 @@ def validate_runs(request: Request, *, as_json: bool) -> None:
     """
     problem = dwell.load(request.cell, traces=request.traces)
     runs = _open(request.runs)
-    ids, work_ms = _sidecar(request.cell)
+    ids, usual = _sidecar(request.cell)
     used = [*ids, *(path.resolve().name for path in request.calibrated_from)]
     with progress("simulating") as show:
         validation = validate(
@@ -52,7 +53,7 @@ def validate_runs(request: Request, *, as_json: bool) -> None:
             problem,
             seeds=request.seeds,
             calibrated_from=used,
-            work_ms=work_ms,
+            usual=usual,
             processes=request.processes,
             progress=show,
         )
@@ -73,18 +74,18 @@ def sidecar_of(cell: Path) -> Path:
     return cell.with_name(f"{cell.stem}.calibration.json")
 
 
-def _sidecar(cell: Path) -> tuple[list[str], dict[str, float]]:
+def _sidecar(cell: Path) -> tuple[list[str], Usual]:
     """Return the ids, or names, of the runs that a cell was calibrated from, and its speeds."""
     file = sidecar_of(cell)
     if not file.is_file():
-        return [], {}
+        return [], Usual()
     try:
         told = json.loads(file.read_text(encoding="utf-8"))
-        speeds = {str(node): float(took) for node, took in told.get("work_ms", {}).items()}
+        usual = Usual.of(told)
         # Runs of two campaigns may have the same name; what their stamps carry differs.
         if told.get("ids"):
-            return [str(one) for one in told["ids"]], speeds
-        return [Path(str(name)).name for name in told.get("runs", [])], speeds
+            return [str(one) for one in told["ids"]], usual
+        return [Path(str(name)).name for name in told.get("runs", [])], usual
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise RunError(
             f"{file}: cannot be read ({error}); it says in `runs` from which runs the cell was "

@@ -17,24 +17,22 @@ import numpy as np
 
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
-from dwell.model import FrozenDict, Placement, Problem
+from dwell.model import Placement, Problem
 from dwell.model.document import to_document
 from dwell.model.scenario import Disturbance, Scenario
 from dwell.policies.registry import by_name
 from dwell.study.predicting import Asked
-from dwell.testbed.speeds import at_speed_of
+from dwell.testbed.speeds import Usual, at_speed_of
 
 if TYPE_CHECKING:
     import polars as pl
 
     from dwell.record import Run
 
-__all__ = ["NO_WORK", "MeasuredRun", "excluded_windows", "read_measured"]
+__all__ = ["MeasuredRun", "excluded_windows", "read_measured"]
 
 Document: TypeAlias = Mapping[str, Any]
 
-#: Where nobody has said how fast the CPUs were.
-NO_WORK: Mapping[str, float] = FrozenDict()
 #: Policies by the name of their class, which is what a run's record says.
 POLICIES = {
     "DTP": "dtp",
@@ -102,9 +100,7 @@ class MeasuredRun:
         )
 
 
-def read_measured(
-    name: str, run: Run, problem: Problem, work_ms: Mapping[str, float] = NO_WORK
-) -> MeasuredRun:
+def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = None) -> MeasuredRun:
     """Find out what a run is a run of, and refuse one that the cell cannot predict.
 
     Parameters
@@ -115,9 +111,9 @@ def read_measured(
         Live, or simulated.
     problem : Problem
         The calibrated cell.
-    work_ms : mapping of str to float
-        How fast its CPUs were (`dwell.testbed.speeds`), by node; where the run says it, too, the
-        cell is predicted on CPUs as fast as the run's.
+    usual : Usual, optional
+        How fast its CPUs were; where the run says it, too, the cell is predicted on CPUs as fast
+        as the run's.
 
     Raises
     ------
@@ -148,7 +144,7 @@ def read_measured(
             warmup_windows=warmup,
             scenarios={**problem.scenarios, scenario: items},
         )
-        problem = at_speed_of(meta, problem, work_ms)
+        problem = at_speed_of(meta, problem, usual or Usual())
     except DwellError as error:
         raise RunError(f"{name}: {error}") from None
     live = meta.get("kind", "simulated") != "simulated"

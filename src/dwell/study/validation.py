@@ -38,7 +38,7 @@ from dwell.study.judged_prediction import (
     within,
     worst,
 )
-from dwell.study.measured_run import NO_WORK, MeasuredRun, read_measured
+from dwell.study.measured_run import MeasuredRun, read_measured
 from dwell.study.predicting import Simulated, Simulator, Unit
 from dwell.study.qos_sample import Piece, QosSample, piece_of
 from dwell.study.resampling import resample_units, resample_windows
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from dwell.record import Run
+    from dwell.testbed.speeds import Usual
 
 __all__ = [
     "GOALS",
@@ -181,7 +182,7 @@ def validate(
     *,
     seeds: int = SEEDS,
     calibrated_from: Sequence[str] = (),
-    work_ms: Mapping[str, float] = NO_WORK,
+    usual: Usual | None = None,
     processes: int | None = 1,
     progress: Progress | None = None,
 ) -> Validation:
@@ -198,9 +199,9 @@ def validate(
     calibrated_from : sequence of str
         Names of the runs from which the cell was made, or their `Run.run_id`; none of them may
         be validated on.
-    work_ms : mapping of str to float
-        CPU time of a probe's piece of work when the cell was calibrated, by node: runs are
-        predicted on CPUs as fast as theirs.
+    usual : Usual, optional
+        How fast the CPUs were when the cell was calibrated: runs are predicted on CPUs as fast as
+        theirs.
     processes : int, optional
         How many to use; where None one a CPU, if there is enough to do.
     progress : callable, optional
@@ -221,7 +222,7 @@ def validate(
         raise RunError("no runs: name at least one")
     if seeds < 2:
         raise RunError(f"seeds is {seeds}; at least 2 are needed, for intervals")
-    measured = _read(named, problem, frozenset[str | None](calibrated_from), work_ms)
+    measured = _read(named, problem, frozenset[str | None](calibrated_from), usual)
     groups = list(_grouped(measured, problem))
     found: dict[int, tuple[Group, pl.DataFrame]] = {}
     waiting: dict[int, dict[Unit, Simulated]] = {place: {} for place in range(len(groups))}
@@ -266,7 +267,7 @@ def _read(
     named: Mapping[str, Run],
     problem: Problem,
     used: frozenset[str | None],
-    work_ms: Mapping[str, float],
+    usual: Usual | None,
 ) -> list[MeasuredRun]:
     """Read every run; what is wrong with any of them is told at once."""
     found: list[MeasuredRun] = []
@@ -276,7 +277,7 @@ def _read(
             faults.append(f"{name}: the cell was calibrated from this run; validate on others")
             continue
         try:
-            one = read_measured(name, run, problem, work_ms)
+            one = read_measured(name, run, problem, usual)
             piece_of(run, one.problem, one.excluded)
             found.append(one)
         except RunError as error:

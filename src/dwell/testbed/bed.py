@@ -324,11 +324,13 @@ class Bed:
             if f"controller@{node}" not in self._processes.running:
                 more = ["--policy", problem.initial]
                 self._processes.start_controller(node, out=self.folder / STARTING, more=more)
-        for problem, watcher in zip(self.problems, self.watchers, strict=True):
-            status = come_up(
-                watcher.status, self.expected(problem), self.folder, patience_s=patience_s
-            )
-            self._past[problem.name] = status["run"]
+        # Interpreters that start would take most of a minute of what a small robot has.
+        with self._groups.unlimited():
+            for problem, watcher in zip(self.problems, self.watchers, strict=True):
+                status = come_up(
+                    watcher.status, self.expected(problem), self.folder, patience_s=patience_s
+                )
+                self._past[problem.name] = status["run"]
         self._processes.stop_controllers()
 
     def begin(self, *, patience_s: float = START_S) -> list[int]:

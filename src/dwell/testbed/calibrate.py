@@ -32,10 +32,10 @@ from dwell.testbed.measured import (
     look_at,
     messaging,
     sites,
-    usual_work_ms,
 )
 from dwell.testbed.paired import paired
-from dwell.testbed.speeds import at_speed_of
+from dwell.testbed.sensitivity import usual_of
+from dwell.testbed.speeds import Usual, at_speed_of
 from dwell.testbed.trace_names import move_traces
 
 __all__ = ["Calibrated", "calibrate", "make_runs"]
@@ -115,8 +115,9 @@ def calibrate(
     problem = dwell.load(cell)
     measured = _looked_at(runs, problem)
     messaging_ms = messaging(measured, problem)
+    usual = usual_of(measured)
     known = hops(measured, messaging_ms, problem, _asked(problem) if emulated else {})
-    found = sites(measured, messaging_ms, known, problem)
+    found = sites(measured, messaging_ms, known, problem, usual)
     behind = backgrounds(measured, found, problem)
     if not found:
         raise RunError("no task has enough jobs in windows that can be used")
@@ -126,8 +127,8 @@ def calibrate(
     document = _document(cell, out)
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
-    beside, usual_ms = beside_jobs(measured, behind), usual_work_ms(measured)
-    more, others = interferences(measured, found), contentions(measured)
+    beside = beside_jobs(measured, behind)
+    more, others = interferences(measured, found, usual), contentions(measured)
     _put_in(document, samples.name, found, delays_ms, behind, beside)
     for name, of_nodes in (("interference", more), ("contention", others)):
         for node, value in of_nodes.items():
@@ -149,9 +150,12 @@ def calibrate(
         "background": {node: _short(value) for node, value in behind.items()},
         "interference": {node: _short(value) for node, value in more.items()},
         "contention": {node: _short(value) for node, value in others.items()},
-        "work_ms": {node: _short(value) for node, value in usual_ms.items()},
+        "work_ms": {node: _short(value) for node, value in usual.work_ms.items()},
+        "sensitivity": {
+            task_name(*site): _short(value) for site, value in usual.sensitivity.items()
+        },
         "background_beside": {node: _short(value) for node, value in beside.items()},
-        "check": [row for one in measured if (row := _check(one, written, usual_ms)) is not None],
+        "check": [row for one in measured if (row := _check(one, written, usual)) is not None],
         "missing": list(missing),
     }
     sidecar = out.with_name(f"{out.stem}.calibration.json")
@@ -406,7 +410,7 @@ def _short(value: float | None) -> float | None:
     return None if value is None else float(f"{value:.5g}")
 
 
-def _check(one: Measured, problem: Problem, usual_ms: Mapping[str, float]) -> dict[str, Any] | None:
+def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | None:
     """Set what the cell says of a run that it was made from beside what that one showed."""
     import polars as pl
 
@@ -416,7 +420,7 @@ def _check(one: Measured, problem: Problem, usual_ms: Mapping[str, float]) -> di
     scenario = "baseline" if scenario == "live" else scenario
     if one.placement not in problem.candidates or scenario not in problem.scenarios:
         return None
-    problem = at_speed_of(one.run.meta, replace(problem, warmup_windows=2), usual_ms)
+    problem = at_speed_of(one.run.meta, replace(problem, warmup_windows=2), usual)
     windows = min(max(one.windows, 50), CHECK_WINDOWS)
     real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
     played = simulate_realisation(problem, real, policy=one.placement)
@@ -460,6 +464,8 @@ def _told(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"{node}: others have {value:.3g} of its CPUs while jobs run")
     for node, value in report["interference"].items():
         lines.append(f"{node}: stages take {value:.3g} times as long beside foreign threads")
+    for name, value in report["sensitivity"].items():
+        lines.append(f"{name}: takes x^{value:.3g} times as long where a CPU is x times as slow")
     for row in report["check"]:
         pairs = (
             f"{name} {_shown(row['measured'][name])} measured, {_shown(row['predicted'][name])} "

@@ -11,8 +11,8 @@ import os
 import shlex
 import signal
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -196,14 +196,36 @@ class Groups:
         else:
             _write(folder / "cpu.shares", str(262_144 if bounded else min(1_024 * count, 262_144)))
 
-    def _limit(self, node: str, quota: Quota) -> None:
-        period_us, quota_us = _microseconds(quota)
+    def _limit(self, node: str, quota: Quota | None) -> None:
         folder = self._folder("cpu", node)
+        period_us, quota_us = (None, None) if quota is None else _microseconds(quota)
         if self._cgroups.version == 2:
-            _write(folder / "cpu.max", f"{quota_us} {period_us}")
+            _write(folder / "cpu.max", "max" if quota is None else f"{quota_us} {period_us}")
             return
-        _write(folder / "cpu.cfs_period_us", str(period_us))
-        _write(folder / "cpu.cfs_quota_us", str(quota_us))
+        if quota is not None:
+            _write(folder / "cpu.cfs_period_us", str(period_us))
+        _write(folder / "cpu.cfs_quota_us", "-1" if quota is None else str(quota_us))
+
+    @contextmanager
+    def unlimited(self) -> Iterator[None]:
+        """Lift the quotas for a while, as for processes that start.
+
+        Raises
+        ------
+        LiveError
+            If the kernel refuses that.
+        """
+        limited = {node: share.quota for node, share in self._shares.items() if share.quota}
+        try:
+            for node in limited:
+                self._limit(node, None)
+        except OSError as error:
+            raise LiveError(f"{error.filename}: {error.strerror}") from None
+        try:
+            yield
+        finally:
+            for node, quota in limited.items():
+                self._limit(node, quota)
 
     def _folder(self, controller: str, node: str) -> Path:
         self._require(node)

@@ -32,7 +32,7 @@ from dwell.model import Flow, Problem
 from dwell.model.bounds import CONTENTION
 from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
-from dwell.testbed.speeds import work_ms
+from dwell.testbed.speeds import Usual, work_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -51,7 +51,6 @@ __all__ = [
     "look_at",
     "messaging",
     "sites",
-    "usual_work_ms",
 ]
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -125,12 +124,13 @@ class Visit:
         CPU time of the stage, in the order of cycles; 0 of a task that an accelerator runs.
     stage_ms : float64 array, shape (jobs,)
         Time that the stage needs where nothing hinders it.
-    cycles : int64 array, shape (jobs,)
+    cycles, windows : int64 array, shape (jobs,)
     """
 
     cpu_ms: Floats
     stage_ms: Floats
     cycles: NDArray[np.int64]
+    windows: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -267,8 +267,12 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             execution = problem.pipeline.tasks[key[0]].on[key[1]]
             on_cpu = execution.accelerator is None
             stage_ms = cpu_ms / execution.threads if on_cpu else of["took"].to_numpy() / 1e6
-            cycles = of["cycle"].to_numpy()
-            visits[key[:2]] = Visit(cpu_ms, np.asarray(stage_ms, np.float64), cycles)
+            visits[key[:2]] = Visit(
+                cpu_ms,
+                np.asarray(stage_ms, np.float64),
+                of["cycle"].to_numpy(),
+                of["window"].to_numpy().astype(np.int64),
+            )
     own = jobs.filter(~pl.col("shadow"))
     handovers_ms = _handovers(own)
     sources = {
@@ -440,6 +444,7 @@ def sites(
     messaging_ms: Mapping[SiteName, float],
     known: OnTheWay,
     problem: Problem,
+    usual: Usual,
 ) -> dict[SiteName, Site]:
     """Execution times of every task on every node that was visited undisturbed.
 
@@ -449,16 +454,18 @@ def sites(
         CPU time that a worker takes for a job besides its stage (`messaging`).
     known : OnTheWay
         What of that lies on the way of messages.
+    problem : Problem
+    usual : Usual
+        How fast the CPUs were in all runs together: samples are of CPUs as fast as that.
     """
     found: dict[SiteName, Site] = {}
-    usual_ms = usual_work_ms(measured)
     for site in sorted({site for one in measured for site in one.visits}):
         of = [one for one in measured if site in one.visits and site[1] not in one.disturbed.nodes]
         if sum(len(one.visits[site].stage_ms) for one in of) < LEAST_JOBS:
             continue
         # As long as it would have taken at the runs' mean speed.
         stages_ms = {
-            one.name: one.visits[site].stage_ms * _to_usual(one, site[1], usual_ms) for one in of
+            one.name: one.visits[site].stage_ms / usual.factor(one.work_ms, *site) for one in of
         }
         begin_ms, end_ms = (
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
@@ -473,17 +480,6 @@ def sites(
         stage_ms = float(np.concatenate(list(stages_ms.values())).mean())
         found[site] = Site(samples, stage_ms, read_ms + write_ms, before_ms, after_ms)
     return found
-
-
-def usual_work_ms(measured: Sequence[Measured]) -> dict[str, float]:
-    """Mean CPU time of a fixed piece of work, by node; of nodes of which every run knows it."""
-    nodes = set.intersection(*(set(one.work_ms) for one in measured)) if measured else set()
-    return {node: float(np.mean([one.work_ms[node] for one in measured])) for node in sorted(nodes)}
-
-
-def _to_usual(one: Measured, node: str, usual_ms: Mapping[str, float]) -> float:
-    """What times of a run have to be multiplied by, for CPUs as fast as usual."""
-    return usual_ms[node] / one.work_ms[node] if node in usual_ms else 1.0
 
 
 def _on_the_way_ms(
@@ -609,16 +605,17 @@ def contentions(measured: Sequence[Measured]) -> dict[str, float]:
     return result
 
 
-def interferences(measured: Sequence[Measured], found: Mapping[SiteName, Site]) -> dict[str, float]:
+def interferences(
+    measured: Sequence[Measured], found: Mapping[SiteName, Site], usual: Usual
+) -> dict[str, float]:
     """How many times as much core time stages took on nodes that were stressed all the time."""
-    usual_ms = usual_work_ms(measured)
     sums: dict[str, list[float]] = {}
     for one in measured:
         for site, visit in one.visits.items():
             node = site[1]
             if node in one.disturbed.stressed and site in found:
                 total = sums.setdefault(node, [0.0, 0.0, 0.0])
-                total[0] += float(visit.stage_ms.sum()) * _to_usual(one, node, usual_ms)
+                total[0] += float(visit.stage_ms.sum()) / usual.factor(one.work_ms, *site)
                 total[1] += len(visit.stage_ms) * found[site].stage_ms
                 total[2] += len(visit.stage_ms)
     return {

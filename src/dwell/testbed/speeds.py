@@ -3,26 +3,75 @@
 A machine that others share is now faster and now slower: what the same work takes of a CPU's time
 changes by a fifth within the hour. The probes of a run do a fixed piece of work all the time
 (`dwell.testbed.probe`), and know nothing of the cell. A calibrated cell says how fast the CPUs were
-that it was measured on; a run that is compared with it is predicted on CPUs as fast as its own.
+that it was measured on, and how much each stage depends on that; a run that is compared with it is
+predicted on CPUs as fast as its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from statistics import median
+from dataclasses import dataclass, replace
+from statistics import fmean, median
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dwell.model import Problem, Trace
+from dwell.model import FrozenDict, Problem, Trace
 from dwell.model.bounds import CONTENTION
 from dwell.model.process import TraceTable
 
 if TYPE_CHECKING:
     from dwell.model import Execution, Process
 
-__all__ = ["at_speed_of", "slowed", "work_ms"]
+__all__ = ["Usual", "at_speed_of", "slowed", "window_work_ms", "work_ms"]
+
+
+@dataclass(frozen=True, slots=True)
+class Usual:
+    """How fast the CPUs were that a cell was measured on, and how much stages depend on it.
+
+    Parameters
+    ----------
+    work_ms : mapping of str to float
+        CPU time of a probe's piece of work, by node.
+    sensitivity : mapping of (str, str) to float
+        By task and node: where the piece of work takes x times as long, the stage takes
+        x**sensitivity times as long. 1 of those that are not there.
+    """
+
+    work_ms: Mapping[str, float] = FrozenDict()
+    sensitivity: Mapping[tuple[str, str], float] = FrozenDict()
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Usual:
+        """Return what a calibration's report says.
+
+        Parameters
+        ----------
+        told : mapping
+            ``work_ms`` by node and ``sensitivity`` by ``task@node``, where they are there.
+        """
+        return cls(
+            {str(node): float(ms) for node, ms in told.get("work_ms", {}).items()},
+            {
+                (task, node): float(value)
+                for name, value in told.get("sensitivity", {}).items()
+                for task, _, node in [str(name).partition("@")]
+            },
+        )
+
+    def factors(self, took_ms: Mapping[str, float]) -> dict[str, float]:
+        """Return how many times as long a probe's piece of work took, by node."""
+        return {
+            node: took_ms[node] / usual_ms
+            for node, usual_ms in self.work_ms.items()
+            if node in took_ms
+        }
+
+    def factor(self, took_ms: Mapping[str, float], task: str, node: str) -> float:
+        """Return how many times as long a stage took as it usually does."""
+        factor = self.factors(took_ms).get(node, 1.0)
+        return float(factor ** self.sensitivity.get((task, node), 1.0))
 
 
 def work_ms(meta: Mapping[str, Any]) -> dict[str, float]:
@@ -33,27 +82,34 @@ def work_ms(meta: Mapping[str, Any]) -> dict[str, float]:
     meta : mapping
         Of a run. Without ``testbed``, or without what its probes did, nothing is known.
     """
+    windows = window_work_ms(meta)
+    return {node: median(of.values()) for node, of in windows.items() if of}
+
+
+def window_work_ms(meta: Mapping[str, Any]) -> dict[str, dict[int, float]]:
+    """CPU time of a probe's piece of work on every node's CPUs, by window of those that count."""
     pressure, testbed = meta.get("pressure"), meta.get("testbed")
     if not isinstance(pressure, Mapping) or not isinstance(testbed, Mapping):
         return {}
     excluded = set(pressure.get("excluded", ()))
     warmup = int(meta.get("problem", {}).get("warmup_windows", 0))
-    rows = [
-        row["work_ms"]
+    rows = {
+        int(row["window"]): row["work_ms"]
         for row in pressure.get("windows", ())
         if row.get("work_ms") and row["window"] >= warmup and row["window"] not in excluded
-    ]
-    found = {}
+    }
+    found: dict[str, dict[int, float]] = {}
     for node, about in testbed.get("nodes", {}).items():
-        took = [row[str(cpu)] for row in rows for cpu in about["cpus"] if str(cpu) in row]
-        if took:
-            found[node] = median(took)
+        cpus = [str(cpu) for cpu in about["cpus"]]
+        found[node] = {
+            window: fmean(row[cpu] for cpu in cpus if cpu in row)
+            for window, row in rows.items()
+            if not row.keys().isdisjoint(cpus)
+        }
     return found
 
 
-def at_speed_of(
-    meta: Mapping[str, Any], problem: Problem, usual_ms: Mapping[str, float]
-) -> Problem:
+def at_speed_of(meta: Mapping[str, Any], problem: Problem, usual: Usual) -> Problem:
     """Return a cell on CPUs as fast as they were in a run.
 
     Parameters
@@ -61,14 +117,17 @@ def at_speed_of(
     meta : mapping
         Of the run.
     problem : Problem
-    usual_ms : mapping of str to float
-        CPU time of a probe's piece of work, by node, where the cell was measured.
+    usual : Usual
+        Where the cell was measured.
     """
-    took = work_ms(meta)
-    return slowed(problem, {node: took[node] / usual_ms[node] for node in usual_ms if node in took})
+    return slowed(problem, usual.factors(work_ms(meta)), usual.sensitivity)
 
 
-def slowed(problem: Problem, factors: Mapping[str, float]) -> Problem:
+def slowed(
+    problem: Problem,
+    factors: Mapping[str, float],
+    sensitivity: Mapping[tuple[str, str], float] = FrozenDict(),
+) -> Problem:
     """Return a cell on CPUs on which everything takes so many times as long.
 
     Parameters
@@ -77,10 +136,12 @@ def slowed(problem: Problem, factors: Mapping[str, float]) -> Problem:
     factors : mapping of str to float
         By node. What was measured takes longer (execution times that are replayed, backgrounds,
         what others take); what was not stays as it is.
+    sensitivity : mapping of (str, str) to float
+        By task and node; see `Usual`.
     """
     if not factors:
         return problem
-    tables = _tables(problem, factors)
+    tables = _tables(problem, factors, sensitivity)
 
     def moved(process: Process) -> Process:
         if isinstance(process, Trace) and id(process.table) in tables:
@@ -116,7 +177,11 @@ def slowed(problem: Problem, factors: Mapping[str, float]) -> Problem:
     )
 
 
-def _tables(problem: Problem, factors: Mapping[str, float]) -> dict[int, TraceTable]:
+def _tables(
+    problem: Problem,
+    factors: Mapping[str, float],
+    sensitivity: Mapping[tuple[str, str], float],
+) -> dict[int, TraceTable]:
     """Tables that nodes' execution times are replayed from, with longer ones, by their identity."""
     longer: dict[int, tuple[TraceTable, dict[str, float]]] = {}
     for task in problem.pipeline.tasks.values():
@@ -124,7 +189,8 @@ def _tables(problem: Problem, factors: Mapping[str, float]) -> dict[int, TraceTa
             # An accelerator is not slower where CPUs are.
             if isinstance(of.exec_ms, Trace) and node in factors and of.accelerator is None:
                 table = of.exec_ms.table
-                longer.setdefault(id(table), (table, {}))[1][of.exec_ms.column] = factors[node]
+                factor = factors[node] ** sensitivity.get((task.name, node), 1.0)
+                longer.setdefault(id(table), (table, {}))[1][of.exec_ms.column] = factor
     return {
         key: replace(
             table,
