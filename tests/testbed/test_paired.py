@@ -34,10 +34,25 @@ def test_a_run_in_which_tasks_were_elsewhere_takes_their_rows_together_from_anot
         }
     )
     assert found["see", "R1"].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert found["find", "R1"].tolist() == [10.0, 20.0, 10.0, 20.0, 10.0]
+    # The slowest rows of the other run, where the task that both have was slowest.
+    assert found["find", "R1"].tolist() == [10.0, 20.0, 10.0, 20.0, 20.0]
     assert found["find", "E"].tolist() == [30.0, 40.0, 30.0, 40.0, 50.0]
     # Tasks of a node stay with each other wherever their rows are from.
     assert (found["plan", "E"] == 10 * found["find", "E"]).all()
+
+
+def test_rows_that_stand_in_are_of_cycles_as_slow_on_the_same_cpu() -> None:
+    parts = {
+        ("see", "R1"): {"loc": part(0, [1.0, 2.0, 3.0, 4.0]), "so": part(0, [5.0, 1.0, 3.0])},
+        ("find", "R2"): {"loc": part(0, [40.0, 10.0, 30.0, 20.0])},
+        ("find", "E"): {"so": part(0, [7.0, 8.0, 9.0])},
+    }
+    shared = paired(parts, {"R1": 0, "R2": 0, "E": 1})
+    assert shared["find", "R2"].tolist() == [40.0, 10.0, 30.0, 20.0, 20.0, 40.0, 30.0]
+    # Nothing on E was there in the first run: its rows come in their order.
+    assert shared["find", "E"].tolist() == [7.0, 8.0, 9.0, 7.0, 7.0, 8.0, 9.0]
+    apart = paired(parts)
+    assert apart["find", "R2"].tolist() == [40.0, 10.0, 30.0, 20.0, 40.0, 10.0, 30.0]
 
 
 def test_rows_that_stand_in_go_on_where_they_ended() -> None:

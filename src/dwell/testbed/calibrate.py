@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -121,7 +121,7 @@ def calibrate(
     behind = backgrounds(measured, found, problem)
     if not found:
         raise RunError("no task has enough jobs in windows that can be used")
-    columns = paired({site: of.samples for site, of in found.items()})
+    columns = paired({site: of.samples for site, of in found.items()}, _cpus(measured))
     rows = len(next(iter(columns.values())))
     added_ms, delays_ms = _links(measured, known, problem, rows, emulated=emulated)
     document = _document(cell, out)
@@ -163,6 +163,17 @@ def calibrate(
     for line in _told(report):
         say(line)
     return Calibrated(out, samples, sidecar, written, report, missing)
+
+
+def _cpus(measured: Sequence[Measured]) -> dict[str, Hashable]:
+    """Return which CPUs of its computer each node had, where the runs were on a testbed's."""
+    found: dict[str, Hashable] = {}
+    for one in measured:
+        testbed = one.run.meta.get("testbed")
+        for node, about in (testbed or {}).get("nodes", {}).items():
+            if about.get("cpus"):
+                found[node] = tuple(about["cpus"])
+    return found
 
 
 def make_runs(

@@ -56,6 +56,9 @@ __all__ = [
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
+#: How many times as long as usual messaging takes where a stage takes longer: in the runs of the
+#: example as many as that, window by window; a job that finds nothing to do has its messages still.
+SLOWER = 0.5, 2.0
 #: What a disturbance has that is not there all the time.
 SOMETIMES = ("at_s", "for_s", "episodes", "ramp_s")
 #: Sides of a hop, in its times and, behind source and target, in its name.
@@ -473,13 +476,23 @@ def sites(
         )
         read_ms, write_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
         before_ms, after_ms = begin_ms + read_ms, write_ms + end_ms
+        stage_ms = float(np.concatenate(list(stages_ms.values())).mean())
         samples = {
-            one.name: Part(one.visits[site].cycles, stages_ms[one.name] + (before_ms + after_ms))
+            one.name: Part(
+                one.visits[site].cycles,
+                _with_messaging(stages_ms[one.name], stage_ms, before_ms + after_ms),
+            )
             for one in of
         }
-        stage_ms = float(np.concatenate(list(stages_ms.values())).mean())
         found[site] = Site(samples, stage_ms, read_ms + write_ms, before_ms, after_ms)
     return found
+
+
+def _with_messaging(stages_ms: Floats, mean_ms: float, around_ms: float) -> Floats:
+    """Add what is done around a stage: what slows the stage down slows that."""
+    if mean_ms <= 0:
+        return stages_ms + around_ms
+    return stages_ms + around_ms * np.clip(stages_ms / mean_ms, *SLOWER)
 
 
 def _on_the_way_ms(

@@ -1,18 +1,21 @@
-"""Paired: execution times as rows in which the tasks of a node keep what they had in common.
+"""Paired: execution times as rows in which the tasks of a CPU keep what they had in common.
 
 Where others share the machine, its CPUs are fast at times and slow at others, for all that runs on
 them. A row holds one cycle of a run, every task on every node. A task that was not there in that
-run, because its cycles were placed elsewhere, takes its times from a run in which it was: with
-those of the other tasks of its node that were not there either, in the order of their cycles.
+run, because its cycles were placed elsewhere, takes its times from a run in which it was: from a
+cycle that was as slow, among those of its run, for the tasks of its CPU that were there in both.
+Where there was none, from the cycles in their order. Tasks that were not there stay together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dwell.model import FrozenDict
 
 __all__ = ["Part", "paired"]
 
@@ -34,38 +37,67 @@ class Part(NamedTuple):
     times_ms: Floats
 
 
-def paired(parts: Mapping[SiteName, Mapping[str, Part]]) -> dict[SiteName, Floats]:
+def paired(
+    parts: Mapping[SiteName, Mapping[str, Part]], cpus: Mapping[str, Hashable] = FrozenDict()
+) -> dict[SiteName, Floats]:
     """Return a column of times for every task on every node, all of one length.
 
     Parameters
     ----------
     parts : mapping of (str, str) to mapping of str to Part
         By task and node, and by run; at least one run each.
+    cpus : mapping of str to hashable
+        What CPUs a node has; those of a node that is not there are its own.
     """
     runs = list(dict.fromkeys(run for of in parts.values() for run in of))
     blocks = {
         run: _block({site: of[run] for site, of in parts.items() if run in of}) for run in runs
     }
+    beside: dict[Hashable, set[SiteName]] = {}
+    for site in parts:
+        beside.setdefault(cpus.get(site[1], site[1]), set()).add(site)
     columns: dict[SiteName, list[Floats]] = {site: [] for site in parts}
     # Where each run's rows go on when they stand in for another's.
-    begins: dict[tuple[str, str], int] = {}
+    begins: dict[tuple[str, Hashable], int] = {}
     for block in blocks.values():
         rows = len(next(iter(block.values())))
-        for node in dict.fromkeys(node for _, node in parts):
-            missing = {site for site in parts if site[1] == node} - block.keys()
-            for site in block.keys() - missing:
-                if site[1] == node:
-                    columns[site].append(block[site])
-            while missing:
-                donor = max(runs, key=lambda other: len(missing & blocks[other].keys()))
-                begin = begins.get((donor, node), 0)
-                length = len(next(iter(blocks[donor].values())))
-                taken = (begin + np.arange(rows)) % length
-                begins[donor, node] = (begin + rows) % length
-                for site in missing & blocks[donor].keys():
-                    columns[site].append(blocks[donor][site][taken])
-                missing -= blocks[donor].keys()
+        for place, sites in beside.items():
+            have = {site: block[site] for site in sites & block.keys()}
+            while missing := sites - have.keys():
+                donor = max(runs, key=lambda run: _use(blocks[run], missing, have))
+                of = blocks[donor]
+                if common := sorted(have.keys() & of.keys()):
+                    taken = _as_slow([have[site] for site in common], [of[site] for site in common])
+                else:
+                    begin, length = begins.get((donor, place), 0), len(next(iter(of.values())))
+                    taken = (begin + np.arange(rows)) % length
+                    begins[donor, place] = (begin + rows) % length
+                have |= {site: of[site][taken] for site in missing & of.keys()}
+            for site, values in have.items():
+                columns[site].append(values)
     return {site: np.concatenate(values) for site, values in columns.items()}
+
+
+def _use(
+    donor: Mapping[SiteName, Floats], missing: set[SiteName], have: Mapping[SiteName, Floats]
+) -> tuple[int, int]:
+    """How many tasks a run has that are missing, and how many that are there."""
+    return len(missing & donor.keys()), len(have.keys() & donor.keys())
+
+
+def _as_slow(ours: Sequence[Floats], theirs: Sequence[Floats]) -> NDArray[np.intp]:
+    """Return for every row of some tasks that of another run that has the same place in it."""
+    own, other = (_slowness(columns) for columns in (ours, theirs))
+    place = np.empty(len(own))
+    place[np.argsort(own, kind="stable")] = (np.arange(len(own)) + 0.5) / len(own)
+    ordered = np.argsort(other, kind="stable")
+    return ordered[(place * len(other)).astype(np.intp)]
+
+
+def _slowness(columns: Sequence[Floats]) -> Floats:
+    """How slow each row is among all, from every task alike."""
+    slowness: Floats = np.sum([values / values.mean() for values in columns], axis=0)
+    return slowness
 
 
 def _block(of: Mapping[SiteName, Part]) -> dict[SiteName, Floats]:

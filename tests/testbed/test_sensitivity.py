@@ -1,0 +1,83 @@
+"""How much longer stages take where a probe's piece of work does."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from dwell.record import Run
+from dwell.testbed.measured import Disturbed, Measured, Visit
+from dwell.testbed.sensitivity import LEAST_WINDOWS, sensitivities, usual_of
+
+SEE, FIND = ("see", "R1"), ("find", "E")
+JOBS = 20
+
+
+def measured(
+    name: str,
+    speed: float,
+    slow: dict[tuple[str, str], float],
+    *,
+    windows: int = LEAST_WINDOWS,
+    spread: float = 0.1,
+    stressed: tuple[str, ...] = (),
+) -> Measured:
+    """A run whose CPUs change from window to window; stages follow by their exponents."""
+    draw = np.random.default_rng(len(name))
+    changes = {node: np.exp(draw.normal(0, spread, windows)) for node in ("R1", "E")}
+    rows = [
+        {"window": i, "work_ms": {"0": 0.1 * speed * changes["R1"][i], "1": 0.2 * changes["E"][i]}}
+        for i in range(windows)
+    ]
+    visits = {}
+    for site, exponent in slow.items():
+        jobs = np.repeat(np.arange(windows), JOBS)
+        noise = draw.gamma(50, 1 / 50, len(jobs))
+        stage_ms = 5.0 * speed**exponent * changes[site[1]][jobs] ** exponent * noise
+        visits[site] = Visit(stage_ms, stage_ms, np.arange(len(jobs)), jobs)
+    meta = {
+        "testbed": {"nodes": {"R1": {"cpus": [0]}, "E": {"cpus": [1]}}},
+        "pressure": {"windows": rows},
+    }
+    return Measured(
+        name=name,
+        run=cast("Run", SimpleNamespace(meta=meta)),
+        disturbed=Disturbed(frozenset(stressed), frozenset(), frozenset(stressed)),
+        placement="",
+        windows=windows,
+        cycles=windows * JOBS,
+        jobs_s=1.0,
+        visits=visits,
+        rates={},
+        starts={},
+        spent_ms={},
+        used={},
+        work_ms={"R1": 0.1 * speed, "E": 0.2},
+    )
+
+
+def test_exponents_are_found_within_runs() -> None:
+    slow = {SEE: 0.5, FIND: 1.5}
+    found = sensitivities([measured("a", 1.0, slow), measured("bb", 1.2, slow)])
+    assert found[SEE] == pytest.approx(0.5, abs=0.1)
+    assert found[FIND] == pytest.approx(1.5, abs=0.1)
+
+
+def test_what_shows_nothing_says_nothing() -> None:
+    assert sensitivities([measured("a", 1.0, {SEE: 1.0}, windows=LEAST_WINDOWS - 1)]) == {}
+    assert sensitivities([measured("a", 1.0, {SEE: 1.0}, spread=0.001)]) == {}
+    busy = measured("a", 1.0, {SEE: 1.0, FIND: 1.0}, stressed=("E",))
+    assert sensitivities([busy]).keys() == {SEE}
+
+
+def test_a_stage_never_takes_less_on_a_slower_cpu() -> None:
+    assert sensitivities([measured("a", 1.0, {SEE: -1.0})])[SEE] == 0.0
+
+
+def test_the_usual_speed_is_that_of_all_runs() -> None:
+    usual = usual_of([measured("a", 1.0, {SEE: 1.0}), measured("bb", 1.2, {SEE: 1.0})])
+    assert usual.work_ms == pytest.approx({"R1": 0.11, "E": 0.2})
+    assert usual.factor({"R1": 0.22}, *SEE) == pytest.approx(2.0, rel=0.1)
