@@ -127,10 +127,14 @@ def _measure(parent: Parent) -> None:
 
 
 def _work_ns() -> int:
-    """Do the piece of work; returns the CPU time that it took."""
+    """Do the piece of work; returns the CPU time that it took.
+
+    Its numbers are small ones, which Python keeps: others are allocated, and where a process's heap
+    stands at the edge of a pool, that takes twice as long, for as long as the process lives.
+    """
     begun_ns, value = time.thread_time_ns(), 1
     for _ in range(WORK_TURNS):
-        value = value * 5 & 0xFFFF | 1
+        value = value * 3 & 0x3F | 1
     return time.thread_time_ns() - begun_ns
 
 
