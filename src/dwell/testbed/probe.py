@@ -3,8 +3,9 @@
 It sleeps 5 ms, and notes how much later than that it runs again: at normal priority, in a group as
 weighty as the nodes' and without a quota. Nodes that use what their quotas grant make it late by
 less than one period of a quota; a machine that stands still, or has more to do than it can, makes
-it later. Every 25 ms it does a fixed piece of work: what that takes of the CPU's time says how fast
-the CPU is, which on a machine that others share depends on them.
+it later. Every 25 ms it does a fixed piece of work, and every 100 ms it goes through more memory
+than a core keeps to itself: what these take of the CPU's time says how fast the CPU is, and how
+fast what it shares with others, on a machine that others share.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ __all__ = ["Lateness", "Probe"]
 SLEEP_NS = 5_000_000
 #: Wakes between two pieces of work, and turns of its loop: about 0.1 ms.
 WORK_EVERY, WORK_TURNS = 5, 2_000
+#: Wakes between two walks through memory; its bytes, and those of a cache line: about 0.2 ms.
+WALK_EVERY, WALK_BYTES, LINE_BYTES = 20, 2 << 20, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +41,15 @@ class Lateness:
     mean_ms, max_ms : float
     work_ms : float or None
         CPU time of its piece of work, the mean; None where it has done none.
+    memory_ms : float or None
+        The same of its walk through memory.
     """
 
     wakes: int
     mean_ms: float
     max_ms: float
     work_ms: float | None
+    memory_ms: float | None
 
 
 class Probe(Started):
@@ -83,13 +89,18 @@ class Probe(Started):
             If it does not run.
         """
         found = cast("dict[str, float]", self._child.ask({}))
-        wakes, works = int(found["wakes"]), int(found["works"])
+        wakes = int(found["wakes"])
         return Lateness(
             wakes=wakes,
             mean_ms=found["late_ns"] / max(wakes, 1) / 1e6,
             max_ms=found["max_ns"] / 1e6,
-            work_ms=found["work_ns"] / works / 1e6 if works else None,
+            work_ms=_mean_ms(found["work_ns"], found["works"]),
+            memory_ms=_mean_ms(found["walk_ns"], found["walks"]),
         )
+
+
+def _mean_ms(sum_ns: float, count: float) -> float | None:
+    return sum_ns / count / 1e6 if count else None
 
 
 def main() -> None:
@@ -104,7 +115,8 @@ def main() -> None:
 
 def _measure(parent: Parent) -> None:
     counts = Counter[str]()
-    longest_ns, until_work = 0, WORK_EVERY
+    memory = bytes(range(256)) * (WALK_BYTES // 256)
+    longest_ns, wakes = 0, 0
     due_ns = time.monotonic_ns() + SLEEP_NS
     while parent.alive:
         wait_s = max(due_ns - time.monotonic_ns(), 0) / 1e9
@@ -113,14 +125,15 @@ def _measure(parent: Parent) -> None:
         if now_ns >= due_ns:
             late_ns = now_ns - due_ns
             counts.update(wakes=1, late_ns=late_ns)
-            longest_ns, until_work = max(longest_ns, late_ns), until_work - 1
-            if not until_work:
+            longest_ns, wakes = max(longest_ns, late_ns), wakes + 1
+            if wakes % WORK_EVERY == 0:
                 counts.update(works=1, work_ns=_work_ns())
-                until_work = WORK_EVERY
+            if wakes % WALK_EVERY == 0:
+                counts.update(walks=1, walk_ns=_walk_ns(memory))
             due_ns = time.monotonic_ns() + SLEEP_NS
         if asked:
             parent.receive()
-            told = ("wakes", "late_ns", "works", "work_ns")
+            told = ("wakes", "late_ns", "works", "work_ns", "walks", "walk_ns")
             parent.answer({name: counts[name] for name in told} | {"max_ns": longest_ns})
             counts.clear()
             longest_ns = 0
@@ -135,6 +148,13 @@ def _work_ns() -> int:
     begun_ns, value = time.thread_time_ns(), 1
     for _ in range(WORK_TURNS):
         value = value * 3 & 0x3F | 1
+    return time.thread_time_ns() - begun_ns
+
+
+def _walk_ns(memory: bytes) -> int:
+    """Read one byte of every cache line; returns the CPU time that it took."""
+    begun_ns = time.thread_time_ns()
+    memory[::LINE_BYTES]
     return time.thread_time_ns() - begun_ns
 
 

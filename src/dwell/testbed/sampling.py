@@ -110,6 +110,9 @@ class Sampler:
             waited_s=waited_s(),
             probe_ms={cpu: one.max_ms for cpu, one in probed.items()},
             work_ms={cpu: one.work_ms for cpu, one in probed.items() if one.work_ms is not None},
+            memory_ms={
+                cpu: one.memory_ms for cpu, one in probed.items() if one.memory_ms is not None
+            },
             packets={name: sum(one.packets for one in ways) for name, ways in passed.items()},
             late={
                 name: sum(sum(one.late[self._first_late :]) for one in ways)

@@ -1,0 +1,30 @@
+"""A probe that runs."""
+
+from __future__ import annotations
+
+import time
+
+from dwell.testbed.probe import Lateness, Probe
+from tests.testbed.machine import CPU
+
+PATIENCE_S = 30.0
+
+
+def test_a_probe_tells_how_late_it_was_and_what_its_work_took() -> None:
+    probe = Probe(CPU)
+    probe.start()
+    try:
+        found: list[Lateness] = []
+        until_s = time.monotonic() + PATIENCE_S
+        while not found or found[-1].memory_ms is None:
+            assert time.monotonic() < until_s
+            time.sleep(0.15)
+            found.append(probe.read())
+        last = found[-1]
+        assert last.wakes >= 1
+        assert 0 <= last.mean_ms <= last.max_ms
+        assert last.memory_ms is not None
+        assert last.memory_ms > 0
+        assert any(one.work_ms for one in found)
+    finally:
+        probe.stop()
