@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace as replaced
 
 import dwell
 from dwell.live.cell import Cell
@@ -156,6 +157,41 @@ def test_decisions_that_are_recorded_are_not_kept(problem: Problem) -> None:
     decisions = cell_of(world).controller.log.decisions
     assert len(decisions) > 8
     assert not any(decisions[:-2])
+
+
+def test_an_order_that_was_asked_for_anew_before_its_answer_came_is_no_move_of_the_guard(
+    problem: Problem,
+) -> None:
+    world = alternating(problem)
+    cell = cell_of(world)
+    send = cell._send
+
+    def sent(order: Order) -> None:
+        send(order)
+        if order.placement and cell._move is not None:
+            # As after a refusal for now: the answer to the first is still on its way.
+            cell._move.order = replaced(order, number=cell._next_number())
+            send(cell._move.order)
+
+    cell._send = sent  # type: ignore[method-assign]
+    world.run(12_000)
+    assert len(world.stamper.moves) >= 12
+    assert {why for _, _, why in world.stamper.moves} == {"order"}
+    assert cell.guard_moves == 0
+    assert not cell.controller.on_fallback
+    assert "guard" not in {why for (why,) in columns(world, "decisions", "reason")}
+
+
+def test_whom_the_stamper_tells_that_no_guard_moved_needs_no_proof(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(4_000)
+    cell = cell_of(world)
+    # An order that was given up, and accepted after all; only its stamp was heard.
+    cell.controller.on_fallback, cell.controller.wanted = True, "SO"
+    before = len(world.stamper.moves)
+    world.run(6_000)
+    assert not cell.controller.on_fallback
+    assert len(world.stamper.moves) >= before + 6
 
 
 def test_a_lost_order_is_sent_again(problem: Problem) -> None:

@@ -204,17 +204,19 @@ class Cell:
         before = held.placement if held is not None else placement
         self.held = Accepted(0, self.name, "", run, term, placement, 0, by_guard)
         self._unwritten = True
+        move, self._move = self._move, None
         if not by_guard:
-            self._move = None
             if self.windows is not None:
-                self.windows.carried_out()
+                if move is None or move.name == placement:
+                    self.windows.carried_out()
+                else:
+                    self.windows.refused(f"the placement became {placement} meanwhile")
             self.migrations += 1
             if placement != self.controller.incumbent:
                 # A person's choice, not the policy's.
                 self.controller.resume(placement)
             self.controller.on_fallback = False
             return
-        self._move = None
         if self.windows is not None:
             self.windows.refused(f"the placement became {placement} meanwhile")
         self.guard_moves += 1
@@ -244,8 +246,11 @@ class Cell:
         move = self._move
         mine = move is not None and move.order is not None and answer.number == move.order.number
         if (answer.run, answer.term) > (held.run, held.term):
-            ours = mine and not answer.refused and not answer.fallback
-            self._now_at(answer.run, answer.term, answer.placement, by_guard=not ours)
+            # What was accepted may be an order before the one that waits for its answer.
+            self._now_at(answer.run, answer.term, answer.placement, by_guard=answer.fallback)
+        elif not answer.fallback:
+            # A stamp says where the cell is, and not who has moved it.
+            self.controller.on_fallback = False
         self.held = answer
         if not mine or move is None:
             return
