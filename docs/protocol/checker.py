@@ -135,14 +135,19 @@ def stuck(explored: Explored[State], good: Callable[[State], bool]) -> list[Stat
 
 
 def without(
-    rule: str, initial: State, cases: Iterable[Callable[..., Iterator[Step[State]]]]
+    rule: str,
+    initial: State,
+    cases: Iterable[Callable[..., Iterator[Step[State]]]],
+    good: Callable[[State], bool],
 ) -> ViolationError | None:
     """Return what goes wrong in any case of a model without one of its rules."""
     for successors in cases:
         try:
-            explore(initial, partial(successors, rules=Rules(frozenset({rule}))))
+            found = explore(initial, partial(successors, rules=Rules(frozenset({rule}))))
         except ViolationError as violation:
             return violation
+        if lost := stuck(found, good):
+            return ViolationError("there is no way back", tuple(found.way(lost[0])))
     return None
 
 
@@ -158,6 +163,5 @@ def report(
         lost = len(stuck(found, good))
         print(f"{len(found.steps)} states, {found.depth} steps deep; from {lost} no way back")
     for rule, text in rules.items():
-        print(
-            f"\nwithout {rule!r} ({text}): {without(rule, initial, cases) or 'nothing goes wrong'}"
-        )
+        wrong = without(rule, initial, cases, good)
+        print(f"\nwithout {rule!r} ({text}): {wrong or 'nothing goes wrong'}")

@@ -5,17 +5,22 @@ delays, repeats and reorders whatever is said: a message that was sent once may 
 later, any number of times, or never. Time is left out: the guard may fire, a lease may run out and
 a process may die and come back whenever there are faults left to spend. Each rule can be left out
 of the model, and the checker then has to find out what it is there for.
+
+A stamp says where the cell is, and not who has moved it: a controller that hears of a new term by a
+stamp takes it for the guard's doing unless it has ordered that very move, and may have forgotten it
+even then. Answers say it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 from docs.protocol.checker import Rules, Step, report
 
-__all__ = ["RULES", "Limits", "State", "good", "initial", "successors"]
+__all__ = ["CASES", "RULES", "Limits", "State", "good", "initial", "successors"]
 
 #: Candidates: the guard's only fallback, where the controllers would like to be, a third one.
 FALLBACK, WANTED, OTHER = "LOC", "SO", "HYB"
@@ -31,6 +36,7 @@ RULES = {
     "fresh proof": "a proof counts for the stay on the fallback that it was made in",
     "charge": "a second controller is refused while the first one is in charge",
     "book": "a stamper that starts again knows its term and placement",
+    "answer": "an answer that it was no move of the guard ends the wait for a proof",
 }
 
 
@@ -47,13 +53,17 @@ class Limits:
     lapses : int
         Times that a lease runs out although its controller lives.
     whims : int
-        Orders to another placement than the one that is wanted otherwise.
+        Orders to another placement than the one that is wanted otherwise: people's, who wait for no
+        proof.
+    controllers : int
+        How many say something.
     """
 
     fires: int = 2
     crashes: int = 1
     lapses: int = 1
     whims: int = 0
+    controllers: int = len(CONTROLLERS)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -76,6 +86,8 @@ class Told:
 
 
 ALL, LIMITS = Rules(), Limits()
+#: Two controllers of one mind, and one that changes it.
+CASES = LIMITS, Limits(fires=2, lapses=0, whims=1, controllers=1)
 NOTHING = Told(0, "", False)
 
 
@@ -98,7 +110,7 @@ class State:
     orders : frozenset of Order
         What has been ordered; may arrive at any time.
     views : tuple of Told
-        What each controller knows: nothing before it has heard anything.
+        What each controller knows, or takes for true: nothing before it has heard anything.
     fires, crashes, lapses, whims : int
         How many there have been.
     done : frozenset of Order
@@ -133,8 +145,8 @@ def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Ite
     """Return everything that may happen next."""
     yield from _faults(state, rules, limits)
     yield from _stamper(state, rules)
-    for index, name in enumerate(CONTROLLERS):
-        yield from _controller(state, limits, index, name)
+    for index, name in enumerate(CONTROLLERS[: limits.controllers]):
+        yield from _controller(state, rules, limits, index, name)
 
 
 def _moved(state: State, rules: Rules, placement: str, *, fallback: bool) -> State:
@@ -207,7 +219,9 @@ def _arrives(state: State, rules: Rules, order: Order) -> Step[State]:
 # ----------------------------------------------------------------------------- controllers
 
 
-def _controller(state: State, limits: Limits, index: int, name: str) -> Iterator[Step[State]]:
+def _controller(
+    state: State, rules: Rules, limits: Limits, index: int, name: str
+) -> Iterator[Step[State]]:
     view = state.views[index]
     for placement in (WANTED, OTHER):
         whim = placement != WANTED
@@ -217,15 +231,28 @@ def _controller(state: State, limits: Limits, index: int, name: str) -> Iterator
             continue
         if whim and state.whims == limits.whims:
             continue
+        if not whim and view.fallback and view.term not in state.probed:
+            continue
         yield Step(
             f"{name} orders {placement} in term {view.term}",
             replace(state, orders=state.orders | {order}, whims=state.whims + whim),
         )
     for told in state.told:
-        if told.term > view.term:
-            heard = replace(state, views=_set(state.views, index, told))
-            yield Step(f"{name} hears of term {told.term}", heard)
+        for what, heard in _hearings(rules, view, told):
+            views = _set(state.views, index, heard)
+            yield Step(f"{name} hears {what} of term {told.term}", replace(state, views=views))
+
+
+def _hearings(rules: Rules, view: Told, told: Told) -> Iterator[tuple[str, Told]]:
+    """What a controller makes of what the stamper has said, by how it was said."""
+    if told.term > view.term:
+        # A stamp of a move that it has ordered, and remembers, is as good.
+        yield "an answer", told
+        if not told.fallback:
+            yield "a stamp", replace(told, fallback=True)
+    elif told.term == view.term and view.fallback and not told.fallback and rules.holds("answer"):
+        yield "an answer", told
 
 
 if __name__ == "__main__":
-    report(initial(), [successors], good, RULES)
+    report(initial(), [partial(successors, limits=one) for one in CASES], good, RULES)

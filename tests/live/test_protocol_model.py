@@ -27,12 +27,14 @@ STEPS = 24
     ("model", "limits"),
     [
         (gate, gate.LIMITS),
-        (orders, orders.LIMITS),
-        # One that changes its mind, too.
-        (orders, orders.Limits(fires=1, crashes=1, lapses=0, whims=1)),
+        *((orders, limits) for limits in orders.CASES),
         *((states, limits) for limits in states.CASES),
     ],
-    ids=["gate", "orders", "whims", *(f"states {i}" for i, _ in enumerate(states.CASES))],
+    ids=[
+        "gate",
+        *(f"orders {i}" for i, _ in enumerate(orders.CASES)),
+        *(f"states {i}" for i, _ in enumerate(states.CASES)),
+    ],
 )
 def test_nothing_goes_wrong_and_there_is_always_a_way_back(model: ModuleType, limits: Any) -> None:
     successors: Callable[[Any], Iterator[Step[Any]]] = partial(model.successors, limits=limits)
@@ -50,7 +52,7 @@ def test_every_rule_is_needed(name: str, rule: str) -> None:
     cases = [partial(model.successors, limits=one) for one in limits]
     # It keeps two controllers from pulling the cell to and fro; terms alone keep it safe.
     needless = rule == "charge"
-    assert (without(rule, model.initial(), cases) is None) == needless
+    assert (without(rule, model.initial(), cases, model.good) is None) == needless
 
 
 # --------------------------------------------------------------------------- model and code

@@ -19,7 +19,8 @@ __all__ = ["Connections"]
 
 #: Open files of this process, by number.
 _OPEN = "/dev/fd"
-_OFF = struct.pack("ii", 0, 0)
+_ON_FOR = "ii"
+_OFF = struct.pack(_ON_FOR, 0, 0)
 #: A connection is given up after a session's lease of silence, which is longer. Looking whenever
 #: Zenoh reports one cost several cycles when E came back after a freeze, and all were made at once.
 EVERY_S = 0.5
@@ -55,25 +56,35 @@ class Connections:
                 about = os.fstat(number)
             except OSError:
                 continue
-            if stat.S_ISSOCK(about.st_mode):
+            if not stat.S_ISSOCK(about.st_mode):
+                continue
+            if about.st_ino in self._known or _released(number):
                 known.add(about.st_ino)
-                if about.st_ino not in self._known:
-                    _release(number)
         self._known = known
 
 
-def _release(number: int) -> None:
+def _released(number: int) -> bool:
+    """Have a connection not wait, and return whether it need not be looked at again.
+
+    One that is still being made has not been asked to wait yet: it will be, once it is there, which
+    takes as long as its peer is out of reach.
+    """
     try:
         # A number of our own: the other may be closed at any time, and mean something else then.
         copy = os.dup(number)
     except OSError:
-        return
+        return False
     try:
         connection = socket.socket(fileno=copy)
     except OSError:
         os.close(copy)
-        return
+        return False
     with connection:
         internet = connection.family in {socket.AF_INET, socket.AF_INET6}
-        if internet and connection.type == socket.SOCK_STREAM:
+        if not internet or connection.type != socket.SOCK_STREAM:
+            return True
+        asked = connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(_OFF))
+        waits = bool(struct.unpack(_ON_FOR, asked)[0])
+        if waits:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _OFF)
+        return waits
