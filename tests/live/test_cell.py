@@ -194,6 +194,16 @@ def test_whom_the_stamper_tells_that_no_guard_moved_needs_no_proof(problem: Prob
     assert len(world.stamper.moves) >= before + 6
 
 
+def test_what_nobody_wants_any_more_is_probed_no_longer(problem: Problem) -> None:
+    world = alternating(problem)
+    world.run(2_000)
+    stamper = world.stamper
+    stamper.guard.adopt(stamper.placement, fallback=True)
+    for number, want in enumerate(("SO", "SO", "", "HYB", "no candidate"), stamper._newest + 1):
+        stamper._accept(Order(number, "other", stamper.run, stamper.term, want=want))
+        assert stamper.probation.wanted == (want if want in problem.candidates else None)
+
+
 def test_a_lost_order_is_sent_again(problem: Problem) -> None:
     world = alternating(problem)
     world.network.impair(world.losing(0.6), CONTROLLER, "stamper@R1")

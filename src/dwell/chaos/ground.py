@@ -334,7 +334,10 @@ class Ground:
             return {}
 
     def at_home(self) -> str:
-        """Look whether all are well and the cell is where its controller wants it."""
+        """Look whether all are well and the cell is where its controller wants it.
+
+        Where the guard's own move has brought it home, there is nothing to order.
+        """
         now_ns = time.monotonic_ns()
         seen = self.actuations.since(now_ns - 6 * self.period_ns)
         lately = [one for one in seen if one.what == APPLY]
@@ -345,7 +348,9 @@ class Ground:
         said = self.status()
         if not said:
             return "the controller does not answer"
-        wanted: dict[str, object] = {"fallback": False, "moving_to": None}
+        wanted: dict[str, object] = {"moving_to": None}
+        if self.home is None or said["wanted"] is not None:
+            wanted["fallback"] = False
         if self.home is not None:
             wanted["placement"] = self.home
         for key, value in wanted.items():

@@ -276,9 +276,10 @@ class Cell:
         """Return an order; whatever it is for, it says what a migration under way forks."""
         held = self.held
         run, term = (held.run, held.term) if held is not None else (0, 0)
-        want = self.controller.wanted or ""
+        move = self._move
+        want = self.controller.wanted or ("" if move is None else move.name)
         fraction = self.controller.shadow_fraction
-        forks = self._move.forks if self._move is not None else ()
+        forks = () if move is None else move.forks
         return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
 
     def _begin(self, name: str, now_ns: int, *, decided: bool = False) -> None:

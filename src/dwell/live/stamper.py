@@ -302,8 +302,9 @@ class Stamper:
         """Take over what an order says beside the placement; an earlier one changes none of it."""
         self._fraction = order.shadow_fraction
         self._forks = order.forks
-        if self.guard.on_fallback and order.want in self.place.problem.candidates:
-            self.probation.want(order.want)
+        if self.guard.on_fallback:
+            known = order.want in self.place.problem.candidates
+            self.probation.want(order.want if known else None)
 
     def _move(self, placement: str, *, by_guard: bool) -> None:
         """Change the placement: a new term, known to the book before any cycle has it."""
