@@ -88,10 +88,9 @@ class Standing:
             # What went wrong once may do so for the rest of the cell's life.
             self.close()
             stall_ms = self.stalls.worst_ms(begin_ns, time.monotonic_ns())
-            # A machine that has kept a thread that only sleeps from running for half a period has
-            # kept the cell's processes, too, and most of them from more than that: no bound in
-            # cycles can be promised, and it is tried once more.
-            if attempt == 2 or stall_ms < PERIOD_MS / 2:
+            # A machine that has kept a thread that only sleeps from running for a whole period has
+            # kept the cell's processes, too: no bound in cycles can hold, and it is tried again.
+            if attempt == 2 or stall_ms < PERIOD_MS:
                 said = "; ".join(wrong)
                 return f"{fault.name}, phase {phase:.2f}: {said} (stall {stall_ms:.0f} ms)"
         return ""

@@ -297,7 +297,7 @@ class Campaign:
             usable = False
         outcome.wrong += observer.look()
         if usable:
-            _recovered(observer, outcome, cell.home)
+            _recovered(observer, outcome)
             outcome.late += [*beyond(outcome), *_old(cell, observer, fault, outcome)]
         self._keep(cell, one, outcome)
         return usable
@@ -324,16 +324,13 @@ class Campaign:
         self.result.actuated += len(cell.actuations.applied)
 
 
-def _recovered(observer: Observer, outcome: Outcome, home: str | None) -> None:
+def _recovered(observer: Observer, outcome: Outcome) -> None:
     """Take the recovery from the wire: the first cycle that an order stands behind."""
-    terms = observer.judge.terms
     at_ns = observer.judge.ordered_since(outcome.end_ns)
-    if at_ns is not None:
-        outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
-    elif terms[max(terms)].placement == home:
-        outcome.note = f"{outcome.note} the guard's move has brought it home".strip()
-    else:
+    if at_ns is None:
         outcome.wrong.append("no cycle was stamped by an order after it has ended")
+    else:
+        outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
 
 
 def _settle(cell: Ground, rests_s: float, outcome: Outcome) -> None:

@@ -334,10 +334,7 @@ class Ground:
             return {}
 
     def at_home(self) -> str:
-        """Look whether all are well and the cell is where its controller wants it.
-
-        Where the guard's own move has brought it home, there is nothing to order.
-        """
+        """Look whether all are well and the cell is where its controller wants it."""
         now_ns = time.monotonic_ns()
         seen = self.actuations.since(now_ns - 6 * self.period_ns)
         lately = [one for one in seen if one.what == APPLY]
@@ -348,9 +345,7 @@ class Ground:
         said = self.status()
         if not said:
             return "the controller does not answer"
-        wanted: dict[str, object] = {"moving_to": None}
-        if self.home is None or said["wanted"] is not None:
-            wanted["fallback"] = False
+        wanted: dict[str, object] = {"fallback": False, "moving_to": None}
         if self.home is not None:
             wanted["placement"] = self.home
         for key, value in wanted.items():
