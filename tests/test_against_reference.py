@@ -174,7 +174,7 @@ def make_guarded(
         case.problem.controller,
         fallbacks=tuple(rng.sample(names, rng.randint(1, len(names)))),
         guard_cycles=rng.choice([2, 2, 3, 4]),
-        probe_cycles=2,
+        probe_cycles=rng.choice([1, 2, 2, 6]),
     )
     problem = replace(case.problem, controller=settings)
     windows = rng.randint(6, 14)

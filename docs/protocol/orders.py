@@ -22,7 +22,8 @@ from docs.protocol.checker import Rules, Step, report
 
 __all__ = ["CASES", "RULES", "Limits", "State", "good", "initial", "successors"]
 
-#: Candidates: the guard's only fallback, where the controllers would like to be, a third one.
+#: Candidates: the guard's first fallback, where the controllers would like to be, and a third one,
+#: its second fallback.
 FALLBACK, WANTED, OTHER = "LOC", "SO", "HYB"
 CONTROLLERS = "A", "B"
 
@@ -157,8 +158,9 @@ def _moved(state: State, rules: Rules, placement: str, *, fallback: bool) -> Sta
 
 
 def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
-    if state.fires < limits.fires and state.now.placement != FALLBACK:
-        fired = _moved(state, rules, FALLBACK, fallback=True)
+    if state.fires < limits.fires:
+        to = FALLBACK if state.now.placement != FALLBACK else OTHER
+        fired = _moved(state, rules, to, fallback=True)
         yield Step("the guard moves the cell", replace(fired, fires=state.fires + 1), fault=True)
     if state.crashes < limits.crashes:
         once = replace(state, crashes=state.crashes + 1)

@@ -20,8 +20,14 @@ P = 1000
 WHOLE = {"LOC": True, "HYB": True, "SO": True}
 
 
-def guard(*fallbacks: str, g: int = 3, placement: str = "SO") -> Guard:
-    return Guard(fallbacks or ("LOC", "HYB"), guard_cycles=g, period_ns=P, placement=placement)
+def guard(*fallbacks: str, g: int = 3, h: int = 5, placement: str = "SO") -> Guard:
+    return Guard(
+        fallbacks or ("LOC", "HYB"),
+        guard_cycles=g,
+        period_ns=P,
+        probe_cycles=h,
+        placement=placement,
+    )
 
 
 def released(mine: Guard | Probation, cycles: Sequence[int], start: int = 0) -> None:
@@ -124,16 +130,19 @@ def test_after_its_own_outage_it_begins_anew() -> None:
 
 
 def test_no_fallbacks_no_guard() -> None:
-    mine = Guard((), guard_cycles=3, period_ns=P, placement="SO")
+    mine = Guard((), guard_cycles=3, period_ns=P, probe_cycles=5, placement="SO")
     released(mine, range(9))
     assert mine.due_ns is None
     assert not fires(mine, 10**9)
 
 
-@pytest.mark.parametrize(("g", "period_ns"), [(1, P), (3, 0)])
-def test_settings_out_of_their_range_are_refused(g: int, period_ns: int) -> None:
-    with pytest.raises(ProblemError, match=r"guard_cycles|period_ns"):
-        Guard(("LOC",), guard_cycles=g, period_ns=period_ns, placement="SO")
+@pytest.mark.parametrize(
+    ("name", "value"), [("guard_cycles", 1), ("period_ns", 0), ("probe_cycles", 0)]
+)
+def test_settings_out_of_their_range_are_refused(name: str, value: int) -> None:
+    settings = {"guard_cycles": 3, "period_ns": P, "probe_cycles": 5, name: value}
+    with pytest.raises(ProblemError, match=name):
+        Guard(("LOC",), **settings, placement="SO")
 
 
 def test_it_keeps_no_more_than_it_needs_while_nothing_completes() -> None:
@@ -264,21 +273,71 @@ def test_it_never_fires_while_completions_flow(data: st.DataObject, g: int) -> N
     assert not [at for at, _ in moves if at <= (len(latencies) - 1) * P]
 
 
-@given(data=st.data(), g=st.integers(2, 6))
-def test_it_never_fires_on_its_fallback(data: st.DataObject, g: int) -> None:
-    mine = guard(g=g)
+@given(data=st.data(), g=st.integers(2, 6), h=st.integers(1, 40))
+def test_it_rests_after_its_own_move_and_is_on_watch_again(
+    data: st.DataObject, g: int, h: int
+) -> None:
+    mine = guard(g=g, h=h)
     released(mine, range(g + 1))
     mine.adopt("LOC", fallback=True)
-    for cycle in range(g + 1, 4 * g):
+    first = g + 1
+    for cycle in range(first, first + h):
+        assert mine.resting
         mine.released(cycle, cycle * P)
         if data.draw(st.booleans()):
             mine.completed(cycle, cycle * P)
         assert mine.due_ns is None
         assert not fires(mine, cycle * P + 100 * P)
-    # The next order arms it again.
+    assert not mine.resting
+    mine.released(first + h, (first + h) * P)
+    assert mine.due_ns == (first + h + g) * P
+    assert mine.on_fallback
+    assert mine.check((first + h + g) * P, WHOLE) == "HYB"
+
+
+def test_an_order_ends_its_rest() -> None:
+    mine = guard()
+    released(mine, range(3))
+    mine.adopt("LOC", fallback=True)
+    mine.released(3, 3 * P)
     mine.adopt("LOC")
-    mine.released(4 * g, 4 * g * P)
-    assert mine.due_ns == 5 * g * P
+    assert not mine.resting
+    mine.released(4, 4 * P)
+    assert mine.due_ns == 7 * P
+
+
+def test_its_rest_doubles_with_its_own_moves_in_a_row_up_to_32_times() -> None:
+    mine = guard(h=2)
+    last = -1
+
+    def rest() -> int:
+        nonlocal last
+        count = 0
+        while mine.resting:
+            last, count = last + 1, count + 1
+            mine.released(last, last * P)
+        return count
+
+    rests = []
+    for name in ("LOC", "HYB") * 4:
+        mine.adopt(name, fallback=True)
+        rests.append(rest())
+    assert rests == [2, 4, 8, 16, 32, 64, 64, 64]
+    mine.adopt("SO")
+    assert rest() == 0
+    mine.adopt("LOC", fallback=True)
+    assert rest() == 2
+
+
+def test_numbers_that_do_not_grow_do_not_shorten_its_rest() -> None:
+    mine = guard(h=2)
+    mine.released(7, 7 * P)
+    mine.adopt("LOC", fallback=True)
+    for cycle in (6, 7, 8, 8):
+        mine.released(cycle, 8 * P)
+    assert mine.resting
+    mine.released(9, 9 * P)
+    assert not mine.resting
 
 
 # -------------------------------------------------------------------------------- what is whole

@@ -377,3 +377,20 @@ def test_moves_of_the_guard_are_told_to_the_policy_and_recorded(problem: Problem
     rows = columns(world, "decisions", "incumbent", "placement", "migrated", "reason")
     assert ("SO", "LOC", True, "guard") in rows
     assert cell.guard_moves == 1
+
+
+def test_it_says_how_long_the_guard_rests_after_its_own_move(problem: Problem) -> None:
+    settings = replace(problem.controller, initial="SO")
+    world = World(replace(problem, controller=settings), exec_ms=EXEC_MS, policy="SO")
+    world.run(1_000)
+    cell = cell_of(world)
+    seen = [cell.status(world.network.now_ns)["resting"]]
+    world.network.freeze("perception@E")
+    for _ in range(60):
+        world.run(problem.pipeline.period_ms)
+        said = cell.status(world.network.now_ns)["resting"]
+        # It knows by answers, one every quarter of a second.
+        if said != seen[-1]:
+            seen.append(said)
+    assert seen == [False, True, False]
+    assert world.stamper.guard.on_fallback

@@ -126,6 +126,54 @@ def test_rule_5_bounds_what_a_single_fault_costs(problem: Problem, name: str, ph
     assert (world.stamper.placement == candidate) == (harmless or not missing)
 
 
+SECOND_FAULTS: dict[str, tuple[Fault, str]] = {
+    "perception on R1 frozen": (freeze("perception@R1"), "HYB"),
+    "planning on R2 killed": (kill("planning@R2"), "SO"),
+}
+
+
+@pytest.mark.parametrize("name", SECOND_FAULTS)
+@settings(max_examples=4, deadline=None)
+@given(phase=st.floats(0, 1))
+def test_rule_5_bounds_a_fault_after_the_guards_own_move_too(
+    problem: Problem, name: str, phase: float
+) -> None:
+    # Nobody confirms the fallback: it may be what the controller wants, or there is none.
+    fault, expected = SECOND_FAULTS[name]
+    world = running(problem, "SO")
+    world.network.freeze("perception@E")
+    world.run(500)
+    assert world.stamper.placement == "LOC"
+    assert world.stamper.guard.resting
+    world.network.thaw("perception@E")
+    rest = problem.controller.probe_cycles
+    world.run((rest + phase) * problem.pipeline.period_ms)
+    guard = world.stamper.guard
+    assert guard.on_fallback
+    assert not guard.resting
+    before = len(world.cycles)
+    fault(world)
+    world.run(30 * problem.pipeline.period_ms)
+    assert world.stamper.placement == expected
+    gap = longest_gap(world.cycles[before - 1 :], world.stamper.cycle - 2)
+    assert 0 < gap <= problem.controller.guard_cycles + 1
+    require_ordered(world)
+
+
+def test_rule_5_the_guard_rests_after_its_own_move(problem: Problem) -> None:
+    world = running(problem, "SO")
+    world.network.freeze("perception@E")
+    world.run(500)
+    world.network.freeze("perception@R1")
+    world.run(500)
+    assert world.stamper.placement == "LOC"
+    world.network.thaw("perception@E")
+    world.run(2 * problem.controller.probe_cycles * problem.pipeline.period_ms)
+    # Cycles that were released after its rest, still under the silence, are waited for.
+    assert world.stamper.placement == "HYB"
+    assert world.stamper.guard.on_fallback
+
+
 def test_rule_5_holds_without_a_controller(problem: Problem) -> None:
     world = running(problem, "SO", 3_000)
     assert lost(world) == 0

@@ -61,8 +61,13 @@ def test_every_rule_is_needed(name: str, rule: str) -> None:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     cell = dwell.load("examples/canonical.yaml")
-    settings = replace(cell.controller, fallbacks=(orders.FALLBACK,), initial=orders.WANTED)
+    fallbacks = orders.FALLBACK, orders.OTHER
+    settings = replace(cell.controller, fallbacks=fallbacks, initial=orders.WANTED)
     return replace(cell, controller=settings)
+
+
+#: What to kill so that the guard leaves a placement for the first of its other fallbacks.
+ENDS = {orders.WANTED: "planning@E", orders.FALLBACK: "perception@R1", orders.OTHER: "perception@E"}
 
 
 class Mirror:
@@ -87,9 +92,12 @@ class Mirror:
         world = self.world
         if label == "the guard moves the cell":
             self._probes(False)
-            world.kill("planning@E")
+            while world.stamper.guard.resting:
+                world.run(self.period_ms)
+            worker = ENDS[world.stamper.placement]
+            world.kill(worker)
             world.run((self.guard_cycles + 3) * self.period_ms)
-            world.start("planning@E")
+            world.start(worker)
         elif label == "the stamper starts again":
             self._probes(False)
             world.kill("stamper@R1")

@@ -257,12 +257,59 @@ def test_it_does_not_move_to_where_it_is() -> None:
     assert moves(found) == [(3, "ALT", "OFF")]
 
 
-def test_it_never_fires_on_its_fallback() -> None:
+def test_it_rests_after_its_own_move() -> None:
     problem = cell(fallbacks=("ALT", "LOC"))
     down = {"E": [(42, 10_000)], "X": [(102, 10_000)]}
     found = play(problem, ("OFF", "ALT"), down=down)
     assert moves(found) == [(1, "OFF", "ALT")]
     assert placements(found) == [("OFF", 7), ("ALT", 24)]
+    # A rest of six cycles, for 7 to 12; cycle 13 is old enough at 160 ms.
+    found = play(cell(fallbacks=("ALT", "LOC"), probe_cycles=6), ("OFF", "ALT"), down=down)
+    assert moves(found) == [(1, "OFF", "ALT"), (3, "ALT", "LOC")]
+    assert placements(found) == [("OFF", 7), ("ALT", 9), ("LOC", 16)]
+
+
+def test_a_fallback_that_the_policy_wants_is_watched_without_an_order() -> None:
+    problem = cell(fallbacks=("ALT", "LOC"), probe_cycles=6)
+    down = {"E": [(42, 10_000)], "X": [(162, 10_000)]}
+    found = play(problem, ("OFF", "ALT"), down=down)
+    assert moves(found) == [(1, "OFF", "ALT"), (4, "ALT", "LOC")]
+    assert lost(found) == [4, 5, 6, 16, 17, 18]
+
+
+def test_its_own_moves_in_a_row_double_its_rest() -> None:
+    problem = cell(fallbacks=("ALT", "OFF"), probe_cycles=3)
+    down = {"E": [(42, 62), (142, 10_000)], "X": [(42, 52), (112, 132)]}
+    found = play(problem, ("OFF", "ALT", "OFF", "OFF", "ALT"), down=down, windows=12)
+    # To ALT at cycle 7, on watch from cycle 10; to OFF at cycle 14, on watch from cycle 20: OFF has
+    # been silent since cycle 14.
+    assert [(left, to) for _, left, to in moves(found)] == [
+        *(("OFF", "ALT"), ("ALT", "OFF"), ("OFF", "ALT"))
+    ]
+    assert placements(found)[:3] == [("OFF", 7), ("ALT", 7), ("OFF", 9)]
+
+
+@pytest.mark.usefixtures("_early_health")
+def test_an_order_that_stamps_nothing_before_the_guard_moves_does_not_count() -> None:
+    problem = cell(fallbacks=("ALT", "OFF"), probe_cycles=1, order_delay_ms=45.0)
+    # Ordered at 190 ms to take effect with cycle 24; X is lost with cycle 19, OFF with cycle 22.
+    down = {"E": [(42, 62), (222, 10_000)], "X": [(192, 240)]}
+    found = play(problem, down=down, windows=12)
+    assert [(left, to) for _, left, to in moves(found)] == [
+        *(("OFF", "ALT"), ("ALT", "OFF"), ("OFF", "ALT"))
+    ]
+    # The second move of its own in a row: a rest of two cycles.
+    assert placements(found)[:3] == [("OFF", 7), ("ALT", 15), ("OFF", 5)]
+
+
+@pytest.mark.usefixtures("_early_health")
+def test_what_is_ordered_while_it_rests_is_watched_at_once() -> None:
+    problem = cell(fallbacks=("ALT", "OFF"), probe_cycles=3)
+    down = {"E": [(42, 62), (142, 240), (332, 10_000)], "X": [(112, 132)]}
+    found = play(problem, down=down, windows=14)
+    # The third rest would be that of cycles 23 to 34; OFF is proven and ordered for cycle 31.
+    assert placements(found)[:5] == [("OFF", 7), ("ALT", 7), ("OFF", 9), ("ALT", 8), ("OFF", 5)]
+    assert lost(found) == [4, 5, 6, *range(11, 23), 33, 34, 35]
 
 
 def test_a_fallback_that_was_ordered_is_watched() -> None:

@@ -297,7 +297,7 @@ class Campaign:
             usable = False
         outcome.wrong += observer.look()
         if usable:
-            _recovered(observer, outcome)
+            _recovered(observer, outcome, cell.home)
             outcome.late += [*beyond(outcome), *_old(cell, observer, fault, outcome)]
         self._keep(cell, one, outcome)
         return usable
@@ -324,11 +324,15 @@ class Campaign:
         self.result.actuated += len(cell.actuations.applied)
 
 
-def _recovered(observer: Observer, outcome: Outcome) -> None:
-    """Take the recovery from the wire: the first cycle that an order stands behind."""
-    at_ns = observer.judge.ordered_since(outcome.end_ns)
+def _recovered(observer: Observer, outcome: Outcome, home: str | None) -> None:
+    """Take the recovery from the wire: the first cycle that is ordered, or at home.
+
+    Home is where the cell has been waited for; where any placement is, the one that holds.
+    """
+    judge = observer.judge
+    at_ns = judge.settled_since(outcome.end_ns, home or judge.terms[max(judge.terms)].placement)
     if at_ns is None:
-        outcome.wrong.append("no cycle was stamped by an order after it has ended")
+        outcome.wrong.append("no cycle was stamped by an order, or at home, after it has ended")
     else:
         outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
 

@@ -334,7 +334,10 @@ class Ground:
             return {}
 
     def at_home(self) -> str:
-        """Look whether all are well and the cell is where its controller wants it."""
+        """Look whether all are well and the cell is watched and where its controller wants it.
+
+        It may be the guard that has moved it there: its controller has nothing to order then.
+        """
         now_ns = time.monotonic_ns()
         seen = self.actuations.since(now_ns - 6 * self.period_ns)
         lately = [one for one in seen if one.what == APPLY]
@@ -345,7 +348,7 @@ class Ground:
         said = self.status()
         if not said:
             return "the controller does not answer"
-        wanted: dict[str, object] = {"fallback": False, "moving_to": None}
+        wanted: dict[str, object] = {"wanted": None, "moving_to": None, "resting": False}
         if self.home is not None:
             wanted["placement"] = self.home
         for key, value in wanted.items():

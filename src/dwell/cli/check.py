@@ -95,7 +95,7 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield candidates under which the guard would fire although nothing is wrong.
 
     It fires when the cycle after the newest completed one is older than `guard_cycles` periods,
-    never while its own move holds; a fallback that was ordered is watched like any other candidate.
+    under a fallback, too, unless it has moved the cell there just now.
     """
     settings = problem.controller
     if not settings.fallbacks:

@@ -1,7 +1,7 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
 from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
-from dwell.control.guard import Guard, Presence, Probation, parts_of
+from dwell.control.guard import Guard, Presence, Probation, parts_of, rest_cycles
 from dwell.control.shadows import shadow_stamps
 from dwell.control.windows import NEVER_NS, final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
@@ -21,6 +21,7 @@ __all__ = [
     "Probation",
     "final_l95_ms",
     "parts_of",
+    "rest_cycles",
     "shadow_stamps",
     "static_columns",
 ]

@@ -14,7 +14,7 @@ from typing import TypeAlias
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import GUARD_CYCLES, PROBE_CYCLES, require
 
-__all__ = ["Guard", "Presence", "Probation", "parts_of"]
+__all__ = ["Guard", "Presence", "Probation", "parts_of", "rest_cycles"]
 
 #: However often a cell relapses, no more than this many times as many.
 MOST_DOUBLINGS = 5
@@ -23,6 +23,11 @@ HEALTH_WINDOWS = 10
 
 #: Whether all parts of a candidate have been heard lately.
 Whole: TypeAlias = Callable[[str], bool] | Mapping[str, bool]
+
+
+def rest_cycles(probe_cycles: int, own_moves: int) -> int:
+    """Return how many cycles the guard rests for after so many moves of its own in a row."""
+    return probe_cycles << min(own_moves - 1, MOST_DOUBLINGS) if own_moves else 0
 
 
 class _Silence:
@@ -90,16 +95,20 @@ class Guard:
       late completion of a cycle of the placement before changes nothing.
     * Completions of cycles that were never released here are ignored.
 
-    The guard is *on a fallback* from its own move until the next order. There it never fires. A
-    fallback that the controller ordered is a placement like any other: the guard watches it, and
-    leaves it for another one.
+    The guard is *on a fallback* from its own move until the next order. There it *rests* at first:
+    the first `probe_cycles` cycles after the move are not waited for, and every further move of its
+    own before an order doubles that, up to 32 times, so that a cell none of whose fallbacks can
+    carry it is not thrown about. The cycles after these are waited for as under any placement: the
+    controller may be content with the fallback, or gone. A fallback that the controller ordered is
+    watched at once.
 
-    **Bound.** After a single fault from which on one fallback is whole, at most g + 1 consecutive
-    cycles bring no actuation: the first that is lost, those released within the g periods after
-    its release, and the one that may be released at the instant of the move. (At most 2g + 1 if an
-    order to another placement that the fault broke takes effect within these g periods.) Without a
-    fault it does not fire while every cycle completes, and is heard, within g periods of its
-    release, nor, where single cycles are lost, while the others are heard within g - 1.
+    **Bound.** After a single fault from which on one fallback is whole, of a cell whose guard does
+    not rest, at most g + 1 consecutive cycles bring no actuation: the first that is lost, those
+    released within the g periods after its release, and the one that may be released at the instant
+    of the move. (At most 2g + 1 if an order to another placement that the fault broke takes effect
+    within these g periods.) Without a fault it does not fire while every cycle completes, and is
+    heard, within g periods of its release, nor, where single cycles are lost, while the others are
+    heard within g - 1.
 
     Parameters
     ----------
@@ -109,6 +118,8 @@ class Guard:
         g, at least 2.
     period_ns : int
         P.
+    probe_cycles : int
+        Cycles that it rests for after its own move, at least 1: as many as would prove a placement.
     placement : str
         Candidate that the first cycles are stamped with.
 
@@ -122,15 +133,32 @@ class Guard:
         Highest cycle completed, -1 for none.
     """
 
-    __slots__ = ("_silence", "fallbacks", "on_fallback", "placement")
+    __slots__ = (
+        "_own_moves",
+        "_rest",
+        "_silence",
+        "fallbacks",
+        "on_fallback",
+        "placement",
+        "probe_cycles",
+    )
 
     def __init__(
-        self, fallbacks: Iterable[str], *, guard_cycles: int, period_ns: int, placement: str
+        self,
+        fallbacks: Iterable[str],
+        *,
+        guard_cycles: int,
+        period_ns: int,
+        probe_cycles: int,
+        placement: str,
     ) -> None:
         GUARD_CYCLES.check("guard_cycles", guard_cycles)
+        PROBE_CYCLES.check("probe_cycles", probe_cycles)
         require(period_ns > 0, "period_ns", period_ns, "at least 1")
+        self.probe_cycles = probe_cycles
         self.fallbacks = tuple(dict.fromkeys(fallbacks))
         self.placement, self.on_fallback = placement, False
+        self._own_moves = self._rest = 0
         self._silence = _Silence(guard_cycles * period_ns)
 
     @classmethod
@@ -141,11 +169,13 @@ class Guard:
             settings.fallbacks,
             guard_cycles=settings.guard_cycles,
             period_ns=round(problem.pipeline.period_ms * 1e6),
+            probe_cycles=settings.probe_cycles,
             placement=placement or problem.initial,
         )
 
     def __repr__(self) -> str:
-        where = f"{self.placement!r}{', on a fallback' if self.on_fallback else ''}"
+        how = ", resting" if self.resting else ", on a fallback" if self.on_fallback else ""
+        where = f"{self.placement!r}{how}"
         return f"Guard({', '.join(self.fallbacks)}; at {where}, newest={self.newest})"
 
     @property
@@ -158,12 +188,18 @@ class Guard:
         """What is waited for a cycle: g periods."""
         return self._silence.patience_ns
 
+    @property
+    def resting(self) -> bool:
+        """Whether the next cycle would not be waited for, so soon after its own move."""
+        return self._rest > 0
+
     def released(self, cycle: int, at_ns: int) -> None:
         """Note a cycle that has been stamped and released."""
-        if not self.on_fallback:
-            self._silence.release(cycle, at_ns)
+        if self._rest and cycle > self._silence.released:
+            self._rest -= 1
+            self._silence.released = cycle
         else:
-            self._silence.released = max(self._silence.released, cycle)
+            self._silence.release(cycle, at_ns)
 
     def completed(self, cycle: int, at_ns: int) -> None:
         """Note that the completion of a cycle (by every sink) has been heard."""
@@ -175,7 +211,7 @@ class Guard:
 
         It lies in the past where the guard has fired and no fallback was whole.
         """
-        if self.on_fallback or not any(name != self.placement for name in self.fallbacks):
+        if not any(name != self.placement for name in self.fallbacks):
             return None
         return self._silence.due_ns
 
@@ -212,6 +248,8 @@ class Guard:
             Whether the guard itself makes it (`check` said so), and no order. An order for the
             placement that holds already is a move, too: it makes a fallback the controller's.
         """
+        self._own_moves = self._own_moves + 1 if fallback else 0
+        self._rest = rest_cycles(self.probe_cycles, self._own_moves)
         self.placement, self.on_fallback = candidate, fallback
         self._silence.forget()
 

@@ -677,7 +677,7 @@ class ControllerEntry(Entry):
     probe_cycles: Annotated[int, Number(bounds.PROBE_CYCLES)] | None = Field(
         None,
         description="Cycles that must complete through another placement, too, before the guard's "
-        "is left for it; default 30.",
+        "is left for it, and that the guard rests for after its own move; default 30.",
     )
     fallbacks: list[str] | None = Field(
         None, description="Candidates that the guard may move to, best first; none: no guard."

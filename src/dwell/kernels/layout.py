@@ -70,8 +70,8 @@ FAIR, FIFO, PRIORITY, TURNS = range(4)
 
 # cells
 # GUARD_T is when the guard looks next, -1 for never, and GUARD_NS is g periods; WAITED is the first
-# cycle that no completion has been heard of or after, MOVED the first one stamped with the newest
-# placement.
+# cycle that no completion has been heard of or after, MOVED the first one of the newest placement
+# that is waited for.
 (
     TASK_0,
     N_TASKS,

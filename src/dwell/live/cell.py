@@ -202,7 +202,9 @@ class Cell:
         """Take note of the placement that holds since a term began."""
         held = self.held
         before = held.placement if held is not None else placement
-        self.held = Accepted(0, self.name, "", run, term, placement, 0, by_guard)
+        self.held = Accepted(
+            *(0, self.name, "", run, term, placement, 0), fallback=by_guard, resting=by_guard
+        )
         self._unwritten = True
         move, self._move = self._move, None
         if not by_guard:
@@ -515,6 +517,7 @@ class Cell:
             "term": held.term if held is not None else None,
             "placement": held.placement if held is not None else None,
             "fallback": self.controller.on_fallback,
+            "resting": held is not None and held.resting,
             "wanted": self.controller.wanted,
             "pinned": self.pinned or None,
             "drained": sorted(self.drained),

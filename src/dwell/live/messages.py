@@ -443,6 +443,8 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Candidate that enough probes have completed through; empty for none.
     newest : int
         Highest number of an order that was carried out.
+    resting : bool
+        Whether the guard rests after its own move.
     """
 
     number: Count
@@ -455,6 +457,7 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     fallback: bool = False
     proven: Annotated[str, msgspec.Meta(max_length=120)] = ""
     newest: Count = 0
+    resting: bool = False
 
 
 T = TypeVar("T", bound=msgspec.Struct)

@@ -241,6 +241,7 @@ class Stamper:
                 self.guard.on_fallback,
                 self._proven(now_ns),
                 self._newest,
+                self.guard.resting,
             )
             self._answered = order.controller, order.number, answer
         self.place.put_twice(self.place.keys.accepted(), answer)

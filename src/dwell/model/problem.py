@@ -66,7 +66,8 @@ class ControllerSettings:
     guard_cycles : int
         Periods without a completion after which the guard on the robot moves to a fallback.
     probe_cycles : int
-        Cycles that must complete through another placement, too, before the guard's is left for it.
+        Cycles that must complete through another placement, too, before the guard's is left for it,
+        and that the guard rests for after its own move.
     fallbacks : tuple of str
         Candidates the guard may move to, best first; none switches the guard off.
     order_delay_ms : float

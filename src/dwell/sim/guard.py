@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import Presence, Probation, parts_of
+from dwell.control import Presence, Probation, parts_of, rest_cycles
 from dwell.kernels import layout as k
 from dwell.kernels.heaps import post_event
 from dwell.model import Placement, Problem
@@ -63,6 +63,7 @@ class Watch:
         self.probation = Probation.of(problem)
         self.probes = _Probes(problem, realisation)
         self.since: int | None = 0
+        self._own_moves = 0
         self._outages = _Outages(problem, realisation)
         self._arm(tables, 0)
 
@@ -72,10 +73,10 @@ class Watch:
         return self.since is None
 
     def _arm(self, tables: k.Tables, first: int) -> None:
-        """Wait for the completions of the cycles from `first` on, the first of a placement."""
+        """Wait for the completions of the cycles from `first` on, and of none before."""
         cell = tables.cells[0]
         cell[k.GUARD_NS] = self.patience_ns
-        cell[k.WAITED] = cell[k.MOVED] = first
+        cell[k.WAITED] = cell[k.MOVED] = min(first, self.cycles)
         if first < self.cycles:
             self._look_at(tables, self._due_ns(first))
 
@@ -128,11 +129,15 @@ class Watch:
     def _parts(self, name: str) -> Iterable[str]:
         return sorted(parts_of(self.problem, name))
 
-    def fell(self, tables: k.Tables, now: int) -> None:
-        """Hold on: the cell has moved to a fallback."""
+    def fell(self, tables: k.Tables, now: int, first: int) -> None:
+        """Rest: the cell has moved to a fallback, which is stamped from a cycle on."""
         self._note_health(tables, now)
         self.probation.fell()
+        # An order that has not stamped a cycle yet is void.
+        under_orders = self.since is not None and self.since < first
+        self._own_moves = 1 if under_orders else self._own_moves + 1
         self.since = None
+        self._arm(tables, first + rest_cycles(self.probation.probe_cycles, self._own_moves))
 
     def moved(self, tables: k.Tables, first: int) -> None:
         """Take note of an order that takes effect at a cycle."""
@@ -140,11 +145,9 @@ class Watch:
             self.probation.left()
             self.probes.end(first)
             self.since = first
-            self._arm(tables, first)
-            return
         cell = tables.cells[0]
-        # The placement before has been stamped with: a window of it has closed.
-        cell[k.WAITED] = max(cell[k.WAITED], cell[k.MOVED])
+        # Cycles before are waited for, but those for which it still rests.
+        cell[k.WAITED] = min(max(cell[k.WAITED], cell[k.MOVED]), first)
         cell[k.MOVED] = first
         # Other fallbacks may be open to the new placement than those that were not whole.
         due_ns, next_ns = self._due_ns(first), int(cell[k.GUARD_T])
