@@ -228,6 +228,19 @@ class TestWhatCounts:
         found = read_measured("run", run, problem)
         assert list(found.problem.candidates) == ["LOC", "SO"]
 
+    def test_where_it_began_and_its_fallbacks_come_with_a_runs_candidates(self) -> None:
+        problem = make_problem()
+        settings = replace(problem.controller, initial="LOC", fallbacks=("LOC", "HYB"))
+        problem = replace(problem, controller=settings)
+        unseen = Placement({"sensing": "R1", "perception": "R1", "planning": "E", "control": "R2"})
+        theirs = replace(settings, policy="ROB-EDGE", initial="ROB-EDGE", fallbacks=("ROB-EDGE",))
+        alone = replace(problem, candidates={"ROB-EDGE": unseen}, controller=theirs)
+        run = simulate(alone, policy="ROB-EDGE", seed=1, windows=6)
+        found = read_measured("run", run, problem)
+        assert list(found.problem.candidates) == ["ROB-EDGE"]
+        assert found.problem.initial == "ROB-EDGE"
+        assert found.problem.controller.fallbacks == ("ROB-EDGE",)
+
     def test_live_runs(self) -> None:
         run = live_run(policy="dtp", scenario="baseline", estimator="Profile")
         found = read_measured("run", run, make_problem())

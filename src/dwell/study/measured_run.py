@@ -253,7 +253,7 @@ def _policy(
         name = found.group(1) if found else str(theirs.get("controller", {}).get("policy"))
     else:
         name = POLICIES.get(head, told)
-    problem = _with_candidates(problem, theirs.get("candidates", {}), own["candidates"])
+    problem = _with_candidates(problem, theirs, own["candidates"])
     policy = by_name(name, problem)
     if name in problem.candidates:
         return name, problem
@@ -270,16 +270,25 @@ def _policy(
 def _with_candidates(problem: Problem, theirs: Document, own: Document) -> Problem:
     """Return the problem with a run's candidates: what could be chosen, or tried, is its own.
 
-    A candidate that the cell has under this name with other nodes is refused.
+    With them come where it began, and the fallbacks. A candidate that the cell has under this name
+    with other nodes is refused.
     """
-    for name, nodes in theirs.items():
+    candidates = theirs.get("candidates", {})
+    for name, nodes in candidates.items():
         if name in own and dict(nodes) != dict(own[name]):
             raise RunError(
                 f"candidate {name} was {dict(nodes)} in the run; in the cell {own[name]}"
             )
-    if list(theirs) == list(own):
+    if list(candidates) == list(own):
         return problem
-    return replace(problem, candidates={name: Placement(theirs[name]) for name in theirs})
+    settings = theirs.get("controller", {})
+    controller = replace(
+        problem.controller,
+        initial=settings.get("initial"),
+        fallbacks=tuple(settings.get("fallbacks") or ()),
+    )
+    placed = {name: Placement(nodes) for name, nodes in candidates.items()}
+    return replace(problem, candidates=placed, controller=controller)
 
 
 def _estimator(meta: Mapping[str, Any]) -> str:
