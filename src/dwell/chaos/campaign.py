@@ -325,16 +325,18 @@ class Campaign:
 
 
 def _recovered(observer: Observer, outcome: Outcome, home: str | None) -> None:
-    """Take the recovery from the wire: the first cycle that is ordered, or at home.
+    """Take the recovery from the wire: the first cycle that an order stands behind.
 
-    Home is where the cell has been waited for; where any placement is, the one that holds.
+    None follows where the guard's own move has brought the cell home; that is said beside it.
     """
     judge = observer.judge
-    at_ns = judge.settled_since(outcome.end_ns, home or judge.terms[max(judge.terms)].placement)
-    if at_ns is None:
-        outcome.wrong.append("no cycle was stamped by an order, or at home, after it has ended")
-    else:
+    at_ns = judge.ordered_since(outcome.end_ns)
+    if at_ns is not None:
         outcome.recovery_ms = (at_ns - outcome.end_ns) / 1e6
+    elif home is not None and judge.terms[max(judge.terms)].placement == home:
+        outcome.note = f"{outcome.note} brought home by the guard, not by an order".strip()
+    else:
+        outcome.wrong.append("no cycle was stamped by an order after it has ended")
 
 
 def _settle(cell: Ground, rests_s: float, outcome: Outcome) -> None:

@@ -336,7 +336,7 @@ class Ground:
     def at_home(self) -> str:
         """Look whether all are well and the cell is watched and where its controller wants it.
 
-        It may be the guard that has moved it there: its controller has nothing to order then.
+        It may be the guard that has moved it home: its controller has nothing to order then.
         """
         now_ns = time.monotonic_ns()
         seen = self.actuations.since(now_ns - 6 * self.period_ns)
@@ -351,6 +351,8 @@ class Ground:
         wanted: dict[str, object] = {"wanted": None, "moving_to": None, "resting": False}
         if self.home is not None:
             wanted["placement"] = self.home
+        else:
+            wanted["fallback"] = False
         for key, value in wanted.items():
             if said[key] != value:
                 return f"{key} is {said[key]}"

@@ -204,17 +204,15 @@ class Judge:
         self._looked = max(self.terms, default=-1)
         return found
 
-    def settled_since(self, at_ns: int, home: str) -> int | None:
-        """Return the instant of the first stamp from `at_ns` on that needs no order any more.
+    def ordered_since(self, at_ns: int) -> int | None:
+        """Return the instant of the first stamp from `at_ns` on that an order stands behind.
 
-        An order stands behind it, or the guard itself has moved the cell home. The placement of a
-        run's beginning counts as ordered. None where there was none yet.
+        The placement of a run's beginning counts as ordered. None where there was none yet.
         """
         instants = [
             self.stamped_ns[cycle]
             for _, cycle, term in self._stamps
-            if self.stamped_ns.get(cycle, -1) >= at_ns
-            and (self._held.get(term, term <= 1) or self.terms[term].placement == home)
+            if self.stamped_ns.get(cycle, -1) >= at_ns and self._held.get(term, term <= 1)
         ]
         return min(instants, default=None)
 
