@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,6 +84,22 @@ def test_a_group_without_quota_has_its_time_counted_too(groups: Groups) -> None:
         use_ns(groups, "B", 50_000_000)
         groups.kill("B")
     assert groups.used_ns("A") == 0
+
+
+@here
+def test_who_sleeps_again_and_again_is_counted_and_who_is_busy_is_not(groups: Groups) -> None:
+    sleeps = "import time\nfor _ in range(200): time.sleep(0.001)\ntime.sleep(60)"
+    busy, sleeper = groups.inside("B", BUSY), groups.inside("B", [sys.executable, "-c", sleeps])
+    with subprocess.Popen(busy) as one, subprocess.Popen(sleeper) as two:
+        until = time.monotonic() + PATIENCE_S
+        while groups.switches("B").get(two.pid, 0) < 200:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        found = groups.switches("B")
+        assert found.keys() == {one.pid, two.pid}
+        assert found[one.pid] < 100
+        groups.kill("B")
+    assert groups.switches("B") == {}
 
 
 @here

@@ -16,15 +16,12 @@ def test_a_probe_tells_how_late_it_was_and_what_its_work_took() -> None:
     try:
         found: list[Lateness] = []
         until_s = time.monotonic() + PATIENCE_S
-        while not found or found[-1].memory_ms is None:
+        while not found or not any(one.work_ms for one in found):
             assert time.monotonic() < until_s
-            time.sleep(0.15)
+            time.sleep(0.05)
             found.append(probe.read())
         last = found[-1]
         assert last.wakes >= 1
         assert 0 <= last.mean_ms <= last.max_ms
-        assert last.memory_ms is not None
-        assert last.memory_ms > 0
-        assert any(one.work_ms for one in found)
     finally:
         probe.stop()

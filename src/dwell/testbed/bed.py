@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -434,10 +435,12 @@ class Bed:
     @property
     def used_ns(self) -> dict[str, Callable[[], int]]:
         """What reads the CPU time that a node has taken so far, by node."""
-        return {node: self._reader(node) for node in self.nodes}
+        return {node: partial(self._groups.used_ns, node) for node in self.nodes}
 
-    def _reader(self, node: str) -> Callable[[], int]:
-        return lambda: self._groups.used_ns(node)
+    @property
+    def switches(self) -> dict[str, Callable[[], dict[int, int]]]:
+        """What reads how often each thread of a node has gone to sleep so far, by node."""
+        return {node: partial(self._groups.switches, node) for node in self.nodes}
 
     @property
     def cpus(self) -> list[int]:

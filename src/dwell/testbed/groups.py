@@ -256,6 +256,16 @@ class Groups:
         counts = (self._folder("cpu", node) / "cpu.stat").read_text().split()
         return 1_000 * int(counts[counts.index("usage_usec") + 1])
 
+    def switches(self, node: str) -> dict[int, int]:
+        """Return how often each thread of a node has gone to sleep by itself so far."""
+        found = {}
+        for pid in self.pids(node):
+            with suppress(OSError):  # it has ended meanwhile
+                for folder in Path(f"/proc/{pid}/task").iterdir():
+                    with suppress(OSError):
+                        found[int(folder.name)] = _voluntary((folder / "status").read_text())
+        return found
+
     def pids(self, node: str) -> list[int]:
         """Return the processes in a node's group."""
         return _pids(self._folder("cpu", node))
@@ -298,6 +308,12 @@ def remove_group(parent: str, cgroups: Cgroups) -> None:
         _kill(folders)
         for folder in folders:
             _remove(folder)
+
+
+def _voluntary(status: str) -> int:
+    """Return the voluntary switches that a thread's status counts (proc_pid_status(5))."""
+    _, _, behind = status.partition("\nvoluntary_ctxt_switches:")
+    return int(behind.split()[0]) if behind else 0
 
 
 def _inherit_cpus(folder: Path) -> None:

@@ -3,8 +3,8 @@
 A window counts if the machine gave every node what its quota says, when it asked. PSI cannot tell:
 processes of one node that wait for each other, or for what their own quota grants, wait for a CPU
 like any others, so that it is high wherever a node is stressed. It is recorded, and so is how fast
-CPUs and memory were (``work_ms``, ``memory_ms``); none of that decides anything. What decides, for
-the CPUs that nodes use (`Rule` has the numbers):
+the CPUs were (``work_ms``); neither decides anything. What decides, for the CPUs that nodes use
+(`Rule` has the numbers):
 
 ``full``
     The CPU was never idle for a fifth of a second, in more than a tenth of the window. Nodes alone
@@ -86,8 +86,6 @@ class Sample:
         Longest lateness of each CPU's probe since the sample before.
     work_ms : mapping of int to float
         CPU time that a fixed piece of work has taken on each CPU since the sample before.
-    memory_ms : mapping of int to float
-        The same of a walk through two megabytes of memory.
     packets, late : mapping of str to int
         By link: those that have left, and of them those that were late, since the sample before.
     late_ms : mapping of str to float
@@ -101,7 +99,6 @@ class Sample:
     waited_s: float | None = None
     probe_ms: Mapping[int, float] = field(default_factory=dict)
     work_ms: Mapping[int, float] = field(default_factory=dict)
-    memory_ms: Mapping[int, float] = field(default_factory=dict)
     packets: Mapping[str, int] = field(default_factory=dict)
     late: Mapping[str, int] = field(default_factory=dict)
     late_ms: Mapping[str, float] = field(default_factory=dict)
@@ -218,7 +215,6 @@ def _row(inside: Sequence[Sample], span: Span, rule: Rule) -> dict[str, Any]:
         "stolen": _rounded(stolen),
         "probe_ms": _rounded(probe_ms),
         "work_ms": _means([one.work_ms for one in since]),
-        "memory_ms": _means([one.memory_ms for one in since]),
         "used": _rounded(used),
         "links": links,
     }

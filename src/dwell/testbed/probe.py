@@ -3,9 +3,8 @@
 It sleeps 5 ms, and notes how much later than that it runs again: at normal priority, in a group as
 weighty as the nodes' and without a quota. Nodes that use what their quotas grant make it late by
 less than one period of a quota; a machine that stands still, or has more to do than it can, makes
-it later. Every 25 ms it does a fixed piece of work, and every 100 ms it goes through more memory
-than a core keeps to itself: what these take of the CPU's time says how fast the CPU is, and how
-fast what it shares with others, on a machine that others share.
+it later. Every 25 ms it does a fixed piece of work: what that takes of the CPU's time says how fast
+the CPU is, on a machine that others share.
 """
 
 from __future__ import annotations
@@ -27,8 +26,6 @@ __all__ = ["Lateness", "Probe"]
 SLEEP_NS = 5_000_000
 #: Wakes between two pieces of work, and turns of its loop: about 0.1 ms.
 WORK_EVERY, WORK_TURNS = 5, 2_000
-#: Wakes between two walks through memory; its bytes, and those of a cache line: about 0.2 ms.
-WALK_EVERY, WALK_BYTES, LINE_BYTES = 20, 2 << 20, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +38,12 @@ class Lateness:
     mean_ms, max_ms : float
     work_ms : float or None
         CPU time of its piece of work, the mean; None where it has done none.
-    memory_ms : float or None
-        The same of its walk through memory.
     """
 
     wakes: int
     mean_ms: float
     max_ms: float
     work_ms: float | None
-    memory_ms: float | None
 
 
 class Probe(Started):
@@ -94,13 +88,8 @@ class Probe(Started):
             wakes=wakes,
             mean_ms=found["late_ns"] / max(wakes, 1) / 1e6,
             max_ms=found["max_ns"] / 1e6,
-            work_ms=_mean_ms(found["work_ns"], found["works"]),
-            memory_ms=_mean_ms(found["walk_ns"], found["walks"]),
+            work_ms=found["work_ns"] / works / 1e6 if (works := found["works"]) else None,
         )
-
-
-def _mean_ms(sum_ns: float, count: float) -> float | None:
-    return sum_ns / count / 1e6 if count else None
 
 
 def main() -> None:
@@ -115,7 +104,6 @@ def main() -> None:
 
 def _measure(parent: Parent) -> None:
     counts = Counter[str]()
-    memory = bytes(range(256)) * (WALK_BYTES // 256)
     longest_ns, wakes = 0, 0
     due_ns = time.monotonic_ns() + SLEEP_NS
     while parent.alive:
@@ -128,12 +116,10 @@ def _measure(parent: Parent) -> None:
             longest_ns, wakes = max(longest_ns, late_ns), wakes + 1
             if wakes % WORK_EVERY == 0:
                 counts.update(works=1, work_ns=_work_ns())
-            if wakes % WALK_EVERY == 0:
-                counts.update(walks=1, walk_ns=_walk_ns(memory))
             due_ns = time.monotonic_ns() + SLEEP_NS
         if asked:
             parent.receive()
-            told = ("wakes", "late_ns", "works", "work_ns", "walks", "walk_ns")
+            told = ("wakes", "late_ns", "works", "work_ns")
             parent.answer({name: counts[name] for name in told} | {"max_ns": longest_ns})
             counts.clear()
             longest_ns = 0
@@ -148,13 +134,6 @@ def _work_ns() -> int:
     begun_ns, value = time.thread_time_ns(), 1
     for _ in range(WORK_TURNS):
         value = value * 3 & 0x3F | 1
-    return time.thread_time_ns() - begun_ns
-
-
-def _walk_ns(memory: bytes) -> int:
-    """Read one byte of every cache line; returns the CPU time that it took."""
-    begun_ns = time.thread_time_ns()
-    memory[::LINE_BYTES]
     return time.thread_time_ns() - begun_ns
 
 

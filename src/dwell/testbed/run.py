@@ -165,7 +165,9 @@ def _play(
         bed.apply(change)
         played.changed(change)
 
-    with Sampler(bed.cpus, bed.used_ns, links, clock, rule, bed.probing) as sampler:
+    with Sampler(
+        bed.cpus, bed.used_ns, bed.switches, links, clock, rule, bed.probing
+    ) as sampler:
         samplers.append(sampler)
         play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
     bed.stop_controllers()
@@ -189,7 +191,7 @@ def _seal(
         spans = spans_of(open_run(folder), played)
         pressure = judged(sampler.samples, spans, rule)
         more["pressure"] = {**pressure, "trouble": sampler.trouble} if sampler.trouble else pressure
-        more["links"] = sampler.links()
+        more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz()
     return played.note(folder, **more)
 
 

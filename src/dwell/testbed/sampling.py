@@ -34,6 +34,8 @@ class Sampler:
         Those that nodes use.
     used_ns : mapping of str to callable
         CPU time that a node has taken so far, by node.
+    switches : mapping of str to callable
+        How often each thread of a node has gone to sleep so far, by node.
     links : mapping of str to TunLink
         By name. Their counters are read, and begin anew.
     clock : callable
@@ -47,6 +49,7 @@ class Sampler:
         self,
         cpus: Collection[int],
         used_ns: Mapping[str, Callable[[], int]],
+        switches: Mapping[str, Callable[[], Mapping[int, int]]],
         links: Mapping[str, TunLink],
         clock: Callable[[], int],
         rule: Rule,
@@ -56,6 +59,7 @@ class Sampler:
         #: What kept it from going on, if anything did.
         self.trouble = ""
         self._totals: dict[tuple[str, str], list[float]] = {}
+        self._switches = {node: Rate(read) for node, read in switches.items()}
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
         self._first_late = next((i for i, ms in enumerate(LATE_MS) if ms >= rule.late_ms), 0) + 1
@@ -72,6 +76,8 @@ class Sampler:
         except BaseException:
             self._stack.close()
             raise
+        for rate in self._switches.values():
+            rate.begin()
         self._thread.start()
         return self
 
@@ -80,6 +86,8 @@ class Sampler:
         self._stopped.set()
         self._thread.join()
         self._stack.close()
+        for rate in self._switches.values():
+            rate.end()
 
     def _run(self) -> None:
         due_s = time.monotonic()
@@ -110,9 +118,6 @@ class Sampler:
             waited_s=waited_s(),
             probe_ms={cpu: one.max_ms for cpu, one in probed.items()},
             work_ms={cpu: one.work_ms for cpu, one in probed.items() if one.work_ms is not None},
-            memory_ms={
-                cpu: one.memory_ms for cpu, one in probed.items() if one.memory_ms is not None
-            },
             packets={name: sum(one.packets for one in ways) for name, ways in passed.items()},
             late={
                 name: sum(sum(one.late[self._first_late :]) for one in ways)
@@ -130,6 +135,10 @@ class Sampler:
         old = self._totals.get(way, [0.0] * len(new))
         self._totals[way] = [a + b for a, b in zip(old, new, strict=True)]
 
+    def wakes_hz(self) -> dict[str, float]:
+        """Return how often a node's threads have woken, per second, over all of them."""
+        return {node: round(rate.hz, 1) for node, rate in self._switches.items()}
+
     def links(self) -> dict[str, Any]:
         """Return what the links have drawn for the messages of each direction, ready for JSON."""
         found = {}
@@ -143,6 +152,36 @@ class Sampler:
                 "vanished": int(vanished),
             }
         return found
+
+
+class Rate:
+    """How often what is counted for each thread happens, from a begin to an end.
+
+    Each look reads a file per thread, a hundred of them, so that there are only these two. Threads
+    that are not there at both do not count.
+
+    Parameters
+    ----------
+    read : callable
+        Returns the counts by thread.
+    """
+
+    def __init__(self, read: Callable[[], Mapping[int, int]]) -> None:
+        self._read = read
+        self._begun_s = 0.0
+        self._before: Mapping[int, int] = {}
+        #: Per second.
+        self.hz = 0.0
+
+    def begin(self) -> None:
+        """Look for the first time."""
+        self._before, self._begun_s = self._read(), time.monotonic()
+
+    def end(self) -> None:
+        """Look for the last time."""
+        after, lasted_s = self._read(), time.monotonic() - self._begun_s
+        counted = sum(after[thread] - self._before[thread] for thread in after.keys() & self._before.keys())
+        self.hz = counted / max(lasted_s, 1e-9)
 
 
 def cpu_times(cpus: Collection[int]) -> tuple[dict[int, float], dict[int, float]]:
