@@ -354,6 +354,8 @@ class NodeState:
         self.had = 0
         self.debt = self.touched = self.touched_by_change = False
         self.period_ago = self.tick_ago = 0
+        self.wakes = [0]
+        self.wake_key = 0
         self.empty_at: int | None = None
 
     @property
@@ -456,11 +458,14 @@ class NodeState:
         self.turn, self.had, self.touched = None, 0, True
 
     def pass_on(self, now: int) -> None:
-        """End a turn, at a tick, if it has lasted long enough."""
+        """End a turn: at a tick, if it has lasted long enough; at a wake, if another had less."""
         at_tick = (now + self.tick_ago) % self.tick == 0
         self.touched = True
+        if self.debt or not self.turn:
+            return
         long = self.had >= self.in_time(LEAST_TURN_MS)
-        if at_tick and not self.debt and long and self.turn:
+        behind = any(thread.received < self.turn.received for thread in self.waiting)
+        if (at_tick and long) or (now in self.wakes and behind):
             self.waiting.append(self.turn)
             self.end_turn()
 
@@ -490,7 +495,18 @@ class NodeState:
         step, ago = self.tick, self.tick_ago
         if self.debt:
             step, ago = self.period, self.period_ago
-        return ((now + ago) // step + 1) * step - ago
+        at = ((now + ago) // step + 1) * step - ago
+        return at if self.debt else min(at, self.next_wake(now, at))
+
+    def next_wake(self, now: int, until: int) -> int:
+        """When something of the background wakes next; `until` if it does not before."""
+        if self.node.background_hz == 0:
+            return until
+        gap_ns = 1e9 / self.node.background_hz
+        while self.wakes[-1] <= now:
+            drawn = attempt_uniform(self.wake_key, len(self.wakes) - 1, 0)
+            self.wakes.append(self.wakes[-1] + 1 + int(-math.log(1 - drawn) * gap_ns))
+        return min(wake for wake in self.wakes if wake > now)
 
     @property
     def rate(self) -> int:
@@ -681,8 +697,9 @@ class Simulation:
         self.heard_of: set[tuple[int, int]] = set()
 
         self.nodes = {name: NodeState(node) for name, node in problem.fabric.nodes.items()}
-        for name, (period_ago, tick_ago) in real.phases.items():
+        for name, (period_ago, tick_ago, wake_key) in real.phases.items():
             self.nodes[name].period_ago, self.nodes[name].tick_ago = period_ago, tick_ago
+            self.nodes[name].wake_key = wake_key
         self.pools = {
             (cell, name, node): Pool(task, execution.workers)
             for cell in range(len(self.reals))

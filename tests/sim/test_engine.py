@@ -38,6 +38,8 @@ from dwell.model import (
 )
 from dwell.model.document import to_document
 from dwell.policies import DTP
+from dwell.record import Run
+from dwell.sim import Phase
 from tests.generate import MS, make_problem
 
 ROOT = Path(__file__).parents[2]
@@ -602,7 +604,7 @@ def test_a_quota_is_noticed_at_ticks_and_its_overrun_paid_back() -> None:
         window_cycles=10,
     )
     real = replace(
-        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": (0, 3 * MS)}
+        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": Phase(0, 3 * MS)}
     )
     run = dwell.simulate_realisation(problem, real, policy="LOC")
     # It runs from 0 to 5: 1 of 2 ms are left at the first tick, and 1 too many of 4 are used at the
@@ -620,7 +622,7 @@ def test_threads_take_turns_from_tick_to_tick() -> None:
         scenario=[stress],
     )
     real = replace(
-        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": (0, 1 * MS)}
+        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": Phase(0, 1 * MS)}
     )
     run = dwell.simulate_realisation(problem, real, policy="LOC", jobs=True)
     assert run.jobs is not None
@@ -630,16 +632,77 @@ def test_threads_take_turns_from_tick_to_tick() -> None:
 
 
 def test_phases_are_drawn_where_ticks_are() -> None:
-    def drawn(tick_ms: float, seed: int) -> Mapping[str, tuple[int, int]]:
+    def drawn(tick_ms: float, seed: int) -> Mapping[str, Phase]:
         node = Node("R", "robot", 1, quota=Quota(0.5, 10.0, tick_ms=tick_ms))
         problem = make_problem([node], [Task("work", {"R": Execution(Constant(1.0))})])
         return dwell.draw(problem, scenario="disturbed", seed=seed, windows=1).phases
 
     assert drawn(0.0, 1) == {}
     assert drawn(4.0, 1) == drawn(4.0, 1) != drawn(4.0, 2)
-    period_ago, tick_ago = zip(*(drawn(4.0, seed)["R"] for seed in range(50)), strict=True)
+    period_ago, tick_ago, wakes = zip(*(drawn(4.0, seed)["R"] for seed in range(50)), strict=True)
+    assert len(set(wakes)) == 50
     assert 0 <= min(period_ago) < 2 * MS < 8 * MS < max(period_ago) < 10 * MS
     assert 0 <= min(tick_ago) < MS < 3 * MS < max(tick_ago) < 4 * MS
+
+
+def woken(hz: float, *disturbances: NodeDisturbance, quota: Quota, exec_ms: float) -> Run:
+    """A job every 40 ms on a node where something else wakes so often."""
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=quota, background_hz=hz)],
+        [Task("work", {"R": Execution(Constant(exec_ms))})],
+        period_ms=40.0,
+        window_cycles=25,
+        scenario=[*disturbances],
+    )
+    real = dwell.draw(problem, scenario="disturbed", seed=1, windows=20)
+    phase = real.phases["R"]._replace(period_ago_ns=0, tick_ago_ns=3 * MS)
+    return dwell.simulate_realisation(problem, replace(real, phases={"R": phase}), policy="LOC")
+
+
+def test_what_wakes_has_the_kernel_look_at_the_quota() -> None:
+    # Beside the ticks, which alone make it 9 ms (above): looked at all the time it is used up after
+    # 2 ms of every 4, and what is overrun by then is paid in the next period.
+    run = woken(100_000.0, quota=Quota(0.5, 4.0, tick_ms=4.0), exec_ms=6.0)
+    latency_ms = run.cycles["latency_ns"] / MS
+    assert latency_ms.mean() == pytest.approx(10.0, abs=0.03)
+    rare = woken(100.0, quota=Quota(0.5, 4.0, tick_ms=4.0), exec_ms=6.0).cycles["latency_ns"] / MS
+    # It runs on to 5 unless something wakes between 2, when 2 are used up, and the tick at 5 ... or
+    # between 4 and 5, when the pool has been filled.
+    assert set(rare.round(3).to_list()) > {9.0}
+    assert 0.6 < (rare == 9.0).mean() < 0.95
+
+
+def test_what_wakes_has_the_kernel_pick_anew_who_runs() -> None:
+    # Beside one foreign thread, on a whole core: 13 ms where threads take turns from tick to tick.
+    stress = NodeDisturbance("R", stress_threads=1)
+    quota = Quota(1.0, 4.0, tick_ms=4.0)
+    run = woken(100_000.0, stress, quota=quota, exec_ms=6.0)
+    assert run.cycles["latency_ns"].to_list() == pytest.approx([12 * MS] * 500, abs=0.2 * MS)
+    # As often as here, turns are two gaps long in the mean, and never longer than to the next tick.
+    often = woken(1_000.0, stress, quota=quota, exec_ms=6.0)
+    assert often.cycles["latency_ns"].mean() == pytest.approx(12 * MS, rel=0.03)
+    assert often.cycles["latency_ns"].std() > 0.3 * MS
+
+
+@pytest.mark.parametrize(("hz", "used"), [(0.0, 0.86), (300.0, 0.955), (1_000.0, 0.99)])
+def test_the_more_often_something_wakes_the_less_of_a_quota_is_lost(hz: float, used: float) -> None:
+    # Measured with a busy thread, 0.8 of a core in 3 ms, beside one that sleeps and wakes (its time
+    # and its going to sleep, at which the kernel looks too, are not in the model).
+    node = Node("R", "robot", 1, quota=Quota(0.8, 3.0, slack_ms=1.0, tick_ms=4.0), background_hz=hz)
+    problem = make_problem(
+        [node],
+        [Task("work", {"R": Execution(Constant(0.1))})],
+        period_ms=100.0,
+        window_cycles=20,
+        scenario=[NodeDisturbance("R", stress_threads=1)],
+    )
+    found = [
+        dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=seed, windows=2).windows[
+            "u_R"
+        ][1]
+        for seed in range(30)
+    ]
+    assert np.mean(found) == pytest.approx(used, abs=0.025)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
 from dwell.testbed.calibrate import Calibrated, calibrate
+from dwell.testbed.measured import look_at, wakes
 
 CELL = """
 dwell: 1
@@ -67,6 +68,8 @@ BESIDE = {"R1": 0.04, "E": 0.05}
 INTERFERENCE = 1.25
 CONTENTION = {"R1": 0.15, "E": 0.1}
 ADDED_MS = 0.35
+#: How often something wakes, per second, in the mean over the four runs.
+HZ = {"R1": 900.0, "E": 1500.0}
 WINDOWS = 60
 BASE = 20_000
 
@@ -155,6 +158,7 @@ def observed(truth: Problem, nominal: Path, placement: str, scenario: str = "bas
     )
     document = to_document(dwell.load(nominal))
     meta = {**played.meta, "kind": "live", "scenario": scenario, "problem": document}
+    meta["wakes_hz"] = {node: hz * (1.1 if placement == "OFF" else 0.7) for node, hz in HZ.items()}
     tables: Mapping[str, Any] = {
         "cycles": played.cycles,
         "windows": played.windows,
@@ -227,6 +231,22 @@ def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
     assert calibrated.problem.fabric.nodes["R1"].quota == Quota(0.4, 4)
     for link in ("R1->E", "E->R1"):
         assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.25)
+
+
+def test_how_often_something_wakes_is_of_nodes_whose_quota_has_ticks(
+    calibrated: Calibrated, nominal: Path, folders: list[Path]
+) -> None:
+    assert calibrated.report["background_hz"] == {}
+    problem = dwell.load(nominal)
+    measured = [look_at(folder.name, dwell.open_run(folder), problem) for folder in folders]
+    nodes = dict(problem.fabric.nodes)
+    nodes["E"] = replace(nodes["E"], quota=Quota(0.8, 4.0, tick_ms=4.0))
+    ticking = replace(problem, fabric=replace(problem.fabric, nodes=nodes))
+    assert wakes(measured, ticking) == {"E": pytest.approx(HZ["E"])}
+    # Runs of before it was recorded say nothing, and leave it out.
+    for one in measured:
+        del one.run.meta["wakes_hz"]
+    assert wakes(measured, ticking) == {}
 
 
 @pytest.mark.parametrize(

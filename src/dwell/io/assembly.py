@@ -207,6 +207,7 @@ class Assembly:
                 quota=self._quota(path, entry.quota),
                 background=entry.background,
                 background_beside=entry.background_beside,
+                background_hz=entry.background_hz,
                 interference=entry.interference,
                 contention=entry.contention,
             ),

@@ -358,6 +358,11 @@ class NodeEntry(Entry):
         description="What of `background` is taken while jobs run and no foreign thread does, on a "
         "node with a quota; all of it by default.",
     )
+    background_hz: Annotated[float, Number(bounds.BACKGROUND_HZ)] | None = Field(
+        None,
+        description="How often in a second something of `background` wakes, in the mean, on a node "
+        "whose quota has `tick_ms`: the kernel looks at the quota then, too; default 0.",
+    )
     interference: Annotated[float, Number(bounds.INTERFERENCE)] | None = Field(
         None,
         description="How many times as much core time jobs take while foreign threads run; "

@@ -138,7 +138,8 @@ FOREIGN = _number(-1)
 # TICK_NS is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last tick
 # was TICK_AGO and the last begin of a period PERIOD_AGO ago. TURN says whether a thread has the
 # turn, TURN_V what it had received before, and TURN_NS what since; a turn lasts LEAST_NS at least.
-# DRAWN_NS is what is drawn on a pool at a time. All that a quota counts is in time of the core: of
+# DRAWN_NS is what is drawn on a pool at a time. WAKE_T is when something of the background wakes next,
+# the WAKES-th time, and WAKE_GAP_NS the mean time between two. All that a quota counts is in time of the core: of
 # that, what runs receives the share PACE.
 (
     SCHEDULER,
@@ -173,11 +174,14 @@ FOREIGN = _number(-1)
     TURN_NS,
     LEAST_NS,
     DRAWN_NS,
+    WAKE_T,
+    WAKES,
+    WAKE_KEY,
     N_SERVER,
-) = range(33)
+) = range(36)
 
 # servers, float64
-VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, PACE, N_SERVER_F = range(8)
+VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, PACE, WAKE_GAP_NS, N_SERVER_F = range(9)
 
 # hops
 LINK, PAYLOAD, N_HOP = range(3)

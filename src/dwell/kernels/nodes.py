@@ -84,8 +84,13 @@ from dwell.kernels.layout import (
     UNKNOWN,
     USED,
     VIRTUAL,
+    WAKE_GAP_NS,
+    WAKE_KEY,
+    WAKE_T,
+    WAKES,
     Tables,
 )
+from dwell.kernels.streams import attempt_uniform
 
 __all__ = [
     "admit",
@@ -103,6 +108,7 @@ __all__ = [
 SLACK = 1e-3
 # Of those that have received the same, jobs go first.
 LATE = 1 << 62
+NEVER = 1 << 62
 
 
 @phase
@@ -203,9 +209,16 @@ def draw_quota(s: Tables, server: int, now: int) -> None:
 
 @phase
 def _strike(s: Tables, server: int, now: int) -> None:
-    """Pass the turn on at a tick, if it has lasted long enough; the clock must be up to date."""
+    """Pass the turn on; the clock must be up to date.
+
+    At a tick, if it has lasted long enough; at a wake, if another has received less.
+    """
     if (now + s.servers[server, TICK_AGO]) % s.servers[server, TICK_NS] == 0:
         _pass_on(s, server)
+    running = s.servers[server, TURN] != 0 and s.servers[server, THROTTLED] == 0
+    if s.servers[server, WAKE_T] == now and running and s.servers[server, N_WAIT] > 0:
+        if s.wait_rank[index(s.servers[server, BASE])] < _by_turn(s, server):
+            _put_back(s, server)
 
 
 @phase
@@ -255,14 +268,32 @@ def _notice(s: Tables, server: int, now: int) -> None:
 
 @phase
 def _next_look(s: Tables, server: int, now: int) -> int:
-    """When the quota of a busy server is looked at next: a begin of a period, or a tick."""
+    """When the quota of a busy server is looked at next.
+
+    At the begin of a period if it is stopped, else at a tick or where the background wakes.
+    """
     if s.servers[server, THROTTLED] != 0:
         begin = (s.servers[server, PERIOD] + 1) * s.servers[server, PERIOD_NS]
         return int(begin - s.servers[server, PERIOD_AGO])
     if s.servers[server, QUOTA_T] == now:
-        return now  # the tick of this instant has yet to come
+        return now  # the look of this instant has yet to come
     tick_ns = s.servers[server, TICK_NS]
-    return int(now + tick_ns - (now + s.servers[server, TICK_AGO]) % tick_ns)
+    tick_t = now + tick_ns - (now + s.servers[server, TICK_AGO]) % tick_ns
+    return int(min(tick_t, _next_wake(s, server, now)))
+
+
+@phase
+def _next_wake(s: Tables, server: int, now: int) -> int:
+    """When something of the background wakes next, after now: a Poisson process."""
+    gap_ns = s.servers_f[server, WAKE_GAP_NS]
+    if gap_ns == np.inf:
+        return NEVER
+    key = np.uint64(s.servers[server, WAKE_KEY])
+    while s.servers[server, WAKE_T] <= now:
+        drawn = attempt_uniform(key, s.servers[server, WAKES], 0)
+        s.servers[server, WAKES] += 1
+        s.servers[server, WAKE_T] += 1 + np.int64(-np.log(1.0 - drawn) * gap_ns)
+    return int(s.servers[server, WAKE_T])
 
 
 @phase

@@ -160,6 +160,7 @@ def _node(node: Node) -> Document:
             "quota": _quota(quota) if quota else None,
             "background": node.background or None,
             "background_beside": node.background_beside,
+            "background_hz": node.background_hz or None,
             "interference": node.interference if node.interference > 1.0 else None,
             "contention": node.contention or None,
             "bursts": _bursts(

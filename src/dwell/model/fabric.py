@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 from dwell.model.bounds import (
     ACCELERATORS,
     BACKGROUND,
+    BACKGROUND_HZ,
     BURST_MEAN,
     CONTENTION,
     CORES,
@@ -107,6 +108,9 @@ class Node:
     background_beside : float, optional
         What of it is taken while jobs run and no foreign thread does; all of it if left out. Only
         of a node with a quota.
+    background_hz : float
+        How often in a second something of it wakes, in the mean: what the kernel looks at the quota
+        for, and picks anew who runs. Only of a node whose quota has ticks.
     interference : float
         How many times as much core time jobs take while foreign threads run, whose data take the
         place of theirs in the caches; at least 1.
@@ -124,6 +128,7 @@ class Node:
     quota: Quota | None = None
     background: float = 0.0
     background_beside: float | None = None
+    background_hz: float = 0.0
     interference: float = 1.0
     contention: float = 0.0
 
@@ -146,6 +151,11 @@ class Node:
             require(0.0 <= beside <= self.background, "background_beside", beside, bound)
             bound = "left out: only a quota gives others something to wait for"
             require(self.quota is not None, "background_beside", beside, bound)
+        BACKGROUND_HZ.check("background_hz", self.background_hz)
+        if self.background_hz > 0.0:
+            ticks = self.quota is not None and self.quota.tick_ms > 0
+            bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
+            require(ticks, "background_hz", self.background_hz, bound)
         CONTENTION.check("contention", self.contention)
         if self.contention > 0.0:
             bound = "0 where there is no quota; elsewhere it is `background`"

@@ -2,11 +2,12 @@
 
 from dwell.sim.drawing import draw
 from dwell.sim.engine import simulate, simulate_realisation
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
+from dwell.sim.realisation import LinkSegment, NodeChange, Phase, Realisation
 
 __all__ = [
     "LinkSegment",
     "NodeChange",
+    "Phase",
     "Realisation",
     "draw",
     "simulate",

@@ -11,7 +11,7 @@ from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Flow, Pipeline, Placement, Problem, Task
 from dwell.sim.guard import back_ns
-from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
+from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 
 __all__ = ["Arrays", "lay_out"]
 
@@ -167,7 +167,10 @@ class _Layout:
                 cpu[k.POOL_NS if pooled else k.LEFT_NS] = quota_ns
                 if cpu[k.TICK_NS]:
                     cpu[k.SCHEDULER] = k.TURNS
-                    cpu[k.PERIOD_AGO], cpu[k.TICK_AGO] = real.phases.get(name, (0, 0))
+                    of_node = real.phases.get(name, Phase())
+                    cpu[k.PERIOD_AGO], cpu[k.TICK_AGO] = of_node.period_ago_ns, of_node.tick_ago_ns
+                    cpu[k.WAKE_KEY], wakes_hz = of_node.wakes, node.background_hz
+                    of[k.WAKE_GAP_NS] = 1e9 / wakes_hz if wakes_hz else np.inf
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
 

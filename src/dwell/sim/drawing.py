@@ -28,7 +28,7 @@ from dwell.model import (
     TraceTable,
 )
 from dwell.model.scenario import RAMP_STEPS
-from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
+from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.sim.spells import LONGEST_NS, Spells, drawn_spells, ramp, spell
 
 __all__ = ["draw", "draw_shadows", "stream"]
@@ -159,7 +159,7 @@ class _Draw:
             phases=self._phases(),
         )
 
-    def _phases(self) -> dict[str, tuple[int, int]]:
+    def _phases(self) -> dict[str, Phase]:
         """Draw where periods and ticks are when the run begins, where a quota is bound to ticks."""
         phases = {}
         for name, node in self.problem.fabric.nodes.items():
@@ -167,7 +167,8 @@ class _Draw:
                 rng = self._rng(f"phase/{name}")
                 period_ns = round(node.quota.period_ms * NS_PER_MS)
                 tick_ns = round(node.quota.tick_ms * NS_PER_MS)
-                phases[name] = (int(rng.integers(period_ns)), int(rng.integers(tick_ns)))
+                ago_ns = int(rng.integers(period_ns)), int(rng.integers(tick_ns))
+                phases[name] = Phase(*ago_ns, self._key(f"wakes/{name}") >> 1)
         return phases
 
     def _rng(self, name: str) -> np.random.Generator:

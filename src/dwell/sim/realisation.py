@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LinkSegment", "LinkSegments", "NodeChange", "NodeChanges", "Realisation"]
+__all__ = ["LinkSegment", "LinkSegments", "NodeChange", "NodeChanges", "Phase", "Realisation"]
 
 
 class NodeChange(NamedTuple):
@@ -45,6 +45,24 @@ class LinkSegment(NamedTuple):
     loss: float
     rate_mbps: float
     layers: tuple[int, ...]
+
+
+class Phase(NamedTuple):
+    """When the kernel of a node looks at its quota.
+
+    Parameters
+    ----------
+    period_ago_ns, tick_ago_ns : int
+        How long before time 0 a period of the quota had begun, and how long before it the last tick
+        was.
+    wakes : int
+        Stream of the times between two wakes of the background (see
+        `dwell.kernels.streams.attempt_uniform`), 63 bits.
+    """
+
+    period_ago_ns: int = 0
+    tick_ago_ns: int = 0
+    wakes: int = 0
 
 
 class NodeChanges(Sequence[NodeChange]):
@@ -167,9 +185,8 @@ class Realisation:
         Ascending in time; kept as `NodeChanges`.
     link_segments : sequence of LinkSegment
         Per link ascending in time; kept as `LinkSegments`.
-    phases : mapping of str to (int, int)
-        Of nodes whose quota is noticed at ticks: how long before time 0 a period of the quota had
-        begun, and how long before it the last tick was, ns. Both 0 where a node is left out.
+    phases : mapping of str to Phase
+        Of nodes whose quota is noticed at ticks; all 0 where one is left out.
     """
 
     scenario: str
@@ -185,7 +202,7 @@ class Realisation:
     extra_ns: NDArray[np.int64]
     node_changes: Sequence[NodeChange]
     link_segments: Sequence[LinkSegment]
-    phases: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    phases: Mapping[str, Phase] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))

@@ -32,6 +32,7 @@ from dwell.testbed.measured import (
     look_at,
     messaging,
     sites,
+    wakes,
 )
 from dwell.testbed.paired import paired
 from dwell.testbed.sensitivity import usual_of
@@ -128,10 +129,14 @@ def calibrate(
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
     beside = beside_jobs(measured, behind)
-    more, others = interferences(measured, found, usual), contentions(measured)
+    of_nodes = {
+        "interference": interferences(measured, found, usual),
+        "contention": contentions(measured),
+        "background_hz": wakes(measured, problem),
+    }
     _put_in(document, samples.name, found, delays_ms, behind, beside)
-    for name, of_nodes in (("interference", more), ("contention", others)):
-        for node, value in of_nodes.items():
+    for name, values in of_nodes.items():
+        for node, value in values.items():
             document["nodes"][node][name] = _short(value)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
@@ -148,8 +153,10 @@ def calibrate(
             for link, values in delays_ms.items()
         },
         "background": {node: _short(value) for node, value in behind.items()},
-        "interference": {node: _short(value) for node, value in more.items()},
-        "contention": {node: _short(value) for node, value in others.items()},
+        **{
+            name: {node: _short(value) for node, value in values.items()}
+            for name, values in of_nodes.items()
+        },
         "work_ms": {node: _short(value) for node, value in usual.work_ms.items()},
         "sensitivity": {
             task_name(*site): _short(value) for site, value in usual.sensitivity.items()
@@ -473,6 +480,8 @@ def _told(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"{node}: background {value:.3g} cores{more}")
     for node, value in report["contention"].items():
         lines.append(f"{node}: others have {value:.3g} of its CPUs while jobs run")
+    for node, value in report["background_hz"].items():
+        lines.append(f"{node}: something wakes {value:.4g} times a second")
     for node, value in report["interference"].items():
         lines.append(f"{node}: stages take {value:.3g} times as long beside foreign threads")
     for name, value in report["sensitivity"].items():

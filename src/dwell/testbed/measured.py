@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 from dwell.model import Flow, Problem
-from dwell.model.bounds import CONTENTION
+from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
 from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
 from dwell.testbed.speeds import Usual, work_ms
@@ -615,6 +615,17 @@ def contentions(measured: Sequence[Measured]) -> dict[str, float]:
         of = [one.outside[node] for one in calm if node in one.outside]
         if (taken := _cores(of)) is not None:
             result[node] = min(taken, CONTENTION.high)
+    return result
+
+
+def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
+    """How often in a second a thread of a node wakes, where the kernel looks at ticks otherwise."""
+    result = {}
+    for name, node in problem.fabric.nodes.items():
+        told = [one.run.meta.get("wakes_hz") or {} for one in measured]
+        known = [float(of[name]) for of in told if name in of]
+        if known and node.quota is not None and node.quota.tick_ms > 0:
+            result[name] = min(sum(known) / len(known), BACKGROUND_HZ.high)
     return result
 
 
