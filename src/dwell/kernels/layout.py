@@ -138,9 +138,9 @@ FOREIGN = _number(-1)
 # TICK_NS is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last tick
 # was TICK_AGO and the last begin of a period PERIOD_AGO ago. TURN says whether a thread has the
 # turn, TURN_V what it had received before, and TURN_NS what since; a turn lasts LEAST_NS at least.
-# DRAWN_NS is what is drawn on a pool at a time. WAKE_T is when something of the background wakes next,
-# the WAKES-th time, and WAKE_GAP_NS the mean time between two. All that a quota counts is in time of the core: of
-# that, what runs receives the share PACE.
+# DRAWN_NS is what is drawn on a pool at a time. WAKE_T is when something of the background wakes
+# next, the WAKES-th time, and WAKE_GAP_NS the mean time between two. All that a quota counts is in
+# time of the core: of that, what runs receives the share PACE.
 (
     SCHEDULER,
     CORES,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,9 +46,34 @@ class Counts(NamedTuple):
         return others_ns, outside_ns
 
 
-@dataclass(frozen=True, slots=True)
+class _Counter:
+    """A file of the kernel's that is read again and again: it stays open."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: int | None = None
+
+    def read(self) -> bytes:
+        """Return what it says now.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read.
+        """
+        if self._file is None:
+            self._file = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+        return os.pread(self._file, 1 << 16, 0)
+
+    def __del__(self) -> None:
+        if self._file is not None:
+            os.close(self._file)
+
+
 class ControlGroup:
     """A control group.
+
+    Workers ask it twice a job: all that it reads stays open.
 
     Parameters
     ----------
@@ -59,8 +83,10 @@ class ControlGroup:
         Folder of the group that all are in.
     """
 
-    counter: Path
-    root: Path = Path()
+    def __init__(self, counter: Path, root: Path = Path()) -> None:
+        self._nanoseconds = counter.name == COUNTERS["cgroup"]
+        self._path, self._used = counter, _Counter(counter)
+        self._by_cpu = [_Counter(folder / BY_CPU) for folder in (root, counter.parent)]
 
     def used_ns(self) -> int:
         """CPU time that its processes have taken, those that have ended included.
@@ -73,12 +99,12 @@ class ControlGroup:
         # This clock brings the group's counter up to date with the thread that asks.
         time.process_time_ns()
         try:
-            text = self.counter.read_text()
-            if self.counter.name == COUNTERS["cgroup"]:
+            text = self._used.read()
+            if self._nanoseconds:
                 return int(text)
-            return int(dict(line.split() for line in text.splitlines())["usage_usec"]) * 1000
+            return int(dict(line.split() for line in text.splitlines())[b"usage_usec"]) * 1000
         except (OSError, ValueError, KeyError) as error:
-            raise LiveError(f"{self.counter}: cannot be read ({error})") from None
+            raise LiveError(f"{self._path}: cannot be read ({error})") from None
 
     def taken_ns(self) -> int:
         """As `used_ns`; `UNKNOWN` where that cannot be read."""
@@ -97,9 +123,9 @@ class ControlGroup:
 
     def _outside_ns(self) -> int:
         taken, cpus = [], os.sched_getaffinity(0)
-        for folder in (self.root, self.counter.parent):
+        for counter in self._by_cpu:
             try:
-                by_cpu = (folder / BY_CPU).read_text().split()
+                by_cpu = counter.read().split()
                 taken.append(sum(int(by_cpu[cpu]) for cpu in cpus))
             except (OSError, ValueError, IndexError):
                 return UNKNOWN

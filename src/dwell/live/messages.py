@@ -116,12 +116,13 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Cycles that the restored state behind it lacked, where it was the first after a failover;
         -1 otherwise.
     cpu_ns : int
-        CPU time that the stage took (see `Worker.run`); -1 where it was not called.
+        CPU time that the job took from its start on (see `Worker.run`); -1 where the stage was not
+        called.
     others_ns, outside_ns : int
         CPU time that other processes of the node's control group took meanwhile, and on its CPUs
         those of no such group; -1 where that is not known.
     group_ns : tuple of int
-        CPU time that the group had taken when the stage was called, and when it returned.
+        CPU time that the group had taken when the job started, and when the stage returned.
     """
 
     task: Name

@@ -38,10 +38,11 @@ closed_unix_ns      time of day of its close
 
 On request there are two more tables. ``jobs`` has a row of every job that is known of: a cycle that
 never reached a sink tells of none, unless a newer one took its place on the way. Its columns are a
-simulated run's, and ``cpu_ns``, the CPU time of the stage's ``process()``. Of nodes with a quota,
-where something counts it, also that of all other processes of the node meanwhile (``others_ns``),
-of everybody else on its CPUs (``outside_ns``), and of the node between a release, or the end of the
-job before on the same node, and the call (``handover_ns``). A job that was replaced has no instants
+simulated run's, and ``cpu_ns``, the CPU time from its start until the stage's ``process()`` has
+returned, reading the inputs included. Of nodes with a quota, where something counts it, also that
+of all other processes of the node meanwhile (``others_ns``), of everybody else on its CPUs
+(``outside_ns``), and of the node between a release, or the end of the job before on the same node,
+and its start (``handover_ns``). A job that was replaced has no instants
 but that of its readiness. ``processes`` has what every process of the cell took of its node's CPU
 in every window, from the release of its first cycle to its close.
 """

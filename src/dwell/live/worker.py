@@ -203,8 +203,8 @@ class Worker:
         }
         self._state_lane = lane_of(problem.pipeline.tasks[task].state_bytes)
         self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
-        #: What is read before and after the stage is called; a stage that is said to use several
-        #: threads is charged with all that its process does meanwhile.
+        #: What is read at a job's start and after the stage was called; a stage that is said to use
+        #: several threads is charged with all that its process does meanwhile.
         alone = problem.pipeline.tasks[task].on[place.node].threads == 1
         self.cpu_clock: Callable[[], int] = time.thread_time_ns if alone else time.process_time_ns
         #: What others have taken of the node, where something counts it.
@@ -489,10 +489,12 @@ class Worker:
     def run(self, job: Job, started_ns: int) -> tuple[Message | None, int]:
         """Call the stage; returns its output, None if it failed, and the state's age.
 
-        The CPU time of the call goes into the job's hop: that of this thread, or of the whole
-        process where the cell gives the task several threads on this node. So does what others of
-        the node took meanwhile, where something counts it.
+        The CPU time from its start on, what it takes to read the inputs included, goes into the
+        job's hop: that of this thread, or of the whole process where the cell gives the task
+        several threads on this node. So does what others of the node took meanwhile, where
+        something counts it.
         """
+        before, begun_ns = self.group_clock(), self.cpu_clock()
         stamp = job.header.stamp
         self._counted = NOT_COUNTED
         state_age = self._recover(job) if self._stateful else UNKNOWN
@@ -510,15 +512,13 @@ class Worker:
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return None, state_age
-        before = self.group_clock()
-        begun_ns = self.cpu_clock()
         try:
             output = self.stage.process(inputs)
         except Exception as error:  # the user's code
             self._failed(f"cycle {stamp.cycle}: process() raised {type(error).__name__}: {error}")
             return None, state_age
-        cpu_ns = max(self.cpu_clock() - begun_ns, 0)
-        self._counted = before, cpu_ns, self.group_clock()
+        after = self.group_clock()
+        self._counted = before, max(self.cpu_clock() - begun_ns, 0), after
         if not isinstance(output, Message):
             what = type(output).__name__
             self._failed(f"cycle {stamp.cycle}: process() returned a {what}, not a Message")

@@ -165,9 +165,7 @@ def _play(
         bed.apply(change)
         played.changed(change)
 
-    with Sampler(
-        bed.cpus, bed.used_ns, bed.switches, links, clock, rule, bed.probing
-    ) as sampler:
+    with Sampler(bed.cpus, bed.used_ns, bed.switches, links, clock, rule, bed.probing) as sampler:
         samplers.append(sampler)
         play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
     bed.stop_controllers()

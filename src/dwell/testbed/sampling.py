@@ -180,7 +180,8 @@ class Rate:
     def end(self) -> None:
         """Look for the last time."""
         after, lasted_s = self._read(), time.monotonic() - self._begun_s
-        counted = sum(after[thread] - self._before[thread] for thread in after.keys() & self._before.keys())
+        both = after.keys() & self._before.keys()
+        counted = sum(after[thread] - self._before[thread] for thread in both)
         self.hz = counted / max(lasted_s, 1e-9)
 
 
