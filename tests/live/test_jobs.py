@@ -7,11 +7,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 
 import dwell
+from dwell.live import payloads
 from dwell.live.agent import CpuCount
 from dwell.live.cell import Cell
 from dwell.live.group import ControlGroup, Counts, own_group
@@ -127,6 +129,28 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
     over = both["latency_ns"] - (both["end_ns"] - both["release_ns"])
     # Until the sink has handed the command to the arm.
     assert 0 <= over.min() <= over.max() < MS  # type: ignore[operator]
+
+
+def test_reading_its_inputs_is_part_of_a_jobs_cpu_time(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spent_ns = [0]
+
+    def reading(*arguments: Any) -> object:
+        spent_ns[0] += CPU_NS
+        return payloads.read_payload(*arguments)
+
+    monkeypatch.setattr("dwell.live.worker.read_payload", reading)
+    world = world_of(problem, "LOC")
+    for role in world.roles.values():
+        if hasattr(role, "worker"):
+            role.worker.cpu_clock = lambda: spent_ns[0]
+    world.run(2_000)
+    jobs = frames(problem, world.recorder.rows)
+    assert dict(jobs.select("task", "cpu_ns").unique().rows()) == {
+        "sensing": 0,
+        **dict.fromkeys(("perception", "planning", "control"), CPU_NS),
+    }
 
 
 def cell_of(world: World) -> Cell:

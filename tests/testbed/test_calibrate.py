@@ -19,7 +19,7 @@ from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
 from dwell.testbed.calibrate import Calibrated, calibrate
-from dwell.testbed.measured import look_at, wakes
+from dwell.testbed.measured import TOGETHER, look_at, wakes
 
 CELL = """
 dwell: 1
@@ -242,7 +242,7 @@ def test_how_often_something_wakes_is_of_nodes_whose_quota_has_ticks(
     nodes = dict(problem.fabric.nodes)
     nodes["E"] = replace(nodes["E"], quota=Quota(0.8, 4.0, tick_ms=4.0))
     ticking = replace(problem, fabric=replace(problem.fabric, nodes=nodes))
-    assert wakes(measured, ticking) == {"E": pytest.approx(HZ["E"])}
+    assert wakes(measured, ticking) == {"E": pytest.approx(HZ["E"] / TOGETHER)}
     # Runs of before it was recorded say nothing, and leave it out.
     for one in measured:
         del one.run.meta["wakes_hz"]

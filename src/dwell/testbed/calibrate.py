@@ -32,6 +32,7 @@ from dwell.testbed.measured import (
     look_at,
     messaging,
     sites,
+    usable,
     wakes,
 )
 from dwell.testbed.paired import paired
@@ -430,8 +431,6 @@ def _short(value: float | None) -> float | None:
 
 def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | None:
     """Set what the cell says of a run that it was made from beside what that one showed."""
-    import polars as pl
-
     from dwell.sim import draw, simulate_realisation
 
     scenario = str(one.run.meta.get("scenario") or "baseline")
@@ -444,7 +443,7 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
     played = simulate_realisation(problem, real, policy=one.placement)
     row: dict[str, Any] = {"run": one.name, "scenario": scenario, "placement": one.placement}
     for what, run in (("measured", one.run), ("predicted", played)):
-        counted = run.windows.filter(~pl.col("warmup") & ~pl.col("mixed"))
+        counted = usable(run)
         cycles = _in_windows(run.cycles, counted, problem.window_cycles)
         latency_ms = cycles["latency_ns"].fill_null(np.iinfo(np.int64).max).to_numpy() / 1e6
         l95_ms = float(np.quantile(latency_ms, 0.95, method="inverted_cdf"))
