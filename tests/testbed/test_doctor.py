@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from dwell.model import Problem, Quota
 from dwell.testbed import doctor
 from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.doctor import Finding, examine
+from dwell.testbed.probe import Lateness
 from tests.testbed.machine import no_groups, no_hosts
 
 ROOT = Path(__file__).parents[2]
@@ -113,3 +115,43 @@ def test_what_goes_wrong_in_a_trial_is_a_finding() -> None:
     assert doctor._attempt("it", fail, "get it") == Finding(
         "it", False, "it is not there", "get it"
     )
+
+
+class Standing:
+    """A probe that is late at every third look."""
+
+    def __init__(self, cpu: int) -> None:
+        self.looks = 0
+
+    def __enter__(self) -> Standing:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def read(self) -> Lateness:
+        self.looks += 1
+        late_ms = 30.0 if self.looks % 3 == 0 else 0.1
+        return Lateness(wakes=20, mean_ms=0.1, max_ms=late_ms, work_ms=None)
+
+
+def test_a_machine_that_stands_still_at_times_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "Probe", Standing)
+    finding = doctor._standstill([], 2.5)
+    assert not finding.ok
+    assert not finding.needed
+    assert "longest was 30.0 ms" in finding.found
+    assert "100% of the windows of 2 s" in finding.found
+    assert finding.remedy
+    # Windows that are so short that most of them had none, but not enough.
+    short = replace(with_quotas(), window_cycles=1)
+    finding = doctor._standstill([short], 2.5)
+    share = int(re.findall(r"(\d+)% of the windows", finding.found)[0])
+    assert 5 < share < 60
+    assert not finding.ok
+
+
+def test_a_watch_is_only_kept_where_it_is_asked_for() -> None:
+    finding = next(one for one in examine(watch_s=0.5) if one.name == "no standstills")
+    assert "in 0.5 s the longest was" in finding.found
+    assert "no standstills" not in {one.name for one in examine()}

@@ -135,13 +135,19 @@ def doctor(
     cells: Annotated[
         list[Path] | None, typer.Argument(metavar="CELL...", help="Cell files to have checked too.")
     ] = None,
+    watch: Annotated[
+        float,
+        typer.Option(
+            min=0, metavar="SECONDS", help="Watch for so long whether the machine stands still."
+        ),
+    ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Say what this machine can do as a testbed and what it cannot, and what to install."""
     import dwell
     from dwell.testbed.doctor import examine
 
-    findings = examine([dwell.load(cell) for cell in cells or ()])
+    findings = examine([dwell.load(cell) for cell in cells or ()], watch_s=watch)
     missing = [one for one in findings if one.needed and not one.ok]
     if as_json:
         rows = [

@@ -6,6 +6,7 @@ Whatever is made for a trial is removed at once; nothing is changed that stays.
 from __future__ import annotations
 
 import gzip
+import math
 import os
 import shutil
 import subprocess
@@ -23,6 +24,9 @@ from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.groups import Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
+from dwell.testbed.pressure import Rule
+from dwell.testbed.probe import Probe
+from dwell.testbed.sampling import EVERY_S
 from dwell.testbed.stress import STRESS_NG
 
 __all__ = ["Finding", "examine"]
@@ -39,6 +43,8 @@ ALLOWANCE = 1.25
 TRIALS = tuple(f"doctor-{number}" for number in range(8))
 ALONE = "one"
 PAIR = ("one", "two")
+#: Length of the windows that a watch is divided into, where no cell says another.
+WINDOW_S = 2.0
 PRIVILEGED = "run it as root; in a container, start that with --privileged"
 
 
@@ -66,13 +72,16 @@ class Finding:
     needed: bool = True
 
 
-def examine(problems: Sequence[Problem] = ()) -> list[Finding]:
+def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[Finding]:
     """Look at all that a testbed needs of this machine.
 
     Parameters
     ----------
     problems : sequence of Problem
         Cells that are to run at the same time; their quotas have to fit.
+    watch_s : float
+        How long to watch whether the machine stands still at times, as one does whose host has
+        other things to do; not at all if 0.
 
     Returns
     -------
@@ -90,6 +99,7 @@ def examine(problems: Sequence[Problem] = ()) -> list[Finding]:
         _pressure(),
         _netem(),
         _fifo(),
+        *([_standstill(problems, watch_s)] if watch_s > 0 else ()),
     ]
 
 
@@ -281,3 +291,45 @@ def _fifo() -> Finding:
         found = f"refused ({failed[0].strerror}); links may be late while CPUs are busy"
         return Finding(name, False, found, PRIVILEGED, needed=False)
     return Finding(name, True, "granted", needed=False)
+
+
+# ------------------------------------------------------------------------- what takes a while
+
+
+def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
+    """Watch CPUs that have nothing to do: what stops them then stops a run of a testbed, too."""
+    name, rule = "no standstills", Rule()
+    window_s = min(
+        (one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems), default=WINDOW_S
+    )
+    try:
+        late_ms = _lateness(watch_s)
+    except LiveError as error:
+        return Finding(name, False, str(error), needed=False)
+    stalls = {at_s: ms for at_s, ms in late_ms.items() if ms > rule.stall_ms}
+    windows = math.ceil(watch_s / window_s)
+    # The last look may be a little late.
+    share = len({min(int(at_s / window_s), windows - 1) for at_s in stalls}) / windows
+    watched = f"in {watch_s:g} s the longest was {max(late_ms.values(), default=0.0):.1f} ms"
+    if not stalls:
+        return Finding(name, True, watched, needed=False)
+    found = (
+        f"{watched}; {share:.0%} of the windows of {window_s:.3g} s had one of more than "
+        f"{rule.stall_ms:g} ms, and above {rule.excluded_most:.0%} a run has failed"
+    )
+    remedy = "an hour, or a machine, at which nobody else wants it"
+    ok = share <= rule.excluded_most
+    return Finding(name, ok, found, "" if ok else remedy, needed=False)
+
+
+def _lateness(watch_s: float) -> dict[float, float]:
+    """Longest lateness of a probe on any CPU, ms, at every look, by the time of the look, s."""
+    found = {}
+    with ExitStack() as stack:
+        probes = [stack.enter_context(Probe(cpu)) for cpu in sorted(os.sched_getaffinity(0))]
+        begun_s = time.monotonic()
+        while time.monotonic() - begun_s < watch_s:
+            time.sleep(EVERY_S)
+            at_s = time.monotonic() - begun_s
+            found[at_s] = max(probe.read().max_ms for probe in probes)
+    return found
