@@ -66,8 +66,8 @@ SOMETIMES = ("at_s", "for_s", "episodes", "ramp_s")
 #: Sides of a hop, in its times and, behind source and target, in its name.
 SENDER, RECEIVER = range(2)
 #: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
-#: worker's. In a trace of the scheduler under the example, the time from any instant to the next
-#: thread that wakes or sleeps is as long as with 0.40 (E) to 0.52 (R1) times as many that come alone.
+#: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
+#: wakes or sleeps is as long as with 0.40 (E) to 0.52 (R1) times as many that come alone.
 TOGETHER = 2.2
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
