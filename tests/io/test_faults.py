@@ -104,6 +104,13 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
         ("several cores",),
     ),
     (
+        ("nodes", "R1"),
+        {"tier": "robot", "background_hz": 50, "quota": {"cpu": 1, "period_ms": 4}},
+        "nodes.R1.background_hz",
+        ("50", "no `quota` with `tick_ms`"),
+    ),
+    (("nodes", "R1", "background_hz"), 1e6, "nodes.R1.background_hz", ("from 0 to 100000",)),
+    (
         ("nodes", "R1", "bursts"),
         {"every_ms": 0, "for_ms": 1},
         "nodes.R1.bursts.every_ms",
