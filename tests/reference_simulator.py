@@ -506,7 +506,7 @@ class NodeState:
         while self.wakes[-1] <= now:
             drawn = attempt_uniform(self.wake_key, len(self.wakes) - 1, 0)
             self.wakes.append(self.wakes[-1] + 1 + int(-math.log(1 - drawn) * gap_ns))
-        return min(wake for wake in self.wakes if wake > now)
+        return self.wakes[-1]
 
     @property
     def rate(self) -> int:

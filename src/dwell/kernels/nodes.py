@@ -108,7 +108,6 @@ __all__ = [
 SLACK = 1e-3
 # Of those that have received the same, jobs go first.
 LATE = 1 << 62
-NEVER = 1 << 62
 
 
 @phase
@@ -286,8 +285,6 @@ def _next_look(s: Tables, server: int, now: int) -> int:
 def _next_wake(s: Tables, server: int, now: int) -> int:
     """When something of the background wakes next, after now: a Poisson process."""
     gap_ns = s.servers_f[server, WAKE_GAP_NS]
-    if gap_ns == np.inf:
-        return NEVER
     key = np.uint64(s.servers[server, WAKE_KEY])
     while s.servers[server, WAKE_T] <= now:
         drawn = attempt_uniform(key, s.servers[server, WAKES], 0)

@@ -170,7 +170,10 @@ class _Layout:
                     of_node = real.phases.get(name, Phase())
                     cpu[k.PERIOD_AGO], cpu[k.TICK_AGO] = of_node.period_ago_ns, of_node.tick_ago_ns
                     cpu[k.WAKE_KEY], wakes_hz = of_node.wakes, node.background_hz
-                    of[k.WAKE_GAP_NS] = 1e9 / wakes_hz if wakes_hz else np.inf
+                    if wakes_hz:
+                        of[k.WAKE_GAP_NS] = 1e9 / wakes_hz
+                    else:
+                        cpu[k.WAKE_T] = NEVER_NS
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
 

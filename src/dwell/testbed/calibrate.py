@@ -131,14 +131,17 @@ def calibrate(
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
     beside = beside_jobs(measured, behind)
     of_nodes = {
-        "interference": interferences(measured, found, usual),
-        "contention": contentions(measured),
-        "background_hz": wakes(measured, problem),
+        name: {node: _short(value) for node, value in values.items()}
+        for name, values in (
+            ("interference", interferences(measured, found, usual)),
+            ("contention", contentions(measured)),
+            ("background_hz", wakes(measured, problem)),
+        )
     }
     _put_in(document, samples.name, found, delays_ms, behind, beside)
     for name, values in of_nodes.items():
         for node, value in values.items():
-            document["nodes"][node][name] = _short(value)
+            document["nodes"][node][name] = value
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
@@ -154,10 +157,7 @@ def calibrate(
             for link, values in delays_ms.items()
         },
         "background": {node: _short(value) for node, value in behind.items()},
-        **{
-            name: {node: _short(value) for node, value in values.items()}
-            for name, values in of_nodes.items()
-        },
+        **of_nodes,
         "work_ms": {node: _short(value) for node, value in usual.work_ms.items()},
         "sensitivity": {
             task_name(*site): _short(value) for site, value in usual.sensitivity.items()
