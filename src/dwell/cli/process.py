@@ -62,7 +62,9 @@ def main(arguments: list[str] | None = None) -> int:
         from dwell.io import load
         from dwell.live.leash import end_with_owner
         from dwell.live.process import run_process
+        from dwell.profiling.memory import keep_memory
 
+        keep_memory()
         end_with_owner(stopped)
         run_process(load(asked.cell), asked.who, asked.state, stopped)
     except DwellError as error:

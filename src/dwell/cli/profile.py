@@ -196,10 +196,12 @@ def _measure_tasks(
     # cores when they are imported. What the tasks print must not get into the results.
     with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
         from dwell.profiling.measure import Settings
+        from dwell.profiling.memory import keep_memory
         from dwell.profiling.profile_file import require_free, task_name, write_profile
 
         settings = Settings(runs, warmup, period_ms)
         require_free(out, [task_name(task, node) for task in sources])
+        keep_memory()  # as the processes of a live cell do
         measured = _measured(node, sources, factories, settings)
     write_profile(out, measured)
     _print_measured(out, measured, as_json=as_json)
