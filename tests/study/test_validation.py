@@ -160,6 +160,22 @@ class TestWhatCounts:
         assert group.predicted.windows == 2 * group.measured.windows
         assert group.excluded == 3
 
+    def test_of_a_policy_that_moves_what_was_decided_on_them_is_left_out_too(self) -> None:
+        problem = make_problem()
+        controller = replace(problem.controller, min_dwell=3)
+        problem = replace(problem, controller=controller)
+        last = WINDOWS - 1
+        for policy, left_out in (
+            ("LOC", {5, 7, 50, last}),
+            ("dtp", {5, 6, 7, 8, 9, 10, 50, 51, 52, 53, last}),
+        ):
+            (name, run), *_ = measured(problem, "baseline", policy, 101).items()
+            told = {"excluded": [5, {"window": 7, "reason": "steal"}, 50, last]}
+            one = read_measured(name, with_meta(run, pressure=told), problem)
+            assert set(one.excluded) == left_out
+            assert one.excluded[7] == "steal"
+        assert one.excluded[52] == "what was decided on window 50 holds for so long"
+
     @pytest.mark.parametrize(
         ("meta", "expected"),
         [

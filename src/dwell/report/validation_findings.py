@@ -65,7 +65,10 @@ def remarks(validation: Validation) -> Iterator[str]:
     excluded = sum(group.excluded for group in validation.groups)
     if excluded:
         windows = excluded + sum(group.measured.windows for group in validation.groups)
-        yield f"{excluded} of {windows} windows are left out, for reasons that their runs give."
+        yield (
+            f"{excluded} of {windows} windows are left out, for reasons that their runs give: under "
+            "policies that move with the windows after them in which what was decided on them holds."
+        )
 
 
 def _missed(group: Group) -> Iterator[str]:

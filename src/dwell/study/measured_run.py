@@ -63,7 +63,8 @@ class MeasuredRun:
     guard : bool
         Whether the cell's guard could act.
     excluded : mapping of int to str
-        Windows that are left out, and why.
+        Windows that are left out, and why: those of its record and, of a policy that moves, those
+        after them in which what was decided on them holds.
     """
 
     name: str
@@ -145,6 +146,10 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
             scenarios={**problem.scenarios, scenario: items},
         )
         problem = at_speed_of(meta, problem, usual or Usual())
+        if policy not in problem.candidates:
+            excluded = _with_consequences(
+                excluded, problem.controller.min_dwell, run.windows.height
+            )
     except DwellError as error:
         raise RunError(f"{name}: {error}") from None
     live = meta.get("kind", "simulated") != "simulated"
@@ -188,6 +193,22 @@ def excluded_windows(meta: Mapping[str, Any]) -> dict[int, str]:
         except (TypeError, ValueError):
             raise RunError(f"{field} is {told!r}; numbers of windows are wanted") from None
     return found
+
+
+def _with_consequences(
+    excluded: Mapping[int, str], min_dwell: int, windows: int
+) -> dict[int, str]:
+    """Add the windows after each in which a move that was decided on it cannot be taken back.
+
+    Whether there was such a move makes no difference: who looks for it would choose by the result.
+    """
+    after = {
+        window + step: f"what was decided on window {window} holds for so long"
+        for window in excluded
+        for step in range(1, min_dwell + 1)
+        if window + step < windows
+    }
+    return after | dict(excluded)
 
 
 def _numbered(item: object) -> tuple[Any, Any]:
