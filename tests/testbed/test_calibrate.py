@@ -233,6 +233,54 @@ def test_backgrounds_and_links_are_found(calibrated: Calibrated) -> None:
         assert calibrated.report["links"][link]["added_ms"] == pytest.approx(ADDED_MS, abs=0.25)
 
 
+def test_what_a_node_takes_beside_a_job_varies_with_the_job(
+    nominal: Path, folders: list[Path], calibrated: Calibrated, tmp_path: Path
+) -> None:
+    run = dwell.open_run(folders[0])
+    found = run.jobs["task"].cast(pl.String) == "find"
+    more_ns = np.random.default_rng(1).gamma(2, 0.5e6, run.jobs.height)
+    more = pl.Series(np.where(found, more_ns, 0)).cast(pl.Int64)
+    tables = {"cycles": run.cycles, "windows": run.windows, "decisions": run.decisions}
+    tables |= {"processes": run.processes}
+    jobs = run.jobs.with_columns(others_ns=pl.col("others_ns") + more)
+    folder = Run(run.meta, {**tables, "jobs": jobs}).save(tmp_path / "LOC-baseline")
+    said = calibrate(nominal, [folder, *folders[1:]], tmp_path / "out.yaml", say=lambda line: None)
+    usual, now = (one.report["tasks"]["find@R1"] for one in (calibrated, said))
+    # The mean is the background's, what it varies by is the job's: the quota is the same.
+    assert now["mean_ms"] == pytest.approx(usual["mean_ms"], abs=0.01)
+    assert now["std_ms"] ** 2 == pytest.approx(usual["std_ms"] ** 2 + 0.5, rel=0.2)
+    # All of the background at most.
+    assert said.report["background_beside"]["R1"] == said.report["background"]["R1"]
+
+
+def test_a_job_beside_a_job_is_no_background(
+    nominal: Path, truth: Problem, folders: list[Path]
+) -> None:
+    run = dwell.open_run(folders[0])
+    shadowed = (pl.col("task").cast(pl.String) == "find") & (pl.col("cycle") % 5 == 0)
+    # A shadow begins within the job, and ends after it; what it takes is counted as others'.
+    shadows = run.jobs.filter(shadowed).with_columns(
+        start_ns=(pl.col("start_ns") + pl.col("end_ns")) // 2,
+        end_ns=pl.col("end_ns") + 10**6,
+        shadow=pl.lit(value=True),
+    )
+    jobs = run.jobs.with_columns(
+        others_ns=pl.col("others_ns") + pl.when(shadowed).then(5 * 10**6).otherwise(0),
+        shadow=pl.lit(value=False),
+    )
+    jobs = pl.concat([jobs, shadows.select(jobs.columns)])
+    tables = {"cycles": run.cycles, "windows": run.windows, "decisions": run.decisions}
+    both = [
+        look_at("one", one, dwell.load(nominal))
+        for one in (run, Run(run.meta, {**tables, "processes": run.processes, "jobs": jobs}))
+    ]
+    (taken_s, took_s), (left_s, out_of_s) = (one.beside["R1"] for one in both)
+    assert left_s / out_of_s == pytest.approx(taken_s / took_s, rel=1e-3)
+    assert out_of_s < 0.95 * took_s
+    for one in both:
+        assert np.abs(one.visits["find", "R1"].beside_ms).max() < 0.01
+
+
 def test_how_often_something_wakes_is_of_nodes_whose_quota_has_ticks(
     calibrated: Calibrated, nominal: Path, folders: list[Path]
 ) -> None:

@@ -37,7 +37,8 @@ def measured(
         jobs = np.repeat(np.arange(windows), JOBS)
         noise = draw.gamma(50, 1 / 50, len(jobs))
         stage_ms = 5.0 * speed**exponent * changes[site[1]][jobs] ** exponent * noise
-        visits[site] = Visit(stage_ms, stage_ms, np.arange(len(jobs)), jobs)
+        none_ms = np.zeros(len(jobs))
+        visits[site] = Visit(stage_ms, stage_ms, none_ms, np.arange(len(jobs)), jobs)
     meta = {
         "testbed": {"nodes": {"R1": {"cpus": [0]}, "E": {"cpus": [1]}}},
         "pressure": {"windows": rows},

@@ -133,11 +133,15 @@ class Visit:
         CPU time of the stage, in the order of cycles; 0 of a task that an accelerator runs.
     stage_ms : float64 array, shape (jobs,)
         Time that the stage needs where nothing hinders it.
+    beside_ms : float64 array, shape (jobs,)
+        CPU time that its node took meanwhile for others, beyond what it takes in the mean of as
+        long: both use up the quota. 0 where nothing counts it.
     cycles, windows : int64 array, shape (jobs,)
     """
 
     cpu_ms: Floats
     stage_ms: Floats
+    beside_ms: Floats
     cycles: NDArray[np.int64]
     windows: NDArray[np.int64]
 
@@ -266,6 +270,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
     jobs = jobs.sort("cycle", maintain_order=True)
     placements = set(windows["placement"].cast(str))
     jobs_s = windows.height * size * problem.pipeline.period_ms / 1e3
+    jobs = jobs.with_columns(accompanied=_accompanied(jobs))
     visits, starts, spent_ms = {}, {}, {}
     for (task, node, shadow), of in jobs.group_by("task", "node", "shadow", maintain_order=True):
         key = str(task), str(node), bool(shadow)
@@ -279,6 +284,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             visits[key[:2]] = Visit(
                 cpu_ms,
                 np.asarray(stage_ms, np.float64),
+                _beside_ms(of),
                 of["cycle"].to_numpy(),
                 of["window"].to_numpy().astype(np.int64),
             )
@@ -304,7 +310,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             for node, of in problem.fabric.nodes.items()
         },
         handovers_ms=handovers_ms,
-        beside=_while_jobs_ran(own, "others_ns"),
+        beside=_while_jobs_ran(own.filter(~pl.col("accompanied")), "others_ns"),
         outside=_while_jobs_ran(own, "outside_ns"),
         work_ms=work_ms(run.meta),
         delays_ms=_delays(own, problem),
@@ -363,6 +369,38 @@ def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, fl
         .agg(pl.col(column).sum() / 1e9, pl.col("took").sum() / 1e9)
     )
     return {node: (taken_s, took_s) for node, taken_s, took_s in sums.iter_rows()}
+
+
+def _accompanied(jobs: pl.DataFrame) -> pl.Series:
+    """Whether another job of the cell, or a shadow, ran on the same node meanwhile."""
+    import polars as pl
+
+    order = jobs.with_row_index().sort("node", "start_ns", "end_ns")
+    ended = pl.col("end_ns").cum_max().shift(1).over("node")
+    follows = pl.col("start_ns").shift(-1).over("node")
+    met = order.with_columns(
+        accompanied=(ended > pl.col("start_ns")).fill_null(value=False)
+        | (follows < pl.col("end_ns")).fill_null(value=False)
+    )
+    return met.sort("index")["accompanied"]
+
+
+def _beside_ms(of: pl.DataFrame) -> Floats:
+    """What a site's jobs took of their node beside them beyond the mean, ms.
+
+    Of one that another job accompanied it is not known; it takes what the one before did.
+    """
+    import polars as pl
+
+    if "others_ns" not in of.columns:
+        return np.zeros(of.height)
+    alone = ~pl.col("accompanied") & pl.col("others_ns").is_not_null()
+    known = of.filter(alone)
+    if not known.height:
+        return np.zeros(of.height)
+    rate = known["others_ns"].sum() / max(known["took"].sum(), 1)
+    more = pl.when(alone).then(pl.col("others_ns") - rate * pl.col("took")) / 1e6
+    return of.select(more.forward_fill().backward_fill()).to_series().to_numpy()
 
 
 def _handovers(own: pl.DataFrame) -> dict[SiteName, float]:
@@ -477,6 +515,7 @@ def sites(
         stages_ms = {
             one.name: one.visits[site].stage_ms / usual.factor(one.work_ms, *site) for one in of
         }
+        beside_ms = {one.name: one.visits[site].beside_ms for one in of}
         begin_ms, end_ms = (
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
             for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
@@ -487,7 +526,8 @@ def sites(
         samples = {
             one.name: Part(
                 one.visits[site].cycles,
-                _with_messaging(stages_ms[one.name], stage_ms, before_ms + after_ms),
+                _with_messaging(stages_ms[one.name], stage_ms, before_ms + after_ms)
+                + beside_ms[one.name],
             )
             for one in of
         }
