@@ -172,7 +172,7 @@ def test_failed_runs_are_repeated_at_the_end_and_counted(tmp_path: Path) -> None
     state, told = run(asked, tmp_path / "there", play)
     assert play.names[6:] == [third, fourth, third]
     assert state == State(6, 5, (planned[0].name,), 4)
-    assert any("windows were measured under pressure" in line for line in told)
+    assert any("windows after the warm-up were measured under pressure" in line for line in told)
     kept = read_campaign(tmp_path / "there")
     assert sorted(one["outcome"] for one in kept.failed) == ["error", "failed", "failed", "failed"]
     # What a failed attempt left is there to be looked at.

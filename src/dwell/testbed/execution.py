@@ -288,10 +288,11 @@ class _Attempts:
 def _judged(run: Run) -> dict[str, Any]:
     """Say whether a run counts: it has windows, and not too many of them are excluded."""
     told = run.meta.get("pressure") or {}
-    excluded, windows = len(told.get("excluded", ())), run.windows.height
+    excluded, windows = len(told.get("excluded", ())), int((~run.windows["warmup"]).sum())
     if told.get("failed"):
         why = f" ({told['why']})" if told.get("why") else ""
-        reason = f"{excluded} of {windows} windows were measured under pressure{why}"
+        after = f"{windows} windows after the warm-up"
+        reason = f"{excluded} of {after} were measured under pressure{why}"
         return {"outcome": "failed", "reason": reason}
     if run.windows["warmup"].all():
         return {"outcome": "failed", "reason": "it has no window after the warm-up"}
