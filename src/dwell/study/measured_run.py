@@ -195,9 +195,7 @@ def excluded_windows(meta: Mapping[str, Any]) -> dict[int, str]:
     return found
 
 
-def _with_consequences(
-    excluded: Mapping[int, str], min_dwell: int, windows: int
-) -> dict[int, str]:
+def _with_consequences(excluded: Mapping[int, str], min_dwell: int, windows: int) -> dict[int, str]:
     """Add the windows after each in which a move that was decided on it cannot be taken back.
 
     Whether there was such a move makes no difference: who looks for it would choose by the result.
