@@ -66,7 +66,7 @@ def remarks(validation: Validation) -> Iterator[str]:
     if excluded:
         windows = excluded + sum(group.measured.windows for group in validation.groups)
         yield (
-            f"{excluded} of {windows} windows are left out, for reasons that their runs give; under "
+            f"{excluded} of {windows} windows are left out, for reasons their runs give; under "
             "policies that move, so are those after them in which what was decided on them holds."
         )
 
