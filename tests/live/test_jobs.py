@@ -19,6 +19,7 @@ from dwell.live.cell import Cell
 from dwell.live.group import ControlGroup, Counts, own_group
 from dwell.live.loads import ProcessLoads
 from dwell.live.recording import RunRecorder
+from dwell.live.sink import Sink
 from dwell.live.tables import columns_of, job_columns
 from dwell.live.windows import Resume, Rows
 from dwell.model import Problem
@@ -89,10 +90,12 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
             worker.cpu_clock = Spent()
             if worker.place.node == "R2":
                 worker.group_clock = counted
+        elif isinstance(role, Sink):
+            role.group_clock = group
     world.run(4_000)
     jobs = frames(problem, world.recorder.rows)
     simulated = dwell.simulate(problem, policy="LOC", seed=1, windows=2, jobs=True).jobs
-    spent = ["cpu_ns", "others_ns", "outside_ns", "handover_ns"]
+    spent = ["cpu_ns", "others_ns", "outside_ns", "handover_ns", "ending_ns"]
     assert jobs.columns == [*simulated.columns, "shadow", *spent]
 
     nodes = {"sensing": "R1", "perception": "R1", "planning": "R2", "control": "R2"}
@@ -116,6 +119,9 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
     # From the end of a job to the start of the next on the same node; the stamper's has no count.
     handed = settled.select("task", "handover_ns").unique(maintain_order=True).rows()
     assert dict(handed) == {**dict.fromkeys(nodes), "control": OTHERS_NS}
+    # From the end of a sink's job to the hand-over of its command.
+    ended = settled.select("task", "ending_ns").unique(maintain_order=True).rows()
+    assert dict(ended) == {**dict.fromkeys(nodes), "control": OTHERS_NS}
     took = settled.with_columns(took=pl.col("end_ns") - pl.col("start_ns"))
     for task, exec_ms in EXEC_MS.items():
         assert took.filter(pl.col("task") == task)["took"].unique().to_list() == [exec_ms * MS]

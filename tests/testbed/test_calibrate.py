@@ -281,6 +281,19 @@ def test_a_job_beside_a_job_is_no_background(
         assert np.abs(one.visits["find", "R1"].beside_ms).max() < 0.01
 
 
+def test_what_the_end_of_a_cycle_takes_is_counted_where_it_can_be(
+    nominal: Path, folders: list[Path], tmp_path: Path
+) -> None:
+    run = dwell.open_run(folders[0])
+    last = pl.col("task").cast(pl.String) == "act"
+    jobs = run.jobs.with_columns(ending_ns=pl.when(last).then(pl.lit(700_000)))
+    tables = {"cycles": run.cycles, "windows": run.windows, "decisions": run.decisions}
+    told = Run(run.meta, {**tables, "processes": run.processes, "jobs": jobs})
+    found = [look_at("one", one, dwell.load(nominal)).ends_ms for one in (run, told)]
+    assert found[0]["act", "R1"] < 0.5
+    assert found[1] == {("act", "R1"): pytest.approx(0.7)}
+
+
 def test_how_often_something_wakes_is_of_nodes_whose_quota_has_ticks(
     calibrated: Calibrated, nominal: Path, folders: list[Path]
 ) -> None:

@@ -288,7 +288,8 @@ class Ledger:
         for key in order:
             hop = found[key]
             handover_ns = self._handover_ns(cycle, hop, found, shadow=key[0])
-            rows.append(self._job_row(cycle, hop, handover_ns, shadow=key[0]))
+            ending_ns = UNKNOWN if key[0] else self._ending_ns(cycle, hop)
+            rows.append(self._job_row(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
         return [row for row in rows if row is not None]
 
     def _handover_ns(
@@ -306,11 +307,18 @@ class Ledger:
             before_ns = cycle.group_ns
         elif len(flows) == 1 and (shadow, flows[0].source, hop.node) in found:
             before_ns = found[shadow, flows[0].source, hop.node].group_ns[1]
-        begun_ns = hop.group_ns[0]
-        known = UNKNOWN not in (before_ns, begun_ns) and begun_ns >= before_ns
-        return begun_ns - before_ns if known else UNKNOWN
+        return _between(before_ns, hop.group_ns[0])
 
-    def _job_row(self, cycle: LiveCycle, hop: Hop, handover_ns: int, *, shadow: bool) -> Row | None:
+    def _ending_ns(self, cycle: LiveCycle, hop: Hop) -> int:
+        """CPU time that a node took between the job of a sink on it and the command's hand-over."""
+        done = cycle.reports.get(hop.task)
+        if done is None or done.node != hop.node:
+            return UNKNOWN
+        return _between(hop.group_ns[1], done.group_ns)
+
+    def _job_row(
+        self, cycle: LiveCycle, hop: Hop, around_ns: tuple[int, int], *, shadow: bool
+    ) -> Row | None:
         ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
         if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
             return None
@@ -320,10 +328,10 @@ class Ledger:
             ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
         who = cycle.row, hop.task, hop.node, ready_ns
         if hop.ended_ns == UNKNOWN:
-            return (*who, None, None, "replaced", shadow, None, None, None, None)
+            return (*who, None, None, "replaced", shadow, *(5 * (None,)))
         start_ns = max(self._since_origin(cycle, hop.node, hop.started_ns), ready_ns)
         end_ns = max(self._since_origin(cycle, hop.node, hop.ended_ns), start_ns)
-        counts = hop.cpu_ns, hop.others_ns, hop.outside_ns, handover_ns
+        counts = hop.cpu_ns, hop.others_ns, hop.outside_ns, *around_ns
         spent = (None if ns == UNKNOWN else ns for ns in counts)
         return (*who, start_ns, end_ns, "done", shadow, *spent)
 
@@ -439,3 +447,9 @@ class Ledger:
                 and there[flow.source] != there[flow.target]
             )
         return sent, total
+
+
+def _between(before_ns: int, after_ns: int) -> int:
+    """What a counter has gone on by; `UNKNOWN` where one of the two is, or it has begun anew."""
+    known = UNKNOWN not in (before_ns, after_ns) and after_ns >= before_ns
+    return after_ns - before_ns if known else UNKNOWN

@@ -184,6 +184,9 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
     hops : tuple of Hop
     node : str
         Of the sink; where a shadow stopped.
+    group_ns : int
+        CPU time that the control group of the sink's node had taken by `done_ns`; -1 where that is
+        not known.
     """
 
     stamp: Stamp
@@ -192,6 +195,7 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
     outcome: Annotated[str, msgspec.Meta(max_length=20)]
     hops: Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)]
     node: Name
+    group_ns: Spent = -1
 
 
 class Heard(msgspec.Struct, array_like=True, frozen=True, gc=False):

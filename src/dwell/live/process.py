@@ -74,7 +74,11 @@ def _run(
         actuator = _actuator(problem, role.task)
         highest = HighestFile(folder / f"{role.who}.highest")
         expected = getattr(actuator, "inputs", {}).get(role.task)
-        _host(Sink(place, role.task, actuator, highest, expected), place, stopped)
+        sink = Sink(place, role.task, actuator, highest, expected)
+        group = _group(problem, role.node)
+        if group is not None:
+            sink.group_clock = group.taken_ns
+        _host(sink, place, stopped)
     else:
         _work(problem, role, place, folder, stopped)
 

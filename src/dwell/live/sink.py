@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from dwell.errors import LiveError
+from dwell.live.group import UNKNOWN
 from dwell.live.messages import Completion, Header
 from dwell.live.payloads import read_payload
 from dwell.live.role import Place, Pulse
@@ -58,6 +59,8 @@ class Sink:
         self.max_age_ns = round(max_age_ms * 1e6)
         self.newest = highest.load()
         self.offsets = place.offsets()
+        #: What its node has taken, where something counts it.
+        self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.pulse = Pulse(place, self._state)
         self.counts = {"actuated": 0, "behind": 0, "stale": 0, "silences": 0}
         self.trouble = ""
@@ -78,12 +81,14 @@ class Sink:
         header = self.place.header(sample)
         if header is None or header.source != self.task:
             return
+        group_ns = self.group_clock()
         outcome = self._gate(header, now_ns)
         self.counts[outcome] += 1
         if outcome == "actuated":
             self._alarm_ns = now_ns + self.max_age_ns
             self._apply(header, sample.payload, now_ns)
-        done = Completion(header.stamp, self.task, now_ns, outcome, header.hops, self.place.node)
+        ways = header.hops, self.place.node, group_ns
+        done = Completion(header.stamp, self.task, now_ns, outcome, *ways)
         self.place.put_twice(self.place.keys.done(self.task), done)
 
     def age_ns(self, header: Header, now_ns: int) -> int:

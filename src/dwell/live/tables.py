@@ -42,9 +42,10 @@ simulated run's, and ``cpu_ns``, the CPU time from its start until the stage's `
 returned, reading the inputs included. Of nodes with a quota, where something counts it, also that
 of all other processes of the node meanwhile (``others_ns``), of everybody else on its CPUs
 (``outside_ns``), and of the node between a release, or the end of the job before on the same node,
-and its start (``handover_ns``). A job that was replaced has no instants
-but that of its readiness. ``processes`` has what every process of the cell took of its node's CPU
-in every window, from the release of its first cycle to its close.
+and its start (``handover_ns``), and between the end of a sink's and the hand-over of its command
+(``ending_ns``). A job that was replaced has no instants but that of its readiness. ``processes``
+has what every process of the cell took of its node's CPU in every window, from the release of its
+first cycle to its close.
 """
 
 from __future__ import annotations
@@ -162,6 +163,7 @@ def job_columns(problem: Problem) -> Columns:
             "others_ns": "Int64",
             "outside_ns": "Int64",
             "handover_ns": "Int64",
+            "ending_ns": "Int64",
         },
         "processes": {
             "window": "Int64",

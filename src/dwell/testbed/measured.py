@@ -175,8 +175,8 @@ class Measured:
         CPU time of a fixed piece of work on every node (`dwell.testbed.speeds`).
     begins_ms, ends_ms : dict of (str, str) to float
         From the arrival of the last input, or a release, to the start of the job; of sinks, from
-        the end of the job to that of the cycle. Unhindered, but for sources: what the node took
-        since the release, where something counts it.
+        the end of the job to that of the cycle. Unhindered, but where something counts what the
+        node took: since a release, and to the end of the cycle.
     handovers_ms : dict of (str, str) to float
         By task and node: CPU time that the node took between a release, or the job before on the
         same node, and the job; where something counts it.
@@ -289,10 +289,11 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
                 of["window"].to_numpy().astype(np.int64),
             )
     own = jobs.filter(~pl.col("shadow"))
-    handovers_ms = _handovers(own)
+    handovers_ms = _taken_ms(own, "handover_ns")
     sources = {
         site: ms for site, ms in handovers_ms.items() if not problem.pipeline.inputs(site[0])
     }
+    endings_ms = _taken_ms(own, "ending_ns")
     return Measured(
         name=name,
         run=run,
@@ -315,7 +316,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
         work_ms=work_ms(run.meta),
         delays_ms=_delays(own, problem),
         begins_ms=_begins(own, run, problem) | sources,
-        ends_ms=_ends(own, run, problem),
+        ends_ms=_ends(own, run, problem) | endings_ms,
     )
 
 
@@ -403,15 +404,16 @@ def _beside_ms(of: pl.DataFrame) -> Floats:
     return of.select(more.forward_fill().backward_fill()).to_series().to_numpy()
 
 
-def _handovers(own: pl.DataFrame) -> dict[SiteName, float]:
+def _taken_ms(own: pl.DataFrame, column: str) -> dict[SiteName, float]:
+    """Mean of what nodes took around their jobs, by task and node, where it is often known."""
     import polars as pl
 
-    if "handover_ns" not in own.columns:
+    if column not in own.columns:
         return {}
     found = (
-        own.filter(pl.col("handover_ns").is_not_null())
+        own.filter(pl.col(column).is_not_null())
         .group_by("task", "node")
-        .agg(pl.col("handover_ns").mean() / 1e6, jobs=pl.len())
+        .agg(pl.col(column).mean() / 1e6, jobs=pl.len())
         .filter(pl.col("jobs") >= LEAST_JOBS)
     )
     return {(task, node): mean_ms for task, node, mean_ms, _ in found.iter_rows()}
