@@ -399,7 +399,7 @@ def _beside_ms(of: pl.DataFrame) -> Floats:
     known = of.filter(alone)
     if not known.height:
         return np.zeros(of.height)
-    rate = known["others_ns"].sum() / max(known["took"].sum(), 1)
+    rate = float(known["others_ns"].sum()) / max(float(known["took"].sum()), 1.0)
     more = pl.when(alone).then(pl.col("others_ns") - rate * pl.col("took")) / 1e6
     return of.select(more.forward_fill().backward_fill()).to_series().to_numpy()
 
