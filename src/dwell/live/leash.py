@@ -18,9 +18,9 @@ __all__ = ["OWNER", "end_with_owner"]
 OWNER = "DWELL_OWNER"
 #: What does not end by itself within this time after its owner is ended.
 PATIENCE_S = 8.0
-#: All see at once that their owner has ended. Zenoh removes a segment of shared memory with the last
-#: that lets go of it, and where two let go at the same instant it stays until a Zenoh starts again: so
-#: each takes one of so many turns.
+#: All see at once that their owner has ended. Zenoh removes a segment of shared memory with the
+#: last that lets go of it; where two do at the same instant it stays until a Zenoh starts again. So
+#: each waits for one of so many turns.
 TURNS, TURN_S = 20, 0.025
 
 
