@@ -66,18 +66,14 @@ def _run(
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
         stamper = Stamper(place, book, time.time_ns(), clock_of(problem, role.node)())
-        group = _group(problem, role.node)
-        if group is not None:
-            stamper.group_clock = group.taken_ns
+        _count(stamper, problem, role.node)
         _host(stamper, place, stopped)
     elif role.kind == "sink":
         actuator = _actuator(problem, role.task)
         highest = HighestFile(folder / f"{role.who}.highest")
         expected = getattr(actuator, "inputs", {}).get(role.task)
         sink = Sink(place, role.task, actuator, highest, expected)
-        group = _group(problem, role.node)
-        if group is not None:
-            sink.group_clock = group.taken_ns
+        _count(sink, problem, role.node)
         _host(sink, place, stopped)
     else:
         _work(problem, role, place, folder, stopped)
@@ -86,6 +82,13 @@ def _run(
 def _group(problem: Problem, node: str) -> ControlGroup | None:
     """What counts the CPU time of a node with a quota."""
     return own_group() if problem.fabric.nodes[node].quota is not None else None
+
+
+def _count(role: Stamper | Sink, problem: Problem, node: str) -> None:
+    """Let a role know what its node has taken, where something counts it."""
+    group = _group(problem, node)
+    if group is not None:
+        role.group_clock = group.taken_ns
 
 
 def _host(role: Role, place: Place, stopped: threading.Event) -> None:

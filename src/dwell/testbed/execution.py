@@ -294,7 +294,7 @@ def _judged(run: Run) -> dict[str, Any]:
         after = f"{windows} windows after the warm-up"
         reason = f"{excluded} of {after} were measured under pressure{why}"
         return {"outcome": "failed", "reason": reason}
-    if run.windows["warmup"].all():
+    if not windows:
         return {"outcome": "failed", "reason": "it has no window after the warm-up"}
     return {"outcome": "done", "reason": "", "windows": windows, "excluded": excluded}
 

@@ -134,8 +134,9 @@ class Visit:
     stage_ms : float64 array, shape (jobs,)
         Time that the stage needs where nothing hinders it.
     beside_ms : float64 array, shape (jobs,)
-        CPU time that its node took meanwhile for others, beyond what it takes in the mean of as
-        long: both use up the quota. 0 where nothing counts it.
+        CPU time that its node took meanwhile for others, by thread of the job, beyond what it takes
+        in the mean of as long: both use up the quota. 0 where nothing counts it, and of a task that
+        an accelerator runs.
     cycles, windows : int64 array, shape (jobs,)
     """
 
@@ -284,7 +285,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             visits[key[:2]] = Visit(
                 cpu_ms,
                 np.asarray(stage_ms, np.float64),
-                _beside_ms(of),
+                _beside_ms(of) / execution.threads if on_cpu else np.zeros(of.height),
                 of["cycle"].to_numpy(),
                 of["window"].to_numpy().astype(np.int64),
             )
@@ -380,8 +381,9 @@ def _accompanied(jobs: pl.DataFrame) -> pl.Series:
     ended = pl.col("end_ns").cum_max().shift(1).over("node")
     follows = pl.col("start_ns").shift(-1).over("node")
     met = order.with_columns(
-        accompanied=(ended > pl.col("start_ns")).fill_null(value=False)
-        | (follows < pl.col("end_ns")).fill_null(value=False)
+        accompanied=((ended > pl.col("start_ns")) | (follows < pl.col("end_ns"))).fill_null(
+            value=False
+        )
     )
     return met.sort("index")["accompanied"]
 
@@ -517,7 +519,6 @@ def sites(
         stages_ms = {
             one.name: one.visits[site].stage_ms / usual.factor(one.work_ms, *site) for one in of
         }
-        beside_ms = {one.name: one.visits[site].beside_ms for one in of}
         begin_ms, end_ms = (
             float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
             for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
@@ -529,7 +530,7 @@ def sites(
             one.name: Part(
                 one.visits[site].cycles,
                 _with_messaging(stages_ms[one.name], stage_ms, before_ms + after_ms)
-                + beside_ms[one.name],
+                + one.visits[site].beside_ms,
             )
             for one in of
         }
