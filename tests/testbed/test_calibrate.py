@@ -337,6 +337,23 @@ def test_the_sidecar_names_the_runs_and_checks_the_cell(calibrated: Calibrated) 
         assert row["predicted"]["mean_ms"] == pytest.approx(row["measured"]["mean_ms"], rel=0.04)
 
 
+def test_the_check_plays_runs_with_the_estimators_that_they_had(
+    nominal: Path, folders: list[Path], tmp_path: Path
+) -> None:
+    """Shadow jobs load nodes: of a run without any, a cell that has some says nothing."""
+    probing = tmp_path / "probing.yaml"
+    half = "estimator: shadow, shadow_fraction: 0.5"
+    probing.write_text(CELL.replace("estimator: profile", half))
+    run, at = dwell.open_run(folders[0]), tmp_path / "runs"
+    tables = {"cycles": run.cycles, "windows": run.windows, "decisions": run.decisions}
+    tables |= {"processes": run.processes, "jobs": run.jobs}
+    told = {name: Run({**run.meta, "estimator": name}, tables) for name in ("Profile", "Shadow")}
+    runs = [*(one.save(at / name) for name, one in told.items()), folders[1]]
+    said = calibrate(probing, runs, tmp_path / "out.yaml", say=lambda line: None).report["check"]
+    without, beside = (row["predicted"]["u_E"] for row in said[:2])
+    assert beside > without + 0.05
+
+
 def test_links_that_nobody_emulates_have_their_own_delays(
     nominal: Path, folders: list[Path], tmp_path: Path
 ) -> None:

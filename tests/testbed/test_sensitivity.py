@@ -10,7 +10,7 @@ import pytest
 
 from dwell.record import Run
 from dwell.testbed.measured import Disturbed, Measured, Visit
-from dwell.testbed.sensitivity import LEAST_WINDOWS, sensitivities, usual_of
+from dwell.testbed.sensitivity import LEAST_POINTS, TOGETHER, sensitivities, usual_of
 
 SEE, FIND = ("see", "R1"), ("find", "E")
 JOBS = 20
@@ -21,22 +21,33 @@ def measured(
     speed: float,
     slow: dict[tuple[str, str], float],
     *,
-    windows: int = LEAST_WINDOWS,
+    windows: int = 200,
     spread: float = 0.1,
+    for_windows: int = 1,
+    blur: float = 0.0,
     stressed: tuple[str, ...] = (),
 ) -> Measured:
-    """A run whose CPUs change from window to window; stages follow by their exponents."""
+    """A run whose CPUs change every so many windows; stages follow by their exponents.
+
+    Probes see it blurred, and one window in twenty as if the CPU were four times as slow.
+    """
     draw = np.random.default_rng(len(name))
-    changes = {node: np.exp(draw.normal(0, spread, windows)) for node in ("R1", "E")}
+    changes = {
+        node: np.exp(np.repeat(draw.normal(0, spread, windows), for_windows)[:windows])
+        for node in ("R1", "E")
+    }
+    off = np.exp(draw.normal(0, blur, windows)) * np.where(draw.random(windows) < 0.05, 4, 1)
+    seen = {node: of * off if blur else of for node, of in changes.items()}
     rows = [
-        {"window": i, "work_ms": {"0": 0.1 * speed * changes["R1"][i], "1": 0.2 * changes["E"][i]}}
+        {"window": i, "work_ms": {"0": 0.1 * speed * seen["R1"][i], "1": 0.2 * seen["E"][i]}}
         for i in range(windows)
     ]
     visits = {}
     for site, exponent in slow.items():
         jobs = np.repeat(np.arange(windows), JOBS)
         noise = draw.gamma(50, 1 / 50, len(jobs))
-        stage_ms = 5.0 * speed**exponent * changes[site[1]][jobs] ** exponent * noise
+        usual_ms = 5.0 * (speed**exponent if site[1] == "R1" else 1.0)
+        stage_ms = usual_ms * changes[site[1]][jobs] ** exponent * noise
         none_ms = np.zeros(len(jobs))
         visits[site] = Visit(stage_ms, stage_ms, none_ms, np.arange(len(jobs)), jobs)
     meta = {
@@ -60,15 +71,25 @@ def measured(
     )
 
 
-def test_exponents_are_found_within_runs() -> None:
+def test_exponents_are_found() -> None:
     slow = {SEE: 0.5, FIND: 1.5}
     found = sensitivities([measured("a", 1.0, slow), measured("bb", 1.2, slow)])
     assert found[SEE] == pytest.approx(0.5, abs=0.1)
     assert found[FIND] == pytest.approx(1.5, abs=0.1)
 
 
+def test_noise_of_the_probes_does_not_flatten_them() -> None:
+    """A line through all windows finds 0.1 here."""
+    slow = {SEE: 1.0, FIND: 1.5}
+    runs = [measured("a" * n, 1.0, slow, windows=60, for_windows=10, blur=0.03) for n in (1, 2, 3)]
+    found = sensitivities(runs)
+    assert found[SEE] == pytest.approx(1.0, abs=0.15)
+    assert found[FIND] == pytest.approx(1.5, abs=0.15)
+
+
 def test_what_shows_nothing_says_nothing() -> None:
-    assert sensitivities([measured("a", 1.0, {SEE: 1.0}, windows=LEAST_WINDOWS - 1)]) == {}
+    few = (LEAST_POINTS - 1) * TOGETHER
+    assert sensitivities([measured("a", 1.0, {SEE: 1.0}, windows=few, spread=1.0)]) == {}
     assert sensitivities([measured("a", 1.0, {SEE: 1.0}, spread=0.001)]) == {}
     busy = measured("a", 1.0, {SEE: 1.0, FIND: 1.0}, stressed=("E",))
     assert sensitivities([busy]).keys() == {SEE}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from dwell.errors import DwellError, RunError
-from dwell.estimators.registry import REGISTRY as ESTIMATORS
+from dwell.estimators.registry import name_in_run
 from dwell.model import Placement, Problem
 from dwell.model.document import to_document
 from dwell.model.scenario import Disturbance, Scenario
@@ -136,7 +136,7 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
         raise RunError("\n".join(f"{name}: {fault}" for fault in faults))
     try:
         excluded = excluded_windows(meta)
-        estimator = _estimator(meta)
+        estimator = name_in_run(meta)
         policy, problem = _policy(meta, recorded, own, problem)
         warmup = int(run.windows["warmup"].sum())
         items = _as_played(meta, recorded, own, problem, scenario, run)
@@ -308,15 +308,6 @@ def _with_candidates(problem: Problem, theirs: Document, own: Document) -> Probl
     )
     placed = {name: Placement(nodes) for name, nodes in candidates.items()}
     return replace(problem, candidates=placed, controller=controller)
-
-
-def _estimator(meta: Mapping[str, Any]) -> str:
-    told = str(meta.get("estimator") or "profile")
-    names = {getattr(maker, "__name__", name): name for name, maker in ESTIMATORS.items()}
-    name = names.get(told, told)
-    if name not in ESTIMATORS:
-        raise RunError(f"estimator {told!r} is not known (here: {', '.join(ESTIMATORS)})")
-    return name
 
 
 # --------------------------------------------------------------------------------- the scenario

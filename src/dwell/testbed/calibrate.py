@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import DwellError, RunError
+from dwell.estimators.registry import name_in_run
 from dwell.model import Problem, Trace
 from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.testbed.hops import OnTheWay, floors, hops, own_delays
@@ -440,7 +441,8 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
     problem = at_speed_of(one.run.meta, replace(problem, warmup_windows=2), usual)
     windows = min(max(one.windows, 50), CHECK_WINDOWS)
     real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
-    played = simulate_realisation(problem, real, policy=one.placement)
+    estimator = name_in_run(one.run.meta)
+    played = simulate_realisation(problem, real, policy=one.placement, estimator=estimator)
     row: dict[str, Any] = {"run": one.name, "scenario": scenario, "placement": one.placement}
     for what, run in (("measured", one.run), ("predicted", played)):
         counted = usable(run)
