@@ -22,11 +22,12 @@ from hypothesis import strategies as st
 import dwell
 from dwell.control import NEVER_NS, ClosedWindow, Controller, Evidence
 from dwell.errors import LiveError
+from dwell.estimators import Profile
 from dwell.live.messages import Completion, Hop, Load, Stamp
 from dwell.live.offsets import Offsets
 from dwell.live.tables import columns_of
 from dwell.live.windows import LiveWindows, Resume, Rows
-from dwell.model import Execution, Flow, Link, Node, Problem, Task
+from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
 from dwell.model.process import Constant
 from dwell.record import Journal, Run, seal_run
 from tests.generate import make_problem
@@ -921,6 +922,54 @@ def test_an_agent_that_begins_to_count_anew_costs_one_report() -> None:
     hand.windows.loaded(load(220, 9000))
     hand.windows.loaded(load(200, 50, life=2))
     assert used_ms(hand) == pytest.approx(150)
+
+
+def job(task: str, ms: float, node: str = "A") -> Hop:
+    return Hop(task, node, 0, 0, 1, cpu_ns=round(ms * MS))
+
+
+def own_ms(hand: Hand) -> float:
+    """Own work of A in a window in which its processes took 100 ms, and all on it 160."""
+    for at_ms in (-100, 400):
+        counted = round(0.8 * (100 + at_ms) * MS), round(0.5 * (100 + at_ms) * MS)
+        hand.windows.loaded(Load("A", 1, at_ms * MS, *counted, 0))
+    window = hand.windows.close()
+    assert window.core_ns[0, 0] / 1e6 == pytest.approx(160)
+    return float(window.core_ns[1, 0]) / 1e6
+
+
+def test_own_work_is_that_of_the_jobs_as_far_as_they_tell() -> None:
+    hand = Hand(small(sinks=2))
+    hand.release(range(W + 1))
+    assert own_ms(hand) == pytest.approx(100)
+    told = Hand(small(sinks=2))
+    told.release(range(W + 1))
+    for cycle in range(3):
+        for sink in (0, 1):
+            # Both sinks tell of the source's job; one of them is elsewhere, and one job not told.
+            hops = (job("see", 5), job(f"act{sink}", 7, "AB"[sink]), Hop("act9", "A", 0, 0, 1))
+            done = Completion(told.stamp(cycle), f"act{sink}", P, "actuated", hops, "A")
+            told.windows.completed(done, P)
+    assert own_ms(told) == pytest.approx(3 * (5 + 7))
+
+
+def test_a_candidate_on_the_same_jobs_is_as_busy_as_the_incumbent() -> None:
+    """What processes take beside their jobs would be missing from every alternative."""
+    hand = Hand(small(sinks=1))
+    profile = Profile(hand.problem)
+    job_ms = profile.own["NEAR"]["A"] * P / MS * hand.problem.fabric.nodes["A"].capacity
+    hand.release(range(W + 1))
+    for cycle in range(W):
+        done = Completion(hand.stamp(cycle), "act0", P, "actuated", (job("see", job_ms),), "A")
+        hand.windows.completed(done, P)
+    for at_ms in (-100, 400):
+        counted = round(0.8 * (100 + at_ms) * MS), round(0.5 * (100 + at_ms) * MS)
+        hand.windows.loaded(Load("A", 1, at_ms * MS, *counted, 0))
+    used, own, _ = hand.controller.utilisation(hand.windows.close())
+    seen = QoS(10.0, 0.0, FrozenDict(zip(hand.controller.nodes, used.tolist(), strict=True)))
+    mine = dict(zip(hand.controller.nodes, own.tolist(), strict=True))
+    estimates = profile.estimate(observed=seen, incumbent="NEAR", own=mine)
+    assert estimates["NEAR"].utilisation["A"] == pytest.approx(used[0])
 
 
 def test_a_node_nobody_reports_of_is_idle() -> None:

@@ -7,6 +7,7 @@ another node of which nothing is known is taken to have been lost.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
@@ -269,6 +270,25 @@ class Ledger:
         return compute_ns, cycle.latency_ns - compute_ns - network_ns, network_ns
 
     # --------------------------------------------------------------------------- jobs
+
+    def spent_ns(self, cycles: Sequence[LiveCycle]) -> Counter[str]:
+        """CPU time that the jobs of some cycles took, by node; of those that told it.
+
+        Nothing of tasks on an accelerator, whose CPU time is no work of theirs to a profile.
+        """
+        spent = Counter[str]()
+        for cycle in cycles:
+            done = (*cycle.replaced.values(), *cycle.reports.values())
+            # What several sinks tell of is one job.
+            for hop in {(hop.task, hop.node): hop for one in done for hop in one.hops}.values():
+                if hop.cpu_ns != UNKNOWN and self._on_cpu(hop):
+                    spent[hop.node] += hop.cpu_ns
+        return spent
+
+    def _on_cpu(self, hop: Hop) -> bool:
+        task = self._pipeline.tasks.get(hop.task)
+        execution = None if task is None else task.on.get(hop.node)
+        return execution is not None and execution.accelerator is None
 
     def jobs(self, cycle: LiveCycle) -> list[Row]:
         """Rows of ``jobs``: all that is known to have become ready for a cycle or its shadow."""

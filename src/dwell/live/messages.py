@@ -346,7 +346,7 @@ class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
     at_ns : int
         On the node's clock.
     busy_ns, own_ns, shadow_ns : int
-        Core-nanoseconds of everything, of the cell's own jobs, and of its shadow workers.
+        Core-nanoseconds of everything, of the cell's own processes, and of its shadow workers.
     accelerator : float
         Utilisation of the node's accelerator, where a hook tells; -1 otherwise.
     processes : tuple of (str, int)

@@ -434,7 +434,7 @@ class LiveWindows:
             release_ns=release_ns,
             close_ns=close_ns,
             open_ns=int(release_ns[0]),
-            core_ns=self._core_ns(cycles[0], close_ns),
+            core_ns=self._core_ns(cycles, close_ns),
             evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
         )
         bound_ns = max(cycle.bound_ns for cycle in cycles)
@@ -481,11 +481,14 @@ class LiveWindows:
                 self._windows.pop(old.window, None)
                 self._controller.log.seen[old.window - self._first_window] = ()
 
-    def _core_ns(self, first: LiveCycle, close_ns: int) -> NDArray[np.float64]:
+    def _core_ns(self, cycles: list[LiveCycle], close_ns: int) -> NDArray[np.float64]:
         """Core-nanoseconds of every node in a window, shape (3, nodes).
 
-        A node is as busy as the busier of its CPU and its accelerator.
+        A node is as busy as the busier of its CPU and its accelerator. Its own work is what its
+        jobs took, as far as they tell: what their processes take beside that, messages and beats,
+        is there under every placement, and no estimate has it among the work that moves.
         """
+        first, jobs_ns = cycles[0], self._ledger.spent_ns(cycles)
         used = np.zeros((3, len(self._loads)))
         for column, (node, load) in enumerate(self._loads.items()):
             begin_ns, end_ns = (
@@ -493,6 +496,8 @@ class LiveWindows:
                 for at_ns in (first.at_ns, close_ns)
             )
             busy_ns, own_ns, shadow_ns, accelerator_ns = load.at(end_ns) - load.at(begin_ns)
+            if jobs_ns:
+                own_ns = jobs_ns[node]
             capacity = self.problem.fabric.nodes[node].capacity
             used[:, column] = max(busy_ns, capacity * accelerator_ns), own_ns, shadow_ns
             load.forget(begin_ns)
