@@ -352,6 +352,11 @@ def test_the_check_plays_runs_with_the_estimators_that_they_had(
     said = calibrate(probing, runs, tmp_path / "out.yaml", say=lambda line: None).report["check"]
     without, beside = (row["predicted"]["u_E"] for row in said[:2])
     assert beside > without + 0.05
+    # One of a user's own cannot be played.
+    told["Oracle"] = Run({**run.meta, "estimator": "Oracle"}, tables)
+    mine = [told["Oracle"].save(at / "Oracle"), folders[1]]
+    said = calibrate(probing, mine, tmp_path / "out.yaml", say=lambda line: None).report["check"]
+    assert [row["run"] for row in said] == [folders[1].name]
 
 
 def test_links_that_nobody_emulates_have_their_own_delays(

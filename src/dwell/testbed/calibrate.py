@@ -438,10 +438,13 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
     scenario = "baseline" if scenario == "live" else scenario
     if one.placement not in problem.candidates or scenario not in problem.scenarios:
         return None
+    try:
+        estimator = name_in_run(one.run.meta)
+    except RunError:
+        return None
     problem = at_speed_of(one.run.meta, replace(problem, warmup_windows=2), usual)
     windows = min(max(one.windows, 50), CHECK_WINDOWS)
     real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
-    estimator = name_in_run(one.run.meta)
     played = simulate_realisation(problem, real, policy=one.placement, estimator=estimator)
     row: dict[str, Any] = {"run": one.name, "scenario": scenario, "placement": one.placement}
     for what, run in (("measured", one.run), ("predicted", played)):
