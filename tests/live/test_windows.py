@@ -928,14 +928,18 @@ def job(task: str, ms: float, node: str = "A") -> Hop:
     return Hop(task, node, 0, 0, 1, cpu_ns=round(ms * MS))
 
 
-def own_ms(hand: Hand) -> float:
-    """Own work of A in a window in which its processes took 100 ms, and all on it 160."""
+def busy_window(hand: Hand) -> ClosedWindow:
+    """A window in which processes on A took 100 ms, and all on it 160."""
     for at_ms in (-100, 400):
         counted = round(0.8 * (100 + at_ms) * MS), round(0.5 * (100 + at_ms) * MS)
         hand.windows.loaded(Load("A", 1, at_ms * MS, *counted, 0))
     window = hand.windows.close()
     assert window.core_ns[0, 0] / 1e6 == pytest.approx(160)
-    return float(window.core_ns[1, 0]) / 1e6
+    return window
+
+
+def own_ms(hand: Hand) -> float:
+    return float(busy_window(hand).core_ns[1, 0]) / 1e6
 
 
 def test_own_work_is_that_of_the_jobs_as_far_as_they_tell() -> None:
@@ -955,17 +959,14 @@ def test_own_work_is_that_of_the_jobs_as_far_as_they_tell() -> None:
 
 def test_a_candidate_on_the_same_jobs_is_as_busy_as_the_incumbent() -> None:
     """What processes take beside their jobs would be missing from every alternative."""
-    hand = Hand(small(sinks=1))
+    hand = Hand()
     profile = Profile(hand.problem)
     job_ms = profile.own["NEAR"]["A"] * P / MS * hand.problem.fabric.nodes["A"].capacity
     hand.release(range(W + 1))
     for cycle in range(W):
         done = Completion(hand.stamp(cycle), "act0", P, "actuated", (job("see", job_ms),), "A")
         hand.windows.completed(done, P)
-    for at_ms in (-100, 400):
-        counted = round(0.8 * (100 + at_ms) * MS), round(0.5 * (100 + at_ms) * MS)
-        hand.windows.loaded(Load("A", 1, at_ms * MS, *counted, 0))
-    used, own, _ = hand.controller.utilisation(hand.windows.close())
+    used, own, _ = hand.controller.utilisation(busy_window(hand))
     seen = QoS(10.0, 0.0, FrozenDict(zip(hand.controller.nodes, used.tolist(), strict=True)))
     mine = dict(zip(hand.controller.nodes, own.tolist(), strict=True))
     estimates = profile.estimate(observed=seen, incumbent="NEAR", own=mine)

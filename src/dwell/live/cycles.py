@@ -8,7 +8,7 @@ another node of which nothing is known is taken to have been lost.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import msgspec
@@ -125,6 +125,12 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     def key(self) -> tuple[int, int]:
         """Its place among all cycles."""
         return self.run, self.number
+
+    @property
+    def hops(self) -> Iterator[Hop]:
+        """All that was told of its own jobs; of one job by everybody downstream."""
+        for done in (*self.replaced.values(), *self.reports.values()):
+            yield from done.hops
 
     @property
     def segment(self) -> tuple[int, int, str]:
@@ -278,9 +284,8 @@ class Ledger:
         """
         spent = Counter[str]()
         for cycle in cycles:
-            done = (*cycle.replaced.values(), *cycle.reports.values())
             # What several sinks tell of is one job.
-            for hop in {(hop.task, hop.node): hop for one in done for hop in one.hops}.values():
+            for hop in {(hop.task, hop.node): hop for hop in cycle.hops}.values():
                 if hop.cpu_ns != UNKNOWN and self._on_cpu(hop):
                     spent[hop.node] += hop.cpu_ns
         return spent
@@ -294,8 +299,7 @@ class Ledger:
         """Rows of ``jobs``: all that is known to have become ready for a cycle or its shadow."""
         found: dict[tuple[bool, str, str], Hop] = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
-        own = (*cycle.replaced.values(), *cycle.reports.values())
-        told = [(hop, False) for done in own for hop in done.hops]
+        told = [(hop, False) for hop in cycle.hops]
         told += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
         for hop, shadow in told:
             if hop.task not in self._tasks or (shadow and hop.task in self.sinks):

@@ -485,8 +485,8 @@ class LiveWindows:
         """Core-nanoseconds of every node in a window, shape (3, nodes).
 
         A node is as busy as the busier of its CPU and its accelerator. Its own work is what its
-        jobs took, as far as they tell: what their processes take beside that, messages and beats,
-        is there under every placement, and no estimate has it among the work that moves.
+        jobs took, where any tell: what their processes take beside that, messages and beats, is in
+        no candidate's own work, and would be missing from the estimates of all.
         """
         first, jobs_ns = cycles[0], self._ledger.spent_ns(cycles)
         used = np.zeros((3, len(self._loads)))
