@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -11,6 +12,9 @@ import threading
 import pytest
 
 from dwell.live.leash import OWNER, end_with_owner
+from dwell.live.transport.orphans import SHARED_MEMORY
+
+PATIENCE_S = 60.0
 
 #: Starts a process that waits on the leash of its parent, tells its id, and waits to be killed.
 OWNER_CODE = """
@@ -49,6 +53,53 @@ def test_an_owner_that_has_gone_already_is_noticed(monkeypatch: pytest.MonkeyPat
     stopped = threading.Event()
     end_with_owner(stopped)
     assert stopped.is_set()
+
+
+#: As above, and both hold a file as Zenoh holds a segment; the sweeper waits as well.
+HOLDER_CODE = """
+import os, subprocess, sys, time
+from dwell.live.leash import start_sweeper
+code = '''
+import fcntl, os, sys, threading, time
+from dwell.live.leash import end_with_owner
+fcntl.flock(os.open(sys.argv[1], os.O_RDWR), fcntl.LOCK_SH)
+stopped = threading.Event()
+end_with_owner(stopped)
+print("waits", flush=True)
+stopped.wait()
+time.sleep(0.5)
+print(os.path.exists(sys.argv[1]), flush=True)
+'''
+environment = {**os.environ, "DWELL_OWNER": str(os.getpid())}
+child = subprocess.Popen([sys.executable, "-c", code, sys.argv[1]], env=environment)
+sweeper = start_sweeper()
+print(sweeper.pid, flush=True)
+time.sleep(3600)
+"""
+
+
+def test_shared_memory_goes_when_the_last_of_an_owner_has_ended() -> None:
+    # No process of Zenoh's ends here that would remove it.
+    segment = SHARED_MEMORY / f"test-{os.getpid()}.zenoh"
+    segment.touch()
+    try:
+        words = [sys.executable, "-c", HOLDER_CODE, str(segment)]
+        owner = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        assert owner.stdout is not None
+        with owner.stdout as told:
+            lines = {told.readline(), told.readline()}
+            lines.discard("waits\n")
+            (sweeper,) = map(int, lines)
+            ended = os.pidfd_open(sweeper)
+            owner.send_signal(signal.SIGKILL)
+            owner.wait()
+            # It was there while somebody held it.
+            assert told.readline() == "True\n"
+        assert select.select([ended], [], [], PATIENCE_S)[0]
+        os.close(ended)
+        assert not segment.exists()
+    finally:
+        segment.unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("text", [None, "", "nobody", "this process"])

@@ -1,7 +1,7 @@
 """The processes of a cell that somebody has to start: an agent on every node, and the controller.
 
 All others are started by the agents. They end with the process that made this (`OWNER`), whatever
-becomes of those in between.
+becomes of those in between, and leave no shared memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import TypeAlias
 import yaml
 
 from dwell.errors import LiveError
-from dwell.live.leash import OWNER
+from dwell.live.leash import OWNER, start_sweeper
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import to_document
@@ -98,6 +98,7 @@ class Processes:
         self.environment = {OWNER: str(os.getpid()), **(environment or {})}
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
         self._traces = Path() if traces is None else traces
+        self._sweeper: subprocess.Popen[bytes] | None = None
 
     def folder_of(self, problem: Problem) -> Path:
         """Return where a cell's file is, and the states of its nodes."""
@@ -158,6 +159,8 @@ class Processes:
     def _start(
         self, who: str, node: str, words: Sequence[str], problems: Sequence[Problem]
     ) -> None:
+        if self._sweeper is None:
+            self._sweeper = start_sweeper()
         command = [sys.executable, "-m", "dwell", *words]
         for problem in problems:
             command += ["--cell", str(self.file_of(problem))]
@@ -188,6 +191,10 @@ class Processes:
         """End everything, the agents after the controllers."""
         self.stop_controllers()
         self.end(list(self.running), STOP_S)
+        if self._sweeper is not None:
+            self._sweeper.kill()
+            self._sweeper.wait()
+            self._sweeper = None
 
     def end(self, names: Iterable[str], patience_s: float) -> None:
         """Tell some to end, and kill those that have not when patience is over."""
