@@ -19,7 +19,8 @@ from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
 from dwell.testbed.calibrate import Calibrated, calibrate
-from dwell.testbed.measured import TOGETHER, look_at, wakes
+from dwell.testbed.measured import look_at
+from dwell.testbed.node_loads import TOGETHER, wakes
 
 CELL = """
 dwell: 1

@@ -23,22 +23,12 @@ from dwell.estimators.registry import name_in_run
 from dwell.model import Problem, Trace
 from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.testbed.hops import OnTheWay, floors, hops, own_delays
-from dwell.testbed.measured import (
-    Measured,
-    Site,
-    backgrounds,
-    beside_jobs,
-    contentions,
-    interferences,
-    look_at,
-    messaging,
-    sites,
-    usable,
-    wakes,
-)
+from dwell.testbed.measured import Measured, look_at, usable
+from dwell.testbed.node_loads import backgrounds, beside_jobs, contentions, interferences, wakes
 from dwell.testbed.paired import paired
 from dwell.testbed.sensitivity import usual_of
 from dwell.testbed.speeds import Usual, at_speed_of
+from dwell.testbed.task_costs import Site, messaging, sites
 from dwell.testbed.trace_names import move_traces
 
 __all__ = ["Calibrated", "calibrate", "make_runs"]

@@ -1,22 +1,4 @@
-"""Measured: what runs that kept their jobs show of tasks, links and nodes.
-
-A job costs its node more CPU than its stage takes: its worker reads and writes messages, and at
-both ends of the pipeline a stamp and a command are handed over. A simulator that knows nothing of
-messages on one node, and of what they cost, is told so by way of the execution times:
-
-- a worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. Runs in which it has jobs
-  and runs in which it has none tell the two apart; a worker that always has jobs idles like others;
-- of the overhead, what lies on the way of messages delays the cycle (`dwell.testbed.hops`);
-- a job takes, besides, what passes between its last input and its start, and a sink's what passes
-  between its end and the command's hand-over, as where the quota does not interfere;
-- where something counts what a node takes between a release and its source's start, or between two
-  jobs of a cycle that both run on it, the job takes that: whoever takes it, the job waits for it.
-
-Everything else that a node does (agents, stampers, sinks, the controller, workers without jobs and
-the messaging that delays nothing) is its background. A link adds to the delay that is asked of it
-what a message takes beyond that, its transmission and the CPU time of sender and receiver, which
-their jobs have already.
-"""
+"""Measured: what the windows of one run that kept its jobs show of its tasks, links and nodes."""
 
 from __future__ import annotations
 
@@ -28,47 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import RunError
-from dwell.model import Flow, Problem
-from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
-from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
-from dwell.testbed.paired import Part
-from dwell.testbed.speeds import Usual, work_ms
+from dwell.model import Problem
+from dwell.testbed.hops import LEAST_JOBS
+from dwell.testbed.speeds import work_ms
 
 if TYPE_CHECKING:
     import polars as pl
 
     from dwell.record import Run
 
-__all__ = [
-    "Disturbed",
-    "Measured",
-    "Site",
-    "Visit",
-    "backgrounds",
-    "beside_jobs",
-    "contentions",
-    "interferences",
-    "look_at",
-    "messaging",
-    "sites",
-    "usable",
-    "wakes",
-]
+__all__ = ["Disturbed", "Measured", "Visit", "look_at", "usable"]
 
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
-#: How many times as long as usual messaging takes where a stage takes longer: in the runs of the
-#: example as many as that, window by window; a job that finds nothing to do has its messages still.
-SLOWER = 0.5, 2.0
 #: What a disturbance has that is not there all the time.
 SOMETIMES = ("at_s", "for_s", "episodes", "ramp_s")
-#: Sides of a hop, in its times and, behind source and target, in its name.
-SENDER, RECEIVER = range(2)
-#: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
-#: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
-#: wakes or sleeps is as long as with 0.40 (E) to 0.52 (R1) times as many that come alone.
-TOGETHER = 2.2
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
 
@@ -210,33 +167,6 @@ class Measured:
     begins_ms: dict[SiteName, float] = field(default_factory=dict)
     ends_ms: dict[SiteName, float] = field(default_factory=dict)
     delays_ms: dict[tuple[str, str, str, str], Floats] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """A task on a node, over all runs.
-
-    Parameters
-    ----------
-    samples : dict of str to Part
-        What an undisturbed job takes of the node, its share of messaging included, by run.
-    stage_ms, messaging_ms : float
-        Means of the stage alone, and of its worker's messaging what lies on the way.
-    before_ms, after_ms : float
-        Means of what other threads do before the stage (input or release, messaging) and after it
-        (messaging, the end of the cycle).
-    """
-
-    samples: dict[str, Part]
-    stage_ms: float
-    messaging_ms: float
-    before_ms: float
-    after_ms: float
-
-    @property
-    def samples_ms(self) -> Floats:
-        """Those of all runs, one after the other."""
-        return np.concatenate([part.times_ms for part in self.samples.values()])
 
 
 def look_at(name: str, run: Run, problem: Problem) -> Measured:
@@ -486,230 +416,3 @@ def _unhindered(task: str, nodes: Sequence[str], wait_ms: Floats) -> dict[SiteNa
         (task, str(node)): max(float(np.quantile(wait_ms[where == node], UNHINDERED)), 0.0)
         for node in np.unique(where)
     }
-
-
-# ------------------------------------------------------------------------------------ tasks
-
-
-def sites(
-    measured: Sequence[Measured],
-    messaging_ms: Mapping[SiteName, float],
-    known: OnTheWay,
-    problem: Problem,
-    usual: Usual,
-) -> dict[SiteName, Site]:
-    """Execution times of every task on every node that was visited undisturbed.
-
-    Parameters
-    ----------
-    messaging_ms : mapping of (str, str) to float
-        CPU time that a worker takes for a job besides its stage (`messaging`).
-    known : OnTheWay
-        What of that lies on the way of messages.
-    problem : Problem
-    usual : Usual
-        How fast the CPUs were in all runs together: samples are of CPUs as fast as that.
-    """
-    found: dict[SiteName, Site] = {}
-    for site in sorted({site for one in measured for site in one.visits}):
-        of = [one for one in measured if site in one.visits and site[1] not in one.disturbed.nodes]
-        if sum(len(one.visits[site].stage_ms) for one in of) < LEAST_JOBS:
-            continue
-        # As long as it would have taken at the runs' mean speed.
-        stages_ms = {
-            one.name: one.visits[site].stage_ms / usual.factor(one.work_ms, *site) for one in of
-        }
-        begin_ms, end_ms = (
-            float(np.mean([ends[site] for ends in ways if site in ends] or 0.0))
-            for ways in ([one.begins_ms for one in of], [one.ends_ms for one in of])
-        )
-        read_ms, write_ms = _on_the_way_ms(site, messaging_ms.get(site, 0.0), known, problem)
-        before_ms, after_ms = begin_ms + read_ms, write_ms + end_ms
-        stage_ms = float(np.concatenate(list(stages_ms.values())).mean())
-        samples = {
-            one.name: Part(
-                one.visits[site].cycles,
-                _with_messaging(stages_ms[one.name], stage_ms, before_ms + after_ms)
-                + one.visits[site].beside_ms,
-            )
-            for one in of
-        }
-        found[site] = Site(samples, stage_ms, read_ms + write_ms, before_ms, after_ms)
-    return found
-
-
-def _with_messaging(stages_ms: Floats, mean_ms: float, around_ms: float) -> Floats:
-    """Add what is done around a stage: what slows the stage down slows that."""
-    if mean_ms <= 0:
-        return stages_ms + around_ms
-    return stages_ms + around_ms * np.clip(stages_ms / mean_ms, *SLOWER)
-
-
-def _on_the_way_ms(
-    site: SiteName, messaging_ms: float, known: OnTheWay, problem: Problem
-) -> tuple[float, float]:
-    """CPU time of a worker on the way of its job's inputs, and outputs; all of it if unknown."""
-    task, node = site
-
-    def part_ms(flow: Flow, side: int) -> float:
-        ends = flow.source, flow.target
-        ways = [
-            hop[side]
-            for name, hop in known.hops.items()
-            if name[:2] == ends and name[2 + side] == node
-        ]
-        return float(np.mean(ways)) if ways else messaging_ms * share(problem, task, *ends)
-
-    pipeline = problem.pipeline
-    return (
-        sum(part_ms(flow, RECEIVER) for flow in pipeline.inputs(task)),
-        sum(part_ms(flow, SENDER) for flow in pipeline.outputs(task)),
-    )
-
-
-def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
-    """CPU time, ms, that every worker takes for a job besides its stage's, by task and node."""
-    of: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
-    for one in measured:
-        for (node, process), rate in one.rates.items():
-            task, at, rest = process.partition("@")
-            worker = at and task in problem.pipeline.tasks and rest == node
-            if not worker or node in one.disturbed.nodes:
-                continue
-            key = task, node, False
-            jobs = one.starts.get(key, 0.0)
-            # Cores besides those of the stage, and jobs a millisecond.
-            besides = rate - jobs * one.spent_ms.get(key, 0.0) / 1e3
-            of.setdefault((process, task, node), []).append((jobs / 1e3, besides))
-    idle: list[float] = []
-    open_ones: list[tuple[str, str, str]] = []
-    overhead_ms: dict[SiteName, float] = {}
-    for (process, task, node), points in of.items():
-        jobs, besides = np.array(points).T
-        if jobs.max() == 0.0:
-            idle.append(max(float(besides.mean()), 0.0))
-        elif np.ptp(jobs) > 0.5 * jobs.max():
-            slope, start = np.polyfit(jobs, besides, 1)
-            idle.append(max(float(start), 0.0))
-            overhead_ms[task, node] = max(float(slope), 0.0)
-        else:
-            open_ones.append((process, task, node))
-    usual = float(np.mean(idle)) if idle else 0.0
-    for process, task, node in open_ones:
-        jobs, besides = np.array(of[process, task, node]).T
-        overhead_ms[task, node] = max(float((besides - usual).mean() / jobs.mean()), 0.0)
-    return overhead_ms
-
-
-# ------------------------------------------------------------------------------------ nodes
-
-
-def backgrounds(
-    measured: Sequence[Measured], found: Mapping[SiteName, Site], problem: Problem
-) -> dict[str, float]:
-    """Cores of every node that neither its jobs nor foreign threads took.
-
-    Of a node with a quota its control group says what was taken in all; elsewhere, where others
-    may have the same CPUs, only the cell's own processes are counted.
-    """
-    result = {}
-    for node, of in problem.fabric.nodes.items():
-        left = []
-        for one in measured:
-            processes = [rate for (where, _), rate in one.rates.items() if where == node]
-            if node in one.disturbed.nodes or not processes:
-                continue
-            used = one.used[node] if of.quota is not None else sum(processes)
-            sites_ = ((key, rate) for key, rate in one.starts.items() if key[1] == node)
-            jobs = sum(rate * _cores_ms(key, one, found, problem) / 1e3 for key, rate in sites_)
-            left.append((used - jobs, one.windows))
-        if left:
-            values, weights = zip(*left, strict=True)
-            mean = float(np.average(values, weights=weights))
-            result[node] = min(max(mean, 0.0), 0.9 * of.capacity)
-    return result
-
-
-def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> dict[str, float]:
-    """Cores of every node's background that were taken while its jobs ran, where it is known.
-
-    Parameters
-    ----------
-    behind : mapping of str to float
-        The backgrounds.
-    """
-    result = {}
-    for node, cores in behind.items():
-        of = [
-            one.beside[node] for one in measured if node in one.beside.keys() - one.disturbed.nodes
-        ]
-        if (taken := _cores(of)) is not None:
-            result[node] = min(taken, cores)
-    return result
-
-
-def _cores(of: Sequence[tuple[float, float]]) -> float | None:
-    """What somebody took while jobs ran, over how long these ran; None where none did."""
-    took_s = sum(took for _, took in of)
-    return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
-
-
-def contentions(measured: Sequence[Measured]) -> dict[str, float]:
-    """Share of the time of every node's jobs in which its CPUs did what is outside of it.
-
-    From runs without any stress: nodes may share CPUs, and one that is stressed takes more of them.
-    """
-    result = {}
-    calm = [one for one in measured if not one.disturbed.nodes]
-    for node in sorted({node for one in calm for node in one.outside}):
-        of = [one.outside[node] for one in calm if node in one.outside]
-        if (taken := _cores(of)) is not None:
-            result[node] = min(taken, CONTENTION.high)
-    return result
-
-
-def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
-    """How often in a second threads of a node wake, where the kernel looks at ticks otherwise."""
-    result = {}
-    for name, node in problem.fabric.nodes.items():
-        told = [one.run.meta.get("wakes_hz") or {} for one in measured]
-        known = [float(of[name]) for of in told if name in of]
-        if known and node.quota is not None and node.quota.tick_ms > 0:
-            result[name] = min(sum(known) / len(known) / TOGETHER, BACKGROUND_HZ.high)
-    return result
-
-
-def interferences(
-    measured: Sequence[Measured], found: Mapping[SiteName, Site], usual: Usual
-) -> dict[str, float]:
-    """How many times as much core time stages took on nodes that were stressed all the time."""
-    sums: dict[str, list[float]] = {}
-    for one in measured:
-        for site, visit in one.visits.items():
-            node = site[1]
-            if node in one.disturbed.stressed and site in found:
-                total = sums.setdefault(node, [0.0, 0.0, 0.0])
-                total[0] += float(visit.stage_ms.sum()) / usual.factor(one.work_ms, *site)
-                total[1] += len(visit.stage_ms) * found[site].stage_ms
-                total[2] += len(visit.stage_ms)
-    return {
-        node: max(took / alone, 1.0)
-        for node, (took, alone, jobs) in sums.items()
-        if jobs >= LEAST_JOBS
-    }
-
-
-def _cores_ms(
-    key: tuple[str, str, bool],
-    one: Measured,
-    found: Mapping[SiteName, Site],
-    problem: Problem,
-) -> float:
-    """Core time, ms, of a job as a simulator will charge it."""
-    execution = problem.pipeline.tasks[key[0]].on[key[1]]
-    if execution.accelerator is not None:
-        return 0.0
-    site = found.get(key[:2])
-    if site is None:
-        return one.spent_ms[key]
-    return one.spent_ms[key] + execution.threads * (site.before_ms + site.after_ms)
