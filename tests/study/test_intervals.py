@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from dwell.study.intervals import (
+    FARTHEST,
     FEWEST,
     mean_interval,
     median_interval,
@@ -93,6 +94,18 @@ def test_one_value_that_differs_leaves_one_side_without_limit() -> None:
     interval = mean_interval(values)
     half = stats.t.ppf(0.975, 19) * np.std(values, ddof=1) / math.sqrt(20)
     assert interval == pytest.approx((4.95, 4.95 - half, high))
+
+
+def test_values_that_nearly_agree_have_limits_at_a_distance_that_makes_sense() -> None:
+    # Ten in 256 of the resamples hold nothing but the first two, which differ by a hair.
+    values = [44.0, 44.01, 50.0, 55.0]
+    low, high = studentised_limits(values, 0.025)
+    mean = np.mean(values)
+    half = stats.t.ppf(0.975, 3) * np.std(values, ddof=1) / math.sqrt(4)
+    assert high - mean > 100 * half
+    assert mean_interval(values) == pytest.approx((mean, low, mean + FARTHEST * half))
+    down = mean_interval([-value for value in values])
+    assert down == pytest.approx((-mean, -mean - FARTHEST * half, -low))
 
 
 def test_a_value_at_the_mean_is_no_surprise() -> None:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "CONFIDENCE",
+    "FARTHEST",
     "FEWEST",
     "RESAMPLES",
     "RESAMPLING_SEED",
@@ -48,6 +49,9 @@ CONFIDENCE = 0.95
 
 #: Values below which there is no bootstrap: 3 have 27 resamples, and 1 in 9 is without spread.
 FEWEST = 4
+#: How many times as far from a mean as Student's t its limits lie at most. Few values of which most
+#: nearly agree have resamples of hardly any spread, and limits a hundred times as far.
+FARTHEST = 3.0
 #: So many that the quantiles of 2.5 % and of 5 % are order statistics of the resamples.
 RESAMPLES = 4999
 #: Of every resampling, so that the same runs always have the same interval.
@@ -81,8 +85,8 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
     -------
     Interval
         An end for which the bootstrap has no limit is that of Student's t (see
-        `studentised_limits`). No width where all values are the same, NaN at the ends for a single
-        one and where one is not finite.
+        `studentised_limits`), and none lies farther than `FARTHEST` times that. No width where all
+        values are the same, NaN at the ends for a single one and where one is not finite.
     """
     sample = np.asarray(values, np.float64)
     mean = float(sample.mean())
@@ -90,10 +94,9 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
         return Interval(mean, math.nan, math.nan)
     tail = (1 - CONFIDENCE) / 2
     low, high = studentised_limits(sample, tail, seed=seed)
-    if math.isinf(low) or math.isinf(high):
-        half = _half_width(sample, tail)
-        low = mean - half if math.isinf(low) else low
-        high = mean + half if math.isinf(high) else high
+    half = _half_width(sample, tail)
+    low = mean - half if math.isinf(low) else max(low, mean - FARTHEST * half)
+    high = mean + half if math.isinf(high) else min(high, mean + FARTHEST * half)
     return Interval(mean, min(low, mean), max(high, mean))
 
 

@@ -25,6 +25,9 @@ __all__ = ["interval_of", "over_seeds"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
+#: Means of what cannot be below 0, as utilisations cannot.
+NOT_NEGATIVE = frozenset({"cost", "j_still", "l95_ms", "migrations", "moved", "returns"})
+
 
 def over_seeds(
     runs: pl.DataFrame, keys: Sequence[str], columns: Sequence[str] | None = None
@@ -72,7 +75,12 @@ def interval_of(column: str) -> Callable[[Floats], Interval]:
         return median_interval
     if column == "violation_rate" or column.startswith(("share_", "over_")):
         return share_interval
-    return mean_interval
+    return _not_negative if column in NOT_NEGATIVE or column.startswith("u_") else mean_interval
+
+
+def _not_negative(values: Floats) -> Interval:
+    mean, low, high = mean_interval(values)
+    return Interval(mean, max(low, 0.0), high)
 
 
 def _floats(runs: pl.DataFrame, column: str) -> Floats:

@@ -1,0 +1,22 @@
+"""Which interval a column of runs has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dwell.study.intervals import mean_interval
+from dwell.study.over_seeds import interval_of
+
+
+@pytest.mark.parametrize("column", ["migrations", "l95_ms", "cost", "u_edge", "u_R1"])
+def test_what_cannot_be_below_nothing_has_no_limit_there(column: str) -> None:
+    values = np.array([0.0, 0.0, 1.0])
+    mean, low, high = mean_interval(values)
+    assert low < 0
+    assert interval_of(column)(values) == (mean, 0.0, high)
+
+
+def test_a_mean_of_differences_may_be_on_either_side() -> None:
+    values = np.array([0.0, 0.0, 1.0])
+    assert interval_of("regret")(values) == mean_interval(values)
