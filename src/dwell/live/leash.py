@@ -78,11 +78,10 @@ def _sweep(owner: int) -> None:
         return  # a kernel without them: nobody ends with an owner
     deadline = time.monotonic() + SWEEP_S
     # Whoever is waited for may have started another one meanwhile.
-    while left := _those_of(owner):
+    while (left_s := deadline - time.monotonic()) > 0 and (left := _those_of(owner)):
         for process in left:
             # Readable when it has let go of all its files.
-            if not select.select([process], [], [], max(deadline - time.monotonic(), 0.0))[0]:
-                return
+            select.select([process], [], [], left_s)
             os.close(process)
     remove_orphans()
 
