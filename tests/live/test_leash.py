@@ -55,7 +55,7 @@ def test_an_owner_that_has_gone_already_is_noticed(monkeypatch: pytest.MonkeyPat
     assert stopped.is_set()
 
 
-#: As above, and both hold a file as Zenoh holds a segment; the sweeper waits as well.
+#: As above; the process holds a file as Zenoh holds a segment, and a sweeper waits as well.
 HOLDER_CODE = """
 import os, subprocess, sys, time
 from dwell.live.leash import start_sweeper

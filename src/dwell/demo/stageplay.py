@@ -16,7 +16,6 @@ from pathlib import Path
 
 from dwell.demo.link import Forward, LinkProcess
 from dwell.errors import LiveError
-from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import PORTS_PER_ROLE, roles, wire
 from dwell.model import Endpoint, Host, NodeDisturbance, Problem
 from dwell.model.scenario import Disturbance
@@ -203,4 +202,3 @@ class Stageplay:
         """End every process, links and burners last."""
         self._processes.stop()
         self._stack.close()
-        remove_orphans()

@@ -19,6 +19,7 @@ import yaml
 
 from dwell.errors import LiveError
 from dwell.live.leash import OWNER, start_sweeper
+from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import to_document
@@ -188,13 +189,14 @@ class Processes:
         self.end([who for who in self.running if who.startswith("controller@")], CONTROLLER_STOP_S)
 
     def stop(self) -> None:
-        """End everything, the agents after the controllers."""
+        """End everything, the agents after the controllers, and remove what memory they left."""
         self.stop_controllers()
         self.end(list(self.running), STOP_S)
         if self._sweeper is not None:
             self._sweeper.kill()
             self._sweeper.wait()
             self._sweeper = None
+        remove_orphans()
 
     def end(self, names: Iterable[str], patience_s: float) -> None:
         """Tell some to end, and kill those that have not when patience is over."""
