@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -21,7 +21,7 @@ from typing import Any
 import simpy
 
 from dwell.control import Guard, Presence, Probation
-from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Task
+from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
 __all__ = [
@@ -336,16 +336,11 @@ class NodeState:
         self.stressed = 0
         self.period = self.quota = self.left = self.pool = self.slack = self.periods = 0
         self.tick = 0
+        self.contention = Fraction(node.contention)
         if node.quota is not None:
             self.period = nanoseconds(node.quota.period_ms)
-            cpu = Fraction(node.quota.cpu)
-            beside = node.background if node.background_beside is None else node.background_beside
-            self.quota, self.stressed = (
-                max(round(self.left_by(taken, cpu) * self.period / self.pace), 1)
-                for taken in (Fraction(beside), Fraction(node.background))
-            )
+            self.count(node.quota)
             self.left = self.quota
-            self.slack = self.in_time(node.quota.slack_ms)
             self.tick = nanoseconds(node.quota.tick_ms)
             if self.slack or self.tick:
                 self.pool, self.left = self.quota, 0
@@ -358,10 +353,33 @@ class NodeState:
         self.wake_key = 0
         self.empty_at: int | None = None
 
+    def count(self, quota: Quota) -> None:
+        """Express the quota, and what outlasts it, in time of a core."""
+        node, cpu = self.node, Fraction(quota.cpu)
+        beside = node.background if node.background_beside is None else node.background_beside
+        self.quota, self.stressed = (
+            max(round(self.left_by(taken, cpu) * self.period / self.pace), 1)
+            for taken in (Fraction(beside), Fraction(node.background))
+        )
+        self.slack = self.in_time(quota.slack_ms)
+
+    def contend(self, stressed: Collection[str]) -> None:
+        """Follow what other nodes, of which these have foreign threads, leave of the cores."""
+        given = self.node.contention_stressed
+        shares = [share for name, share in given.items() if name in stressed]
+        contention = Fraction(max(shares, default=self.node.contention))
+        if self.node.quota is None or contention == self.contention:
+            return
+        before, self.contention = self.pace, contention
+        self.left = round(self.left * before / self.pace)
+        self.pool = round(self.pool * before / self.pace)
+        self.count(self.node.quota)
+        self.touched = True
+
     @property
     def pace(self) -> Fraction:
         """Core time that what runs receives of the time that it has a core."""
-        return 1 - Fraction(self.node.contention)
+        return 1 - self.contention
 
     def in_time(self, ms: float) -> int:
         """How long a core has to be had for so much core time."""
@@ -1348,6 +1366,9 @@ class Simulation:
                 self.come_up(change.node)
                 if self.guard is not None and change.node == self.problem.stamper_node:
                     self.guard.restart()
+            up = {name for name, other in self.nodes.items() if other.foreign and not other.down}
+            for other in self.nodes.values():
+                other.contend(up)
 
         return happen
 

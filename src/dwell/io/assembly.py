@@ -210,6 +210,7 @@ class Assembly:
                 background_hz=entry.background_hz,
                 interference=entry.interference,
                 contention=entry.contention,
+                contention_stressed=entry.contention_stressed,
             ),
         )
 

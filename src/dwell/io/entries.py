@@ -373,6 +373,11 @@ class NodeEntry(Entry):
         description="Share of a CPU's time that others take from what runs there, and that the "
         "node's quota does not count; default 0.",
     )
+    contention_stressed: dict[str, Annotated[float, Number(bounds.CONTENTION)]] | None = Field(
+        None,
+        description="What `contention` is while another node, on the same CPUs, has foreign "
+        "threads, as `{R1: 0.4}`; of several the largest counts.",
+    )
     bursts: NodeBurstsEntry | None = Field(None, description="Foreign work, in every scenario.")
 
 

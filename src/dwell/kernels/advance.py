@@ -76,6 +76,7 @@ from dwell.kernels.layout import (
     N_JOB,
     N_LINK,
     N_OUT,
+    N_PACE,
     N_READY,
     N_RUN,
     N_SEGMENT,
@@ -95,8 +96,10 @@ from dwell.kernels.layout import (
     NODE,
     NODE_DOWN,
     NODE_OF,
+    OTHER,
     OUT_0,
     PACE,
+    PACED,
     PARENT,
     PAUSE,
     PAUSED,
@@ -145,6 +148,7 @@ from dwell.kernels.nodes import (
     mark,
     next_thread,
     renew_before_stress,
+    repace,
     restress,
     set_speed,
     tick,
@@ -335,6 +339,10 @@ def _change(s: Tables, now: int) -> None:
             s.servers[server, STRESS] = stress
         set_speed(s, server)
         mark(s, server)
+    for number in range(s.paces.shape[0]):
+        other = s.paces[index(number), OTHER]
+        if other >= 0 and s.servers[index(other), NODE_OF] == node:
+            repace(s, index(s.paces[index(number), PACED]), now)
     if turned:
         _turn_sites(s, node, down, now)
 
@@ -540,6 +548,8 @@ def advance(
     segments: Ints,
     segments_f: Floats,
     changes: Ints,
+    paces: Ints,
+    paces_f: Floats,
     release_ns: Ints,
     exec_ns: Ints,
     delay_ns: Ints,
@@ -605,6 +615,8 @@ def advance(
         fixed_columns(segments, N_SEGMENT),
         fixed_columns(segments_f, N_SEGMENT_F),
         fixed_columns(changes, N_CHANGE),
+        fixed_columns(paces, N_PACE),
+        paces_f,
         release_ns,
         exec_ns,
         delay_ns,

@@ -180,6 +180,19 @@ FOREIGN = _number(-1)
     N_SERVER,
 ) = range(36)
 
+# What a server's quota counts while the CPU of a node, server OTHER, has foreign threads; -1: while
+# none has of those for which there are rows.
+(
+    PACED,
+    OTHER,
+    PACED_QUOTA_NS,
+    PACED_STRESSED_NS,
+    PACED_SLACK_NS,
+    PACED_LEAST_NS,
+    PACED_DRAWN_NS,
+    N_PACE,
+) = range(8)
+
 # servers, float64
 VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, PACE, WAKE_GAP_NS, N_SERVER_F = range(9)
 
@@ -236,6 +249,8 @@ class Tables(NamedTuple):
     segments: Ints  # (segments, N_SEGMENT)
     segments_f: Floats  # (segments, N_SEGMENT_F)
     changes: Ints  # (changes, N_CHANGE)
+    paces: Ints  # (paces, N_PACE)
+    paces_f: Floats  # (paces,) PACE of the server meanwhile
     release_ns: Ints  # (cells, N + 1)
     exec_ns: Ints  # (sites, N)
     delay_ns: Ints  # (hops, N)

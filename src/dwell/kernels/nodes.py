@@ -54,7 +54,14 @@ from dwell.kernels.layout import (
     NEED,
     NEXT_KEY,
     NEXT_T,
+    OTHER,
     PACE,
+    PACED,
+    PACED_DRAWN_NS,
+    PACED_LEAST_NS,
+    PACED_QUOTA_NS,
+    PACED_SLACK_NS,
+    PACED_STRESSED_NS,
     PERIOD,
     PERIOD_AGO,
     PERIOD_NS,
@@ -98,6 +105,7 @@ __all__ = [
     "job_row",
     "leave",
     "mark",
+    "repace",
     "restress",
     "schedule",
     "set_speed",
@@ -360,6 +368,42 @@ def set_speed(s: Tables, server: int) -> None:
         s.servers_f[server, SPEED] *= s.servers_f[server, BESIDE]
     if s.servers[server, THROTTLED] != 0:
         s.servers_f[server, SPEED] = 0.0
+
+
+@phase
+def repace(s: Tables, server: int, now: int) -> None:
+    """Set what others leave of a server's core by which of them have foreign threads.
+
+    What it counts is in time of the core: what is left of it is converted, to the nanosecond.
+    """
+    row, pace, stressed = FIRST, 0.0, False
+    for number in range(s.paces.shape[0]):
+        i = index(number)
+        if s.paces[i, PACED] != server:
+            continue
+        other = s.paces[i, OTHER]
+        if other < 0:  # comes first
+            row, pace = FIRST + number, s.paces_f[i]
+        elif s.servers[index(other), STRESS] > 0 and s.servers[index(other), DOWN] == 0:
+            if not stressed or s.paces_f[i] < pace:
+                row, pace, stressed = FIRST + number, s.paces_f[i], True
+    if pace == s.servers_f[server, PACE]:
+        return
+    tick(s, server, now)
+    renew_before_stress(s, server, now)
+    s.servers_f[server, BEHIND_NS] += s.servers[server, BUSY] * s.servers_f[server, PACE]
+    s.servers[server, BUSY] = 0
+    ratio = s.servers_f[server, PACE] / pace
+    s.servers[server, LEFT_NS] = np.int64(np.rint(s.servers[server, LEFT_NS] * ratio))
+    s.servers[server, POOL_NS] = np.int64(np.rint(s.servers[server, POOL_NS] * ratio))
+    s.servers[server, QUOTA_NS] = s.paces[index(row), PACED_QUOTA_NS]
+    s.servers[server, STRESSED_NS] = s.paces[index(row), PACED_STRESSED_NS]
+    s.servers[server, SLACK_NS] = s.paces[index(row), PACED_SLACK_NS]
+    s.servers[server, LEAST_NS] = s.paces[index(row), PACED_LEAST_NS]
+    s.servers[server, DRAWN_NS] = s.paces[index(row), PACED_DRAWN_NS]
+    s.servers_f[server, PACE] = pace
+    set_speed(s, server)
+    mark(s, server)
 
 
 @phase

@@ -163,6 +163,7 @@ def _node(node: Node) -> Document:
             "background_hz": node.background_hz or None,
             "interference": node.interference if node.interference > 1.0 else None,
             "contention": node.contention or None,
+            "contention_stressed": dict(node.contention_stressed) or None,
             "bursts": _bursts(
                 f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
             ),

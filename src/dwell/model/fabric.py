@@ -117,6 +117,9 @@ class Node:
     contention : float
         Share of a CPU's time that others take from what runs there, and that no quota counts: what
         else a machine does whose CPUs the node has not for itself. Only of a node with a quota.
+    contention_stressed : mapping of str to float
+        The same while another node, by name, has foreign threads: one that has the same CPUs. Of
+        several the largest counts.
     """
 
     name: str
@@ -131,6 +134,7 @@ class Node:
     background_hz: float = 0.0
     interference: float = 1.0
     contention: float = 0.0
+    contention_stressed: Mapping[str, float] = field(default_factory=FrozenDict)
 
     def __post_init__(self) -> None:
         require(self.tier in TIERS, "tier", self.tier, f"one of {', '.join(TIERS)}")
@@ -156,14 +160,17 @@ class Node:
             ticks = self.quota is not None and self.quota.tick_ms > 0
             bound = "0 where there is no `quota` with `tick_ms`; elsewhere it is looked at any time"
             require(ticks, "background_hz", self.background_hz, bound)
-        CONTENTION.check("contention", self.contention)
-        if self.contention > 0.0:
+        stressed = self.contention_stressed.items()
+        shares = {f"contention_stressed.{name}": share for name, share in stressed}
+        for path, share in {"contention": self.contention, **shares}.items():
+            CONTENTION.check(path, share)
             bound = "0 where there is no quota; elsewhere it is `background`"
-            require(self.quota is not None, "contention", self.contention, bound)
+            require(self.quota is not None or share == 0.0, path, share, bound)
         if self.quota is not None and self.quota.tick_ms > 0:
             tick_ms, bound = self.quota.tick_ms, "0 where a node has several cores, or is not fair"
             require(self.cores == 1 and self.scheduler == "fair", "quota.tick_ms", tick_ms, bound)
         object.__setattr__(self, "accelerators", FrozenDict(self.accelerators))
+        object.__setattr__(self, "contention_stressed", FrozenDict(self.contention_stressed))
 
     @property
     def capacity(self) -> float:

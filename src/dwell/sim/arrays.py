@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dwell.control import NEVER_NS
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
-from dwell.model import Flow, Pipeline, Placement, Problem, Task
+from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.sim.guard import back_ns
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 
@@ -20,6 +21,8 @@ RING_START = 64
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
 #: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
+#: What a server counts in time of its core (`_counted_ns`).
+COUNTED = k.QUOTA_NS, k.STRESSED_NS, k.SLACK_NS, k.LEAST_NS, k.DRAWN_NS
 
 
 class Arrays:
@@ -127,6 +130,8 @@ class _Layout:
         self.back_ns: list[int] = []
         self.shadow_parts: list[list[int]] = []
         self.changes = [np.empty((0, k.N_CHANGE), np.int64)]
+        self.paces: list[list[int]] = []
+        self.paces_f: list[float] = []
         self.extra_rows = 0
 
     def arrays(self) -> Arrays:
@@ -143,10 +148,12 @@ class _Layout:
         return name if self.single or name in self.shared else f"{index}/{name}"
 
     def _add_nodes(self, index: int, problem: Problem, real: Realisation) -> None:
+        new = []
         for name, node in problem.fabric.nodes.items():
             key = self._node_key(index, name)
             if key in self.node_row:
                 continue
+            new.append(name)
             self.node_row[key] = len(self.node_row)
             scheduler = SCHEDULER_CODE[node.scheduler]
             cpu = self._add_server(key, None, scheduler, node.cores)
@@ -157,14 +164,12 @@ class _Layout:
             cpu[k.QUOTA_T] = -1
             if node.quota is not None:
                 period_ns = round(node.quota.period_ms * 1e6)
-                quota_ns = max(node.wall_ns(node.budget_ms), 1)
-                cpu[k.PERIOD_NS], cpu[k.QUOTA_NS] = period_ns, quota_ns
-                cpu[k.STRESSED_NS] = max(node.wall_ns(node.stressed_budget_ms), 1)
-                cpu[k.SLACK_NS] = node.wall_ns(node.quota.slack_ms)
-                cpu[k.LEAST_NS], cpu[k.DRAWN_NS] = node.wall_ns(LEAST_MS), node.wall_ns(DRAWN_MS)
+                cpu[k.PERIOD_NS] = period_ns
+                for column, value in zip(COUNTED, _counted_ns(node, node.quota), strict=True):
+                    cpu[column] = value
                 cpu[k.TICK_NS] = round(node.quota.tick_ms * 1e6)
                 pooled = cpu[k.SLACK_NS] or cpu[k.TICK_NS]
-                cpu[k.POOL_NS if pooled else k.LEFT_NS] = quota_ns
+                cpu[k.POOL_NS if pooled else k.LEFT_NS] = cpu[k.QUOTA_NS]
                 if cpu[k.TICK_NS]:
                     cpu[k.SCHEDULER] = k.TURNS
                     of_node = real.phases.get(name, Phase())
@@ -176,6 +181,22 @@ class _Layout:
                         cpu[k.WAKE_T] = NEVER_NS
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
+        for name in new:
+            self._add_paces(index, problem.fabric.nodes[name])
+
+    def _add_paces(self, index: int, node: Node) -> None:
+        """Add how fast a node is while others on its CPUs have foreign threads."""
+        if node.quota is None or not node.contention_stressed:
+            return
+        server = self.server_row[self._node_key(index, node.name), None]
+        others = {
+            self.server_row[self._node_key(index, other), None]: share
+            for other, share in node.contention_stressed.items()
+        }
+        for other, share in ({-1: node.contention} | others).items():
+            of = replace(node, contention=share)
+            self.paces.append([server, other, *_counted_ns(of, node.quota)])
+            self.paces_f.append(of.pace)
 
     def _add_server(self, node: str, kind: str | None, scheduler: int, cores: int) -> list[int]:
         row = [0] * k.N_SERVER
@@ -398,6 +419,8 @@ class _Layout:
             segments=np.concatenate(self.segments),
             segments_f=np.concatenate(self.segments_f),
             changes=changes,
+            paces=_table(self.paces, k.N_PACE),
+            paces_f=np.array(self.paces_f, np.float64),
             release_ns=_stack([real.release_ns[None] for real in reals], cycles + 1),
             exec_ns=_stack([real.exec_ns for real in reals], cycles),
             delay_ns=_stack([real.delay_ns for real in reals], cycles),
@@ -469,6 +492,12 @@ def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> lis
         k.SHARED if name not in diverging else k.SHADOWED if pipeline.outputs(name) else k.DISCARDED
         for name in pipeline.tasks
     ]
+
+
+def _counted_ns(node: Node, quota: Quota) -> list[int]:
+    """Quota without and with foreign threads, slack, least turn, and what is drawn at a time."""
+    budgets = (max(node.wall_ns(ms), 1) for ms in (node.budget_ms, node.stressed_budget_ms))
+    return [*budgets, *(node.wall_ns(ms) for ms in (quota.slack_ms, LEAST_MS, DRAWN_MS))]
 
 
 def _table(rows: Sequence[Sequence[int]], columns: int) -> k.Ints:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import json
 import os
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,7 +24,14 @@ from dwell.model import Problem, Trace
 from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.testbed.hops import OnTheWay, floors, hops, own_delays
 from dwell.testbed.measured import Measured, look_at, usable
-from dwell.testbed.node_loads import backgrounds, beside_jobs, contentions, interferences, wakes
+from dwell.testbed.node_loads import (
+    backgrounds,
+    beside_jobs,
+    contentions,
+    contentions_stressed,
+    interferences,
+    wakes,
+)
 from dwell.testbed.paired import paired
 from dwell.testbed.sensitivity import usual_of
 from dwell.testbed.speeds import Usual, at_speed_of
@@ -114,7 +121,8 @@ def calibrate(
     behind = backgrounds(measured, found, problem)
     if not found:
         raise RunError("no task has enough jobs in windows that can be used")
-    columns = paired({site: of.samples for site, of in found.items()}, _cpus(measured))
+    cpus = _cpus(measured)
+    columns = paired({site: of.samples for site, of in found.items()}, cpus)
     rows = len(next(iter(columns.values())))
     added_ms, delays_ms = _links(measured, known, problem, rows, emulated=emulated)
     document = _document(cell, out)
@@ -130,9 +138,15 @@ def calibrate(
         )
     }
     _put_in(document, samples.name, found, delays_ms, behind, beside)
+    stressed = {
+        node: {other: _short(share) for other, share in shares.items()}
+        for node, shares in contentions_stressed(measured, cpus).items()
+    }
     for name, values in of_nodes.items():
         for node, value in values.items():
             document["nodes"][node][name] = value
+    for node, shares in stressed.items():
+        document["nodes"][node]["contention_stressed"] = shares
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
@@ -149,6 +163,7 @@ def calibrate(
         },
         "background": {node: _short(value) for node, value in behind.items()},
         **of_nodes,
+        "contention_stressed": stressed,
         "work_ms": {node: _short(value) for node, value in usual.work_ms.items()},
         "sensitivity": {
             task_name(*site): _short(value) for site, value in usual.sensitivity.items()
@@ -164,9 +179,9 @@ def calibrate(
     return Calibrated(out, samples, sidecar, written, report, missing)
 
 
-def _cpus(measured: Sequence[Measured]) -> dict[str, Hashable]:
+def _cpus(measured: Sequence[Measured]) -> dict[str, tuple[int, ...]]:
     """Return which CPUs of its computer each node had, where the runs were on a testbed's."""
-    found: dict[str, Hashable] = {}
+    found: dict[str, tuple[int, ...]] = {}
     for one in measured:
         testbed = one.run.meta.get("testbed")
         for node, about in (testbed or {}).get("nodes", {}).items():
@@ -474,6 +489,9 @@ def _told(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"{node}: background {value:.3g} cores{more}")
     for node, value in report["contention"].items():
         lines.append(f"{node}: others have {value:.3g} of its CPUs while jobs run")
+    for node, shares in report["contention_stressed"].items():
+        for other, value in shares.items():
+            lines.append(f"{node}: and {value:.3g} while {other} is stressed")
     for node, value in report["background_hz"].items():
         lines.append(f"{node}: something wakes {value:.4g} times a second")
     for node, value in report["interference"].items():

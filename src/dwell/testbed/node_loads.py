@@ -6,7 +6,7 @@ workers without jobs and the messaging that delays nothing) is its background.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -17,7 +17,14 @@ from dwell.testbed.measured import Measured, SiteName
 from dwell.testbed.speeds import Usual
 from dwell.testbed.task_costs import Site
 
-__all__ = ["backgrounds", "beside_jobs", "contentions", "interferences", "wakes"]
+__all__ = [
+    "backgrounds",
+    "beside_jobs",
+    "contentions",
+    "contentions_stressed",
+    "interferences",
+    "wakes",
+]
 
 #: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
 #: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
@@ -86,6 +93,28 @@ def contentions(measured: Sequence[Measured]) -> dict[str, float]:
         of = [one.outside[node] for one in calm if node in one.outside]
         if (taken := _cores(of)) is not None:
             result[node] = min(taken, CONTENTION.high)
+    return result
+
+
+def contentions_stressed(
+    measured: Sequence[Measured], cpus: Mapping[str, Collection[int]]
+) -> dict[str, dict[str, float]]:
+    """Contention of every node while another one on its CPUs is stressed, by both.
+
+    Parameters
+    ----------
+    cpus : mapping of str to collection of int
+        CPUs of every node.
+    """
+    result: dict[str, dict[str, float]] = {}
+    for other in sorted({name for one in measured for name in one.disturbed.stressed}):
+        runs = [one for one in measured if one.disturbed.nodes == {other}]
+        for node in sorted({node for one in runs for node in one.outside} - {other}):
+            if set(cpus.get(node, ())).isdisjoint(cpus.get(other, ())):
+                continue
+            taken = _cores([one.outside[node] for one in runs if node in one.outside])
+            if taken is not None:
+                result.setdefault(node, {})[other] = min(taken, CONTENTION.high)
     return result
 
 
