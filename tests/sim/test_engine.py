@@ -777,6 +777,19 @@ def test_what_no_quota_counts_makes_the_core_slower_and_the_quota_last() -> None
     assert min(run.cycles["latency_ns"].to_list()) >= 16 * MS
 
 
+def test_a_period_that_begins_with_stress_and_a_job_is_a_stressed_one() -> None:
+    # All three at 30 ms. Without stress a period has 5 ms, with it 2.5, of which the job has half.
+    problem = make_problem(
+        [Node("R1", "robot", 1, quota=Quota(0.5, 10.0), background=0.25, background_beside=0.0)],
+        [Task("work", {"R1": Execution(Constant(4.0))}, offset_ms=30.0)],
+        period_ms=100.0,
+        window_cycles=5,
+        scenario=[NodeDisturbance("R1", at_s=0.03, stress_threads=1)],
+    )
+    run = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=1)
+    assert run.cycles["latency_ns"][0] == 60.5 * MS
+
+
 def test_foreign_threads_of_a_node_on_the_same_cpu_take_more_of_it() -> None:
     # R2 has all of its core, and in the second of four windows, while R1 is stressed, a quarter.
     quota = Quota(0.4, 20.0)

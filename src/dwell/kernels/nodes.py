@@ -168,8 +168,14 @@ def renew_before_stress(s: Tables, server: int, now: int) -> None:
     Without a pool, what happens at the instant at which a period begins comes before it.
     """
     if s.servers[server, QUOTA_NS] > 0:
-        pooled = s.servers[server, SLACK_NS] > 0 or s.servers[server, SCHEDULER] == TURNS
-        _renew(s, server, now if pooled else now - 1)
+        if s.servers[server, SLACK_NS] > 0 or s.servers[server, SCHEDULER] == TURNS:
+            _renew(s, server, now)
+            return
+        _renew(s, server, now - 1)
+        # One that a job of this instant has begun already begins anew, with nothing used of it.
+        period = now // s.servers[server, PERIOD_NS]
+        if period > 0 and period * s.servers[server, PERIOD_NS] == now:
+            s.servers[server, PERIOD] = period - 1
 
 
 @phase
