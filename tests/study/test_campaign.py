@@ -210,6 +210,19 @@ def test_a_verdict_asks_for_all_others(by_other: dict[str, float], answer: str) 
     assert len(outcome.evidence) == 2
 
 
+def test_a_run_that_is_missing_does_not_undo_what_the_others_show() -> None:
+    ramp = np.linspace(1.0, 1.1, 9)
+    lower = paired_difference(0.3 * ramp, 0.5 * ramp)
+    short = paired_difference(0.3 * ramp[:8], 0.5 * ramp[:8])
+    others = {f"net: {name}, LOC": short for name in "ABCDEFG"}
+    family = Family("?", "violation_rate", {"net: HYB, LOC": lower, **others})
+    outcome = verdict(family, "HYB", ("LOC",))
+    assert outcome.answer == "yes"
+    assert "nothing can be shown" not in outcome.verdict
+    fewer = Family("?", "violation_rate", {"net: HYB, LOC": short, **others})
+    assert "With 8 repetitions nothing can be shown" in verdict(fewer, "HYB", ("LOC",)).verdict
+
+
 def test_jobs_are_not_needed(folder: Path, tmp_path: Path) -> None:
     run = dwell.simulate(PROBLEM, scenario="baseline", policy="LOC", seed=1, windows=8)
 

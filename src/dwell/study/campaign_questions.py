@@ -261,7 +261,7 @@ def verdict(family: Family, first: str, others: Sequence[str]) -> Outcome:
         text = (
             f"V_D of {first} is shown to be lower than that of {them} in "
             f"{counted(len(lower), len(mine), 'scenarios')}, and higher than that of "
-            f"{'one of them' if len(others) > 1 else them} in {len(higher)}."
+            f"{'at least one of them' if len(others) > 1 else them} in {len(higher)}."
         )
     else:
         where = f"of {len(mine)} scenarios" if len(mine) > 1 else "scenario"
@@ -269,7 +269,7 @@ def verdict(family: Family, first: str, others: Sequence[str]) -> Outcome:
             f"In {'none' if len(mine) > 1 else 'the one'} {where} V_D of {first} is "
             f"{'' if len(mine) > 1 else 'not '}shown to differ from that of {them}."
         )
-    pairs = min((item.n for item in family.comparisons.values()), default=0)
+    pairs = max((item.n for item in family.comparisons.values()), default=0)
     needed = needed_pairs(len(family.comparisons))
     if pairs < needed:
         text += (
