@@ -41,7 +41,9 @@ def replayed(tmp_path: Path) -> Problem:
     document["tasks"]["perception"]["on"]["R1"]["exec_ms"] = trace("robot")
     document["tasks"]["perception"]["on"]["E"]["exec_ms"] = trace("edge")
     document["links"][0]["delay_ms"] = trace("link")
-    document["nodes"]["R1"] |= {"background": 0.2}
+    quota = {"cpu": 0.9, "period_ms": 4}
+    others = {"contention": 0.1, "contention_stressed": {"E": 0.4}}
+    document["nodes"]["R1"] |= {"background": 0.2, "quota": quota, **others}
     return from_document(document, folder=tmp_path)
 
 
@@ -66,6 +68,8 @@ def test_what_was_measured_takes_longer_and_keeps_its_rows(replayed: Problem) ->
     # One table still: a cycle takes the same row of all of them.
     assert robot.table is edge.table is link.table
     assert slow.fabric.nodes["R1"].background == pytest.approx(0.3)
+    assert slow.fabric.nodes["R1"].contention == pytest.approx(0.15)
+    assert slow.fabric.nodes["R1"].contention_stressed == pytest.approx({"E": 0.6})
     assert slow.pipeline.tasks["sensing"] == replayed.pipeline.tasks["sensing"]
 
 

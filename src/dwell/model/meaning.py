@@ -73,6 +73,7 @@ def find_faults(parts: Parts) -> list[Fault]:
     """Return every fault in the meaning of a cell's parts, in the order of the file."""
     return [
         *_names(parts),
+        *_nodes(parts),
         *_links(parts),
         *_tasks(parts),
         *_flows(parts),
@@ -114,7 +115,7 @@ def _bad_name(name: str) -> str:
     )
 
 
-def _links(parts: Parts) -> Iterator[Fault]:
+def _nodes(parts: Parts) -> Iterator[Fault]:
     if not parts.nodes:
         yield Fault("nodes", "none is declared; a cell needs at least one node")
     for name, node in parts.nodes.items():
@@ -123,6 +124,9 @@ def _links(parts: Parts) -> Iterator[Fault]:
             yield from _unknown(here, "node", other, parts.nodes)
             if other == name:
                 yield Fault(here, "is the node itself; its own foreign threads are no contention")
+
+
+def _links(parts: Parts) -> Iterator[Fault]:
     seen: dict[str, str] = {}
     for path, link in parts.links:
         yield from _unknown(f"{path}.from", "node", link.source, parts.nodes)
