@@ -174,6 +174,10 @@ def test_cost_of_a_window_is_its_row_of_the_bulk() -> None:
         (180.0, 0.49, 0.5),
         (60.0, 0.98 * 1.25, 0.25),
         (180.0, 0.98 * 1.25, 0.5),
+        # From 0.995 on a node counts as full.
+        (60.0, 0.9949, 0.9949 / 0.98 - 1),
+        (60.0, 0.995, 1 / 0.98 - 1),
+        (60.0, 1.0, 1 / 0.98 - 1),
     ],
 )
 def test_excess_by_hand(l95_ms: float, busiest: float, expected: float) -> None:

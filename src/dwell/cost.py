@@ -30,8 +30,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = [
+    "SATURATED",
     "TierNodes",
     "TierUtilisation",
+    "busiest",
     "cost",
     "excess",
     "hamming",
@@ -41,6 +43,9 @@ __all__ = [
 ]
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
+
+#: Utilisation from which a node is full: what more is asked of it cannot be seen any more.
+SATURATED = 0.995
 
 
 class TierNodes(NamedTuple):
@@ -199,15 +204,24 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
     return J
 
 
+def busiest(qos: QoS) -> float:
+    """Utilisation of the busiest node, as caps are compared with it; 0 where there is no node.
+
+    A saturated node counts as full, observed or estimated: an observation of 0.997 is no less than
+    an estimate of 1.
+    """
+    largest = max(qos.utilisation.values(), default=0.0)
+    return largest if largest < SATURATED else max(largest, 1.0)
+
+
 def excess(qos: QoS, objective: Objective) -> float:
     """Largest relative excess over the caps L_max and U_max (constraints of paper, eq. 8).
 
     Returns
     -------
     float
-        Maximum of ``value / cap - 1`` over L95 and the utilisation of every node in `qos`; above
-        0 if and only if a cap is exceeded, -1 where there are no caps.
+        Maximum of ``value / cap - 1`` over L95 and the utilisation of every node in `qos` (see
+        `busiest`); above 0 if and only if a cap is exceeded, -1 where there are no caps.
     """
     caps = objective.caps
-    busiest = max(qos.utilisation.values(), default=0.0)
-    return max(qos.l95_ms / caps.latency_ms, busiest / caps.utilisation) - 1.0
+    return max(qos.l95_ms / caps.latency_ms, busiest(qos) / caps.utilisation) - 1.0

@@ -337,7 +337,7 @@ def test_demo_as_json(tmp_path: Path) -> None:
     found = read_json(call("demo", *arguments))
     rows = found["comparisons"]["canonical"]
     corrected = {"dtp+corrected", "cusum+corrected"}
-    others = {"LOC", "SO", "HYB", "atp", "dtp", "latency-first"}
+    others = {"LOC", "SO", "HYB", "atp", "dtp", "dtp, no caps", "latency-first"}
     assert {row["policy"] for row in rows} == others | corrected
     assert {row["seeds"] for row in rows} == {1}
 

@@ -268,6 +268,17 @@ def test_window_by_window_is_bit_for_bit_the_static_run(
             assert_same(fast, slow)
 
 
+def test_stress_on_the_edge_is_no_reason_to_leave_it(canonical: Problem) -> None:
+    """E is full under every placement, so that LOC is not the only one within the caps."""
+    for seed in (1, 2):
+        run = dwell.simulate(
+            canonical, scenario="edge-cpu-stress", policy="dtp", seed=seed, windows=30
+        )
+        after = run.decisions.filter(run.decisions["incumbent"] != "LOC")
+        assert not after.is_empty()
+        assert (after["placement"] != "LOC").all()
+
+
 # --------------------------------------------------------------------------- what tables say
 
 

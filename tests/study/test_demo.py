@@ -51,8 +51,8 @@ def test_the_canonical_demo() -> None:
     )
     paper = {"baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment"}
     assert paper < set(found.scenarios)
-    beliefs = ("dtp+corrected", "cusum+corrected")
-    assert found.policies == ("LOC", "SO", "HYB", "atp", "dtp", "latency-first", *beliefs)
+    plain = ("LOC", "SO", "HYB", "atp", "dtp", "dtp, no caps", "latency-first")
+    assert found.policies == (*plain, "dtp+corrected", "cusum+corrected")
     assert seen[-1] == (found.runs.height, found.runs.height)
 
 

@@ -18,7 +18,8 @@ What nobody measured
     its regime, is corrected with it: the foreign threads that explain the slowdown of the longest
     job slow the other jobs of the node, and the extra delay and the losses of one message are those
     of the others on its link. A node of which nothing at all was measured is judged by its foreign
-    load.
+    load; where others have a part of a saturated node, that is only known to be at least what they
+    got.
 
 Age
     A part that was not measured for a windows is less and less known: each of its times is
@@ -37,6 +38,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.cost import SATURATED
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, message_of
 from dwell.estimators.paths import longest_path, seen_windows, steps_of
@@ -169,7 +171,8 @@ class Corrected:
         places = np.tile((np.arange(self._row) + 0.5) / self._row, rows)
         ages = 1 + np.floor(places * problem.window_cycles)
         self._age_ms = ages * problem.pipeline.period_ms
-        self._foreign = dict.fromkeys(problem.fabric.nodes, 0.0)
+        #: Least and most foreign load that each node's windows agree with.
+        self._foreign = dict.fromkeys(problem.fabric.nodes, (0.0, 0.0))
         self._seen: frozenset[str] = frozenset()
         self._forgotten: frozenset[Part] = frozenset()
 
@@ -294,13 +297,20 @@ class Corrected:
     def _judge_by_load(self, observed: QoS, own: Mapping[str, float]) -> None:
         """Judge by its foreign load a node of which nothing was measured in this window."""
         for name, node in self.problem.fabric.nodes.items():
-            foreign = max(observed.utilisation[name] - own[name], 0.0)
-            changed = abs(foreign - self._foreign[name]) > LOAD_STEP
-            if changed or name in self._seen:
-                self._foreign[name] = foreign
+            used = observed.utilisation[name]
+            least = max(used - own[name], 0.0)
+            hidden = used >= SATURATED and own[name] < SATURATED
+            most = math.inf if hidden else least
+            before_least, before_most = self._foreign[name]
+            changed = least - before_most > LOAD_STEP or before_least - most > LOAD_STEP
+            # What was known before says more than a full node that agrees with it.
+            if changed or (name in self._seen and not hidden):
+                self._foreign[name] = (least, most)
             if name in self._seen or not (changed or self._forgotten):
                 continue
+            least, most = self._foreign[name]
             # A saturated node hides how many there are: at least one for each core.
+            foreign = least if most < math.inf else 1.0
             threads = foreign * node.capacity
             for part in self._pools:
                 judged = changed or (part in self._forgotten and foreign > LOAD_STEP)

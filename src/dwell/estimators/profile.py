@@ -17,6 +17,11 @@ own, keyed by its name: adding a node, a link or a task shifts nobody else's dra
 What a window adds is the foreign load: utilisation that was seen and is not the cell's own work.
 It is expected to stay where it is, whichever candidate runs. Latencies take no notice of it: a
 stressed robot looks busy here, not slow.
+
+Of a saturated node that others have a part of, the foreign load cannot be seen: what others got is
+only the least that they ask for, and where the cell leaves they may take all of it. Such a node is
+expected to be full under every candidate, but under one that was active before and showed less, if
+the node has been saturated at every close since: then it was the cell that filled it.
 """
 
 from __future__ import annotations
@@ -28,6 +33,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.cost import SATURATED
 from dwell.errors import MetricError
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.model.fabric import Link, Node
@@ -90,6 +96,13 @@ class Profile:
             (name, l95_ms[name], violation_rate[name], tuple(own[name].items()))
             for name in problem.candidates
         )
+        self.start(problem)
+
+    def start(self, problem: Problem) -> None:
+        """Forget every window."""
+        #: What each node showed, by the candidate it was last seen under, at its last close without
+        #: saturation and at all after it.
+        self._shown: dict[str, dict[str, float]] = {node: {} for node in self._nodes}
 
     def estimate(
         self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
@@ -97,11 +110,19 @@ class Profile:
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
         # Conditions and not min() and max(): this runs at the close of every window.
         used = observed.utilisation
-        foreign = {}
+        foreign, full = {}, {}
         try:
             for node in self._nodes:
-                load = used[node] - own[node]
+                busy, load = used[node], used[node] - own[node]
                 foreign[node] = load if load > 0.0 else 0.0
+                shown = self._shown[node]
+                if busy < SATURATED:
+                    shown.clear()
+                    shown[incumbent] = busy
+                else:
+                    shown[incumbent] = 1.0
+                    if own[node] < SATURATED:
+                        full[node] = shown
         except KeyError as error:
             what = "own" if error.args[0] in used else "observed.utilisation"
             raise MetricError(
@@ -114,6 +135,8 @@ class Profile:
             for node, share in work:
                 busy = foreign[node] + share
                 utilisation[node] = busy if busy < 1.0 else 1.0
+            for node, shown in full.items():
+                utilisation[node] = shown.get(name, 1.0)
             estimates[name] = QoS(l95_ms, violation_rate, FrozenDict(utilisation))
         return estimates
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from operator import itemgetter
 from typing import NoReturn
 
-from dwell.cost import TierUtilisation, excess, hamming, price, tier_nodes
+from dwell.cost import TierUtilisation, busiest, excess, hamming, price, tier_nodes
 from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
@@ -150,8 +150,7 @@ class Pricing:
         within = []
         for name in self.candidates:
             qos = estimates[name]
-            used = qos.utilisation.values()
-            if qos.l95_ms <= latency_ms and (not used or max(used) <= utilisation):
+            if qos.l95_ms <= latency_ms and busiest(qos) <= utilisation:
                 within.append(name)
         if within:
             return within, True

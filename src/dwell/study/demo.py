@@ -31,6 +31,7 @@ __all__ = [
 POLICIES = (
     "atp",
     "dtp",
+    Contender("dtp, no caps", "dtp", settings={"objective.caps": {}}),
     "latency-first",
     Contender("dtp+corrected", "dtp", "corrected"),
     Contender("cusum+corrected", "cusum", "corrected"),
