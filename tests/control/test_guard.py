@@ -498,7 +498,7 @@ def test_the_guards_move_is_in_the_log_and_in_the_next_windows_cost() -> None:
         (1, "LOC", "OFF", True, "guard", 0),
         (1, "OFF", "OFF", False, "dwell", 1),
     ]
-    names = controller.log.columns(controller.problem.candidates, support=controller.supports)
+    names = controller.decision_columns
     assert {len(row) for row in controller.log.decisions} == {len(names)}
     moved = [row[2] for row in controller.log.seen]
     controller.decide(SEEN, OWN)

@@ -62,7 +62,7 @@ def test_advice_is_recorded_and_not_followed(problem: Problem) -> None:
     assert not stayed.stamper.moves
     rows = stayed.recorder.rows["decisions"]
     assert len(rows) >= 3
-    names = controller(stayed).controller.log.columns(tuple(problem.candidates))
+    names = controller(stayed).controller.decision_columns
     assert {dict(zip(names, row, strict=False))["placement"] for row in rows} - {"LOC"}
 
 

@@ -46,8 +46,9 @@ def price(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:
 
 
 def worst(q: QoS, objective: Objective) -> float:
-    """Largest value / cap - 1."""
-    shares = [u / objective.caps.utilisation for u in q.utilisation.values()]
+    """Largest value / cap - 1; a node that is full to 0.995 counts as full."""
+    used = [max(u, 1.0) if u >= 0.995 else u for u in q.utilisation.values()]
+    shares = [u / objective.caps.utilisation for u in used]
     return max([q.l95_ms / objective.caps.latency_ms, *shares]) - 1
 
 
@@ -85,7 +86,8 @@ def algorithm_1(
         if star != now and Delta > Delta_min:
             n_d = 0
             pi.append(star)
-            reason = "infeasible" if infeasible else "migrate"
+            left_out = any(J_of[c] < lowest for c in candidates if c not in allowed)
+            reason = "infeasible" if infeasible else "capped" if left_out else "migrate"
         else:
             n_d += 1
             pi.append(now)

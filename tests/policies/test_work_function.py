@@ -154,7 +154,10 @@ def test_caps_and_the_record(played: list[dict[str, QoS]], initial: str) -> None
         moves = decision.name != now
         dwell = 0 if moves else dwell + 1
         assert decision.migrated == moves
-        assert decision.reason == ("infeasible" if infeasible else "migrate" if moves else "hold")
+        J = decision.costs
+        left_out = any(J[c] < J[decision.name] for c in CANDIDATES if excess[c] > 0)
+        moved = "capped" if left_out else "migrate"
+        assert decision.reason == ("infeasible" if infeasible else moved if moves else "hold")
         assert decision.placement == CANDIDATES[decision.name]
         assert decision.dwell == dwell
         assert math.isnan(decision.delta_j)
@@ -309,7 +312,7 @@ def test_what_is_over_a_cap_is_not_chosen_but_remembered() -> None:
     policy = WorkFunction(candidates=CANDIDATES, initial="LOC", objective=capped)
     window = shown(CANDIDATES, [4.125, 4.0, 4.25])
     decision = policy.decide(observed=window["LOC"], estimates=window)
-    assert (decision.name, decision.reason) == ("SO", "migrate")
+    assert (decision.name, decision.reason) == ("SO", "capped")
     assert policy.work == {"LOC": 0.0, "SO": 0.375, "HYB": 0.25}
 
 

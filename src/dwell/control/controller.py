@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ns, utilisation
-from dwell.cost import SATURATED, hamming, price, tier_nodes
+from dwell.cost import SATURATED, excess, hamming, price, tier_nodes
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
 from dwell.estimators import by_name as estimator_by_name
-from dwell.model import Decision, FrozenDict, Problem, QoS
+from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
 from dwell.model.meaning import too_many_shadows
-from dwell.policies import MinimalPolicy, Static
+from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
 
 __all__ = ["ClosedWindow", "Controller", "Log", "static_columns"]
@@ -66,27 +66,12 @@ class Log:
         ``(l95_ms, violation_rate, cost)`` of every window; None thrice where the controller did
         not see the close, because its node was down.
     decisions : list of tuple
-        ``(window, incumbent, placement, migrated, reason, dwell, delta_j)``, then J of every
-        candidate (None where not priced), then the estimated L95 (ms) and violation rate of every
-        candidate, and where the estimator says it, how many samples stand behind the estimate and
-        how old (windows) the newest is. A move of the guard is a row of its own, without any of
-        these, before the row of the window that it began.
+        As `Controller.decision_columns` has it. A move of the guard is a row of its own, with
+        nothing priced, before the row of the window that it began.
     """
 
     seen: list[tuple[float | None, ...]] = field(default_factory=list)
     decisions: list[tuple[object, ...]] = field(default_factory=list)
-
-    def columns(self, candidates: Iterable[str], *, support: bool = False) -> tuple[str, ...]:
-        """Names of the decisions' columns."""
-        names = tuple(candidates)
-        behind = ("est_samples", "est_age_windows") if support else ()
-        return (
-            *("window", "incumbent", "placement", "migrated", "reason", "dwell", "delta_j"),
-            *(f"j_{name}" for name in names),
-            *(f"est_l95_ms_{name}" for name in names),
-            *(f"est_violation_rate_{name}" for name in names),
-            *(f"{what}_{name}" for what in behind for name in names),
-        )
 
 
 class Controller:
@@ -152,6 +137,39 @@ class Controller:
         }
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ns = round(problem.censor_ms * 1e6)
+        #: By which caps candidates are eligible: the policy's own, where it has any.
+        self.objective: Objective = getattr(self.policy, "objective", None) or problem.objective
+        self._has_caps = self.objective.caps != Caps()
+
+    @property
+    def decision_columns(self) -> tuple[str, ...]:
+        """Names of the columns of `Log.decisions`.
+
+        J of every candidate (null where the policy prices none), what was estimated of it (L95 in
+        ms, violation rate, utilisation of every node), whether it is within the caps, by how much
+        it is over them at most (null without caps), and where the estimator says it, how many
+        samples stand behind the estimate and how old (windows) the newest is.
+        """
+        behind = ("est_samples", "est_age_windows") if self.supports else ()
+        each = (
+            *("j", "est_l95_ms", "est_violation_rate"),
+            *(f"est_u_{node}" for node in self.nodes),
+            *("eligible", "excess", *behind),
+        )
+        return (
+            *("window", "incumbent", "placement", "migrated", "reason", "dwell", "delta_j"),
+            *(f"{column}_{name}" for column in each for name in self._names),
+        )
+
+    def described(self) -> dict[str, object]:
+        """Policy, its parameters and estimator as the record of a run names them."""
+        policy = self.policy
+        known = type(policy).__repr__ is not object.__repr__
+        return {
+            "policy": repr(policy) if known else type(policy).__name__,
+            "parameters": parameters_of(policy),
+            "estimator": type(self.estimator).__name__,
+        }
 
     @property
     def learns(self) -> bool:
@@ -293,8 +311,8 @@ class Controller:
         self._tell(name)
         self.previous, self.incumbent, self.dwell = left, name, 0
         self.on_fallback, self.wanted = True, None
-        priced = [None] * (3 * len(self._names) + (2 * len(self._names) if self.supports else 0))
         fixed = (len(self.log.seen), left, name, name != left, "guard", 0, None)
+        priced = [None] * (len(self.decision_columns) - len(fixed))
         self.log.decisions.append((*fixed, *priced))
 
     def resume(self, name: str, *, fallback: bool = False) -> None:
@@ -358,9 +376,17 @@ class Controller:
                 *[costs.get(name) for name in names],
                 *[estimate.l95_ms for estimate in known],
                 *[estimate.violation_rate for estimate in known],
+                *[estimate.utilisation.get(node) for node in self.nodes for estimate in known],
+                *self._capped(known),
                 *self._supported(),
             )
         )
+
+    def _capped(self, known: Iterable[QoS]) -> list[float | bool | None]:
+        """Whether candidates are within the caps, then by how much they are over them."""
+        excesses = [excess(estimate, self.objective) for estimate in known]
+        within = [over <= 0 for over in excesses]
+        return [*within, *(excesses if self._has_caps else [None] * len(excesses))]
 
     @property
     def supports(self) -> bool:
@@ -451,7 +477,7 @@ def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
 
 def static_columns(
     controller: Controller, profile: Profile, window: ClosedWindow
-) -> tuple[dict[str, Floats], dict[str, dict[str, Floats]]]:
+) -> tuple[dict[str, Floats], dict[str, dict[str, NDArray[np.generic]]]]:
     """Metrics, costs and estimates of all windows of a run that never moves, in one go.
 
     Bit for bit what `Controller.close` gives window by window (tested).
@@ -468,15 +494,16 @@ def static_columns(
     -------
     seen : dict of str to float64 array, shape (windows,)
         ``l95_ms``, ``violation_rate``, ``cost`` and ``u_<node>``.
-    estimated : dict of candidate to dict of str to float64 array
-        ``l95_ms``, ``violation_rate`` and ``j``.
+    estimated : dict of candidate to dict of str to array, shape (windows,)
+        ``l95_ms``, ``violation_rate``, ``u_<node>``, ``j``, ``eligible`` and ``excess`` (NaN
+        without caps).
     """
     problem, name = controller.problem, controller.incumbent
     age_ns = window.close_ns - window.release_ns
     missed = missed_cycles(window.latency_ns, age_ns, controller._deadline_ns)
     share = controller.utilisation(window)
     used, own = share[:, 0], share[:, 1]
-    seen = {
+    seen: dict[str, Floats] = {
         "l95_ms": seen_l95_ns(window.latency_ns, age_ns, controller._censor_ns) / 1e6,
         "violation_rate": missed / age_ns.shape[-1],
     }
@@ -485,7 +512,7 @@ def static_columns(
     # No other candidate is ever active, so that none is known to leave a full node less than full.
     censored = (used >= SATURATED) & (own < SATURATED)
     foreign = np.where(censored, 1.0, np.maximum(used - own, 0.0))
-    estimated: dict[str, dict[str, Floats]] = {}
+    estimated: dict[str, dict[str, NDArray[np.generic]]] = {}
     for candidate, placement in problem.candidates.items():
         l95_ms, violation_rate, busy = seen["l95_ms"], seen["violation_rate"], by_node
         if candidate != name:
@@ -497,13 +524,25 @@ def static_columns(
                 for i, node in enumerate(controller.nodes)
             }
         switching = hamming(placement, problem.candidates[name])
+        over = _excess(controller.objective.caps, l95_ms, busy)
         estimated[candidate] = {
             "l95_ms": l95_ms,
             "violation_rate": violation_rate,
+            **{f"u_{node}": values for node, values in busy.items()},
             "j": _priced(problem, l95_ms, violation_rate, busy, switching),
+            "eligible": over <= 0,
+            "excess": over if controller._has_caps else np.full(len(used), np.nan),
         }
     seen.update({f"u_{node}": values for node, values in by_node.items()})
     return seen, estimated
+
+
+def _excess(caps: Caps, l95_ms: Floats, by_node: Mapping[str, Floats]) -> Floats:
+    """`dwell.cost.excess` of many windows."""
+    largest: Floats = np.maximum.reduce(list(by_node.values()))
+    largest = np.where(largest < SATURATED, largest, np.maximum(largest, 1.0))
+    excess: Floats = np.maximum(l95_ms / caps.latency_ms, largest / caps.utilisation) - 1.0
+    return excess
 
 
 def _priced(

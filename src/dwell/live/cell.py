@@ -444,7 +444,7 @@ class Cell:
         """Return the last window as people look at it."""
         log, names = self.controller.log, tuple(self.place.problem.candidates)
         l95_ms, violation_rate, cost = log.seen[-1]
-        decision = dict(zip(log.columns(names), log.decisions[-1], strict=False))
+        decision = dict(zip(self.controller.decision_columns, log.decisions[-1], strict=True))
         used = last.used[0].tolist()
         return {
             "number": last.number,

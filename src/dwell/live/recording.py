@@ -91,15 +91,12 @@ class RunRecorder:
         return journal.folder
 
     def _meta(self) -> dict[str, object]:
-        policy = self.controller.policy
-        known = type(policy).__repr__ is not object.__repr__
         packages = ("dwell", "numpy", "eclipse-zenoh")
         return {
             "kind": "live",
             "cell": self.problem.name,
             "scenario": "live",
-            "policy": repr(policy) if known else type(policy).__name__,
-            "estimator": type(self.controller.estimator).__name__,
+            **self.controller.described(),
             "problem": to_document(self.problem),
             "versions": {
                 **{name: importlib.metadata.version(name) for name in packages},

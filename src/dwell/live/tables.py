@@ -57,7 +57,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from dwell.control import NEVER_NS, Controller
 from dwell.live.cycles import LiveCycle
 from dwell.live.offsets import UNBOUNDED_NS
-from dwell.model import Problem
+from dwell.model import REASONS, Problem
 from dwell.record import OUTCOMES, Columns
 
 if TYPE_CHECKING:
@@ -75,8 +75,6 @@ __all__ = [
 
 Row: TypeAlias = tuple[object, ...]
 
-REASONS = ("dwell", "hold", "migrate", "infeasible", "guard")
-
 
 def sends_shadows(controller: Controller) -> bool:
     """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
@@ -89,8 +87,8 @@ def columns_of(controller: Controller) -> Columns:
     placements = list(problem.candidates)
     nodes = list(problem.fabric.nodes)
     shadows = sends_shadows(controller)
-    names = controller.log.columns(placements, support=controller.supports)
-    decisions: dict[str, str | list[str]] = dict.fromkeys(names, "Float64")
+    decisions: dict[str, str | list[str]] = dict.fromkeys(controller.decision_columns, "Float64")
+    decisions.update({f"eligible_{name}": "Boolean" for name in placements})
     decisions.update(
         window="Int64",
         incumbent=placements,

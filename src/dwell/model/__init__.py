@@ -19,7 +19,7 @@ from dwell.model.process import (
     TraceTable,
     Uniform,
 )
-from dwell.model.qos import Decision, QoS, Reason
+from dwell.model.qos import REASONS, Decision, QoS, Reason
 from dwell.model.scenario import (
     Disturbance,
     Episodes,
@@ -31,6 +31,7 @@ from dwell.model.servo import MovingTarget, Servo
 
 __all__ = [
     "AR1",
+    "REASONS",
     "Bursts",
     "Caps",
     "Constant",

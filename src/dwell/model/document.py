@@ -13,13 +13,14 @@ import numpy as np
 from dwell.errors import Fault, ProblemError
 from dwell.model.fabric import Bursts, Link, Node, Quota
 from dwell.model.live import LiveSettings
+from dwell.model.objective import Objective
 from dwell.model.pipeline import Execution, Task
 from dwell.model.problem import ControllerSettings, Problem
 from dwell.model.process import DRAWN, Constant, Process, Trace
 from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
 from dwell.model.servo import Servo
 
-__all__ = ["VERSION", "digest", "fingerprint", "to_document"]
+__all__ = ["VERSION", "digest", "fingerprint", "objective_document", "to_document"]
 
 # Version of the cell file.
 VERSION = 1
@@ -249,17 +250,24 @@ def _episodes(path: str, episodes: Episodes | None) -> Document | None:
     return {"name": episodes.name, "every_s": every_s, "for_s": for_s}
 
 
-def _objective(problem: Problem) -> Document:
-    objective = problem.objective
-    usual = {name: node.tier for name, node in problem.fabric.nodes.items()}
+def objective_document(objective: Objective) -> Document:
+    """Return an objective as a cell file's ``objective`` says it, every tier named."""
     return _filled(
         {
             "weights": _dataclass(objective.weights),
             "targets": _dataclass(objective.targets),
             "caps": _dataclass(objective.caps),
-            "tiers": None if objective.tiers == usual else dict(objective.tiers),
+            "tiers": dict(objective.tiers),
         }
     )
+
+
+def _objective(problem: Problem) -> Document:
+    document = objective_document(problem.objective)
+    usual = {name: node.tier for name, node in problem.fabric.nodes.items()}
+    if problem.objective.tiers == usual:
+        document.pop("tiers", None)
+    return document
 
 
 def _controller(settings: ControllerSettings) -> Document:

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 from dwell.errors import MetricError
 from dwell.model.frozen import FrozenDict
 from dwell.model.placement import Placement
 
-__all__ = ["Decision", "QoS", "Reason"]
+__all__ = ["REASONS", "Decision", "QoS", "Reason"]
 
-Reason: TypeAlias = Literal["dwell", "hold", "migrate", "infeasible", "guard"]
+Reason: TypeAlias = Literal["dwell", "hold", "migrate", "capped", "infeasible", "guard"]
+#: Every reason, in the order in which they are looked at.
+REASONS: tuple[Reason, ...] = get_args(Reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,7 @@ class Decision:
         Its candidate name.
     migrated : bool
         Whether it differs from the incumbent.
-    reason : {"dwell", "hold", "migrate", "infeasible", "guard"}
+    reason : {"dwell", "hold", "migrate", "capped", "infeasible", "guard"}
         Which rule made it.
     costs : mapping of str to float
         Estimated J of every candidate against the incumbent; empty where the policy prices none.

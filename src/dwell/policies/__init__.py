@@ -5,6 +5,7 @@ from dwell.policies.check import check_policy
 from dwell.policies.cusum import Cusum
 from dwell.policies.dtp import DTP
 from dwell.policies.latency_first import LatencyFirst
+from dwell.policies.parameters import parameters_of
 from dwell.policies.protocol import MinimalPolicy, Policy
 from dwell.policies.registry import by_name
 from dwell.policies.static import Static
@@ -21,4 +22,5 @@ __all__ = [
     "WorkFunction",
     "by_name",
     "check_policy",
+    "parameters_of",
 ]

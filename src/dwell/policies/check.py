@@ -210,8 +210,8 @@ class _Check:
             self.note(
                 "reason", f"{said} with reason {decision.reason!r}; it must be one of {known}"
             )
-        elif (decision.reason == "migrate") > moves or moves > (
-            decision.reason in ("migrate", "infeasible", "guard")
+        elif (decision.reason in ("migrate", "capped")) > moves or moves > (
+            decision.reason in ("migrate", "capped", "infeasible", "guard")
         ):
             verb = "migrates" if moves else "stays"
             self.note("reason", f"{said} that {verb}, with reason {decision.reason!r}")

@@ -39,8 +39,8 @@ __all__ = ["Cusum"]
 class Cusum:
     """Moves to the cheapest candidate whose advantage over the incumbent has added up.
 
-    A candidate over a cap is not eligible, as in DTP; if none is eligible, those closest to their
-    caps are compared, and the reason is ``infeasible``. Sums of candidates over a cap go on.
+    A candidate over a cap is not eligible, as in DTP, and the reasons are the same; if none is
+    eligible, those closest to their caps are compared. Sums of candidates over a cap go on.
 
     Parameters
     ----------
@@ -147,4 +147,5 @@ class Cusum:
         if delta_j <= 0:
             return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
         self._sums = dict.fromkeys(self.candidates, 0.0)
-        return incumbent.move(best, "migrate" if within_caps else "infeasible", costs, delta_j)
+        reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
+        return incumbent.move(best, reason, costs, delta_j)

@@ -11,8 +11,9 @@ cases decided:
   floor(K / (N_min + 1)) of them, whatever the metrics do.
 * The minimum goes to the incumbent on a tie, then to the order of the candidates. If it is the
   incumbent, the window is a hold whatever Delta J says, and n_d grows.
-* A candidate over a cap is not eligible. If none is eligible, those closest to their caps are
-  compared by J as usual, and the reason is ``infeasible``; the hysteresis still applies.
+* A candidate over a cap is not eligible; where a cheaper one was left out for that, the reason of
+  a move is ``capped``. If none is eligible, those closest to their caps are compared by J as
+  usual, and the reason is ``infeasible``; the hysteresis still applies.
 
 ``escape`` is an addition to the algorithm, off by default: an incumbent that was seen over a cap
 moves to the cheapest candidate within its caps, if there is one, whatever n_d and Delta J say. The
@@ -135,7 +136,8 @@ class DTP:
             eligible, within_caps = pricing.eligible({**estimates, incumbent.name: observed})
             if within_caps:
                 best = cheapest(costs, eligible, incumbent.name)
-                return incumbent.move(best, "migrate", costs, measured - costs[best])
+                reason = pricing.reason(best, costs, eligible, within_caps=True)
+                return incumbent.move(best, reason, costs, measured - costs[best])
         if incumbent.dwell < self.min_dwell:
             return incumbent.stay("dwell", costs)
         if estimates is None:
@@ -147,7 +149,8 @@ class DTP:
         best = cheapest(costs, eligible, incumbent.name)
         delta_j = measured - costs[best]
         if best != incumbent.name and delta_j > self.min_improvement:
-            return incumbent.move(best, "migrate" if within_caps else "infeasible", costs, delta_j)
+            reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
+            return incumbent.move(best, reason, costs, delta_j)
         return incumbent.stay("hold" if within_caps else "infeasible", costs, delta_j)
 
 

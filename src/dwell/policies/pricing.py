@@ -7,7 +7,7 @@ nodes and comparing placements again in every window.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from operator import itemgetter
 from typing import NoReturn
 
@@ -16,7 +16,7 @@ from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.qos import QoS
+from dwell.model.qos import QoS, Reason
 
 __all__ = ["EXCESS_TOLERANCE", "Pricing", "check_metrics", "explain_estimate"]
 
@@ -157,6 +157,15 @@ class Pricing:
         excesses = {name: excess(estimates[name], self.objective) for name in self.candidates}
         bound = min(excesses.values()) + EXCESS_TOLERANCE
         return [name for name, value in excesses.items() if value <= bound], False
+
+    def reason(
+        self, best: str, costs: Mapping[str, float], eligible: Sequence[str], *, within_caps: bool
+    ) -> Reason:
+        """Why the cell moves to `best`; what `eligible` gave comes last."""
+        if not within_caps:
+            return "infeasible"
+        cheaper = [name for name, value in costs.items() if value < costs[best]]
+        return "migrate" if set(cheaper) <= set(eligible) else "capped"
 
     def _price(self, qos: QoS, switching: float) -> float:
         used = qos.utilisation

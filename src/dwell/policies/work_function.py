@@ -161,7 +161,8 @@ class WorkFunction:
         best = self._choose(served, eligible)
         if best == now:
             return incumbent.stay("hold" if within_caps else "infeasible", costs)
-        return incumbent.move(best, "migrate" if within_caps else "infeasible", costs)
+        reason = pricing.reason(best, costs, eligible, within_caps=within_caps)
+        return incumbent.move(best, reason, costs)
 
     def _choose(self, served: list[float], eligible: list[str]) -> str:
         """Return the eligible candidate with the least ``served + distance``; ties move.

@@ -51,6 +51,7 @@ REASONS = {
     "dwell": "too soon after the last migration",
     "hold": "no other placement promised enough",
     "migrate": "another placement promised more than the least improvement",
+    "capped": "the cheapest placement within the caps; a cheaper one was over a cap",
     "infeasible": "every placement was over a cap, and those nearest to it were compared",
     "guard": "the robot moved by itself",
 }

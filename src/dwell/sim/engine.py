@@ -446,15 +446,11 @@ def _evidence(
 def _meta(
     problem: Problem, realisation: Realisation, controller: Controller, *, guard: bool
 ) -> dict[str, Any]:
-    policy = controller.policy
     return {
         "kind": "simulated",
         "cell": problem.name,
         "scenario": realisation.scenario,
-        "policy": repr(policy)
-        if type(policy).__repr__ is not object.__repr__
-        else type(policy).__name__,
-        "estimator": type(controller.estimator).__name__,
+        **controller.described(),
         "guard": guard and controller.guarded,
         "seed": realisation.seed,
         "windows": realisation.windows,

@@ -17,7 +17,7 @@ from dwell.control import (
     static_columns,
 )
 from dwell.kernels import layout as k
-from dwell.model import Problem
+from dwell.model import REASONS, Problem
 from dwell.record import OUTCOMES
 from dwell.sim.arrays import Arrays
 from dwell.sim.realisation import Realisation
@@ -112,9 +112,9 @@ def make_tables(played: Played, *, jobs: bool = False) -> dict[str, Callable[[],
     """Functions that make each table when it is first asked for; `jobs` asks for that of jobs."""
     controller = played.controller
     profile = None if controller.log.seen else controller.fixed_profile
-    seen: tuple[dict[str, Floats], dict[str, dict[str, Floats]]] | None = None
+    seen: tuple[dict[str, Floats], dict[str, dict[str, NDArray[np.generic]]]] | None = None
 
-    def columns() -> tuple[dict[str, Floats], dict[str, dict[str, Floats]]]:
+    def columns() -> tuple[dict[str, Floats], dict[str, dict[str, NDArray[np.generic]]]]:
         nonlocal seen
         if seen is None and profile is not None:
             seen = static_columns(controller, profile, played.closed_windows())
@@ -240,9 +240,6 @@ def _seen(played: Played) -> dict[str, Floats]:
     }
 
 
-REASONS = ("dwell", "hold", "migrate", "infeasible", "guard")
-
-
 def _decision_frame(columns: Mapping[str, object], candidates: tuple[str, ...]) -> pl.DataFrame:
     import polars as pl
 
@@ -250,20 +247,22 @@ def _decision_frame(columns: Mapping[str, object], candidates: tuple[str, ...]) 
         pl.col("incumbent", "placement").cast(pl.Enum(candidates)),
         pl.col("reason").cast(pl.Enum(REASONS)),
         pl.col("window", "dwell").cast(pl.Int64),
-        pl.col("migrated").cast(pl.Boolean),
-        pl.col("delta_j", "^j_.*$", "^est_.*$").cast(pl.Float64).fill_nan(None),
+        pl.col("migrated", "^eligible_.*$").cast(pl.Boolean),
+        pl.col("delta_j", "^j_.*$", "^est_.*$", "^excess_.*$").cast(pl.Float64).fill_nan(None),
     )
 
 
 def _decisions(controller: Controller) -> pl.DataFrame:
     candidates = tuple(controller.problem.candidates)
-    names = controller.log.columns(candidates, support=controller.supports)
+    names = controller.decision_columns
     rows = controller.log.decisions
     columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
     return _decision_frame(columns, candidates)
 
 
-def _static_decisions(played: Played, estimated: dict[str, dict[str, Floats]]) -> pl.DataFrame:
+def _static_decisions(
+    played: Played, estimated: dict[str, dict[str, NDArray[np.generic]]]
+) -> pl.DataFrame:
     controller = played.controller
     candidates = tuple(controller.problem.candidates)
     count = len(played.first)
@@ -279,9 +278,12 @@ def _static_decisions(played: Played, estimated: dict[str, dict[str, Floats]]) -
     }
     for name in candidates:
         columns[f"j_{name}"] = estimated[name]["j"] if priced else np.full(count, np.nan)
-    for metric in ("l95_ms", "violation_rate"):
+    for metric in ("l95_ms", "violation_rate", *(f"u_{node}" for node in controller.nodes)):
         for name in candidates:
             columns[f"est_{metric}_{name}"] = estimated[name][metric]
+    for column in ("eligible", "excess"):
+        for name in candidates:
+            columns[f"{column}_{name}"] = estimated[name][column]
     return _decision_frame(columns, candidates)
 
 

@@ -1,0 +1,37 @@
+"""What a policy was made with, as its run's record keeps it."""
+
+from __future__ import annotations
+
+import inspect
+import math
+
+from dwell.model.document import objective_document
+from dwell.model.objective import Objective
+
+__all__ = ["parameters_of"]
+
+
+def parameters_of(policy: object) -> dict[str, object]:
+    """Return the arguments of a policy's class that it keeps under their own names.
+
+    Parameters
+    ----------
+    policy : policy
+        Ours or a user's.
+
+    Returns
+    -------
+    dict of str to object
+        Ready for JSON: numbers, names and None, an infinite number as ``"inf"``, and the objective
+        as in a cell file. What is none of these (candidates, objects of a user's) is left out.
+    """
+    kept: dict[str, object] = {}
+    for name in inspect.signature(type(policy)).parameters:
+        value = getattr(policy, name, inspect.Parameter.empty)
+        if isinstance(value, Objective):
+            kept[name] = objective_document(value)
+        elif isinstance(value, float) and not math.isfinite(value):
+            kept[name] = str(value)
+        elif value is None or isinstance(value, bool | int | float | str):
+            kept[name] = value
+    return kept

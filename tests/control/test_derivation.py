@@ -1,0 +1,394 @@
+"""Decisions derived again from the table of decisions and the parameters in the run's record.
+
+The rules are written here once more, from docs/concepts.md and the policies' own pages, on plain
+numbers: nothing of `dwell.policies` or `dwell.cost` is used.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import pytest
+
+import dwell
+from dwell.model import Caps, NodeDisturbance, Problem, QoS
+from dwell.policies import DTP, Cusum, WorkFunction
+
+Row: TypeAlias = Mapping[str, Any]
+
+#: Caps by which candidates are left out, one by one or all together.
+CAPS = {
+    "own": None,
+    "none": Caps(),
+    "utilisation": Caps(utilisation=0.16),
+    "latency": Caps(latency_ms=31.0),
+    "all": Caps(latency_ms=1.0, utilisation=0.01),
+}
+TOLERANCE = 1e-6
+
+
+@pytest.fixture(scope="module")
+def canonical() -> Problem:
+    return dwell.load("examples/canonical.yaml")
+
+
+# ------------------------------------------------------------------------------- the record
+
+
+class Record:
+    """What a run's folder says: parameters, candidates, and rows of decisions."""
+
+    def __init__(self, folder: Path) -> None:
+        self.meta = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        self.rows = list(dwell.open_run(folder).decisions.iter_rows(named=True))
+        document = self.meta["problem"]
+        self.parameters = self.meta["parameters"]
+        first = {name: next(iter(task["on"])) for name, task in document["tasks"].items()}
+        self.places = {name: {**first, **moves} for name, moves in document["candidates"].items()}
+        self.names = list(self.places)
+        self.nodes = {name: node["tier"] for name, node in document["nodes"].items()}
+        self.objective = self.parameters.get("objective", document["objective"])
+
+    def moved(self, one: str, other: str) -> float:
+        here, there = self.places[one], self.places[other]
+        moved = [task for task in here if here[task] != there[task]]
+        return len(moved) / len(here)
+
+    def cost(self, row: Row, name: str, before: str) -> float:
+        """J of a candidate's estimate, equation 7 of the paper."""
+        weights, targets = self.objective["weights"], self.objective["targets"]
+        busiest = {
+            tier: max(
+                (row[f"est_u_{node}_{name}"] for node, of in self.nodes.items() if of == tier),
+                default=0.0,
+            )
+            for tier in ("robot", "edge")
+        }
+        return float(
+            weights["latency"] * row[f"est_l95_ms_{name}"] / targets["latency_ms"]
+            + weights["violations"] * row[f"est_violation_rate_{name}"]
+            + weights["robot"] * busiest["robot"] / targets["robot"]
+            + weights["edge"] * busiest["edge"] / targets["edge"]
+            + weights["switching"] * self.moved(name, before)
+        )
+
+    def over(self, row: Row, name: str) -> float | None:
+        """Largest value / cap - 1; None without caps."""
+        caps = self.objective.get("caps", {})
+        if not caps:
+            return None
+        used = max(row[f"est_u_{node}_{name}"] for node in self.nodes)
+        full = max(used, 1.0) if used >= 0.995 else used
+        over = row[f"est_l95_ms_{name}"] / caps.get("latency_ms", math.inf) - 1
+        return max(float(over), float(full / caps.get("utilisation", math.inf) - 1))
+
+    def choosable(self, row: Row) -> tuple[list[str], bool]:
+        """Candidates to choose from, and whether they are within the caps."""
+        within = [name for name in self.names if row[f"eligible_{name}"]]
+        if within:
+            return within, True
+        over = {name: row[f"excess_{name}"] for name in self.names}
+        least = min(over.values())
+        return [name for name in self.names if over[name] <= least + TOLERANCE], False
+
+    def reason(self, row: Row, best: str, *, within: bool) -> str:
+        if not within:
+            return "infeasible"
+        out = [name for name in self.names if not row[f"eligible_{name}"]]
+        capped = any(row[f"j_{name}"] < row[f"j_{best}"] for name in out)
+        return "capped" if capped else "migrate"
+
+
+def cheapest(costs: Mapping[str, float], incumbent: str) -> str:
+    return min(costs, key=lambda name: (costs[name], name != incumbent))
+
+
+# ---------------------------------------------------------------------------------- the rules
+
+
+class Rule:
+    """A policy's rule; keeps the incumbent, the one before, and the windows since the last move."""
+
+    def __init__(self, record: Record, initial: str) -> None:
+        self.record, self.parameters = record, record.parameters
+        self.now = self.before = initial
+        self.dwelt = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what adds up."""
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        """Return the candidate and the reason."""
+        raise NotImplementedError
+
+    def take(self, name: str) -> None:
+        """Let a window pass, and the cell be on a candidate."""
+        self.dwelt = self.dwelt + 1 if name == self.now else 0
+        self.before, self.now = self.now, name
+
+
+class Hysteresis(Rule):
+    """Algorithm 1, with its escape."""
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        record, now = self.record, self.now
+        measured = record.cost(row, now, self.before)
+        names, within = record.choosable(row)
+        best = cheapest({name: row[f"j_{name}"] for name in names}, now)
+        over = record.over(row, now)
+        if self.parameters["escape"] and over is not None and over > 0 and within:
+            return best, record.reason(row, best, within=True)
+        if self.dwelt < self.parameters["min_dwell"]:
+            return now, "dwell"
+        gain = measured - row[f"j_{best}"]
+        if best != now and gain > self.parameters["min_improvement"]:
+            return best, record.reason(row, best, within=within)
+        return now, "hold" if within else "infeasible"
+
+
+class Sums(Rule):
+    """CUSUM."""
+
+    def begin(self) -> None:
+        self.sums = dict.fromkeys(self.record.names, 0.0)
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        record, now, set_to = self.record, self.now, self.parameters
+        measured = record.cost(row, now, now)
+        for name in record.names:
+            gain = measured - row[f"j_{name}"] - set_to["slack"]
+            grown = max(0.0, set_to["memory"] * self.sums[name] + gain)
+            self.sums[name] = 0.0 if name == now else grown
+        names, within = record.choosable(row)
+        due = {n: row[f"j_{n}"] for n in names if self.sums[n] > set_to["threshold"]}
+        best = cheapest(due, now) if due else now
+        if best == now or row[f"j_{best}"] >= measured:
+            return now, "hold" if within else "infeasible"
+        return best, record.reason(row, best, within=within)
+
+    def take(self, name: str) -> None:
+        if name != self.now:
+            self.begin()
+        super().take(name)
+
+
+class Hindsight(Rule):
+    """The work function."""
+
+    def begin(self) -> None:
+        self.work = {name: self.distance(self.now, name) for name in self.record.names}
+
+    def distance(self, one: str, other: str) -> float:
+        weight = self.record.objective["weights"]["switching"]
+        return float(weight * self.record.moved(one, other))
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        record, now = self.record, self.now
+        served = {n: self.work[n] + record.cost(row, n, n) for n in record.names}
+        self.work = {
+            name: min(served[other] + self.distance(other, name) for other in record.names)
+            for name in record.names
+        }
+        names, within = record.choosable(row)
+        least = min(served.values())
+        totals = {n: served[n] - least + self.distance(n, now) for n in names}
+        bound = min(totals.values()) * (1 + 1e-9) + 1e-12
+        ties = [n for n in names if totals[n] <= bound]
+        away = [n for n in ties if self.distance(n, now) > 1e-9] if now in ties else ties
+        best = away[0] if away else now
+        if best == now:
+            return now, "hold" if within else "infeasible"
+        return best, record.reason(row, best, within=within)
+
+
+class Quickest(Rule):
+    """Latency-first."""
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        best = cheapest({n: row[f"est_l95_ms_{n}"] for n in self.record.names}, self.now)
+        return best, "hold" if best == self.now else "migrate"
+
+
+class Still(Rule):
+    """A placement that never moves."""
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        return self.now, "hold"
+
+
+RULES: dict[str, type[Rule]] = {
+    "dtp": Hysteresis,
+    "cusum": Sums,
+    "work-function": Hindsight,
+    "latency-first": Quickest,
+    "SO": Still,
+}
+
+
+def derive(record: Record, rule: Rule) -> Iterator[tuple[Row, str, str]]:
+    """Yield every row with the placement and the reason that follow from it."""
+    for row in record.rows:
+        assert row["incumbent"] == rule.now or row["reason"] == "guard"
+        if row[f"est_l95_ms_{rule.now}"] is None:
+            yield row, row["placement"], "guard"
+            rule.before, rule.now, rule.dwelt = row["incumbent"], row["placement"], 0
+            rule.begin()
+            continue
+        priced(record, row)
+        name, reason = rule.wants(row)
+        yield row, name, reason
+        rule.take(name)
+
+
+def priced(record: Record, row: Row) -> None:
+    """Hold what was recorded of every candidate against the formulas."""
+    for name in record.names:
+        over = record.over(row, name)
+        assert row[f"eligible_{name}"] is (over is None or over <= 0)
+        assert row[f"excess_{name}"] == (None if over is None else pytest.approx(over))
+        J = record.cost(row, name, row["incumbent"])
+        assert row[f"j_{name}"] == pytest.approx(J)
+
+
+# ---------------------------------------------------------------------------------- the tests
+
+
+def capped(problem: Problem, caps: str) -> Problem:
+    given = CAPS[caps]
+    if given is None:
+        return problem
+    return replace(problem, objective=replace(problem.objective, caps=given))
+
+
+@pytest.mark.parametrize("policy", RULES)
+@pytest.mark.parametrize("caps", CAPS)
+def test_every_decision_follows_from_its_row(
+    canonical: Problem, policy: str, caps: str, tmp_path: Path
+) -> None:
+    problem = capped(canonical, caps)
+    for seed, (scenario, estimator) in enumerate(
+        [
+            ("robot-cpu-stress", "profile"),
+            ("edge-cpu-stress", "corrected"),
+            ("edge-cpu-stress", "profile"),
+            ("network-impairment-mild", "scaling"),
+        ]
+    ):
+        folder = tmp_path / str(seed)
+        run = dwell.simulate(
+            problem, scenario=scenario, policy=policy, estimator=estimator, seed=seed, windows=25
+        )
+        run.save(folder)
+        record = Record(folder)
+        rule = RULES[policy](record, "SO" if policy == "SO" else "LOC")
+        for row, name, reason in derive(record, rule):
+            assert (row["placement"], row["reason"]) == (name, reason), row["window"]
+
+
+def test_caps_that_leave_out_a_cheaper_candidate_are_the_reason(canonical: Problem) -> None:
+    reasons = {
+        caps: set(
+            dwell.simulate(
+                capped(canonical, caps),
+                scenario="robot-cpu-stress",
+                policy="cusum",
+                seed=1,
+                windows=25,
+            )
+            .decisions["reason"]
+            .cast(str)
+        )
+        for caps in ("none", "utilisation", "latency", "all")
+    }
+    assert reasons["none"] == {"hold", "migrate"}
+    assert "infeasible" in reasons["all"]
+    assert "capped" not in reasons["none"] | reasons["all"]
+
+
+def test_a_dearer_candidate_within_the_caps_is_capped(canonical: Problem) -> None:
+    """SO is the cheapest but over the cap on L95, HYB within it."""
+    objective = replace(canonical.objective, caps=Caps(latency_ms=50.0))
+    quiet = {"R1": 0.2, "E": 0.1, "R2": 0.1}
+    estimates = {
+        "LOC": QoS(45.0, 1.0, quiet),
+        "SO": QoS(51.0, 0.0, {**quiet, "E": 0.0}),
+        "HYB": QoS(49.0, 0.2, quiet),
+    }
+    for policy in (
+        DTP(candidates=canonical.candidates, objective=objective, min_dwell=0),
+        Cusum(candidates=canonical.candidates, objective=objective, threshold=0.0),
+        WorkFunction(candidates=canonical.candidates, objective=objective),
+    ):
+        decision = policy.decide(observed=estimates["LOC"], estimates=estimates)
+        assert (decision.name, decision.reason) == ("HYB", "capped")
+
+
+@pytest.mark.parametrize("escape", [False, True])
+def test_parameters_of_an_object_are_its_own(
+    canonical: Problem, escape: bool, tmp_path: Path
+) -> None:
+    """And not those of the cell file."""
+    policy = DTP(
+        candidates=canonical.candidates,
+        initial="SO",
+        objective=replace(canonical.objective, caps=Caps(latency_ms=33.0)),
+        min_dwell=1,
+        min_improvement=0.123456789,
+        escape=escape,
+    )
+    run = dwell.simulate(
+        canonical, scenario="network-impairment-mild", policy=policy, seed=3, windows=30
+    )
+    run.save(tmp_path / "run")
+    record = Record(tmp_path / "run")
+    told = {"initial": "SO", "min_dwell": 1, "min_improvement": 0.123456789, "escape": escape}
+    assert told.items() <= record.parameters.items()
+    assert record.objective["caps"] == {"latency_ms": 33.0}
+    reasons = set()
+    for row, name, reason in derive(record, Hysteresis(record, "SO")):
+        assert (row["placement"], row["reason"]) == (name, reason)
+        reasons.add(reason)
+    assert {"dwell", "hold"} & reasons or escape
+
+
+def test_what_a_policy_of_a_users_keeps_is_recorded(canonical: Problem) -> None:
+    class Mine:
+        def __init__(self, least: float, name: str = "SO", more: object = None) -> None:
+            self.least, self.name, self.more = math.inf, name, [1]
+
+        def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+            """Go where it was told."""
+            return self.name
+
+    run = dwell.simulate(canonical, policy=Mine(1.0), seed=1, windows=6)
+    assert run.meta["parameters"] == {"least": "inf", "name": "SO"}
+    decisions = run.decisions
+    assert decisions["eligible_LOC"].all()
+    assert decisions["excess_LOC"].null_count() == 0
+    assert decisions["est_u_E_SO"].null_count() == 0
+    assert decisions["reason"][0] == "migrate"
+
+
+def test_a_guards_move_has_nothing_priced_and_what_it_holds_back_has(
+    canonical: Problem, tmp_path: Path
+) -> None:
+    down = (NodeDisturbance("E", at_s=20.0, for_s=12.0, down=True),)
+    controller = replace(canonical.controller, on="R2", initial="SO", min_dwell=0)
+    problem = replace(canonical, scenarios={"down": down}, controller=controller)
+    run = dwell.simulate(problem, scenario="down", policy="dtp", seed=1, windows=25, guard=True)
+    run.save(tmp_path / "run")
+    rows = Record(tmp_path / "run").rows
+    guards = [row for row in rows if row["reason"] == "guard"]
+    moved = [row for row in guards if row["migrated"]]
+    held = [row for row in guards if not row["migrated"]]
+    assert moved
+    assert held
+    for column in ("j_SO", "est_l95_ms_SO", "est_u_E_SO", "eligible_SO", "excess_SO"):
+        assert all(row[column] is None for row in moved)
+        assert all(row[column] is not None for row in rows if row not in moved)
