@@ -13,7 +13,7 @@ import pytest
 
 from dwell.report import comparison_html
 from dwell.report.findings import explain, judge_all, question, standing, verdict
-from dwell.study import compare
+from dwell.study import compare, tenants_demo
 from dwell.study.predictions import PAPER, judge_placement
 from tests.report.pages import Page, small_comparison
 from tests.study.cell import SEEDS, make_comparison, make_problem
@@ -98,6 +98,13 @@ def test_a_cell_without_dtp_or_predictions_has_a_page() -> None:
     page = Page(comparison_html(found))
     assert page.outside == []
     assert not any("Prediction" in heading for heading in page.headings)
+
+
+def test_the_shares_of_the_tenants_are_columns() -> None:
+    tenants = tenants_demo("examples", seeds=2, windows=7, processes=1)
+    page = Page(comparison_html(small_comparison(), tenants=tenants))
+    assert page.outside == []
+    assert all(share in page.text for share in ("0.00 %", "3.00 %", "6.25 %", "10.0 %"))
 
 
 def test_several_comparisons_stand_in_one_page() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from dwell.errors import TraceError
 from dwell.model import Problem, Trace, TraceTable
-from dwell.study import canonical_demo, real_demo
+from dwell.study import canonical_demo, real_demo, tenants_demo
 from dwell.study.demo import longest_run
 from tests.study.cell import make_problem
 
@@ -54,6 +54,22 @@ def test_the_canonical_demo() -> None:
     plain = ("LOC", "SO", "HYB", "atp", "dtp", "dtp, no caps", "latency-first")
     assert found.policies == (*plain, "dtp+corrected", "cusum+corrected")
     assert seen[-1] == (found.runs.height, found.runs.height)
+
+
+def test_the_tenants_of_the_edge_are_varied_and_nothing_else() -> None:
+    found = tenants_demo(ROOT / "examples", seeds=1, windows=7, processes=1)
+    shares = []
+    for point in found.study.points:
+        bursts = point.problem.fabric.nodes["E"].bursts
+        assert bursts is not None
+        every_ms, for_ms = bursts.every_ms.expectation, bursts.for_ms.expectation
+        shares.append(for_ms / (every_ms + for_ms))
+    assert shares == pytest.approx([0.0, 0.03, 0.0625, 0.1], abs=1e-6)
+    assert found.runs.height == 4 * 2 * 3
+    canonical = canonical_demo(ROOT / "examples", seeds=1, windows=7, processes=1)
+    own = found.runs.filter(found.runs[found.parameters[0]] == 3000.0)
+    for scenario, policy, rate in own.select("scenario", "policy", "violation_rate").rows():
+        assert canonical.values(scenario, policy, "violation_rate") == [rate]
 
 
 @pytest.mark.skipif(not TRACES.is_dir(), reason="the measurements are not at ../shared/data")

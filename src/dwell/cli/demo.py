@@ -11,7 +11,7 @@ import dwell
 from dwell.cli.output import print_json, progress, working, write_file
 from dwell.errors import ProblemError
 from dwell.report import comparison_html, comparison_text
-from dwell.study import Comparison, canonical_demo, real_demo
+from dwell.study import Comparison, StudyResult, canonical_demo, real_demo, tenants_demo
 from dwell.study.demo import CANONICAL
 
 __all__ = ["find_examples", "run_demo"]
@@ -45,12 +45,16 @@ def run_demo(
     folder = find_examples(examples)
     with progress("simulating") as shown:
         comparisons: Sequence[Comparison]
+        tenants: StudyResult | None = None
         if real is None:
             comparisons = [
                 canonical_demo(
                     folder, seeds=seeds, windows=windows, processes=processes, progress=shown
                 )
             ]
+            tenants = tenants_demo(
+                folder, seeds=seeds, windows=windows, processes=processes, progress=shown
+            )
         else:
             comparisons = real_demo(
                 folder, real, seeds=seeds, windows=windows, processes=processes, progress=shown
@@ -61,7 +65,7 @@ def run_demo(
             typer.echo(f"Cell {comparison.problem.name}\n")
             typer.echo(comparison_text(comparison))
     with working("writing the report"):
-        write_file(page, comparison_html(*comparisons))
+        write_file(page, comparison_html(*comparisons, tenants=tenants))
     if as_json:
         tables = {one.problem.name: one.table().to_dicts() for one in comparisons}
         print_json({"report": page, "comparisons": tables})

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 
 import numpy as np
 
+from dwell.model import Node
 from dwell.report import figures
 from dwell.report.contenders import describe_contenders, palette_of
 from dwell.report.findings import (
@@ -49,7 +52,7 @@ from dwell.report.wording import (
     write_interval,
     write_number,
 )
-from dwell.study import AIM, Comparison, Interval
+from dwell.study import AIM, Comparison, Interval, StudyResult
 from dwell.study.predictions import Answer, Prediction, judge_claim
 
 __all__ = ["comparison_html"]
@@ -94,13 +97,15 @@ STANDING: dict[Status, tuple[str, str]] = {
 }
 
 
-def comparison_html(*comparisons: Comparison) -> str:
+def comparison_html(*comparisons: Comparison, tenants: StudyResult | None = None) -> str:
     """Return a self-contained page about one comparison, or about several one after the other.
 
     Parameters
     ----------
     *comparisons : Comparison
         At least one, of cells with different names.
+    tenants : StudyResult, optional
+        Of `dwell.study.tenants_demo`; a table of its own.
 
     Returns
     -------
@@ -111,17 +116,19 @@ def comparison_html(*comparisons: Comparison) -> str:
     for comparison in comparisons:
         if len(comparisons) > 1:
             body.append(f'<h1 class="chapter">Cell {escape(comparison.problem.name)}</h1>')
-        body += _chapter(comparison)
+        body += _chapter(comparison, tenants)
     return document(TITLE, body)
 
 
-def _chapter(comparison: Comparison) -> Iterator[str]:
+def _chapter(comparison: Comparison, tenants: StudyResult | None) -> Iterator[str]:
     palette = palette_of(comparison.problem, comparison.policies)
     look = Look(palette, frozenset(comparison.scenarios))
     yield paragraph(_subtitle(comparison), "subtitle")
     yield paragraph(question(comparison), "question")
     yield items(verdict(comparison))
     yield section("Results", *_results(comparison, palette))
+    if tenants is not None:
+        yield section("V_D by the share of time that E’s tenants take", _tenants(tenants))
     if judge_all(comparison):
         yield section("Prediction and result", *_predictions(comparison, palette))
     yield section("Figures", *_figures(comparison, look))
@@ -183,6 +190,40 @@ def _results(comparison: Comparison, palette: Palette) -> Iterator[str]:
         f"{_on_no_miss(comparison)}{_ours(comparison)}",
         kind="wide of-chapter small",
     )
+
+
+def _tenants(result: StudyResult) -> str:
+    """Return V_D of every contender of the study of tenants, by scenario and share of the time."""
+    (column,) = result.parameters
+    shares = [_share_of_bursts(point.problem.fabric.nodes["E"]) for point in result.study.points]
+    found: dict[tuple[str, str], list[Interval]] = {}
+    for row in result.table(["violation_rate"]).sort(column, descending=True).to_dicts():
+        value, *ends = (row[f"violation_rate{end}"] for end in ("", "_low", "_high"))
+        low, high = (math.nan if end is None else end for end in ends)
+        found.setdefault((row["scenario"], row["policy"]), []).append(Interval(value, low, high))
+    rows: list[tuple[str, Sequence[Cell]]] = []
+    for scenario in result.study.scenarios:
+        rows.append(
+            ("group", [Cell(escape(shown_scenario(scenario)), columns=1 + 2 * len(shares))])
+        )
+        for policy in result.study.policies:
+            pairs = [_pair(interval, RATE) for interval in found[scenario, policy]]
+            rows.append(("", [Cell(escape(shown_contender(policy))), *itertools.chain(*pairs)]))
+    seeds = len(result.study.seeds)
+    return table(
+        [Cell("policy"), *(Cell(percent(share, 2), "pair", 2) for share in sorted(shares))],
+        rows,
+        f"V_D in %, mean over {seeds} seeds with its 95 % interval.",
+        kind="small",
+    )
+
+
+def _share_of_bursts(node: Node) -> float:
+    """Share of the time that a node's bursts last."""
+    if node.bursts is None:
+        return 0.0
+    every_ms, for_ms = node.bursts.every_ms.expectation, node.bursts.for_ms.expectation
+    return for_ms / (every_ms + for_ms)
 
 
 def _on_no_miss(comparison: Comparison) -> str:

@@ -1,7 +1,7 @@
 """Studies: many runs, and the statistics over their seeds."""
 
 from dwell.study.comparison import AIM, Comparison, Example, compare
-from dwell.study.demo import canonical_demo, real_demo
+from dwell.study.demo import canonical_demo, real_demo, tenants_demo
 from dwell.study.engine import StudyResult, run_study
 from dwell.study.family import Family
 from dwell.study.intervals import Interval, under
@@ -34,6 +34,7 @@ __all__ = [
     "sobol_design",
     "sobol_indices",
     "sobol_pairs",
+    "tenants_demo",
     "under",
     "validate",
 ]

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
 from dwell.errors import TraceError
 from dwell.model import Problem
 from dwell.study.comparison import Comparison, compare
-from dwell.study.study import Contender
+from dwell.study.engine import StudyResult, run_study
+from dwell.study.study import Contender, load_study
 
 __all__ = [
     "CANONICAL",
@@ -25,6 +27,7 @@ __all__ = [
     "canonical_demo",
     "longest_run",
     "real_demo",
+    "tenants_demo",
 ]
 
 #: Policies beside every candidate as a static placement.
@@ -42,6 +45,8 @@ WINDOWS = 150
 #: Cells by the names of their files in the folder of examples.
 CANONICAL = "canonical.yaml"
 REAL = ("real.yaml", "real-5g.yaml")
+#: Study of the assumption that decides the demo's answer, in the same folder.
+TENANTS = "studies/tenants.yaml"
 
 Progress: TypeAlias = Callable[[int, int], None]
 Folder: TypeAlias = "str | os.PathLike[str]"
@@ -76,6 +81,33 @@ def canonical_demo(
     problem = load(Path(examples) / CANONICAL)
     (comparison,) = _compare_all([problem], seeds, windows, processes, progress)
     return comparison
+
+
+def tenants_demo(
+    examples: Folder,
+    *,
+    seeds: int = SEEDS,
+    windows: int = WINDOWS,
+    processes: int | None = None,
+    progress: Progress | None = None,
+) -> StudyResult:
+    """Play the canonical cell with other shares of the edge taken by its tenants.
+
+    Parameters
+    ----------
+    examples : path-like
+        Folder with `TENANTS`.
+    seeds, windows, processes, progress
+        See `canonical_demo`.
+
+    Raises
+    ------
+    ProblemError
+        If the study is missing or wrong.
+    """
+    study = load_study(Path(examples) / TENANTS)
+    study = replace(study, seeds=tuple(range(1, seeds + 1)), windows=windows)
+    return run_study(study, processes=processes, progress=progress)
 
 
 def real_demo(
