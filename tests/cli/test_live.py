@@ -198,6 +198,9 @@ def test_status_says_who_is_there(cell: RealCell) -> None:
     assert lines[2].startswith("window ")
     shown = {line.split()[0] for line in lines[3:]}
     assert shown == {role.who for role in roles(cell.problem)} - {"controller@E"}
+    code, stdout, _ = invoke("live", "status", "--check", "--json", "--cell", cell.file)
+    found = json.loads(stdout)
+    assert (code, found["health"], found["headline"]) == (0, "ok", None)
 
 
 def test_processes_are_placed_one_by_one(cell: RealCell) -> None:
@@ -279,6 +282,36 @@ def test_a_drained_node_gets_other_code(cell: RealCell) -> None:
     assert "the old code" in cell.log("R1", "perception@R1")
 
 
+def test_status_says_what_the_controller_does_not_hear(cell: RealCell) -> None:
+    cell.until(lambda status: status["health"] == "ok")
+    killed = cell.processes.pop("agent-E")
+    killed.kill()
+    killed.wait(timeout=PATIENCE_S)
+    found = cell.until(lambda status: status["health"] == "silent")
+    assert "the relay, agent E, is silent" in found["headline"]
+    code, stdout, _ = invoke("live", "status", "--check", "--cell", cell.file)
+    lines = stdout.splitlines()
+    assert code == 1
+    assert lines[0].startswith("light-follower is silent: the controller hears nobody since ")
+    assert not any(line.split()[1:2] == ["ready"] for line in lines[1:])
+    assert invoke("live", "status", "--cell", cell.file)[0] == 0
+    cell.agent("E")
+    cell.until(lambda status: status["health"] == "ok")
+
+
+def test_status_watches_until_it_is_interrupted(cell: RealCell) -> None:
+    words = [sys.executable, "-m", "dwell", "live", "status", "--watch", "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    with subprocess.Popen(
+        [*words, "--cell", str(cell.file)], stdout=subprocess.PIPE, env=environment
+    ) as watching:
+        assert watching.stdout is not None
+        looks = [json.loads(watching.stdout.readline()) for _ in range(3)]
+        watching.send_signal(signal.SIGINT)
+        assert watching.wait(timeout=PATIENCE_S) == 130
+    assert [look["cell"] for look in looks] == ["light-follower"] * 3
+
+
 def test_a_second_agent_of_a_node_is_refused(cell: RealCell) -> None:
     state = cell.folder / "state" / "second"
     second = cell.start(
@@ -318,6 +351,11 @@ def test_nobody_answers(tmp_path: Path) -> None:
     words = "no controller of cell 'light-follower' answers; is `dwell controller` running on E?"
     with Visitor(made.problem) as visitor, pytest.raises(LiveError, match=re.escape(words)):
         visitor.ask("status", patience_s=0.2)
+    code, stdout, stderr = invoke("live", "status", "--json", "--cell", made.file)
+    found = json.loads(stdout)
+    assert (code, stderr) == (1, "")
+    assert (found["health"], found["headline"], found["answer_age_ms"]) == ("absent", words, None)
+    assert invoke("live", "status", "--cell", made.file) == (1, "", f"error: {words}\n")
 
 
 # ------------------------------------------------------------------------ before the start

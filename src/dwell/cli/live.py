@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import fnmatch
 import os
+import shutil
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
-from dwell.cli.output import print_json
+from dwell.cli.output import json_text, print_json
+
+if TYPE_CHECKING:
+    from dwell.live.visiting import Visitor
 
 __all__ = ["agent", "controller", "live"]
 
 T = TypeVar("T")
+
+#: Time between two looks of ``status --watch``.
+WATCH_S = 1.0
 
 Cell = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file.")]
 Cpus = Annotated[
@@ -158,10 +166,62 @@ def controller(
 
 @live.command()
 def status(
-    cell: Cell, keys: Keys = None, insecure: Insecure = False, as_json: AsJson = False
+    cell: Cell,
+    check: Annotated[
+        bool, typer.Option("--check", help="Exit with 1 unless the cell's health is ok.")
+    ] = False,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="Look again every second; with --json, a line each time."),
+    ] = False,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Show how a cell is."""
-    _ask(cell, "status", "", keys, insecure=insecure, as_json=as_json)
+    """Show how a cell is, and first what is wrong with it."""
+    if check and watch:
+        raise typer.BadParameter("--check looks once; leave --watch out")
+    import dwell
+    from dwell.live.visiting import Visitor
+
+    with Visitor(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
+        if watch:
+            _watch(visitor, as_json=as_json)
+        found = visitor.look()
+    absent = found["health"] == "absent"
+    if as_json:
+        print_json(found)
+    elif absent:
+        typer.echo(f"error: {found['headline']}", err=True)
+    else:
+        typer.echo("\n".join(told(found)))
+    if absent or (check and found["headline"]):
+        raise typer.Exit(1)
+
+
+def _watch(visitor: Visitor, *, as_json: bool) -> NoReturn:
+    """Show how a cell is every second, until interrupted."""
+    screen = sys.stdout.isatty() and not as_json
+    while True:
+        until_s = time.monotonic() + WATCH_S
+        found = visitor.look(patience_s=WATCH_S)
+        if as_json:
+            typer.echo(json_text(found, None))
+        elif screen:
+            typer.echo(_drawn(told(found)), nl=False)
+        else:
+            typer.echo("\n".join((*told(found), "")))
+        time.sleep(max(until_s - time.monotonic(), 0.0))
+
+
+def _drawn(lines: list[str]) -> str:
+    """Return lines as they replace what a terminal shows, as many as it has room for."""
+    width, height = shutil.get_terminal_size()
+    more = len(lines) - (height - 1)
+    if more > 0:
+        lines = [*lines[: -more - 1], f"  and {more + 1} more lines"]
+    rows = "".join(f"{line[:width]}\x1b[K\n" for line in lines)
+    return f"\x1b[H{rows}\x1b[J"
 
 
 @live.command()
@@ -281,7 +341,11 @@ def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
 
 
 def told(status: dict[str, Any]) -> list[str]:
-    """Return a status as lines of text."""
+    """Return a status as lines of text: first what is wrong, and who is not well."""
+    headline = status["headline"]
+    lines = [f"{status['cell']} is {status['health']}: {headline}"] if headline else []
+    if status["health"] == "absent":
+        return lines
     where = status["placement"] or "not known yet"
     extras = [
         f"{word} {status[key]}"
@@ -296,7 +360,7 @@ def told(status: dict[str, Any]) -> list[str]:
         extras.append(f"without {', '.join(status['drained'])}")
     if status["refused"]:
         extras.append(f"last order refused: {status['refused']}")
-    lines = [f"{status['cell']}: {where}{''.join(f'; {extra}' for extra in extras)}"]
+    lines.append(f"{status['cell']}: {where}{''.join(f'; {extra}' for extra in extras)}")
     lines.append(
         f"mode {status['mode']}, term {status['term']}, migrations {status['migrations']}, moves "
         f"of the guard {status['guard_moves']}"
@@ -304,16 +368,17 @@ def told(status: dict[str, Any]) -> list[str]:
     if window := status["window"]:
         used = ", ".join(f"{node} {share:.0%}" for node, share in window["utilisation"].items())
         lines.append(
-            f"window {window['number']}: L95 {window['l95_ms']:.1f} ms, V_D "
-            f"{window['violation_rate']:.1%}, J {window['cost']:.3f}, {window['reason']}; "
-            f"utilisation {used}"
+            f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: L95 "
+            f"{window['l95_ms']:.1f} ms, V_D {window['violation_rate']:.1%}, J "
+            f"{window['cost']:.3f}, {window['reason']}; utilisation {used}"
         )
-    for who, process in sorted(status["processes"].items()):
-        state = "ready" if process["ready"] else "not ready"
+    lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]
+    lines += [f"  {who:24} not heard" for who in status["silent"]]
+    processes = status["processes"]
+    for who, process in sorted(processes.items(), key=lambda item: (item[1]["ready"], item[0])):
+        state = "ready" if process["ready"] else "not ready" if process["heard"] else "silent"
         note = f"  {process['note']}" if process["note"] else ""
         lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
-    lines += [f"  {who:24} not heard" for who in status["silent"]]
-    lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]
     return lines
 
 

@@ -44,9 +44,9 @@ def print_json(value: Mapping[str, Any]) -> None:
     typer.echo(json_text(value))
 
 
-def json_text(value: Mapping[str, Any]) -> str:
-    """Return JSON; what is no number or infinite becomes null."""
-    return json.dumps(_plain(value), indent=2, allow_nan=False)
+def json_text(value: Mapping[str, Any], indent: int | None = 2) -> str:
+    """Return JSON, on one line where `indent` is None; NaN and infinities become null."""
+    return json.dumps(_plain(value), indent=indent, allow_nan=False)
 
 
 def _plain(value: Any) -> Any:

@@ -12,6 +12,8 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 from dwell.control import Controller
 from dwell.errors import LiveError
+from dwell.live.agent import AGENT_BEAT
+from dwell.live.health import diagnose, silent_after_ns
 from dwell.live.messages import (
     Accepted,
     Answer,
@@ -36,8 +38,6 @@ ASK_NS = 250_000_000
 RESEND_NS = 40_000_000
 #: Time after which a migration that does not come about is given up.
 PATIENCE_NS = 2_000_000_000
-#: Periods between two beats: nobody's decision hangs on them.
-BEAT = 5
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
 
@@ -94,7 +94,7 @@ class Cell:
         # Of the others the relay's agent tells it now and then. What beats say of the clocks is
         # what they have heard themselves: it is as good when it comes late, by way of others.
         agent = place.relay, f"agent@{place.relay}"
-        self.pulse = Pulse(place, lambda: (True, ""), hears=[agent], every=BEAT)
+        self.pulse = Pulse(place, lambda: (True, ""), hears=[agent], every=AGENT_BEAT)
         self._keys = place.keys
         self.held: Accepted | None = None
         self.refused = ""
@@ -102,9 +102,11 @@ class Cell:
         self.drained: set[str] = set()
         self._move: _Move | None = None
         self._number = now_ns
+        self._began_ns: int | None = None
         self._ask_ns = 0
         self.guard_moves = self.migrations = 0
         self._window: dict[str, Any] = {}
+        self._window_ns = 0
         # Whether a window has closed that is not recorded.
         self._unwritten = False
 
@@ -357,6 +359,8 @@ class Cell:
 
     def wake(self, now_ns: int) -> int:
         """Close the windows that are due, push a migration on, beat; returns what is due next."""
+        if self._began_ns is None:
+            self._began_ns = now_ns
         windows = self.windows
         due_ns = None
         unwritten = self._unwritten
@@ -405,7 +409,7 @@ class Cell:
             self.controller.miss()
             return
         wanted = self.controller.close(closed, proven=held.proven or None)
-        self._window = self._shown(last)
+        self._window, self._window_ns = self._shown(last), now_ns
         target = self._allowed(wanted)
         if self.place.problem.live.mode == "advise" and not self.pinned:
             target = held.placement
@@ -509,9 +513,12 @@ class Cell:
     def status(self, now_ns: int) -> dict[str, Any]:
         """Return how the cell is, as plain values."""
         held = self.held
-        return {
+        began_ns = now_ns if self._began_ns is None else self._began_ns
+        age_ms = round((now_ns - self._window_ns) / 1e6, 1)
+        found = {
             "cell": self.place.problem.name,
             "controller": self.name,
+            "up_ms": round((now_ns - began_ns) / 1e6, 1),
             "mode": self.place.problem.live.mode,
             "run": held.run if held is not None else None,
             "term": held.term if held is not None else None,
@@ -525,14 +532,26 @@ class Cell:
             "refused": self.refused or None,
             "migrations": self.migrations,
             "guard_moves": self.guard_moves,
-            "window": self._window,
+            "window": {**self._window, "age_ms": age_ms} if self._window else {},
             **(self.windows.status() if self.windows is not None else {}),
-            "processes": {
-                who: {"age_ms": round(age_ns / 1e6, 1), "ready": beat.ready, "note": beat.note}
-                for who, beat, age_ns in self.pulse.hearing.everybody(now_ns)
-            },
+            "processes": self._processes(now_ns),
             **self._missing(now_ns),
             "complaints": dict(list(self.place.complaints.items())[-10:]),
+        }
+        health, headline = diagnose(self.place.problem, found)
+        return {"health": health, "headline": headline, **found}
+
+    def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:
+        """Return what is known of everybody that was ever heard."""
+        silent_ns = silent_after_ns(self.place.problem)
+        return {
+            who: {
+                "age_ms": round(age_ns / 1e6, 1),
+                "heard": age_ns <= silent_ns,
+                "ready": beat.ready and age_ns <= silent_ns,
+                "note": beat.note,
+            }
+            for who, beat, age_ns in self.pulse.hearing.everybody(now_ns)
         }
 
     def _missing(self, now_ns: int) -> dict[str, Any]:

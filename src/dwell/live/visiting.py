@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import time
 import uuid
 from collections.abc import Mapping
 from typing import Any
@@ -43,6 +44,7 @@ class Visitor:
         self._controller = f"controller@{problem.controller_node}"
         self._keys = Keys(problem.name)
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._answered_s: float | None = None
         role = Role(self._name, problem.controller_node, "visitor")
         security = self._security = Security.of(problem, role, environment)
         self._transport = security.visit(self._name, self._controller)
@@ -83,6 +85,37 @@ class Visitor:
         keyring = self._security.keyring
         if what != "status" and keyring is not None and keyring.own.role == "observer":
             raise TrustError(f"{keyring.folder}: keys of an observer, who may look and no more")
+        answer = self._answer(what, about, patience_s)
+        if answer is None:
+            raise LiveError(self._absent())
+        if answer.refused:
+            raise LiveError(f"refused: {answer.refused}")
+        return answer.status
+
+    def look(self, *, patience_s: float = 3.0) -> dict[str, Any]:
+        """Return how the cell is, and that nobody answers where that is so.
+
+        Parameters
+        ----------
+        patience_s : float
+
+        Returns
+        -------
+        dict
+            The controller's status (`dwell.live.cell.Cell.status`) and ``answer_age_ms``. Without
+            an answer: ``cell``, ``health`` (``absent``), ``headline``, and the age of the last
+            answer to this visitor, None where there was none.
+        """
+        answer = self._answer("status", "", patience_s)
+        if answer is not None:
+            return {**answer.status, "answer_age_ms": 0.0}
+        found = {"cell": self.problem.name, "health": "absent", "headline": self._absent()}
+        if self._answered_s is None:
+            return {**found, "answer_age_ms": None}
+        return {**found, "answer_age_ms": round((time.monotonic() - self._answered_s) * 1e3, 1)}
+
+    def _answer(self, what: str, about: str, patience_s: float) -> Answer | None:
+        """Ask until there is an answer, or patience ends."""
         ask = encode(Ask(self._name, what, about))
         # Who only looks may do so with the keys of an observer.
         key = self._keys.look() if what == "status" else self._keys.ask()
@@ -95,10 +128,15 @@ class Visitor:
                 answer = self._answers.get(timeout=RESEND_S)
             except queue.Empty:
                 continue
-            if answer.refused:
-                raise LiveError(f"refused: {answer.refused}")
-            return answer.status
-        raise LiveError(
-            f"no controller of cell {self.problem.name!r} answers; is `dwell controller` running "
-            f"on {self.problem.controller_node}?"
+            self._answered_s = time.monotonic()
+            return answer
+        return None
+
+    def _absent(self) -> str:
+        since = ""
+        if self._answered_s is not None:
+            since = f" since {time.monotonic() - self._answered_s:.0f} s"
+        return (
+            f"no controller of cell {self.problem.name!r} answers{since}; is `dwell controller` "
+            f"running on {self.problem.controller_node}?"
         )

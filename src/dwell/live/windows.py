@@ -573,6 +573,7 @@ class LiveWindows:
             status["bound_ms"] = last.bound_ns / 1e6 if known else None
             status["unproven"] = last.unproven
             status["heard_cycles"] = last.heard
+            status["done_cycles"] = sum(self._ledger.complete(c) or c.told for c in last.cycles)
         return status
 
     def _touch(self, cycle: LiveCycle) -> None:

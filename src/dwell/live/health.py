@@ -1,0 +1,164 @@
+"""Health of a live cell: what is wrong with it, in a word and a line, from a controller's status.
+
+============  ====================================================================================
+``health``    what it means
+============  ====================================================================================
+``ok``        all processes are heard and ready, windows close, and cycles are completed
+``degraded``  windows close, but a process is silent, not ready, or has another cell file or version
+``stalled``   no window has closed for too long, or no cycle of the last one was completed
+``silent``    the controller hears no process of the cell
+``absent``    no controller answers; only who asks can tell (`dwell.live.visiting`)
+============  ====================================================================================
+
+Processes on a node that is drained may be silent: somebody has said so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, TypeAlias
+
+from dwell.live.agent import AGENT_BEAT
+from dwell.live.wiring import Role, roles
+from dwell.model import Problem
+
+__all__ = ["Health", "diagnose", "silent_after_ns", "window_late_ns"]
+
+Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
+
+#: Nobody is called silent sooner: a machine that is busy is no fault.
+LEAST_NS = 1_000_000_000
+#: A migration that does not come about delays a window by so much.
+MOVE_NS = 2_000_000_000
+#: Faults of single processes that the headline names.
+NAMED = 3
+
+
+def silent_after_ns(problem: Problem) -> int:
+    """Return the age from which a process that was heard is silent.
+
+    The guard's g periods, and what the controller is behind by: who beats seldom does so every
+    `AGENT_BEAT` periods, and the relay's agent tells of beats as often.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    periods = problem.controller.guard_cycles + 2 * AGENT_BEAT
+    return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
+
+
+def window_late_ns(problem: Problem) -> int:
+    """Return the age from which the last window is too old.
+
+    A window that a move interrupts begins anew.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    window_ms = problem.window_cycles * problem.pipeline.period_ms
+    return round((2 * window_ms + problem.controller.close_grace_ms) * 1e6) + MOVE_NS
+
+
+def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:
+    """Return a cell's health, and the headline that says what is wrong.
+
+    Parameters
+    ----------
+    problem : Problem
+    status : mapping
+        Of `dwell.live.cell.Cell.status`.
+
+    Returns
+    -------
+    str
+    str or None
+        None where nothing is.
+    """
+    members = [
+        role
+        for role in roles(problem)
+        if role.kind != "controller" and role.who not in status["strangers"]
+    ]
+    deaf = _hears_nobody(problem, status, members)
+    stalled = _no_window(problem, status) or _no_cycle(status)
+    faults = [] if deaf else list(_faults(status, members))
+    faults += status["strangers"].values()
+    more = len(faults) - NAMED
+    found = [*filter(None, (deaf, stalled)), *faults[:NAMED]]
+    if more > 0:
+        found.append(f"and {more} more")
+    if not found:
+        return "ok", None
+    return "silent" if deaf else "stalled" if stalled else "degraded", "; ".join(found)
+
+
+def _hears_nobody(
+    problem: Problem, status: Mapping[str, Any], members: Sequence[Role]
+) -> str | None:
+    heard = status["processes"]
+    if not members or any(_heard(status, role) for role in members):
+        return None
+    ages_ms = [heard[role.who]["age_ms"] for role in members if role.who in heard]
+    relay = problem.live.relay or problem.controller_node
+    why = f": the relay, agent {relay}, is silent"
+    if not ages_ms:
+        return f"the controller has heard nobody since it began {_time(status['up_ms'])} ago{why}"
+    return f"the controller hears nobody since {_time(min(ages_ms))}{why}"
+
+
+def _no_window(problem: Problem, status: Mapping[str, Any]) -> str | None:
+    window = status["window"]
+    age_ms = window["age_ms"] if window else status["up_ms"]
+    if age_ms * 1e6 <= window_late_ns(problem):
+        return None
+    return f"no window since {_time(age_ms)}"
+
+
+def _no_cycle(status: Mapping[str, Any]) -> str | None:
+    window = status["window"]
+    if not window or status["done_cycles"]:
+        return None
+    notes = [one["note"] for one in status["processes"].values() if one["heard"] and one["note"]]
+    return f"no cycle of the last window was completed{_because(notes[:1])}"
+
+
+def _faults(status: Mapping[str, Any], members: Sequence[Role]) -> Iterator[str]:
+    """Yield what is wrong with processes; of a node that is not heard at all, once."""
+    heard = status["processes"]
+    for node in dict.fromkeys(role.node for role in members):
+        there = [role for role in members if role.node == node]
+        missing = [] if node in status["drained"] else [r for r in there if not _heard(status, r)]
+        ages_ms = [heard[role.who]["age_ms"] for role in missing if role.who in heard]
+        if missing and len(missing) == len(there):
+            since = f" since {_time(min(ages_ms))}" if ages_ms else ""
+            yield f"nothing is heard of {node}{since}"
+            continue
+        for role in missing:
+            known = heard.get(role.who)
+            silent = f"is silent since {_time(known['age_ms'])}" if known else "was never heard"
+            yield f"{role.who} {silent}"
+        for role in there:
+            if _heard(status, role) and not heard[role.who]["ready"]:
+                yield f"{role.who} is not ready{_because([heard[role.who]['note']])}"
+
+
+def _heard(status: Mapping[str, Any], role: Role) -> bool:
+    known = status["processes"].get(role.who)
+    return known is not None and bool(known["heard"])
+
+
+def _because(notes: Sequence[str]) -> str:
+    """Return the first line of a note, as a reason."""
+    return next((f": {note.splitlines()[0][:200]}" for note in notes if note.strip()), "")
+
+
+def _time(ms: float) -> str:
+    """Return a time in words, to two digits or so."""
+    seconds = ms / 1e3
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7_200 else f"{seconds / 3_600:.0f} h"
