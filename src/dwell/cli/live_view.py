@@ -114,7 +114,9 @@ class Lines:
         status, window = look.status, look.window
         silent = look.silent_s > 0
         active = tuple(f"{one.kind} ({one.what})" for one in look.active)
-        key = (status.get("placement"), status.get("guard_moves"), silent, active)
+        headline = "" if silent else status.get("headline") or ""
+        moved = status.get("placement"), status.get("guard_moves")
+        key = (*moved, silent, status.get("health"), active)
         if key == self.last:
             return
         self.last = key
@@ -125,7 +127,8 @@ class Lines:
             f"  V_D {_number(_hundred(window.get('violation_rate')), '%')}"
             f"  error {_number(look.error_mm, 'mm')}"
             f"{'  the controller is silent' if silent else ''}"
-            f"  {'; '.join(active) or 'nothing disturbs it'}",
+            f"  {'; '.join(active) or 'nothing disturbs it'}"
+            f"{f'  {headline}' if headline else ''}",
             err=True,
         )
 
@@ -364,6 +367,8 @@ class Screen:
         remark = Text(no_wrap=True, overflow="ellipsis")
         if look.silent_s:
             remark.append(f"no answer from the controller for {look.silent_s:.0f} s", "bold red")
+        elif status.get("headline"):
+            remark.append(status["headline"], "bold red")
         elif status.get("fallback"):
             wanted = status.get("wanted")
             proving = f"; proving {wanted}" if wanted else ""
