@@ -19,6 +19,7 @@ __all__ = [
     "SimulationError",
     "TraceError",
     "TrustError",
+    "UnwritableError",
 ]
 
 
@@ -101,6 +102,10 @@ class SimulationError(DwellError, RuntimeError):
 
 class RunError(DwellError, ValueError):
     """A folder is not the record of a run, or not one that this version can read."""
+
+
+class UnwritableError(RunError):
+    """A run cannot be written at the moment: its disk is full, or fails; later it may be."""
 
 
 class ProfileError(DwellError, ValueError):

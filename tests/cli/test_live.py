@@ -21,6 +21,7 @@ import yaml
 from typer.testing import CliRunner
 
 import dwell
+from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.cli.commands import app
 from dwell.errors import LiveError
 from dwell.live.leash import OWNER
@@ -344,6 +345,35 @@ def test_the_run_is_a_run(cell: RealCell) -> None:
     run = dwell.open_run(folder)
     assert run.windows.height > 5
     assert {"LOC", "SO"} <= set(run.windows["placement"])
+
+
+@pytest.mark.skipif(not may_mount(), reason="nobody but root mounts a disk")
+def test_a_run_folder_that_is_full_from_the_start_keeps_nobody_from_deciding(
+    tmp_path: Path,
+) -> None:
+    made = RealCell(tmp_path)
+    with SmallDisk(tmp_path / "runs") as disk:
+        disk.fill()
+        try:
+            made.controller()
+            for node in ("R2", "E", "R1"):
+                made.agent(node)
+            made.until(lambda status: status["window"] and not status["silent"])
+            assert invoke("live", "pin", "SO", "--cell", made.file)[0] == 0
+            status = made.until(lambda status: status["placement"] == "SO" and status["window"])
+            assert "No space left on device" in status["record"]
+            assert "No space left on device" in invoke("live", "status", "--cell", made.file)[1]
+            assert "No space left on device" in (tmp_path / "controller.log").read_text()
+            disk.clear()
+            status = made.until(lambda status: status["record"] is None)
+            assert made.end("controller") == 0
+        finally:
+            made.close()
+        (folder,) = disk.folder.iterdir()
+        run = dwell.open_run(folder)
+        assert run.meta["recovered"]["missing_windows"] == 0
+        assert run.windows.height >= status["windows"]
+        assert {"LOC", "SO"} <= set(run.windows["placement"])
 
 
 def test_nobody_answers(tmp_path: Path) -> None:

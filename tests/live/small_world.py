@@ -103,6 +103,8 @@ class Counting(Passing):
 class MemoryRecorder:
     """Rows as they come."""
 
+    trouble = ""
+
     def __init__(self) -> None:
         self.rows: dict[str, list[tuple[object, ...]]] = {}
 

@@ -8,15 +8,28 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 import dwell
+from dwell.chaos.disk import limit_file_size
 from dwell.cli.commands import app
+from dwell.control import Controller
+from dwell.errors import LiveError
+from dwell.live.cell import Cell
+from dwell.live.node import run_controller
+from dwell.live.recording import RunRecorder
+from dwell.model import Problem
+from dwell.record import open_run
 from dwell.record.journal import JOURNAL, MARK
+from tests.live.small_world import World
 
 #: A cell in memory, at full speed; its controller records as that of real processes does.
 RECORDER = """
@@ -43,6 +56,166 @@ cell._recorder = Telling(Path(sys.argv[1]), world.problem, cell.controller, lamb
 for _ in range(400):
     world.run(100)
 """
+
+
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+
+
+class Recorded(World):
+    """A cell in memory whose controller keeps its runs in a folder."""
+
+    def __init__(self, problem: Problem, out: Path, *, most_waiting: int = 50_000) -> None:
+        self.out, self.most_waiting = out, most_waiting
+        self.log: list[str] = []
+        super().__init__(problem, exec_ms=EXEC_MS, policy="LOC")
+
+    def start(self, who: str) -> None:
+        if who.startswith("controller"):
+            controller = Controller(self.problem, self.policy)
+            self.kept = RunRecorder(
+                *(self.out, self.problem, controller, self.log.append),
+                most_waiting=self.most_waiting,
+            )
+            self.recorder = self.kept  # type: ignore[assignment]
+        super().start(who)
+
+    @property
+    def cell(self) -> Cell:
+        return next(role for role in reversed(self.roles.values()) if isinstance(role, Cell))
+
+    @property
+    def windows(self) -> int:
+        """How many have closed."""
+        assert self.cell.windows is not None
+        return int(str(self.cell.windows.status()["windows"]))
+
+    def finish(self) -> Path:
+        """End the run as its controller does."""
+        assert self.cell.windows is not None
+        self.cell.write()
+        folder = self.kept.finish(self.cell.windows.rows(last=True))
+        assert folder is not None
+        return folder
+
+
+@pytest.fixture
+def problem() -> Problem:
+    canonical = dwell.load("examples/canonical.yaml")
+    return replace(canonical, window_cycles=10, warmup_windows=0)
+
+
+@pytest.fixture
+def limits() -> Iterator[Callable[[int | None], None]]:
+    """Lets no file of this process grow beyond a length, as on a disk that is full."""
+    yield lambda longest: limit_file_size(os.getpid(), longest)
+    limit_file_size(os.getpid(), None)
+
+
+Limits = Callable[[int | None], None]
+
+
+def status_of(world: Recorded) -> dict[str, Any]:
+    return world.cell.status(world.network.now_ns)
+
+
+@pytest.mark.parametrize("room", [0, 100_000], ids=["from the start", "later"])
+def test_a_full_disk_costs_no_decision_and_once_it_has_room_no_row(
+    problem: Problem, tmp_path: Path, limits: Limits, room: int
+) -> None:
+    world = Recorded(problem, tmp_path)
+    limits(room)
+    world.run(30_000)
+    assert world.windows > 50
+    world.pin("SO")
+    world.run(2_000)
+    assert status_of(world)["placement"] == "SO"
+    assert "cannot be written (File too large)" in status_of(world)["record"]
+    assert "the run is not kept: " in status_of(world)["headline"]
+    assert sum("cannot be written (File too large)" in line for line in world.log) == 1
+    limits(None)
+    world.run(1_000)
+    assert status_of(world)["record"] is None
+    assert world.log[-1].endswith("canonical-1: can be written again")
+    # Before anything is sealed, and afterwards.
+    (folder,) = tmp_path.iterdir()
+    assert open_run(folder).windows["window"].to_list() == list(range(world.windows))
+    run = open_run(world.finish())
+    assert run.windows["window"].to_list() == list(range(world.windows))
+    assert run.cycles["cycle"].to_list() == list(range(run.cycles.height))
+    assert run.meta["recovered"]["missing_windows"] == 0
+    assert run.decisions["placement"][-1] == "SO"
+
+
+def test_rows_that_have_waited_for_too_long_are_dropped_and_counted(
+    problem: Problem, tmp_path: Path, limits: Limits
+) -> None:
+    world = Recorded(problem, tmp_path, most_waiting=200)
+    limits(0)
+    world.run(30_000)
+    full = world.windows
+    limits(None)
+    world.run(5_000)
+    assert "rows found no room, and are missing" in world.log[-1]
+    run = open_run(world.finish())
+    missing = run.meta["recovered"]["missing_windows"]
+    assert full - 20 <= missing < full
+    # From then on the run is complete.
+    assert run.windows["window"].to_list() == list(range(missing, world.windows))
+    told = report(next(tmp_path.iterdir()))
+    assert f"note: Windows missing from the run: {missing}." in told
+
+
+def test_a_folder_that_cannot_be_made_yet_is_made_later(problem: Problem, tmp_path: Path) -> None:
+    out = tmp_path / "runs"
+    out.symlink_to(tmp_path / "disk" / "not mounted" / "yet")
+    world = Recorded(problem, out)
+    world.run(10_000)
+    assert world.windows > 10
+    assert "cannot be written (" in status_of(world)["record"]
+    (tmp_path / "disk" / "not mounted" / "yet").mkdir(parents=True)
+    world.run(1_000)
+    assert open_run(world.finish()).windows.height == world.windows
+
+
+def test_a_controller_that_starts_while_the_disk_is_full_goes_on_where_the_run_was(
+    problem: Problem, tmp_path: Path, limits: Limits
+) -> None:
+    world = Recorded(problem, tmp_path)
+    world.run(10_000)
+    before = world.windows
+    (folder,) = tmp_path.iterdir()
+    limits((folder / JOURNAL).stat().st_size)
+    who = "controller@E"
+    world.kill(who)
+    world.kept._journal.close()  # type: ignore[union-attr]  # as the kernel does
+    world.start(who)
+    world.run(10_000)
+    limits(None)
+    world.run(2_000)
+    run = open_run(world.finish())
+    assert run.windows["window"].to_list() == list(range(world.windows))
+    assert world.windows > before + 10
+    assert run.meta["recovered"]["opened"] == 2
+
+
+def test_a_run_that_another_controller_writes_is_kept_in_a_folder_of_its_own(
+    problem: Problem, tmp_path: Path
+) -> None:
+    first = Recorded(problem, tmp_path)
+    first.run(5_000)
+    second = Recorded(problem, tmp_path)
+    second.run(5_000)
+    folders = {first.finish(), second.finish()}
+    assert len(folders) == 2
+    assert all(open_run(folder).windows.height > 5 for folder in folders)
+
+
+def test_runs_that_can_go_nowhere_end_the_controller_before_it_begins(
+    problem: Problem, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LiveError, match=r"file/runs: cannot be made \(Not a directory\)"):
+        run_controller([problem], tmp_path / "file" / "runs", threading.Event())
 
 
 def report(folder: Path) -> str:

@@ -9,13 +9,16 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
 
-from dwell.errors import RunError
+from dwell.chaos.disk import SmallDisk, limit_file_size, may_mount
+from dwell.errors import RunError, UnwritableError
 from dwell.record import Journal, Run, open_run, require_free, seal_run
 from dwell.record.journal import JOURNAL
 
@@ -95,6 +98,8 @@ def test_what_was_written_is_read_while_it_is_written(tmp_path: Path) -> None:
         "torn_bytes": 0,
         "damaged_bytes": 0,
         "damaged_places": 0,
+        "missing_cycles": 0,
+        "missing_windows": 0,
     }
     journal.close()
     journal.close()
@@ -299,6 +304,72 @@ def test_two_writers_are_one_too_many(tmp_path: Path) -> None:
     journal.append(rows_of(0))
     journal.close()
     assert_holds(seal_run(tmp_path / "run"), 1)
+
+
+@contextmanager
+def full_at(length: int) -> Iterator[None]:
+    """Let no file of this process grow beyond a length, as on a disk that is full."""
+    limit_file_size(os.getpid(), length)
+    try:
+        yield
+    finally:
+        limit_file_size(os.getpid(), None)
+
+
+def test_what_finds_no_room_leaves_no_damage_and_can_be_appended_again(tmp_path: Path) -> None:
+    journal = start(tmp_path / "run")
+    journal.append(rows_of(0))
+    # Room for a part of the next window.
+    with full_at(journal.file.stat().st_size + 40):
+        for _ in range(3):
+            with pytest.raises(UnwritableError, match=r"journal\.bin: cannot be written \("):
+                journal.append(rows_of(1))
+        assert_holds(open_run(journal.folder), 1)
+        assert journal.following("windows") == 1
+    journal.append(rows_of(1))
+    run = open_run(journal.folder)
+    assert_holds(run, 2)
+    assert not any(run.meta["recovered"][f"{what}_bytes"] for what in ("torn", "damaged"))
+
+
+def test_a_journal_without_room_for_its_beginning_begins_later(tmp_path: Path) -> None:
+    with full_at(10):
+        journal = start(tmp_path / "run")
+        with pytest.raises(UnwritableError):
+            journal.append(rows_of(0))
+    journal.append(rows_of(0))
+    assert_holds(open_run(tmp_path / "run"), 1)
+    journal.close()
+    # One that goes on is to know where, whether or not it may say that it does.
+    with full_at(10):
+        again = start(tmp_path / "run")
+        assert again.following("windows") == 1
+    again.append(rows_of(1))
+    assert open_run(tmp_path / "run").meta["recovered"]["opened"] == 2
+    assert_holds(open_run(tmp_path / "run"), 2)
+
+
+def test_windows_that_were_never_written_are_counted(tmp_path: Path) -> None:
+    journal = start(tmp_path / "run")
+    for window in (0, 3):
+        journal.append({**rows_of(window), "cycles": rows_of(window)["cycles"][-W:]})
+    recovered = open_run(tmp_path / "run").meta["recovered"]
+    assert (recovered["missing_windows"], recovered["missing_cycles"]) == (2, 2 * W)
+    journal.close()
+    assert seal_run(tmp_path / "run").meta["recovered"]["missing_windows"] == 2
+
+
+@pytest.mark.skipif(not may_mount(), reason="nobody but root mounts a disk")
+def test_a_full_disk_keeps_a_run_from_being_sealed_and_loses_nothing(tmp_path: Path) -> None:
+    with SmallDisk(tmp_path / "disk") as disk:
+        write(disk.folder / "run", 2)
+        disk.fill()
+        with pytest.raises(RunError, match="cannot be written"):
+            seal_run(disk.folder / "run")
+        assert_holds(open_run(disk.folder / "run"), 2)
+        disk.clear()
+        assert_holds(seal_run(disk.folder / "run"), 2)
+        assert {path.suffix for path in (disk.folder / "run").iterdir()} == {".parquet", ".json"}
 
 
 WRITER = """

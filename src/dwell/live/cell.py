@@ -45,6 +45,11 @@ Phase: TypeAlias = Literal["fork", "state", "order"]
 class Recorder(Protocol):
     """Keeps the rows of a run."""
 
+    @property
+    def trouble(self) -> str:
+        """What keeps the rows from being written; empty for nothing."""
+        ...
+
     def open(self, run: int) -> Resume:
         """Begin to keep a run, or go on; returns where."""
         ...
@@ -94,7 +99,7 @@ class Cell:
         # Of the others the relay's agent tells it now and then. What beats say of the clocks is
         # what they have heard themselves: it is as good when it comes late, by way of others.
         agent = place.relay, f"agent@{place.relay}"
-        self.pulse = Pulse(place, lambda: (True, ""), hears=[agent], every=AGENT_BEAT)
+        self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
         self._keys = place.keys
         self.held: Accepted | None = None
         self.refused = ""
@@ -228,10 +233,10 @@ class Cell:
 
     def _begin_run(self, answer: Accepted) -> None:
         """Begin where the stamper says that the cell is."""
-        self.held = answer
         self.controller.resume(answer.placement, fallback=answer.fallback)
         resume = self._recorder.open(answer.run)
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
+        self.held = answer
 
     # ------------------------------------------------------------------------- orders
 
@@ -537,6 +542,7 @@ class Cell:
             "processes": self._processes(now_ns),
             **self._missing(now_ns),
             "complaints": dict(list(self.place.complaints.items())[-10:]),
+            "record": self._recorder.trouble or None,
         }
         health, headline = diagnose(self.place.problem, found)
         return {"health": health, "headline": headline, **found}

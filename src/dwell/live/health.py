@@ -85,6 +85,8 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     stalled = _no_window(problem, status) or _no_cycle(status)
     faults = [] if deaf else list(_faults(status, members))
     faults += status["strangers"].values()
+    if status["record"]:
+        faults.append(f"the run is not kept: {status['record']}")
     more = len(faults) - NAMED
     found = [*filter(None, (deaf, stalled)), *faults[:NAMED]]
     if more > 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import threading
@@ -27,6 +28,9 @@ from dwell.live.wiring import wire
 from dwell.model import Problem
 
 __all__ = ["run_agent", "run_controller"]
+
+#: Why a folder cannot be made that somebody has to put right; anything else is tried again.
+MISTAKEN = frozenset({errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
 
 
 def run_agent(
@@ -171,14 +175,15 @@ def run_controller(
     Raises
     ------
     LiveError
-        If two cells have one name, or ports cannot be had, or a cell leaves this computer without
-        keys.
+        If two cells have one name, or ports cannot be had, or the runs' folder can be made by
+        nobody, or a cell leaves this computer without keys.
     TrustError
         If the keys are not the controller's.
     """
     names = [problem.name for problem in problems]
     if len(set(names)) < len(names):
         raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
+    _require_runs(out)
     name = name or f"controller-{os.getpid()}"
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
@@ -205,6 +210,15 @@ def run_controller(
         finally:
             folders = [_finished(recorder, cell) for recorder, cell in recorders]
         return [folder for folder in folders if folder is not None]
+
+
+def _require_runs(out: Path) -> None:
+    """Raise a LiveError where runs can never be kept; a disk that is full may have room later."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if error.errno in MISTAKEN:
+            raise LiveError(f"{out}: cannot be made ({error.strerror})") from None
 
 
 def _finished(recorder: RunRecorder, cell: Cell) -> Path | None:

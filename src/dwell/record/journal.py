@@ -19,11 +19,12 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from dwell.errors import RunError
+from dwell.errors import RunError, UnwritableError
 
 if TYPE_CHECKING:
     import polars as pl
@@ -258,6 +259,11 @@ def read_journal(folder: str | os.PathLike[str]) -> Recovered:
         "torn_bytes": torn_bytes,
         "damaged_bytes": sum(end - begin for begin, end in scan.damaged),
         "damaged_places": len(scan.damaged),
+        **{
+            f"missing_{name}": contents.following.get(name, 0) - len(tables[name])
+            for name in NUMBERED
+            if name in tables
+        },
     }
     windows = len(tables["windows"]) if "windows" in tables else 0
     meta = {"windows": windows, **contents.meta, "recovered": recovered}
@@ -275,7 +281,8 @@ class Journal:
     run : str
         Id of the run.
     meta : mapping
-        JSON-able: what the run is the record of (see `Run`).
+        JSON-able: what the run is the record of (see `Run`). Where a journal that can be opened has
+        no room for it, it is written with the first rows that find some.
     columns : mapping
         Type of every column of ``cycles``, ``windows``, ``decisions`` and other tables.
 
@@ -290,7 +297,9 @@ class Journal:
     ------
     RunError
         If the folder holds a finished run, the journal of another run or with other columns, one
-        that somebody is writing, or something else; or cannot be written.
+        that somebody is writing, or something else.
+    UnwritableError
+        If it cannot be made, or opened.
     """
 
     def __init__(
@@ -320,7 +329,7 @@ class Journal:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._descriptor = os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
-            raise RunError(f"{self.file}: cannot be written ({error.strerror})") from None
+            raise self._unwritable(error) from None
         try:
             self._lock()
             contents = self._go_on()
@@ -328,7 +337,9 @@ class Journal:
             self.meta: dict[str, Any] = {**contents.meta, **meta}
             frame = _frame({**header, "opened": contents.opened + 1})
             # The header stands twice, so that damage at one place loses no more than that place.
-            self._write(frame + frame if contents.opened == 0 else frame)
+            self._header = frame + frame if contents.opened == 0 else frame
+            with suppress(UnwritableError):
+                self._write(b"")
         except BaseException:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -370,16 +381,27 @@ class Journal:
         os.lseek(self._descriptor, 0, os.SEEK_END)
         return contents
 
+    def _unwritable(self, error: OSError) -> UnwritableError:
+        return UnwritableError(f"{self.file}: cannot be written ({error.strerror})")
+
     def _write(self, data: bytes) -> None:
-        """Hand bytes to the operating system: they survive the process, not a loss of power."""
+        """Hand bytes to the operating system: they survive the process, not a loss of power.
+
+        Of what does not fit as a whole nothing stays.
+        """
         if self._descriptor < 0:
             raise RunError(f"{self.file}: the journal is closed")
-        rest = memoryview(data)
+        rest = memoryview(self._header + data)
+        end = os.lseek(self._descriptor, 0, os.SEEK_CUR)
         try:
             while rest:
                 rest = rest[os.write(self._descriptor, rest) :]
         except OSError as error:
-            raise RunError(f"{self.file}: cannot be written ({error.strerror})") from None
+            with suppress(OSError):
+                os.ftruncate(self._descriptor, end)
+                os.lseek(self._descriptor, end, os.SEEK_SET)
+            raise self._unwritable(error) from None
+        self._header = b""
 
     def following(self, table: str) -> int:
         """Return the number after the last row's of a numbered table; 0 where it has none."""
@@ -398,7 +420,9 @@ class Journal:
         Raises
         ------
         RunError
-            If a row has not as many values as its table has columns, or cannot be written.
+            If a row has not as many values as its table has columns.
+        UnwritableError
+            If there is no room for them: they can be appended again.
         """
         for name, of in rows.items():
             width = len(self.columns.get(name, ()))

@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -129,7 +130,7 @@ class Run:
             raise RunError(f"{target.parent}: cannot be written ({error.strerror})") from None
         try:
             for name in self._tables:
-                self._table(name).write_parquet(draft / f"{name}.parquet")
+                _write_table(self._table(name), draft / f"{name}.parquet")
             text = json.dumps(self.meta, indent=2, allow_nan=False)
             (draft / "run.json").write_text(text + "\n", encoding="utf-8")
             draft.chmod(0o755)
@@ -249,7 +250,7 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
         try:
             for name, table in found._tables.items():
                 frame = table() if callable(table) else table
-                _write(folder / f"{name}.parquet", frame.write_parquet)
+                _write(folder / f"{name}.parquet", partial(_write_table, frame))
             # From here on the folder is a finished run.
             _write(file, lambda draft: draft.write_text(text, encoding="utf-8"))
         except OSError as error:
@@ -267,10 +268,24 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
 def _write(file: Path, write: Callable[[Path], object]) -> None:
     """Write a file so that it is there as a whole, also after a loss of power, or not at all."""
     draft = file.with_name(f".{file.name}.draft")
-    write(draft)
-    with draft.open("rb") as stream:
-        os.fsync(stream.fileno())
-    draft.replace(file)
+    try:
+        write(draft)
+        with draft.open("rb") as stream:
+            os.fsync(stream.fileno())
+        draft.replace(file)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+
+
+def _write_table(table: pl.DataFrame, file: Path) -> None:
+    """Write a table; a disk that is full is an OSError, whatever Polars calls it."""
+    import polars as pl
+
+    try:
+        table.write_parquet(file)
+    except pl.exceptions.PolarsError as error:
+        raise OSError(str(error)) from None
 
 
 def _reader(file: Path) -> Callable[[], pl.DataFrame]:

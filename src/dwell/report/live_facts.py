@@ -88,6 +88,8 @@ def recovery(told: Mapping[str, Any]) -> Iterator[str]:
     ]
     if lost:
         yield f"{listed(lost)}; what they said is not here."
+    if told.get("missing_windows"):
+        yield f"Windows missing from the run: {told['missing_windows']}."
     if told and not told.get("sealed", True):
         yield (
             "The run was not closed: it goes on, or its controller was killed. This is what its "
