@@ -215,6 +215,64 @@ class Quickest(Rule):
         return best, "hold" if best == self.now else "migrate"
 
 
+class Thresholds(Rule):
+    """One task by thresholds: on the window, or with a cost on the mean of some windows."""
+
+    cost_answers = False
+
+    def begin(self) -> None:
+        self.seen: list[Row] = []
+
+    def shown(self, name: str) -> tuple[float, float, float]:
+        """Means of L95, U_r and U_e of a candidate."""
+
+        def mean(columns: list[str]) -> float:
+            largest = [float(max(row[column] for column in columns)) for row in self.seen]
+            return sum(largest) / len(largest)
+
+        robots = [f"est_u_{n}_{name}" for n, of in self.record.nodes.items() if of == "robot"]
+        edges = [f"est_u_{n}_{name}" for n, of in self.record.nodes.items() if of == "edge"]
+        return mean([f"est_l95_ms_{name}"]), mean(robots), mean(edges)
+
+    def total(self, shown: tuple[float, float, float], moved: float) -> float:
+        weights, targets = self.record.objective["weights"], self.record.objective["targets"]
+        keys = (("latency", "latency_ms"), ("robot", "robot"), ("edge", "edge"))
+        terms = [
+            weights[weight] * value / targets[target]
+            for value, (weight, target) in zip(shown, keys, strict=True)
+        ]
+        return float(sum(terms) + weights["switching"] * moved)
+
+    def wants(self, row: Row) -> tuple[str, str]:
+        set_to, now = self.parameters, self.now
+        document = self.record.meta["problem"]
+        size = 1
+        if self.cost_answers:
+            window_ms = document["window_cycles"] * document["period_ms"]
+            size = max(1, round(set_to["every_ms"] / window_ms))
+        stays = "dwell" if self.dwelt < set_to["min_dwell"] else "hold"
+        self.seen.append(row)
+        if len(self.seen) < size:
+            return now, stays
+        l95_ms, robot, edge = here = self.shown(now)
+        home = now == set_to["local"]
+        other = set_to["offload"] if home else set_to["local"]
+        busy = robot > set_to["robot"] if home else edge > set_to["edge"]
+        asked = l95_ms > set_to["latency_ms"] or busy
+        moved = self.record.moved(now, other)
+        cheaper = self.total(self.shown(other), moved) < self.total(here, 0.0)
+        self.begin()
+        if stays == "hold" and asked and (cheaper or not self.cost_answers):
+            return other, "migrate"
+        return now, stays
+
+
+class Answered(Thresholds):
+    """ATP."""
+
+    cost_answers = True
+
+
 class Still(Rule):
     """A placement that never moves."""
 
@@ -224,6 +282,8 @@ class Still(Rule):
 
 RULES: dict[str, type[Rule]] = {
     "dtp": Hysteresis,
+    "atp": Answered,
+    "atp-thresholds": Thresholds,
     "cusum": Sums,
     "work-function": Hindsight,
     "latency-first": Quickest,

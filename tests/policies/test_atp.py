@@ -1,193 +1,233 @@
-"""ATP: one task toggled by thresholds."""
+"""ATP: thresholds open the question, a cost of three terms answers it, on means of windows."""
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dwell.errors import MetricError, PolicyError
-from dwell.model import Objective, Placement, QoS, Targets, Tier
-from dwell.policies import ATP
-from dwell.policies.atp import find_pairs
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
+from dwell.model import Problem, QoS
+from dwell.policies import ATP, ATPThresholds, by_name, check_policy
+from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, problem, qos
 
-CALM, SLOW = qos(40.0, 1.0, 0.7, 0.7), qos(40.1)
-BUSY_ROBOT, BUSY_EDGE = qos(robot=0.71), qos(edge=0.71)
+SLOW = 50.0  # milliseconds; the threshold is 40
 
 
-def atp(
-    min_dwell: int = 0,
-    initial: str = "LOC",
-    candidates: Mapping[str, Placement] = CANDIDATES,
-    objective: Objective = OBJECTIVE,
-) -> ATP:
-    return ATP(candidates=candidates, initial=initial, objective=objective, min_dwell=min_dwell)
+def timed(period_ms: float, window_cycles: int = 10) -> Problem:
+    """The cell with windows of another length."""
+    base = problem()
+    pipeline = replace(base.pipeline, period_ms=period_ms, deadline_ms=period_ms)
+    return replace(base, pipeline=pipeline, window_cycles=window_cycles)
 
 
-def names(policy: ATP, observed: Sequence[QoS]) -> list[str]:
-    return [policy.decide(observed=window).name for window in observed]
+def atp(min_dwell: int = 0, window_ms: float = 2000.0, every_ms: float = 2000.0) -> ATP:
+    policy = ATP(candidates=CANDIDATES, objective=OBJECTIVE, min_dwell=min_dwell, every_ms=every_ms)
+    policy.start(timed(window_ms / 10))
+    return policy
 
 
-# ------------------------------------------------------------------------------------ toggling
+def play(policy: ATP, shown: Sequence[Mapping[str, QoS]]) -> list[tuple[str, str]]:
+    """Return placement and reason of every window."""
+    decisions: list[tuple[str, str]] = []
+    for window in shown:
+        decision = policy.decide(observed=window[policy.incumbent], estimates=window)
+        decisions.append((decision.name, decision.reason))
+    return decisions
 
 
-def test_on_the_robot_a_threshold_must_be_exceeded() -> None:
-    assert names(atp(), [CALM, BUSY_EDGE]) == ["LOC", "LOC"]
-    assert names(atp(), [SLOW]) == ["HYB"]
-    assert names(atp(), [BUSY_ROBOT]) == ["HYB"]
+# -------------------------------------------------------------------------- question and answer
 
 
-def test_offloaded_a_threshold_must_be_exceeded() -> None:
-    assert names(atp(initial="HYB"), [CALM, BUSY_ROBOT]) == ["HYB", "HYB"]
-    assert names(atp(initial="HYB"), [SLOW]) == ["LOC"]
-    assert names(atp(initial="HYB"), [BUSY_EDGE]) == ["LOC"]
+def test_a_threshold_alone_moves_nothing() -> None:
+    same = estimates(qos(SLOW), qos(SLOW), qos(SLOW))
+    assert play(atp(), [same] * 3) == [("LOC", "hold")] * 3
+    by_thresholds = ATPThresholds(candidates=CANDIDATES, objective=OBJECTIVE, min_dwell=0)
+    assert by_thresholds.decide(observed=qos(SLOW), estimates=same).name == "HYB"
 
 
-def test_it_never_asks_what_the_other_side_would_show() -> None:
-    policy = atp()
-    shown = estimates(qos(50.0), qos(500.0), qos(500.0))
-    assert policy.decide(observed=shown["LOC"], estimates=shown).name == "HYB"
+def test_a_cheaper_side_alone_moves_nothing() -> None:
+    assert play(atp(), [estimates(qos(40.0), qos(1.0), qos(1.0))]) == [("LOC", "hold")]
 
 
-def test_both_sides_over_a_threshold_make_it_toggle_within_the_dwell() -> None:
-    decisions = [policy.decide(observed=SLOW) for policy in [atp(2)] for _ in range(7)]
-    assert [d.name for d in decisions] == ["LOC", "LOC", "HYB", "HYB", "HYB", "LOC", "LOC"]
-    reasons = ["dwell", "dwell", "migrate", "dwell", "dwell", "migrate", "dwell"]
-    assert [d.reason for d in decisions] == reasons
-    assert [d.dwell for d in decisions] == [1, 2, 0, 1, 2, 0, 1]
-    assert [d.migrated for d in decisions] == [reason == "migrate" for reason in reasons]
+def test_a_threshold_and_a_cheaper_side_move_it() -> None:
+    shown = estimates(qos(SLOW), qos(1.0), qos(30.0))
+    assert play(atp(), [shown]) == [("HYB", "migrate")]
 
 
-def test_decisions_are_complete() -> None:
-    policy = atp()
-    shown = estimates(qos(20.0), qos(20.0), qos(20.0))
-    decision = policy.decide(observed=SLOW, estimates=shown)
-    assert decision.placement == CANDIDATES["HYB"]
-    assert decision.costs == {"LOC": 0.5, "SO": 0.75, "HYB": 0.625}
-    assert math.isnan(decision.delta_j)
-    assert policy.decide(observed=CALM).reason == "hold"
+def test_violations_are_in_neither() -> None:
+    """The other side misses every deadline, and is cheaper by latency."""
+    shown = estimates(qos(SLOW, 0.0), qos(1.0), qos(20.0, 1.0))
+    assert play(atp(), [shown]) == [("HYB", "migrate")]
+    assert shown["HYB"].violation_rate == 1.0
+    shown = estimates(qos(30.0, 1.0), qos(1.0), qos(20.0))
+    assert play(atp(), [shown]) == [("LOC", "hold")]
 
 
-def test_thresholds_of_its_own() -> None:
-    policy = ATP(
-        candidates=CANDIDATES,
-        objective=OBJECTIVE,
-        latency_ms=10.0,
-        robot=math.inf,
-        edge=0.2,
-        min_dwell=0,
-    )
-    assert names(policy, [qos(10.0, robot=1.0), qos(10.1)]) == ["LOC", "HYB"]
-    assert names(policy, [qos(10.0, edge=0.2), qos(1.0, edge=0.21)]) == ["HYB", "LOC"]
+def test_the_switch_has_its_price() -> None:
+    """One task of two, times 0.5; 10 ms are 0.25 of the target."""
+    assert OBJECTIVE.weights.switching == 0.5
+    price_ms = 40.0 * 0.5 * 0.25
+    for l95_ms, name in ((SLOW - price_ms - 0.01, "HYB"), (SLOW - price_ms + 0.01, "LOC")):
+        moved = ATP(candidates=CANDIDATES, objective=OBJECTIVE, min_dwell=0)
+        share = len(CANDIDATES["LOC"].moved(CANDIDATES["HYB"])) / len(CANDIDATES["LOC"])
+        assert share == 0.25
+        shown = estimates(qos(SLOW), qos(1.0), qos(l95_ms))
+        assert moved.decide(observed=shown["LOC"], estimates=shown).name == name
 
 
-def test_a_cloud_weighed_apart_has_its_own_threshold() -> None:
-    tiers: dict[str, Tier] = {"R1": "robot", "R2": "robot", "E": "edge", "C": "cloud"}
-    weights = replace(OBJECTIVE.weights, cloud=0.1)
-    apart = replace(
-        OBJECTIVE,
-        tiers=tiers,
-        weights=weights,
-        targets=Targets(40.0, cloud=0.3),
-    )
-    together = replace(OBJECTIVE, tiers=tiers)
-    candidates = {"LOC": place("R1", "R2"), "CLOUD": place("C", "R2")}
-    for edge, cloud, with_apart, with_together in [
-        (1.0, 0.0, "CLOUD", "LOC"),
-        (0.0, 0.31, "LOC", "CLOUD"),
-        (0.0, 0.3, "CLOUD", "CLOUD"),
-    ]:
-        shown = QoS(1.0, 0.0, {"R1": 0.0, "R2": 0.0, "E": edge, "C": cloud})
-        assert names(atp(0, "CLOUD", candidates, apart), [shown]) == [with_apart]
-        assert names(atp(0, "CLOUD", candidates, together), [shown]) == [with_together]
+def test_what_moving_saves_is_recorded() -> None:
+    shown = estimates(qos(SLOW, 0.5), qos(1.0), qos(30.0))
+    decision = atp().decide(observed=shown["LOC"], estimates=shown)
+    assert decision.delta_j == pytest.approx(20.0 / 40.0 - 0.5 * 0.25)
+    assert decision.costs["LOC"] == pytest.approx(50 / 40 + 3 * 0.5)
+    calm = estimates(qos(1.0), qos(1.0), qos(1.0))
+    assert math.isnan(atp().decide(observed=calm["LOC"], estimates=calm).delta_j)
 
 
-def test_from_neither_side_it_goes_by_where_the_task_is() -> None:
-    # SO has perception on the edge, as HYB does: it is the offloaded side of LOC | HYB.
-    policy = ATP(candidates=CANDIDATES, initial="SO", objective=OBJECTIVE, local="LOC", min_dwell=0)
-    assert policy.pair == ("LOC", "HYB", "perception")
-    assert names(policy, [BUSY_ROBOT, BUSY_EDGE]) == ["SO", "LOC"]
-
-
-def test_start_and_adopt() -> None:
-    policy = atp(1)
-    assert names(policy, [SLOW, SLOW]) == ["LOC", "HYB"]
-    policy.adopt("LOC")
-    assert names(policy, [SLOW, SLOW]) == ["LOC", "HYB"]
-    policy.start(problem())
-    assert names(policy, [SLOW, SLOW]) == ["LOC", "HYB"]
-
-
-# ---------------------------------------------------------------------------------------- pairs
-
-
-def test_pairs_differ_in_one_task_between_robot_and_edge() -> None:
-    assert find_pairs(CANDIDATES, OBJECTIVE.tiers) == (
-        ("LOC", "HYB", "perception"),
-        ("HYB", "SO", "planning"),
-    )
+# ------------------------------------------------------------------------------- every two seconds
 
 
 @pytest.mark.parametrize(
-    ("initial", "pair"),
+    ("window_ms", "every_ms", "windows"),
     [
-        ("LOC", ("LOC", "HYB", "perception")),
-        ("HYB", ("LOC", "HYB", "perception")),
-        ("SO", ("HYB", "SO", "planning")),
+        (2000.0, 2000.0, 1),
+        (1000.0, 2000.0, 2),
+        (300.0, 2000.0, 7),
+        (3333.0, 2000.0, 1),
+        (100_000.0, 2000.0, 1),
+        (500.0, 1000.0, 2),
+        (1500.0, 2000.0, 1),
     ],
 )
-def test_the_pair_contains_the_initial_candidate(initial: str, pair: tuple[str, str, str]) -> None:
-    assert atp(initial=initial).pair == pair
+def test_windows_are_taken_together(window_ms: float, every_ms: float, windows: int) -> None:
+    policy = atp(window_ms=window_ms, every_ms=every_ms)
+    shown = estimates(qos(SLOW), qos(1.0), qos(1.0))
+    assert play(policy, [shown] * windows) == [("LOC", "hold")] * (windows - 1) + [
+        ("HYB", "migrate")
+    ]
 
 
-def test_a_side_may_be_named() -> None:
-    policy = ATP(candidates=CANDIDATES, objective=OBJECTIVE, offload="SO", min_dwell=0)
-    assert policy.pair == ("HYB", "SO", "planning")
-    # It starts on LOC, which has planning on the robot.
-    assert names(policy, [SLOW]) == ["SO"]
+def test_the_mean_counts_and_not_the_last_window() -> None:
+    fast, slow = (estimates(qos(ms), qos(1.0), qos(1.0)) for ms in (20.0, 70.0))
+    assert play(atp(window_ms=1000.0), [slow, fast]) == [("LOC", "hold"), ("HYB", "migrate")]
+    assert play(atp(window_ms=1000.0), [fast, fast, slow, slow])[-1] == ("HYB", "migrate")
+    fine = estimates(qos(20.0), qos(1.0), qos(1.0))
+    assert play(atp(window_ms=500.0), [slow, fine, fine, fine])[-1] == ("LOC", "hold")
 
 
-def test_without_a_pair_around_the_initial_candidate_it_takes_another() -> None:
-    candidates = {name: CANDIDATES[name] for name in ("LOC", "HYB")}
-    policy = atp(0, "ODD", {"ODD": place("R2", "E"), **candidates})
-    assert policy.pair == ("LOC", "HYB", "perception")
-    assert names(policy, [BUSY_EDGE, BUSY_ROBOT, BUSY_EDGE]) == ["ODD", "HYB", "LOC"]
+def test_a_dwell_is_counted_in_windows_and_a_move_begins_anew() -> None:
+    away = estimates(qos(SLOW), qos(1.0), qos(SLOW))
+    away["HYB"] = qos(SLOW)
+    back = {**away, "LOC": qos(1.0)}
+    policy = atp(3, 1000.0)
+    shown = [estimates(qos(SLOW), qos(1.0), qos(1.0))] * 4 + [back] * 5
+    reasons = ["dwell", "dwell", "dwell", "migrate", "dwell", "dwell", "dwell", "migrate", "dwell"]
+    assert [reason for _, reason in play(policy, shown)] == reasons
 
 
-def test_moves_between_robots_make_no_pair() -> None:
-    candidates = {"A": place("R1", "R2"), "B": place("R2", "R2"), "C": place("E", "E")}
-    assert find_pairs(candidates, OBJECTIVE.tiers) == ()
-    with pytest.raises(PolicyError, match="no such pair among A, B, C"):
-        atp(initial="A", candidates=candidates)
+def test_somebody_elses_move_begins_anew() -> None:
+    policy = atp(window_ms=1000.0)
+    slow = estimates(qos(SLOW), qos(1.0), qos(1.0))
+    play(policy, [slow])
+    policy.adopt("LOC")
+    assert play(policy, [slow, slow]) == [("LOC", "hold"), ("HYB", "migrate")]
 
 
-# --------------------------------------------------------------------------------------- errors
+def test_never_started_it_decides_at_every_close() -> None:
+    policy = ATP(candidates=CANDIDATES, objective=OBJECTIVE, min_dwell=0)
+    assert play(policy, [estimates(qos(SLOW), qos(1.0), qos(1.0))]) == [("HYB", "migrate")]
 
 
-def test_wrong_parameters_are_named() -> None:
-    with pytest.raises(PolicyError, match="min_dwell is -1"):
-        atp(min_dwell=-1)
-    with pytest.raises(PolicyError, match=r"initial is 'HIB', .* did you mean 'HYB'"):
-        atp(initial="HIB")
-    with pytest.raises(PolicyError, match="latency_ms is -1"):
-        ATP(candidates=CANDIDATES, objective=OBJECTIVE, latency_ms=-1)
-    with pytest.raises(PolicyError, match="robot is nan"):
-        ATP(candidates=CANDIDATES, objective=OBJECTIVE, robot=math.nan)
-    with pytest.raises(PolicyError, match=r"edge is -0\.5"):
-        ATP(candidates=CANDIDATES, objective=OBJECTIVE, edge=-0.5)
-    with pytest.raises(PolicyError, match="offload is 'NOWHERE'"):
-        ATP(candidates=CANDIDATES, objective=OBJECTIVE, offload="NOWHERE")
-    with pytest.raises(PolicyError, match="no such pair with local='LOC', offload='SO'"):
-        ATP(candidates=CANDIDATES, objective=OBJECTIVE, local="LOC", offload="SO")
+# ---------------------------------------------------------------------------- the rule, once more
+
+METRICS = st.tuples(
+    st.sampled_from([5.0, 39.0, 40.0, 41.0, 80.0]), *[st.sampled_from([0.0, 0.5, 0.71, 1.0])] * 2
+)
 
 
-def test_missing_metrics_are_an_error() -> None:
-    with pytest.raises(MetricError, match="observed is None"):
-        atp().decide(observed=None)  # type: ignore[arg-type]
-    with pytest.raises(MetricError, match="observed has no utilisation of E"):
-        atp().decide(observed=QoS(1.0, 0.0, {"R1": 0.0, "R2": 0.0}))
-    with pytest.raises(MetricError, match="nothing for candidate SO"):
-        atp().decide(observed=qos(), estimates={"LOC": qos()})
+@given(
+    st.lists(st.tuples(METRICS, METRICS, METRICS), min_size=1, max_size=30),
+    st.integers(0, 3),
+    st.sampled_from([300.0, 1000.0, 2000.0, 5000.0]),
+)
+def test_it_is_the_rule_as_it_is_written_down(
+    shown: list[tuple[tuple[float, float, float], ...]], min_dwell: int, window_ms: float
+) -> None:
+    policy = atp(min_dwell, window_ms)
+    size = max(1, round(2000.0 / window_ms))
+    now, dwell = "LOC", 0
+    seen: list[tuple[tuple[float, float, float], ...]] = []
+    weights, targets = OBJECTIVE.weights, OBJECTIVE.targets
+
+    def cost(metrics: Sequence[float], moved: float) -> float:
+        l95_ms, robot, edge = metrics
+        return (
+            weights.latency * l95_ms / targets.latency_ms
+            + weights.robot * robot / targets.robot
+            + weights.edge * edge / targets.edge
+            + weights.switching * moved
+        )
+
+    for row in shown:
+        window = {
+            name: qos(ms, 0.3, robot, edge)
+            for name, (ms, robot, edge) in zip(CANDIDATES, row, strict=True)
+        }
+        decision = policy.decide(observed=window[now], estimates=window)
+        seen.append(row)
+        expected, reason = now, "dwell" if dwell < min_dwell else "hold"
+        if len(seen) == size:
+            columns = dict(zip(CANDIDATES, zip(*seen, strict=True), strict=True))
+            mean = {
+                name: [sum(values) / size for values in zip(*column, strict=True)]
+                for name, column in columns.items()
+            }
+            here = mean[now]
+            busy = here[1] > targets.robot if now == "LOC" else here[2] > targets.edge
+            other = "HYB" if now == "LOC" else "LOC"
+            asked = here[0] > targets.latency_ms or busy
+            if reason == "hold" and asked and cost(mean[other], 0.25) < cost(here, 0.0):
+                expected, reason = other, "migrate"
+            seen = []
+        dwell = 0 if expected != now else dwell + 1
+        now = expected
+        assert (decision.name, decision.reason, decision.dwell) == (expected, reason, dwell)
+
+
+# ------------------------------------------------------------------------------------- contracts
+
+
+def test_it_keeps_its_word_in_awkward_windows() -> None:
+    for window_ms in (500.0, 2000.0):
+        cell = timed(window_ms / 10)
+        assert check_policy(by_name("atp", cell), cell) == ()
+
+
+def test_a_copy_goes_its_own_way() -> None:
+    policy = atp(window_ms=1000.0)
+    slow = estimates(qos(SLOW), qos(1.0), qos(1.0))
+    play(policy, [slow])
+    twin = copy.deepcopy(policy)
+    assert play(twin, [slow]) == [("HYB", "migrate")]
+    assert play(policy, [slow]) == [("HYB", "migrate")]
+
+
+def test_the_answer_needs_estimates() -> None:
+    policy = atp(window_ms=1000.0)
+    assert policy.decide(observed=qos(20.0)).reason == "hold"
+    with pytest.raises(MetricError, match="estimates is None in 2 of the 2 windows decided on"):
+        policy.decide(observed=qos(90.0))
+    # Nothing has changed: the same window again, and one in which nothing asks.
+    assert policy.decide(observed=qos(20.0)).reason == "hold"
+
+
+@pytest.mark.parametrize("every_ms", [0.0, -1.0, math.nan, math.inf])
+def test_the_time_between_decisions_is_checked(every_ms: float) -> None:
+    with pytest.raises(PolicyError, match="every_ms is"):
+        ATP(candidates=CANDIDATES, objective=OBJECTIVE, every_ms=every_ms)

@@ -112,6 +112,22 @@ def test_the_columns_that_every_run_has() -> None:
     assert schemas[0] == schemas[1] == schemas[2]
 
 
+def test_what_was_called_atp_is_read_as_thresholds_alone(tmp_path: Path) -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    run = dwell.simulate(problem, policy="atp-thresholds", seed=1, windows=6)
+    now = run.meta["policy"]
+    before = now.replace("ATPThresholds", "ATP")
+    run.save(tmp_path / "old")
+    file = tmp_path / "old" / "run.json"
+    meta = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(json.dumps({**meta, "policy": before}), encoding="utf-8")
+    assert before.startswith("ATP(initial=")
+    assert open_run(tmp_path / "old").meta["policy"] == now
+    today = dwell.simulate(problem, policy="atp", seed=1, windows=6)
+    today.save(tmp_path / "new")
+    assert open_run(tmp_path / "new").meta["policy"].startswith("ATP(initial=")
+
+
 # ------------------------------------------------------------------------------- atomicity
 
 

@@ -257,6 +257,15 @@ class TestWhatCounts:
         assert found.problem.initial == "ROB-EDGE"
         assert found.problem.controller.fallbacks == ("ROB-EDGE",)
 
+    def test_what_was_called_atp_is_predicted_as_thresholds_alone(self) -> None:
+        problem = make_problem()
+        run = simulate(problem, policy="atp-thresholds", seed=1, windows=6)
+        before = str(run.meta["policy"]).replace("ATPThresholds", "ATP")
+        found = read_measured("run", with_meta(run, policy=before), problem)
+        assert found.contender == "atp-thresholds+profile"
+        run = simulate(problem, policy="atp", seed=1, windows=6)
+        assert read_measured("run", run, problem).contender == "atp+profile"
+
     def test_live_runs(self) -> None:
         run = live_run(policy="dtp", scenario="baseline", estimator="Profile")
         found = read_measured("run", run, make_problem())

@@ -83,8 +83,10 @@ def test_what_estimates_nothing_has_no_shadow_jobs() -> None:
         PROBLEM, controller=replace(PROBLEM.controller, estimator="corrected", shadow_fraction=0.1)
     )
     found = {one.name: one.estimator for one in default_entrants(believing)}
+    assert entrant(believing, "atp-thresholds").estimator == "profile"
     assert found == {
-        **dict.fromkeys((*PROBLEM.candidates, "atp"), "profile"),
+        **dict.fromkeys(PROBLEM.candidates, "profile"),
+        "atp": "corrected",
         "dtp": "corrected",
         "cusum+corrected": "corrected",
     }

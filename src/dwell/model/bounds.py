@@ -96,6 +96,7 @@ BURST_MEAN = Bound(0.01, LARGEST)
 
 # Pipeline.
 PERIOD_MS = Bound(1e-3, LARGEST)
+EVERY_MS = Bound(0, LARGEST, above=True)
 DEADLINE_MS = Bound(1e-6, LARGEST)
 TIME_MS = Bound(0, LARGEST)
 THREADS = Bound(1, MAX_COUNT, whole=True)

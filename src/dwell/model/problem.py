@@ -31,7 +31,7 @@ from dwell.model.servo import Servo
 
 __all__ = ["ESTIMATORS", "MIGRATIONS", "POLICIES", "ControllerSettings", "Problem"]
 
-POLICIES = ("dtp", "atp", "latency-first", "work-function", "cusum")
+POLICIES = ("dtp", "atp", "atp-thresholds", "latency-first", "work-function", "cusum")
 ESTIMATORS = ("profile", "shadow", "scaling", "corrected")
 MIGRATIONS = ("warm", "cold")
 

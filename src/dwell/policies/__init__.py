@@ -1,6 +1,7 @@
 """Policies: observation and estimates in, the decision for the next window out."""
 
 from dwell.policies.atp import ATP
+from dwell.policies.atp_thresholds import ATPThresholds
 from dwell.policies.check import check_policy
 from dwell.policies.cusum import Cusum
 from dwell.policies.dtp import DTP
@@ -14,6 +15,7 @@ from dwell.policies.work_function import WorkFunction
 __all__ = [
     "ATP",
     "DTP",
+    "ATPThresholds",
     "Cusum",
     "LatencyFirst",
     "MinimalPolicy",

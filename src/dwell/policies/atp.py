@@ -1,96 +1,83 @@
-"""ATP: adaptive task placement of one stage by thresholds.
+"""ATP: one stage moved where thresholds ask for it and a cost of three terms agrees.
 
-The rule of the published controller has no public numbers. What is here is a **reconstruction**
-from what the paper says of it: it relocates a single stage, it decides by binary thresholds on
-individual metrics, and it has no cost function. Every table that shows it should say so.
+Tran et al., "Edge-Based QoS-Aware Adaptive Task Placement: A Closed-Loop Control in Multi-Robot
+Systems", arXiv 2606.00552. The full text was not at hand; this is a **reconstruction** from the
+abstract. What is from where:
 
-* On the robot (`local`), the stage is offloaded if L95 or the robots' utilisation is above its
-  threshold.
-* Offloaded, it returns if L95 or the edge's utilisation is above its threshold.
-* After a move it stays for at least `min_dwell` windows, counted as in DTP.
+* *Abstract*: candidate placements are scored by a cost of normalised latency, CPU utilisation and
+  switching overhead over control windows of two seconds; placement is switched based on measured
+  latency and utilisation thresholds.
+* *The paper of DTP* (arXiv 2605.19887): a single stage moves. It also says that ATP decides by
+  thresholds alone, without a cost of switching (`dwell.policies.atp_thresholds`); the abstract
+  holds.
+* *Ours*: thresholds open the question and the cost answers it; the weights and targets are those of
+  the cell's objective, violations not among them; thresholds default to the targets; a dwell as in
+  DTP.
 
-It looks at the last window only, and never asks what the other side would have shown: where both
-sides are over a threshold it moves to and fro, held back by the dwell alone.
+Windows are taken together until `every_ms` is reached, max(1, round(every_ms / (W P))) of them. At
+the close of the last of them, with means over them, and unless the dwell goes on:
+
+1. *Question.* On the robot, is L95 or U_r above its threshold; offloaded, L95 or U_e (U_c where the
+   objective weighs cloud nodes apart)? If not, it stays.
+2. *Answer.* It moves if the other side costs less than staying::
+
+       C(s) = a_L * L95 / L_target + a_r * U_r / U_r_target + a_e * U_e / U_e_target
+              [+ a_c * U_c / U_c_target] + a_S * S
+
+   with what was observed and S = 0 for staying, and with what was estimated of the other side.
+
+At other closes it stays (``hold``, or ``dwell`` while the dwell lasts). A move, its own or somebody
+else's, begins the next such windows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dwell.errors import PolicyError
-from dwell.model.bounds import MIN_DWELL, Bound
-from dwell.model.objective import Objective, Tier
+from dwell.cost import TierUtilisation, price
+from dwell.errors import MetricError
+from dwell.model.bounds import EVERY_MS
+from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import (
-    NOT_PRICED,
-    Incumbent,
-    check_candidates,
-    check_name,
-    check_parameter,
-)
-from dwell.policies.pricing import Pricing
+from dwell.policies.atp_thresholds import ATPThresholds
+from dwell.policies.incumbent import NOT_PRICED, check_parameter
 
-__all__ = ["ATP", "Pair", "find_pairs"]
-
-THRESHOLD = Bound(0)
+__all__ = ["ATP"]
 
 
-class Pair(NamedTuple):
-    """Two candidates that differ in where one task runs: on a robot, or on the edge or cloud."""
+class _Shown(NamedTuple):
+    """What the rule looks at of a window, observed or estimated: L95 (ms), U_r, U_e and U_c."""
 
-    local: str
-    offload: str
-    task: str
-
-
-def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -> tuple[Pair, ...]:
-    """Return every pair of candidates that ATP could toggle between, in the candidates' order."""
-    pairs = []
-    for local, here in candidates.items():
-        for offload, there in candidates.items():
-            moved = here.moved(there)
-            if len(moved) != 1:
-                continue
-            task = moved[0]
-            outside = tiers.get(there[task]) in ("edge", "cloud")
-            if tiers.get(here[task]) == "robot" and outside:
-                pairs.append(Pair(local, offload, task))
-    return tuple(pairs)
+    l95_ms: float
+    used: TierUtilisation
 
 
-class ATP:
-    """Toggles one task between a robot and the edge by thresholds (our reconstruction).
+def _mean(windows: Sequence[_Shown]) -> _Shown:
+    count = len(windows)
+    used = [sum(tier) / count for tier in zip(*(one.used for one in windows), strict=True)]
+    return _Shown(sum(one.l95_ms for one in windows) / count, TierUtilisation(*used))
+
+
+class ATP(ATPThresholds):
+    """Toggles one task by thresholds and a cost of three terms (our reconstruction).
 
     Parameters
     ----------
-    candidates : mapping of str to Placement
-        Over the same tasks.
-    initial : str, optional
-        The candidate it starts on; the first where None. On one that is neither `local` nor
-        `offload`, the side it is on is that of the toggled task's tier.
-    objective : Objective
-        Tiers of the nodes, and the thresholds that are not given.
-    local, offload : str, optional
-        Candidates that differ in exactly one task, on a robot in `local` and on the edge or in
-        the cloud in `offload`. Where None, the first pair that contains `initial`, else the
-        first pair.
-    latency_ms : float, optional
-        Threshold on L95, milliseconds; ``targets.latency_ms`` where None.
-    robot, edge : float, optional
-        Thresholds on U_r and U_e, infinity for none; ``targets.robot`` and ``targets.edge``
-        where None. Where the objective weighs cloud nodes apart and the task is offloaded to one,
-        `edge` is a threshold on U_c, and ``targets.cloud`` where None.
-    min_dwell : int
-        Windows after a migration that never migrate.
+    candidates, initial, objective, local, offload, latency_ms, robot, edge, min_dwell
+        As in `dwell.policies.ATPThresholds`; weights and targets of the objective are those of the
+        cost, too.
+    every_ms : float
+        Time between two decisions, milliseconds; rounded to whole windows when a run starts. A
+        policy that was never started decides at every close.
 
     Raises
     ------
     PolicyError
-        If a parameter is out of its range, a name is no candidate, candidates place different
-        tasks, or no two candidates make a pair.
+        As in `dwell.policies.ATPThresholds`.
     """
 
     def __init__(
@@ -105,78 +92,63 @@ class ATP:
         robot: float | None = None,
         edge: float | None = None,
         min_dwell: int = 3,
+        every_ms: float = 2000.0,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
-        self.objective = objective
-        self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
-        self._pricing = Pricing(self.candidates, objective)
-        self.pair = self._choose(local, offload)
-        targets = objective.targets
-        outside_tier = objective.tiers[self.candidates[self.pair.offload][self.pair.task]]
-        self._on_cloud = objective.weights.cloud is not None and outside_tier == "cloud"
-        outside = targets.cloud if self._on_cloud and targets.cloud else targets.edge
-        self.latency_ms = targets.latency_ms if latency_ms is None else latency_ms
-        self.robot = targets.robot if robot is None else robot
-        self.edge = outside if edge is None else edge
-        check_parameter("latency_ms", self.latency_ms, THRESHOLD)
-        check_parameter("robot", self.robot, THRESHOLD)
-        check_parameter("edge", self.edge, THRESHOLD)
-        self._incumbent = Incumbent(self.candidates, self.initial)
+        super().__init__(
+            candidates=candidates,
+            initial=initial,
+            objective=objective,
+            local=local,
+            offload=offload,
+            latency_ms=latency_ms,
+            robot=robot,
+            edge=edge,
+            min_dwell=min_dwell,
+        )
+        self.every_ms = check_parameter("every_ms", every_ms, EVERY_MS)
+        #: Windows that a decision is made on.
+        self.every_windows = 1
+        self._begin()
 
     def __repr__(self) -> str:
         return (
             f"ATP(initial={self.initial!r}, local={self.pair.local!r}, "
-            f"offload={self.pair.offload!r}, min_dwell={self.min_dwell})"
+            f"offload={self.pair.offload!r}, min_dwell={self.min_dwell}, "
+            f"every_ms={self.every_ms:g})"
         )
 
-    def _choose(self, local: str | None, offload: str | None) -> Pair:
-        """Return the first pair that agrees with what is given, one with `initial` before others.
-
-        Raises
-        ------
-        PolicyError
-            If there is none.
-        """
-        for field, name in (("local", local), ("offload", offload)):
-            if name is not None:
-                check_name(field, name, self.candidates)
-        pairs = [
-            pair
-            for pair in find_pairs(self.candidates, self.objective.tiers)
-            if local in (None, pair.local) and offload in (None, pair.offload)
-        ]
-        if not pairs:
-            asked = f" with local={local!r}, offload={offload!r}" if local or offload else ""
-            raise PolicyError(
-                f"atp needs two candidates that differ in exactly one task, on a robot node in "
-                f"one and on an edge or cloud node in the other; there is no such pair{asked} "
-                f"among {', '.join(self.candidates)}: add a candidate, or use another policy"
-            )
-        return next((pair for pair in pairs if self.initial in pair[:2]), pairs[0])
-
-    @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
     def start(self, problem: Problem) -> None:
-        """Begin again: the initial candidate, n_d = 0."""
-        self._incumbent.begin(self.initial)
+        """Begin again: the initial candidate, n_d = 0, and no window seen."""
+        super().start(problem)
+        window_ms = problem.window_cycles * problem.pipeline.period_ms
+        self.every_windows = max(1, round(self.every_ms / window_ms))
+        self._begin()
 
     def adopt(self, name: str) -> None:
         """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
+        super().adopt(name)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Forget the windows since the last decision."""
+        self._observed: tuple[_Shown, ...] = ()
+        self._estimated: tuple[Mapping[str, _Shown] | None, ...] = ()
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
-        """Toggle the task if a metric of the last window is above its threshold.
+        """Toggle the task if a threshold asks for it and the other side costs less.
 
         Parameters
         ----------
         observed : QoS
-            Metrics of the window under the incumbent; all that the rule looks at.
+            Metrics of the window under the incumbent.
         estimates : mapping of str to QoS, optional
-            Where given, J of every candidate is recorded.
+            Metrics by candidate; needed in every window of those that a question is answered on.
+
+        Returns
+        -------
+        Decision
+            `costs` are J of the window, as every policy records them; `delta_j` is what moving
+            saves in the three terms, NaN where no threshold asked.
 
         Raises
         ------
@@ -185,17 +157,40 @@ class ATP:
         """
         incumbent = self._incumbent
         used = self._pricing.used(observed)
+        here = _Shown(observed.l95_ms, used)
         costs = NOT_PRICED
+        there: Mapping[str, _Shown] | None = None
         if estimates is not None:
             costs = self._pricing.estimated(estimates, incumbent.name)
-        if incumbent.dwell < self.min_dwell:
+            there = {
+                name: _Shown(estimates[name].l95_ms, self._pricing.used(estimates[name]))
+                for name in self.candidates
+            }
+        shown, told = (*self._observed, here), (*self._estimated, there)
+        dwells = incumbent.dwell < self.min_dwell
+        if len(shown) < self.every_windows:
+            self._observed, self._estimated = shown, told
+            return incumbent.stay("dwell" if dwells else "hold", costs)
+        if dwells:
+            self._begin()
             return incumbent.stay("dwell", costs)
-        task = self.pair.task
-        if self.objective.tiers.get(self.candidates[incumbent.name][task]) == "robot":
-            other, busy = self.pair.offload, used.robot > self.robot
-        else:
-            outside = used.cloud if self._on_cloud else used.edge
-            other, busy = self.pair.local, outside > self.edge
-        if observed.l95_ms > self.latency_ms or busy:
-            return incumbent.move(other, "migrate", costs)
-        return incumbent.stay("hold", costs)
+        mean = _mean(shown)
+        other, over = self._question(mean.l95_ms, mean.used)
+        saved = math.nan
+        if over:
+            known = [one[other] for one in told if one is not None]
+            if len(known) < len(told):
+                raise MetricError(
+                    f"estimates is None in {len(told) - len(known)} of the {len(told)} windows "
+                    f"decided on; give one for each of {', '.join(self.candidates)}"
+                )
+            moved = self._pricing.switching(incumbent.name)[other]
+            saved = self._cost(mean, 0.0) - self._cost(_mean(known), moved)
+        self._begin()
+        if over and saved > 0:
+            return incumbent.move(other, "migrate", costs, saved)
+        return incumbent.stay("hold", costs, saved)
+
+    def _cost(self, shown: _Shown, switching: float) -> float:
+        """C of the module's head: J without violations."""
+        return price(shown.l95_ms, 0.0, *shown.used, switching, self.objective)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 from dwell.errors import PolicyError
 from dwell.model.meaning import nearest
 from dwell.model.problem import Problem
-from dwell.policies.atp import ATP, Pair, find_pairs
+from dwell.policies.atp import ATP
+from dwell.policies.atp_thresholds import ATPThresholds, Pair, find_pairs
 from dwell.policies.cusum import Cusum
 from dwell.policies.dtp import DTP
 from dwell.policies.latency_first import LatencyFirst
@@ -16,6 +18,8 @@ from dwell.policies.static import Static
 from dwell.policies.work_function import WorkFunction
 
 __all__ = ["REGISTRY", "by_name"]
+
+Toggled = TypeVar("Toggled", bound=ATPThresholds)
 
 
 def by_name(name: str, problem: Problem) -> Policy:
@@ -54,7 +58,8 @@ def _dtp(problem: Problem) -> DTP:
     )
 
 
-def _atp(problem: Problem) -> ATP:
+def _toggled(kind: type[Toggled], problem: Problem) -> Toggled:
+    """Make a policy that toggles one task: the heaviest, of pairs with the initial candidate."""
     pairs = find_pairs(problem.candidates, problem.objective.tiers)
 
     def robot_time_ms(pair: Pair) -> float:
@@ -69,7 +74,7 @@ def _atp(problem: Problem) -> ATP:
         key=lambda pair: (problem.initial in pair[:2], robot_time_ms(pair)),
         default=None,
     )
-    return ATP(
+    return kind(
         candidates=problem.candidates,
         initial=problem.initial,
         objective=problem.objective,
@@ -77,6 +82,14 @@ def _atp(problem: Problem) -> ATP:
         offload=pair.offload if pair else None,
         min_dwell=problem.controller.min_dwell,
     )
+
+
+def _atp(problem: Problem) -> ATP:
+    return _toggled(ATP, problem)
+
+
+def _atp_thresholds(problem: Problem) -> ATPThresholds:
+    return _toggled(ATPThresholds, problem)
 
 
 def _latency_first(problem: Problem) -> LatencyFirst:
@@ -104,6 +117,7 @@ def _cusum(problem: Problem) -> Cusum:
 REGISTRY: dict[str, Callable[[Problem], Policy]] = {
     "dtp": _dtp,
     "atp": _atp,
+    "atp-thresholds": _atp_thresholds,
     "latency-first": _latency_first,
     "work-function": _work_function,
     "cusum": _cusum,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -40,7 +41,7 @@ class Run:
     """
 
     def __init__(self, meta: Mapping[str, Any], tables: Mapping[str, Table]) -> None:
-        self.meta: dict[str, Any] = {**meta, "schema_version": SCHEMA_VERSION}
+        self.meta: dict[str, Any] = {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
         self._tables: dict[str, Table] = dict(tables)
 
     def _table(self, name: str) -> pl.DataFrame:
@@ -222,6 +223,17 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     more = [name for name in MORE_TABLES if (folder / f"{name}.parquet").is_file()]
     names = [*TABLES, *more]
     return Run(meta, {name: _reader(folder / f"{name}.parquet") for name in names})
+
+
+def _in_todays_words(meta: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return what a run says of itself in today's words.
+
+    The class ``ATP`` of runs without ``every_ms`` is today's ``ATPThresholds``.
+    """
+    policy = meta.get("policy")
+    if isinstance(policy, str) and re.match(r"ATP(\(|$)", policy) and "every_ms=" not in policy:
+        return {**meta, "policy": f"ATPThresholds{policy.removeprefix('ATP')}"}
+    return meta
 
 
 def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:

@@ -271,10 +271,7 @@ def limits_of(measured: Measured) -> Iterator[str]:
             "change shows in the warm-up only, which does not count."
         )
     if any(name.partition("+")[0] == "atp" for name in comparison.policies):
-        yield (
-            "ATP is our reconstruction from a description in words: its rule has no public "
-            "numbers, and its authors' may do better or worse."
-        )
+        yield ("ATP is our reconstruction: its authors' may do better or worse.")
 
 
 def _drawn(item: Figure, look: Look, caption: str) -> str:

@@ -15,7 +15,8 @@ __all__ = ["POLICIES", "describe_contenders", "palette_of"]
 POLICIES = {
     "dtp": "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
     "once the dwell time is over and the improvement large enough.",
-    "atp": "ATP moves one task to the edge and back by thresholds on L95 and utilisation.",
+    "atp": "ATP moves one task to the edge and back, where a threshold on L95 or utilisation is "
+    "exceeded and the other side costs less latency, utilisation and switching.",
     "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
     "work-function": "Work-function follows the optimum in hindsight over all windows so far, one "
     "window late.",
@@ -42,6 +43,7 @@ BELIEFS = {
 }
 #: By what stands with a hyphen behind a policy.
 VARIANTS = {
+    "thresholds": "by the thresholds alone, without a cost.",
     "tuned": "with settings that were chosen on seeds that nothing else is done on.",
     "escape": "with the escape: it may move before the dwell time is over, where the placement it "
     "is on is over a cap.",

@@ -409,10 +409,7 @@ def limits(comparison: Comparison) -> list[str]:
         "change shows only where one happens.",
     ]
     if ATP in comparison.policies:
-        items.append(
-            "ATP is our reconstruction from a description in words: its rule has no public "
-            "numbers, and its authors' may do better or worse."
-        )
+        items.append("ATP is our reconstruction: its authors' may do better or worse.")
     if problem.controller.estimator == "profile" and DTP in comparison.policies:
         items.append(
             "DTP without brackets has the estimator `profile` (static profiling), the simplest of "

@@ -63,7 +63,7 @@ FAMILIES = {
 }
 #: Places of what a policy believes: each has its marker and dashes, whoever else is shown.
 BELIEFS = ("corrected", "profile", "shadow", "scaling", "hindsight")
-VARIANTS = ("tuned", "escape", "dwell")
+VARIANTS = ("tuned", "escape", "dwell", "thresholds")
 
 
 class Contended(NamedTuple):

@@ -32,7 +32,7 @@ from dwell.report.phase_rows import PhaseRow, phase_rows
 from dwell.report.phases import Disturbed
 from dwell.report.svg import inline
 from dwell.report.timeline import run_timeline
-from dwell.report.wording import listed, percent, shown_scenario, write_number
+from dwell.report.wording import OURS, listed, percent, shown_scenario, write_number
 from dwell.study import AIM
 from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
 
@@ -437,10 +437,8 @@ def _about(facts: Facts) -> Iterator[str]:
             "versions": ", ".join(f"{name} {text}" for name, text in facts.versions.items()),
         }
     )
-    if facts.policy_name == "ATP":
-        yield paragraph(
-            "ATP is our reconstruction from a description in words: its rule has no public numbers."
-        )
+    if facts.policy_name in ("ATP", "ATPThresholds"):
+        yield paragraph(OURS)
 
 
 def _placements(facts: Facts) -> str:

@@ -36,7 +36,7 @@ NAMES = {
     "best static": "Best static",
 }
 #: What has to stand beside everything that shows ATP.
-OURS = "ATP is our reconstruction: its rule has no public numbers."
+OURS = "ATP is our reconstruction."
 #: A symbol with its index: V_D, N_min, α_L.
 SYMBOL = re.compile(r"(?<![\w.])([A-ZΔα-ωdp])_(D|L|V|S|r|e|z|min|max|loss)(?!\w)")
 ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}

@@ -37,6 +37,7 @@ Document: TypeAlias = Mapping[str, Any]
 POLICIES = {
     "DTP": "dtp",
     "ATP": "atp",
+    "ATPThresholds": "atp-thresholds",
     "LatencyFirst": "latency-first",
     "WorkFunction": "work-function",
     "Cusum": "cusum",

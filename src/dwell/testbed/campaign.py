@@ -37,7 +37,7 @@ __all__ = [
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
 #: Policies that estimate nothing: with the profile no shadow jobs load their nodes.
-BLIND = ("atp",)
+BLIND = ("atp-thresholds",)
 #: Folder of a campaign with the trace files of its cell.
 TRACES = "traces"
 #: Parts of this package that a measurement depends on.

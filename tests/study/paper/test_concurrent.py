@@ -10,7 +10,7 @@ import pytest
 
 from dwell.model import NodeDisturbance
 from dwell.policies import ATP
-from dwell.policies.atp import find_pairs
+from dwell.policies.atp_thresholds import find_pairs
 from dwell.sim import draw, simulate_realisation
 from dwell.study.paper import Runner
 from dwell.study.paper import concurrent as module

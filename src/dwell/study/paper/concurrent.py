@@ -15,7 +15,7 @@ import numpy as np
 
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.policies import ATP
-from dwell.policies.atp import Pair, find_pairs
+from dwell.policies.atp_thresholds import Pair, find_pairs
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import over_seeds

@@ -1,0 +1,216 @@
+"""ATPThresholds: one stage moved by thresholds alone, as the paper of DTP describes its forerunner.
+
+Tran et al. (arXiv 2605.19887) say of ATP that it relocates a single stage, decides by binary
+thresholds on individual metrics, and has no model of the cost of switching. The abstract of the
+paper of ATP itself says otherwise (see `dwell.policies.atp`). This is the rule of the first, with
+thresholds of our own: the design targets.
+
+* On the robot (`local`), the stage is offloaded if L95 or the robots' utilisation is above its
+  threshold.
+* Offloaded, it returns if L95 or the edge's utilisation is above its threshold.
+* After a move it stays for at least `min_dwell` windows, counted as in DTP.
+
+It looks at the last window only, and never asks what the other side would have shown: where both
+sides are over a threshold it moves to and fro, held back by the dwell alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from dwell.cost import TierUtilisation
+from dwell.errors import PolicyError
+from dwell.model.bounds import MIN_DWELL, Bound
+from dwell.model.objective import Objective, Tier
+from dwell.model.placement import Placement
+from dwell.model.problem import Problem
+from dwell.model.qos import Decision, QoS
+from dwell.policies.incumbent import (
+    NOT_PRICED,
+    Incumbent,
+    check_candidates,
+    check_name,
+    check_parameter,
+)
+from dwell.policies.pricing import Pricing
+
+__all__ = ["ATPThresholds", "Pair", "find_pairs"]
+
+THRESHOLD = Bound(0)
+
+
+class Pair(NamedTuple):
+    """Two candidates that differ in where one task runs: on a robot, or on the edge or cloud."""
+
+    local: str
+    offload: str
+    task: str
+
+
+def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -> tuple[Pair, ...]:
+    """Return every pair of candidates that one task could toggle between, in their order."""
+    pairs = []
+    for local, here in candidates.items():
+        for offload, there in candidates.items():
+            moved = here.moved(there)
+            if len(moved) != 1:
+                continue
+            task = moved[0]
+            outside = tiers.get(there[task]) in ("edge", "cloud")
+            if tiers.get(here[task]) == "robot" and outside:
+                pairs.append(Pair(local, offload, task))
+    return tuple(pairs)
+
+
+class ATPThresholds:
+    """Toggles one task between a robot and the edge by thresholds (our reconstruction).
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+        Over the same tasks.
+    initial : str, optional
+        The candidate it starts on; the first where None. On one that is neither `local` nor
+        `offload`, the side it is on is that of the toggled task's tier.
+    objective : Objective
+        Tiers of the nodes, and the thresholds that are not given.
+    local, offload : str, optional
+        Candidates that differ in exactly one task, on a robot in `local` and on the edge or in
+        the cloud in `offload`. Where None, the first pair that contains `initial`, else the
+        first pair.
+    latency_ms : float, optional
+        Threshold on L95, milliseconds; ``targets.latency_ms`` where None.
+    robot, edge : float, optional
+        Thresholds on U_r and U_e, infinity for none; ``targets.robot`` and ``targets.edge``
+        where None. Where the objective weighs cloud nodes apart and the task is offloaded to one,
+        `edge` is a threshold on U_c, and ``targets.cloud`` where None.
+    min_dwell : int
+        Windows after a migration that never migrate.
+
+    Raises
+    ------
+    PolicyError
+        If a parameter is out of its range, a name is no candidate, candidates place different
+        tasks, or no two candidates make a pair.
+    """
+
+    def __init__(
+        self,
+        *,
+        candidates: Mapping[str, Placement],
+        initial: str | None = None,
+        objective: Objective,
+        local: str | None = None,
+        offload: str | None = None,
+        latency_ms: float | None = None,
+        robot: float | None = None,
+        edge: float | None = None,
+        min_dwell: int = 3,
+    ) -> None:
+        self.candidates = check_candidates(candidates)
+        self.initial = check_name("initial", initial, self.candidates)
+        self.objective = objective
+        self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
+        self._pricing = Pricing(self.candidates, objective)
+        self.pair = self._choose(local, offload)
+        targets = objective.targets
+        outside_tier = objective.tiers[self.candidates[self.pair.offload][self.pair.task]]
+        self._on_cloud = objective.weights.cloud is not None and outside_tier == "cloud"
+        outside = targets.cloud if self._on_cloud and targets.cloud else targets.edge
+        self.latency_ms = targets.latency_ms if latency_ms is None else latency_ms
+        self.robot = targets.robot if robot is None else robot
+        self.edge = outside if edge is None else edge
+        check_parameter("latency_ms", self.latency_ms, THRESHOLD)
+        check_parameter("robot", self.robot, THRESHOLD)
+        check_parameter("edge", self.edge, THRESHOLD)
+        self._incumbent = Incumbent(self.candidates, self.initial)
+
+    def __repr__(self) -> str:
+        return (
+            f"ATPThresholds(initial={self.initial!r}, local={self.pair.local!r}, "
+            f"offload={self.pair.offload!r}, min_dwell={self.min_dwell})"
+        )
+
+    def _choose(self, local: str | None, offload: str | None) -> Pair:
+        """Return the first pair that agrees with what is given, one with `initial` before others.
+
+        Raises
+        ------
+        PolicyError
+            If there is none.
+        """
+        for field, name in (("local", local), ("offload", offload)):
+            if name is not None:
+                check_name(field, name, self.candidates)
+        pairs = [
+            pair
+            for pair in find_pairs(self.candidates, self.objective.tiers)
+            if local in (None, pair.local) and offload in (None, pair.offload)
+        ]
+        if not pairs:
+            asked = f" with local={local!r}, offload={offload!r}" if local or offload else ""
+            raise PolicyError(
+                f"atp needs two candidates that differ in exactly one task, on a robot node in "
+                f"one and on an edge or cloud node in the other; there is no such pair{asked} "
+                f"among {', '.join(self.candidates)}: add a candidate, or use another policy"
+            )
+        return next((pair for pair in pairs if self.initial in pair[:2]), pairs[0])
+
+    @property
+    def incumbent(self) -> str:
+        """Name of the active candidate."""
+        return self._incumbent.name
+
+    @property
+    def local(self) -> str:
+        """The candidate with the task on a robot."""
+        return self.pair.local
+
+    @property
+    def offload(self) -> str:
+        """The candidate with the task on the edge or in the cloud."""
+        return self.pair.offload
+
+    def start(self, problem: Problem) -> None:
+        """Begin again: the initial candidate, n_d = 0."""
+        self._incumbent.begin(self.initial)
+
+    def adopt(self, name: str) -> None:
+        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
+        self._incumbent.adopt(name)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
+        """Toggle the task if a metric of the last window is above its threshold.
+
+        Parameters
+        ----------
+        observed : QoS
+            Metrics of the window under the incumbent; all that the rule looks at.
+        estimates : mapping of str to QoS, optional
+            Where given, J of every candidate is recorded.
+
+        Raises
+        ------
+        MetricError
+            If a metric, or the estimate of a candidate, is missing. Nothing has changed then.
+        """
+        incumbent = self._incumbent
+        used = self._pricing.used(observed)
+        costs = NOT_PRICED
+        if estimates is not None:
+            costs = self._pricing.estimated(estimates, incumbent.name)
+        if incumbent.dwell < self.min_dwell:
+            return incumbent.stay("dwell", costs)
+        other, over = self._question(observed.l95_ms, used)
+        return incumbent.move(other, "migrate", costs) if over else incumbent.stay("hold", costs)
+
+    def _question(self, l95_ms: float, used: TierUtilisation) -> tuple[str, bool]:
+        """Return the other side of the pair, and whether a metric is above its threshold here."""
+        task = self.pair.task
+        if self.objective.tiers.get(self.candidates[self.incumbent][task]) == "robot":
+            other, busy = self.pair.offload, used.robot > self.robot
+        else:
+            outside = used.cloud if self._on_cloud else used.edge
+            other, busy = self.pair.local, outside > self.edge
+        return other, l95_ms > self.latency_ms or busy
