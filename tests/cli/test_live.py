@@ -46,6 +46,9 @@ def perceive(inputs):
     mood = MOOD.read_text() if MOOD.exists() else ""
     if mood == "raise":
         raise ValueError("no light")
+    if mood == "draw":
+        print("\\x1b[2Jnone\\r\\ntold", flush=True)
+        raise ValueError("\\x1b[2Jno\\r\\nlight")
     if mood == "text":
         return "left"
     return stages.perceive(inputs)
@@ -233,6 +236,22 @@ def test_a_stage_that_raises_is_named_and_the_loop_goes_on(cell: RealCell) -> No
     before = cell.until(lambda status: status["window"])["window"]["number"]
     cell.until(lambda status: status["window"]["number"] > before)
     assert "process() raised ValueError: no light" in cell.log("R1", "perception@R1")
+
+
+def test_what_a_stage_says_cannot_draw_on_a_terminal(cell: RealCell) -> None:
+    cell.mood.write_text("draw")
+    try:
+        who = cell.note("perception@R1")
+        found = who(cell.until(lambda status: "no\\r\\nlight" in who(status)))
+        assert found.endswith(r"process() raised ValueError: \x1b[2Jno\r\nlight")
+        _, stdout, _ = invoke("live", "status", "--cell", cell.file)
+        assert r"\x1b[2Jno\r\nlight" in stdout
+        log = cell.log("R1", "perception@R1")
+        assert r"\x1b[2Jnone\r" + "\ntold\n" in log
+        for text in (stdout, log):
+            assert text.replace("\n", "").isprintable()
+    finally:
+        cell.mood.unlink()
 
 
 def test_a_pin_and_a_drain_move_the_cell(cell: RealCell) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -18,6 +20,7 @@ class Waiting:
 
     def __init__(self, wanted_ns: int | None) -> None:
         self.wanted_ns = wanted_ns
+        self.taken = b""
         self.woken = threading.Semaphore(0)
 
     def subscriptions(self) -> tuple[str, ...]:
@@ -110,6 +113,79 @@ def test_a_clock_that_is_set_back_keeps_nobody_asleep(back_ms: int) -> None:
     hosted.wake()
     assert role.log == ["a", "a"]
     assert 0 < hosted.rest_ns() <= 200_000_000
+
+
+def test_a_message_that_a_role_fails_at_is_told_and_the_next_one_is_taken() -> None:
+    class Failing(Waiting):
+        def receive(self, sample: Sample, now_ns: int) -> int | None:
+            if sample.payload == b"poison":
+                return 1 // len(sample.header)
+            self.taken = sample.payload
+            return None
+
+    network, told = Network(), list[str]()
+    stamper = network.transport("stamper@R1", "R1")
+    role = Failing(None)
+    end = network.transport("controller@E", "E")
+    Hosted(role, end, lambda: 1, complain=lambda error: told.append(str(error)))
+    for payload in (b"poison", b"food"):
+        stamper.put("dwell/c/stamped", payload)
+    network.advance(1_000_000_000)
+    assert role.taken == b"food"
+    (line,) = told
+    assert line.startswith("a message under dwell/c/stamped: ZeroDivisionError: ")
+    assert "(test_hosting.py:" in line
+
+
+#: A worker of a cell in memory; what is appended makes something of it fail.
+WORKER = """
+import sys, threading, time
+from dataclasses import replace
+import dwell
+from dwell.live.hosting import Hosted, work
+from dwell.live.role import Pulse
+from dwell.live.transport.protocol import Sample
+from tests.live.small_world import Passing, World
+
+problem = dwell.load("examples/canonical.yaml")
+world = World(problem, exec_ms={"sensing": 3.0, "perception": 1.0, "planning": 6.0, "control": 0.5})
+worker = world.worker("perception@E")
+"""
+FAILING = {
+    "thread 'beats' failed: MemoryError": """
+def wake(*_):
+    raise MemoryError
+Pulse.wake = wake
+work(worker, worker.place.transport, stopped=threading.Event())
+""",
+    "a message under dwell/canonical/x failed: SystemExit: 3": """
+worker.receive = lambda *_: sys.exit(3)
+hosted = Hosted(worker, worker.place.transport, complain=worker.place.complain)
+hosted._receive(Sample("dwell/canonical/x", b""))
+""",
+    "thread 'frames' failed: SystemExit": """
+class Camera(Passing):
+    def wait(self):
+        raise SystemExit
+worker.triggers, worker.stage = True, Camera("perception")
+work(worker, worker.place.transport, stopped=threading.Event())
+""",
+}
+
+
+@pytest.mark.parametrize("words", FAILING)
+def test_what_cannot_go_on_ends_its_process_and_says_why(words: str) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", WORKER + FAILING[words]],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert ended.returncode == 1, ended.stderr
+    last = ended.stderr.splitlines()[-1]
+    assert last.startswith(words)
+    assert last.endswith("; the process ends")
 
 
 def test_a_role_that_fails_stops_all() -> None:

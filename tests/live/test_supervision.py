@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -92,6 +93,80 @@ def test_a_message_that_kills_twice_is_put_aside_with_its_bytes(
     supervisor.step()
     assert child.pid is not None
     assert psutil.pid_exists(child.pid)
+
+
+@pytest.fixture
+def small_group(tmp_path: Path) -> Iterator[Path]:
+    """A control group with 64 MB of memory; its folder."""
+    for parent, limit in (
+        (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes"),
+        (Path("/sys/fs/cgroup"), "memory.max"),
+    ):
+        folder = parent / f"dwell-test-{os.getpid()}"
+        try:
+            folder.mkdir()
+        except OSError:
+            continue
+        try:
+            (folder / limit).write_text(str(64 << 20))
+            yield folder
+            return
+        except OSError:
+            continue
+        finally:
+            for _ in range(100):
+                with suppress(OSError):
+                    folder.rmdir()
+                    break
+                time.sleep(0.02)
+    pytest.skip("nobody but root limits a group's memory")
+
+
+def test_what_the_kernel_kills_for_memory_is_told_from_what_somebody_kills(
+    supervisor: Supervisor, said: list[str], small_group: Path
+) -> None:
+    code = (
+        "import os, time\n"
+        "from pathlib import Path\n"
+        f"Path({str(small_group / 'cgroup.procs')!r}).write_text(str(os.getpid()))\n"
+        "kept = []\n"
+        "while True:\n"
+        "    kept.append(b'x' * (1 << 20))\n"
+        "    time.sleep(0.005)\n"
+    )
+    hungry = keep(supervisor, "hungry@E", code)
+    other = keep(supervisor, "other@E", "import time; time.sleep(1000)")
+    until(supervisor, lambda: hungry.starts == 2)
+    assert "hungry@E was killed by the kernel, which had no memory left" in said[0]
+    # Also once, and from then on for a while.
+    assert "hungry@E was killed by the kernel, which had no memory left" in supervisor.notes()
+    hungry.next_s = float("inf")
+    assert hungry.pid is not None
+    os.kill(hungry.pid, signal.SIGKILL)
+    supervisor.step()
+    supervisor.tend()
+    assert other.pid is not None
+    os.kill(other.pid, signal.SIGKILL)
+    until(supervisor, lambda: other.starts == 2)
+    assert said[-1] == "other@E was killed by SIGKILL"
+    assert "other@E" not in supervisor.notes()
+
+
+def test_a_process_that_may_not_have_more_memory_says_so(
+    supervisor: Supervisor, said: list[str]
+) -> None:
+    code = (
+        "import resource, threading, time\n"
+        "from dwell.live.failures import start_thread\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))\n"
+        "start_thread('beats', lambda: bytearray(4 << 30))\n"
+        "time.sleep(1000)\n"
+    )
+    child = keep(supervisor, "hungry@E", code)
+    until(supervisor, lambda: child.starts == 2)
+    assert said[0].startswith("hungry@E ended with exit code 1 for want of memory")
+    assert "thread 'beats' failed: MemoryError" in said[0]
+    assert "for want of memory" in supervisor.notes()
 
 
 def test_processes_outlive_their_agent_and_the_next_one_adopts_them(

@@ -61,9 +61,12 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         from dwell.io import load
         from dwell.live.leash import end_with_owner
+        from dwell.live.log import escape_output
         from dwell.live.process import run_process
         from dwell.profiling.memory import keep_memory
 
+        # What a user's code prints, and its exceptions, are shown on terminals.
+        escape_output()
         keep_memory()
         end_with_owner(stopped)
         run_process(load(asked.cell), asked.who, asked.state, stopped)

@@ -6,13 +6,13 @@ It also tells what the node's CPU does, and on one node it is the detour for sma
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Iterable
 
 import psutil
 
 from dwell.live.bundle import MOST_MESSAGES, Bundle
+from dwell.live.failures import start_thread
 from dwell.live.group import ControlGroup
 from dwell.live.messages import Carried, Load, encode
 from dwell.live.role import TWICE, Place, Pulse
@@ -84,7 +84,7 @@ class Gauge:
         self._read, self._every_s = read, every_s
         self._value, self._read_s = -1.0, time.monotonic()
         self._trouble = ""
-        threading.Thread(target=self._run, name="gauge", daemon=True).start()
+        start_thread("gauge", self._run)
 
     def _run(self) -> None:
         while True:
@@ -93,7 +93,7 @@ class Gauge:
                 if not 0.0 <= value <= 1.0 or math.isnan(value):
                     raise ValueError(f"{value:g} is no share from 0 to 1")
                 self._value, self._trouble = value, ""
-            except Exception as error:  # the user's code
+            except (Exception, SystemExit) as error:  # the user's code
                 self._value = -1.0
                 self._trouble = f"the accelerator's utilisation: {type(error).__name__}: {error}"
             self._read_s = time.monotonic()

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 from dwell.errors import LiveError
 from dwell.live.clocks import wrong_clock
+from dwell.live.failures import described, end_process, start_thread
 from dwell.live.role import Role
 from dwell.live.stage import Message
 from dwell.live.transport.protocol import Sample, Transport
@@ -57,6 +58,8 @@ class Hosted:
         Ends `run` within a fifth of a second.
     hurry : Event, optional
         Set when something is due sooner than was said; roles that take turns share one.
+    complain : callable, optional
+        Told of a message at which the role has failed; it goes on with the next one.
     """
 
     def __init__(
@@ -67,12 +70,13 @@ class Hosted:
         heard: Callable[[], bool] | None = None,
         stopped: threading.Event | None = None,
         hurry: threading.Event | None = None,
+        complain: Callable[[LiveError], None] | None = None,
     ) -> None:
         self.role, self.transport, self.clock = role, transport, clock
         self.lock = threading.Lock()
         self.stopped = stopped or threading.Event()
         self.hurry = hurry or threading.Event()
-        self._heard = heard
+        self._heard, self._complain = heard, complain
         self.news = threading.Semaphore(0)
         self._due_ns = self._seen_ns = 0
         for key in role.subscriptions():
@@ -82,7 +86,7 @@ class Hosted:
         if self.stopped.is_set():
             return
         with self.lock:
-            wanted_ns = self.role.receive(sample, self.clock())
+            wanted_ns = self._taken(sample)
             sooner = wanted_ns is not None and wanted_ns < self._due_ns
             if sooner and wanted_ns is not None:
                 self._due_ns = wanted_ns
@@ -90,6 +94,20 @@ class Hosted:
             self.hurry.set()
         if self._heard is not None and self._heard():
             self.news.release()
+
+    def _taken(self, sample: Sample) -> int | None:
+        """Have the role take a message."""
+        try:
+            return self.role.receive(sample, self.clock())
+        except KeyboardInterrupt:
+            raise
+        except Exception as error:
+            if self._complain is None:
+                raise
+            self._complain(LiveError(f"a message under {sample.key}: {described(error)}"))
+            return None
+        except BaseException as error:  # an actuator that calls sys.exit(), a panic of Zenoh's
+            end_process(f"a message under {sample.key}", error)
 
     def rest_ns(self) -> int:
         """Time until the role is due; negative where it is late."""
@@ -161,9 +179,9 @@ def work(
     ready : callable, optional
         Called when the stage has started.
     """
-    hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work)
-    beats = threading.Thread(target=hosted.run, name="beats", daemon=True)
-    beats.start()
+    complain = worker.place.complain
+    hosted = Hosted(worker, transport, clock, heard=lambda: worker.has_work, complain=complain)
+    start_thread("beats", hosted.run)
     stage = worker.stage
     start = getattr(stage, "start", None)
     if start is not None:
@@ -174,8 +192,7 @@ def work(
     if ready is not None:
         ready()
     if worker.triggers:
-        arguments = (worker, hosted, getattr(stage, "wait", None), stopped)
-        threading.Thread(target=_frames, args=arguments, name="frames", daemon=True).start()
+        start_thread("frames", _frames, worker, hosted, getattr(stage, "wait", None), stopped)
     try:
         while not stopped.is_set():
             _drain(worker, hosted, note, clock)

@@ -21,6 +21,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from dwell.live.failures import start_thread
 from dwell.live.transport.orphans import remove_orphans
 
 __all__ = ["OWNER", "end_with_owner", "start_sweeper"]
@@ -48,7 +49,7 @@ def end_with_owner(stopped: threading.Event) -> None:
         return
     except OSError:
         return  # a kernel without them
-    threading.Thread(target=_wait, args=(owner, stopped), name="leash", daemon=True).start()
+    start_thread("leash", _wait, owner, stopped)
 
 
 def _wait(owner: int, stopped: threading.Event) -> None:

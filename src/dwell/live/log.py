@@ -1,13 +1,51 @@
-"""Log: what went wrong, without its floods."""
+"""Log: what went wrong, without its floods, and as it can be shown on a terminal."""
 
 from __future__ import annotations
 
+import io
+import sys
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
 
-__all__ = ["Log"]
+__all__ = ["Log", "escape_output", "printable"]
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Return a text with escapes in place of all that a terminal may take for something else.
+
+    Parameters
+    ----------
+    text : str
+        Of a user's code, or from the network.
+    keep : str
+        Characters that stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        one if one.isprintable() or one in keep else one.encode("unicode_escape").decode()
+        for one in text
+    )
+
+
+class _Escaping(io.TextIOWrapper):
+    """Writes printable lines."""
+
+    def write(self, text: str) -> int:
+        super().write(printable(text, keep="\n\t"))
+        return len(text)
+
+
+def escape_output() -> None:
+    """Have all that this process prints from now on escaped, at once and line by line."""
+    for name in ("stdout", "stderr"):
+        before = getattr(sys, name)
+        with suppress(OSError):
+            before.flush()
+        raw = io.FileIO(before.fileno(), "wb", closefd=False)
+        setattr(sys, name, _Escaping(raw, encoding="utf-8", write_through=True))
 
 
 class Log:
@@ -44,4 +82,4 @@ class Log:
             self._next_s, self._left_out = now_s + self._every_s, 0
         # A log on a disk that is full must not end who writes it.
         with suppress(OSError):
-            self._say(f"{line}{more}")
+            self._say(printable(f"{line}{more}"))

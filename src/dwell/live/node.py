@@ -93,7 +93,8 @@ def run_agent(
         place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
         agent = Agent(place, supervisor, _cpu_count(problem, node, say), gauge)
-        hosted = Hosted(agent, transport, clock_of(problem, node), stopped=stopped)
+        clock, complain = clock_of(problem, node), place.complain
+        hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         keep_collections_short()
         hosted.run()
     finally:
@@ -202,7 +203,14 @@ def run_controller(
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
             clock = clock_of(problem, node)
             cell = Cell(place, controller, recorder, name, time.time_ns())
-            hosted.append(Hosted(cell, transport, clock, stopped=stopped, hurry=hurry))
+            hosted.append(
+                Hosted(
+                    *(cell, transport, clock),
+                    stopped=stopped,
+                    hurry=hurry,
+                    complain=place.complain,
+                )
+            )
             recorders.append((recorder, cell))
         keep_collections_short()
         try:

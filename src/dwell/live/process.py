@@ -93,7 +93,8 @@ def _count(role: Stamper | Sink, problem: Problem, node: str) -> None:
 
 def _host(role: Role, place: Place, stopped: threading.Event) -> None:
     """Run a role in this thread until the process is told to end."""
-    hosted = Hosted(role, place.transport, clock_of(place.problem, place.node), stopped=stopped)
+    clock = clock_of(place.problem, place.node)
+    hosted = Hosted(role, place.transport, clock, stopped=stopped, complain=place.complain)
     keep_collections_short()
     hosted.run()
 

@@ -13,6 +13,7 @@ from dwell import __version__
 from dwell.errors import LiveError, TrustError
 from dwell.live.hearing import Hearing
 from dwell.live.keys import CONTROLLER, Keys
+from dwell.live.log import printable
 from dwell.live.messages import (
     MAX_HEADER_BYTES,
     Beat,
@@ -281,7 +282,7 @@ class Place:
 
     def complain(self, error: LiveError) -> None:
         """Count a message that could not be used; a flood of them takes no memory."""
-        what = str(error)[:300]
+        what = printable(str(error))[:300]
         if what not in self.complaints and len(self.complaints) >= MAX_COMPLAINTS:
             del self.complaints[next(iter(self.complaints))]
         self.complaints[what] = self.complaints.get(what, 0) + 1
@@ -468,7 +469,7 @@ class Pulse:
         heard = self.hearing.heard()
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, note[:2000], __version__),
+            *(self._digest, printable(note)[:2000], __version__),
         )
         place.put_twice(self._key, beat)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault, LiveError, TrustError
+from dwell.live.failures import start_thread
 from dwell.live.role import Place
 from dwell.live.transport.protocol import Transport
 from dwell.live.transport.zenoh import LONGEST_BYTES, ZenohSettings, ZenohTransport
@@ -154,7 +155,7 @@ class Security:
                 self._tell(say)
 
         self._tell(say)
-        threading.Thread(target=repeat, name="keys", daemon=True).start()
+        start_thread("keys", repeat)
 
     def _tell(self, say: Callable[[str], None]) -> None:
         for line in self.warnings():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import signal
@@ -17,6 +18,7 @@ from pathlib import Path
 import psutil
 
 from dwell.live.files import InFlight
+from dwell.live.log import printable
 
 __all__ = ["Child", "Supervisor"]
 
@@ -29,6 +31,12 @@ POISONOUS = 2
 #: A process has warmed up after this time; it is reported when it has gained this much since, and
 #: has more than twice what it had then.
 WARM_S, GROWTH_BYTES = 30.0, 128 << 20
+#: How long it is told that a process has died for want of memory.
+STARVED_S = 60.0
+#: Of a process that an agent before has started, nobody knows what it died of.
+ENDED = "has ended"
+#: Where the kernel counts the processes that it has killed because there was no memory left.
+EVENTS, OOM_KILL = Path("/proc/vmstat"), "oom_kill"
 #: A log that is longer becomes the older one, which is dropped.
 LOG_BYTES = 8 << 20
 
@@ -56,6 +64,10 @@ class Child:
     next_s: float = 0.0
     note: str = ""
     deaths: Counter[str] = field(default_factory=Counter)
+    #: What it died of last where that was its memory, and when.
+    starved: str = ""
+    starved_s: float = -math.inf
+    has_bytes: int = 0
     watched: psutil.Process | None = None
     warm_bytes: int | None = None
     growth: str = ""
@@ -112,6 +124,7 @@ class Supervisor:
         self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
         self.children: list[Child] = []
         self._say = say
+        self._oom_kills = _oom_kills()
         given = os.environ if environment is None else environment
         self._environment = {**given, "PYTHONUNBUFFERED": "1"}
 
@@ -142,24 +155,42 @@ class Supervisor:
             if child.adopted.is_running() and child.adopted.status() != psutil.STATUS_ZOMBIE:
                 return True
             child.adopted = None
-            self._died(child, "has ended")
+            self._died(child, ENDED)
         return False
 
     def _died(self, child: Child, reason: str) -> None:
-        lived_s = time.monotonic() - child.started_s
+        now_s = time.monotonic()
+        lived_s = now_s - child.started_s
+        last = _last_line(child.log)
+        if starved := self._starved(child, reason, last):
+            reason = starved
+            child.starved, child.starved_s = f"{child.who} {starved}", now_s
         child.failures = 1 if lived_s > HEALTHY_S else child.failures + 1
         wait_s = min(FIRST_WAIT_S * 2 ** (child.failures - 1), LONGEST_WAIT_S)
-        child.next_s = time.monotonic() + (wait_s if child.failures > 1 else 0.0)
-        last = _last_line(child.log)
+        child.next_s = now_s + (wait_s if child.failures > 1 else 0.0)
         child.note = f"{child.who} {reason}{f': {last}' if last else ''}"
         again = f"; start {child.starts + 1} in {wait_s:.1f} s" if child.failures > 1 else ""
         self._say(f"{child.note}{again}")
         try:
-            self._blame(child)
+            self._blame(child, reason)
         except OSError as error:
             self._say(f"{child.who}: what it died of cannot be kept ({error.strerror})")
 
-    def _blame(self, child: Child) -> None:
+    def _starved(self, child: Child, reason: str, last: str) -> str:
+        """Return that a process died for want of memory, and how; empty where it did not.
+
+        The kernel counts the processes that it has killed for that, of the whole machine.
+        """
+        killed = self._oom_kills < (kills := _oom_kills())
+        self._oom_kills = kills
+        had = f"; it had {child.has_bytes >> 20} MB" if child.has_bytes else ""
+        if killed and reason in (_reason(-signal.SIGKILL), ENDED):
+            return f"was killed by the kernel, which had no memory left{had}"
+        if "MemoryError" in last:
+            return f"{reason} for want of memory{had}"
+        return ""
+
+    def _blame(self, child: Child, reason: str) -> None:
         """Give the message that a worker died of to the next one, but not twice."""
         content = InFlight.read(child.inflight)
         again = child.folder / f"{child.who}.again"
@@ -176,7 +207,7 @@ class Supervisor:
         quarantine.mkdir(exist_ok=True)
         kept = quarantine / f"{child.who}-{name}.bin"
         kept.write_bytes(content)
-        child.note = f"{child.who}: a message has killed it twice; it is kept in {kept}"
+        child.note = f"{child.who}: a message has killed it twice ({reason}); it is kept in {kept}"
         self._say(child.note)
 
     def _start(self, child: Child) -> None:
@@ -219,6 +250,7 @@ class Supervisor:
 
     def tend(self) -> None:
         """Look how much memory the processes have taken, and how much they have printed."""
+        self._oom_kills = _oom_kills()
         for child in self.children:
             _shorten(child.log, self._log_bytes)
             if child.process is not None and not child.mark.exists():
@@ -227,14 +259,16 @@ class Supervisor:
 
     def _weigh(self, child: Child) -> None:
         """Report a process whose memory has doubled since it had warmed up, at every doubling."""
-        if child.pid is None or time.monotonic() - child.started_s < self._warm_s:
+        if child.pid is None:
             return
         try:
             memory = psutil.Process(child.pid).memory_info()
         except psutil.Error:
             return
         # Without what it shares with others: the payloads in shared memory.
-        has_bytes = memory.rss - memory.shared
+        child.has_bytes = has_bytes = memory.rss - memory.shared
+        if time.monotonic() - child.started_s < self._warm_s:
+            return
         before = child.warm_bytes
         if before is None:
             child.warm_bytes = has_bytes
@@ -262,8 +296,10 @@ class Supervisor:
         return found
 
     def notes(self) -> str:
-        """What went wrong last, of processes that keep dying or growing."""
-        found = [child.note for child in self.children if child.failures > 1]
+        """What went wrong last, of processes that keep dying or growing, or died for memory."""
+        since_s = time.monotonic() - STARVED_S
+        found = [child.starved for child in self.children if child.starved_s > since_s]
+        found += [child.note for child in self.children if child.failures > 1]
         found += [child.growth for child in self.children if child.growth]
         return "; ".join(found)[:2000]
 
@@ -313,6 +349,15 @@ def _reason(code: int) -> str:
     return f"ended with exit code {code}"
 
 
+def _oom_kills() -> int:
+    """Return how many processes the kernel has killed for memory; 0 where it does not count."""
+    try:
+        counts = dict(line.split() for line in EVENTS.read_text().splitlines())
+        return int(counts.get(OOM_KILL, 0))
+    except (OSError, ValueError):
+        return 0
+
+
 def _shorten(path: Path, longest: int) -> None:
     """Begin a log anew that is too long; its process goes on appending to the same file."""
     try:
@@ -328,7 +373,7 @@ def _last_line(path: Path) -> str:
     try:
         with path.open("rb") as file:
             file.seek(max(file.seek(0, os.SEEK_END) - 2_000, 0))
-            lines = file.read().decode(errors="replace").strip().splitlines()
+            lines = file.read().decode(errors="replace").strip().split("\n")
     except OSError:
         return ""
-    return lines[-1][:300] if lines else ""
+    return printable(lines[-1])[:300] if lines else ""

@@ -8,8 +8,11 @@ import uuid
 from collections.abc import Mapping
 from typing import Any
 
+import msgspec
+
 from dwell.errors import LiveError, TrustError
 from dwell.live.keys import Keys
+from dwell.live.log import printable
 from dwell.live.messages import Answer, Ask, decode, encode
 from dwell.live.security import Security
 from dwell.live.transport.protocol import Sample
@@ -60,9 +63,11 @@ class Visitor:
 
     def _heard(self, sample: Sample) -> None:
         try:
-            self._answers.put(decode(sample.payload, Answer))
+            answer = decode(sample.payload, Answer)
         except LiveError:
             return
+        refused, status = printable(answer.refused), _shown(answer.status)
+        self._answers.put(msgspec.structs.replace(answer, refused=refused, status=status))
 
     def ask(self, what: str, about: str = "", *, patience_s: float = 3.0) -> dict[str, Any]:
         """Ask, and return how the cell is.
@@ -140,3 +145,12 @@ class Visitor:
             f"no controller of cell {self.problem.name!r} answers{since}; is `dwell controller` "
             f"running on {self.problem.controller_node}?"
         )
+
+
+def _shown(value: Any) -> Any:
+    """Return plain values with all their texts printable."""
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, dict):
+        return {_shown(key): _shown(one) for key, one in value.items()}
+    return [_shown(one) for one in value] if isinstance(value, list) else value

@@ -260,6 +260,32 @@ def test_a_message_that_is_too_long_is_dropped_on_arrival() -> None:
         mesh.close()
 
 
+def test_a_receiver_that_fails_gets_the_next_message_and_its_failure_is_logged_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    mesh = ZenohMesh([ME, FAR])
+    try:
+        sender, receiver = mesh.open(ME), mesh.open(FAR)
+        assert isinstance(receiver, ZenohTransport)
+        inbox, key = mesh.inbox(), "dwell/t/stamped"
+
+        def receive(sample: Sample) -> None:
+            if sample.payload == b"poison":
+                raise ZeroDivisionError
+            inbox(sample)
+
+        receiver.subscribe(key, receive)
+        introduce(mesh, sender, key, [inbox])
+        for payload in (b"poison", b"poison", b"food"):
+            sender.put(key, payload)
+        mesh.joined(lambda: b"food" in inbox.payloads, lambda: sender.put(key, b"food"))
+        assert receiver.failed == 2
+        (record,) = caplog.records
+        assert record.getMessage() == f"{FAR}: a receiver of {key} failed"
+    finally:
+        mesh.close()
+
+
 def test_what_was_put_under_another_key_is_not_heard() -> None:
     """Zenoh has delivered messages under keys of the session before, when it began anew."""
     mesh = ZenohMesh([ME, FAR])

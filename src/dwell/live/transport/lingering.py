@@ -15,6 +15,8 @@ import struct
 import threading
 from contextlib import suppress
 
+from dwell.live.failures import start_thread
+
 __all__ = ["Connections"]
 
 #: Open files of this process, by number.
@@ -32,11 +34,10 @@ class Connections:
     def __init__(self) -> None:
         self._known: set[int] = set()
         self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="dwell-lingering", daemon=True)
 
     def start(self) -> None:
         """Look after them from now on."""
-        self._thread.start()
+        start_thread("dwell-lingering", self._run)
 
     def stop(self) -> None:
         """Look no more."""

@@ -25,6 +25,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError
+from dwell.live.failures import described, start_thread
 from dwell.live.transport.expressions import require_expression, require_key
 from dwell.live.transport.lingering import Connections
 from dwell.live.transport.losses import Losses
@@ -47,6 +48,8 @@ MARKED_BYTES = 5
 _LOG = logging.getLogger(__name__)
 _SENT_BY = "zenoh/bytes;"
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
+#: Different failures of receivers that are logged.
+MOST_FAILURES = 100
 #: Publishers kept declared; more keys than a process ever puts, answers to questions aside.
 _PUBLISHERS = 256
 #: Large payloads of one key that wait while another is on its way.
@@ -162,6 +165,9 @@ class ZenohTransport:
         self._connections = Connections()
         #: Messages that arrived under another key than they were put under.
         self.misled = 0
+        #: Messages that nobody could handle.
+        self.failed = 0
+        self._failures: set[str] = set()
         # Read and filled without a lock: a publisher too many does no harm.
         self._ways: dict[tuple[str, Lane], _Way] = {}
         self._locks: dict[Lane, threading.RLock] = {
@@ -208,7 +214,7 @@ class ZenohTransport:
             # is behind makes its senders drop instead of growing a queue here.
             session.declare_subscriber(
                 key,
-                self._zenoh.handlers.Callback(deliver, indirect=False),
+                self._zenoh.handlers.Callback(self._told(deliver), indirect=False),
                 allowed_origin=self._zenoh.Locality.REMOTE,
             )
 
@@ -317,14 +323,26 @@ class ZenohTransport:
                 header = header[MARKED_BYTES:]
             message = Sample(key, sample.payload.to_bytes(), header)
             with lock:
-                if self._closed:
-                    return
-                try:
+                if not self._closed:
                     receive(message)
-                except Exception:
-                    _LOG.exception("%s: a receiver of %s failed", self.entry.role.who, message.key)
 
         return deliver
+
+    def _told(self, deliver: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+        """Have the log say once of each message that nobody could handle, in Zenoh's thread."""
+        who = self.entry.role.who
+
+        def tell(sample: zenoh.Sample) -> None:
+            try:
+                deliver(sample)
+            except Exception as error:
+                what = described(error)
+                self.failed += 1
+                if what not in self._failures and len(self._failures) < MOST_FAILURES:
+                    self._failures.add(what)
+                    _LOG.exception("%s: a receiver of %s failed", who, sample.key_expr)
+
+        return tell
 
     def _misled(self, key: str) -> None:
         self.misled += 1
@@ -390,8 +408,7 @@ class _Sender:
         self._changed = threading.Condition()
         self._waiting: deque[tuple[bytes, bytes]] = deque(maxlen=_WAITING)
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="dwell-sender", daemon=True)
-        self._thread.start()
+        self._thread = start_thread("dwell-sender", self._run)
 
     def send(self, data: bytes, header: bytes) -> None:
         """Have a message put next; the oldest that waits is dropped where there are too many."""
