@@ -165,6 +165,40 @@ def test_check_warns(cell: Path, old: str, new: str, words: tuple[str, ...]) -> 
     assert len(read_json(call("check", cell, "--json"))["warnings"]) == 1
 
 
+@pytest.mark.parametrize(
+    ("jitter", "warned"),
+    [
+        ("{exponential: {mean: 1000}}", True),
+        ("{uniform: {low: 0, high: 25}}", True),
+        ("{uniform: {low: 0, high: 19}}", False),
+        ("2", False),
+    ],
+)
+def test_a_jitter_of_releases_beyond_the_period_is_warned_of(
+    cell: Path, jitter: str, warned: bool
+) -> None:
+    text = cell.read_text(encoding="utf-8")
+    cell.write_text(f"{text}\nrelease_jitter_ms: {jitter}\n", encoding="utf-8")
+    found = read_json(call("check", cell, "--json"))["warnings"]
+    assert [one["path"] for one in found if one["path"] == "release_jitter_ms"] == (
+        ["release_jitter_ms"] if warned else []
+    )
+
+
+def test_cycles_on_their_way_when_a_run_ends_are_told_apart_from_lost_ones(cell: Path) -> None:
+    """A task that takes more than a period: the queue before it grows to the end."""
+    cell.write_text(SMALL.replace("{R: {exec_ms: 8}", "{R: {exec_ms: 130}"), encoding="utf-8")
+    arguments = ("run", cell, "--policy", "LOC", "--windows", "10")
+    row = read_json(call(*arguments, "--out", "one", "--json"))["summary"]
+    assert row["lost"] == 0
+    assert row["in_flight"] > row["cycles"] / 2
+    text = call(*arguments, "--out", "two").stdout
+    assert f"{row['in_flight']} of {row['cycles']}" in text
+    assert "unfinished at the end" in text
+    assert "inf" not in text
+    assert "unfinished" not in call("run", cell, "--policy", "OFF", "--out", "three").stdout
+
+
 def test_no_warning_about_a_guard_that_is_off_or_has_nowhere_to_go(cell: Path) -> None:
     slow = SMALL.replace("E: {exec_ms: 2}}}", "E: {exec_ms: 37.5}}}")
     for controller in ("", "controller: {fallbacks: [OFF]}\n"):

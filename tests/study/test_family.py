@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import SimulationError
-from dwell.study.family import Family, holm
+from dwell.study.family import Family, cannot_tell, holm
 from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
 
 chances = st.lists(st.floats(0, 1), max_size=12)
@@ -89,7 +89,23 @@ def test_a_verdict_rests_on_the_adjusted_p() -> None:
 
 def test_five_seeds_show_nothing() -> None:
     family = Family("q", "m", {"a": paired_difference([1.0] * 5, [2.0, 2.1, 2.2, 2.3, 2.4])})
-    assert family.verdict("a") == "no difference shown"
+    assert family.verdict("a") == "cannot tell with 5 seeds"
+
+
+def test_what_a_family_cannot_tell_it_says() -> None:
+    assert [cannot_tell(seeds) for seeds in (1, 3, 5, 6)] == [
+        "cannot tell with 1 seed",
+        "cannot tell with 3 seeds",
+        "cannot tell with 5 seeds",
+        "",
+    ]
+    # The smallest of 2 p values is doubled: 2 * 2 / 2**6 is above 5 %.
+    assert cannot_tell(6, 2) == "cannot tell with 6 seeds"
+    assert cannot_tell(7, 2) == ""
+    first, second = [1.0, 1.1, 1.2, 1.3, 1.4, 1.5], [2.0] * 6
+    pairs = {name: paired_difference(first, second) for name in ("a", "b")}
+    assert set(Family("q", "m", pairs).verdicts.values()) == {"cannot tell with 6 seeds"}
+    assert Family("q", "m", {"a": pairs["a"]}).verdict("a") == "lower"
 
 
 def test_an_unknown_comparison_is_named() -> None:

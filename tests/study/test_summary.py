@@ -147,6 +147,7 @@ def test_a_row_holds_what_the_tables_show() -> None:
         "lost": 3,
         "longest_misses": 1,
         # There are 12 cycles: the whole run is the only stretch.
+        "in_flight": 0,
         "misses_in_20": 3,
         "over_1_in_20": 1.0,
         "misses_in_100": 3,

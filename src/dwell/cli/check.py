@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 
 from dwell.cli.output import aligned, print_json
@@ -13,9 +14,12 @@ from dwell.errors import Fault, ProblemError
 from dwell.estimators import Profile
 from dwell.io import load
 from dwell.live.cautions import find_cautions
-from dwell.model import Problem
+from dwell.model import Problem, Trace
 
 __all__ = ["check_cell", "find_warnings"]
+
+#: Draws of a process that a percentile is taken of, and their seed.
+DRAWS, SEED = 10_000, 1
 
 
 def check_cell(
@@ -64,6 +68,7 @@ def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
     yield from _overloads(problem, profile)
     yield from _over_caps(problem, profile)
     yield from _false_alarms(problem, profile)
+    yield from _late_releases(problem)
     yield from find_cautions(problem)
 
 
@@ -111,6 +116,21 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
                 f"take {needed_ms:.1f} ms of (guard_cycles - 1) periods = {bound_ms:.1f} ms, so "
                 "that the guard fires without a fault; raise it",
             )
+
+
+def _late_releases(problem: Problem) -> Iterator[Fault]:
+    """Yield a jitter of releases that exceeds the period: many then fall on the same instant."""
+    jitter, period_ms = problem.pipeline.release_jitter_ms, problem.pipeline.period_ms
+    rng = np.random.default_rng(SEED)
+    draws = jitter.values if isinstance(jitter, Trace) else jitter.marginal(rng, DRAWS)
+    p99_ms = float(np.quantile(draws, 0.99))
+    if p99_ms > period_ms:
+        yield Fault(
+            "release_jitter_ms",
+            f"its 99th percentile is {p99_ms:.4g} ms, more than the period of {period_ms:.4g} ms: "
+            "no cycle is released before the one ahead of it, so that releases gather behind a "
+            "late one; lower it",
+        )
 
 
 def _return_ms(problem: Problem, candidate: str) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -105,10 +106,11 @@ def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -
     lines = (
         ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
         ("L95, mean of windows", f"{row['l95_ms']:.2f} ms"),
-        ("median latency", f"{row['p50_ms']:.2f} ms"),
-        ("95th percentile of all cycles", f"{row['p95_ms']:.2f} ms"),
+        ("median latency", _latency(row["p50_ms"])),
+        ("95th percentile of all cycles", _latency(row["p95_ms"])),
         ("cost J, mean of windows", f"{row['cost']:.3f}"),
         ("cycles lost", f"{row['lost']} of {row['cycles']}"),
+        *_unfinished(row),
         ("longest run of misses", f"{row['longest_misses']}"),
         *_control(row),
         ("migrations", f"{row['migrations']}"),
@@ -120,6 +122,18 @@ def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -
     left_out = f", the first {warmup} (warm-up) left out below" if warmup else ""
     body = "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)
     return f"{title}{left_out}\n\n{body}"
+
+
+def _latency(value: object) -> str:
+    """``12.34 ms``; infinite where too many cycles never finished."""
+    latency_ms = float(str(value))
+    return f"{latency_ms:.2f} ms" if math.isfinite(latency_ms) else "∞: too many never finished"
+
+
+def _unfinished(row: Row) -> Iterator[tuple[str, str]]:
+    """Yield how many cycles were still on their way when the run ended, where any were."""
+    if row["in_flight"]:
+        yield "unfinished at the end", f"{row['in_flight']} of {row['cycles']}"
 
 
 def _control(row: Row) -> Iterator[tuple[str, str]]:

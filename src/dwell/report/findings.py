@@ -19,6 +19,7 @@ from dwell.report.wording import (
     write_number,
 )
 from dwell.study import AIM, Comparison, Interval
+from dwell.study.family import cannot_tell
 from dwell.study.intervals import Verdict, rule_of_three, under
 from dwell.study.predictions import PAPER, Judgement, applies, judge_placement
 
@@ -157,10 +158,10 @@ def _on_statics(comparison: Comparison) -> str:
         )
         for scenario in comparison.scenarios
     }
-    said = _higher_or_lower(gaps, decimals=2)
+    said = _higher_or_lower(comparison, gaps, decimals=2)
     return (
         "Against the static placement that is cheapest in each scenario, which is known only "
-        f"afterwards, the cost J of DTP is {said}."
+        f"afterwards, the cost J of DTP{said}."
     )
 
 
@@ -172,8 +173,8 @@ def _on_atp(comparison: Comparison) -> str:
         for scenario in comparison.scenarios
     }
     points = {name: Interval(*(100 * end for end in gap)) for name, gap in gaps.items()}
-    said = _higher_or_lower(points, decimals=1, unit=" points")
-    return f"Against {shown_policy(ATP)}, V_D of DTP is {said}."
+    said = _higher_or_lower(comparison, points, decimals=1, unit=" points")
+    return f"Against {shown_policy(ATP)}, V_D of DTP{said}."
 
 
 def _on_beliefs(comparison: Comparison) -> list[str]:
@@ -187,8 +188,8 @@ def _on_beliefs(comparison: Comparison) -> list[str]:
             scenario: comparison.difference(scenario, (name, DTP), COST.column)
             for scenario in comparison.scenarios
         }
-        said = _higher_or_lower(gaps, decimals=2)
-        found.append(f"Against DTP, the cost J of {shown_policy(name)} is {said}.")
+        said = _higher_or_lower(comparison, gaps, decimals=2)
+        found.append(f"Against DTP, the cost J of {shown_policy(name)}{said}.")
     return found
 
 
@@ -451,8 +452,13 @@ def _gap(gap: float, decimals: int) -> str:
     return write_number(gap, decimals) if gap >= least / 2 else f"less than {least:.{decimals}f}"
 
 
-def _higher_or_lower(gaps: Mapping[str, Interval], decimals: int, unit: str = "") -> str:
+def _higher_or_lower(
+    comparison: Comparison, gaps: Mapping[str, Interval], decimals: int, unit: str = ""
+) -> str:
     """Say in which scenarios a difference is above 0, below, or not told by the seeds."""
+    word = cannot_tell(len(comparison.seeds))
+    if word:
+        return f": {word}"
     higher = {name: gap.value for name, gap in gaps.items() if gap.known and gap.low > 0}
     lower = {name: -gap.value for name, gap in gaps.items() if gap.known and gap.high < 0}
     words = []
@@ -468,4 +474,4 @@ def _higher_or_lower(gaps: Mapping[str, Interval], decimals: int, unit: str = ""
     for names, word in ((equal, "the same"), (level, "not told apart")):
         if names:
             words.append(f"{word} in {listed(map(shown_scenario, names))}")
-    return "; ".join(words)
+    return f" is {'; '.join(words)}"

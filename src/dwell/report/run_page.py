@@ -106,7 +106,7 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     begins = _begins(run, facts)
     yield section("Through time", *_in_time(run, facts, palette, begins))
     yield section("Latency", *_latency(facts, counted, palette))
-    yield section("Decisions", *_decisions(run, facts, palette, begins))
+    yield section("Decisions", *_decisions(run, counted, facts, palette, begins))
     yield section(
         "Worst windows", _worst_windows(facts, counted, palette, _by_window(run.windows, begins))
     )
@@ -327,9 +327,9 @@ def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
 
 
 def _decisions(
-    run: Run, facts: Facts, palette: Palette, begins: NDArray[np.float64]
+    run: Run, counted: Counted, facts: Facts, palette: Palette, begins: NDArray[np.float64]
 ) -> Iterator[str]:
-    decisions = run.decisions
+    decisions = counted.decisions
     counts = dict(decisions["reason"].cast(str).value_counts().rows())
     yield items(
         f"`{name}`, {_count(counts[name], 'time')}: {text}"

@@ -105,7 +105,7 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
 
     Intervals become ``± half``, the larger one, where the halves differ by no more than a unit of
     the last digit, and the sign is as certain as the ends say; others ``[low, high]``. Where every
-    seed showed the same number, or the same extreme of a share, nothing stands beside it.
+    seed showed the same number, nothing stands beside it, but beside a share of none or of all.
 
     Parameters
     ----------
@@ -116,9 +116,9 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
         finite: for tables that are short of room and say so.
     """
     value, low, high = (end * measure.factor for end in interval)
-    text = write_number(value, measure.decimals, signed=measure.signed)
-    if not interval.known or low == high or (value in (low, high) and interval.value in (0, 1)):
-        return Written(text if value else "0", "")
+    text = write_number(value, measure.decimals, signed=measure.signed) if value else "0"
+    if not interval.known or low == high:
+        return Written(text, "")
     half = max(high - value, value - low)
     if measure.ends or not math.isfinite(half):
         return Written(text, _between(low, high, measure))

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from dwell.model import Problem
 from dwell.study.engine import Progress, play_in_memory
-from dwell.study.intervals import Interval, mean_interval
-from dwell.study.over_seeds import interval_of, over_seeds
+from dwell.study.intervals import Interval
+from dwell.study.over_seeds import difference_of, interval_of, over_seeds
 from dwell.study.player import Example, Player
 from dwell.study.software import versions
 from dwell.study.study import Contender, Point, Study
@@ -90,9 +90,13 @@ class Comparison:
         return interval_of(column)(self.values(scenario, policy, column))
 
     def difference(self, scenario: str, policies: tuple[str, str], column: str) -> Interval:
-        """Return the mean over seeds of what the first policy shows less what the second does."""
+        """Return the mean over seeds of what the first policy shows less what the second does.
+
+        Its interval is that of pairs of runs, and for shares (the violation rate, say) no narrower
+        than what either policy's own leaves open (see `share_difference_interval`).
+        """
         first, second = (self.values(scenario, policy, column) for policy in policies)
-        return mean_interval(first - second)
+        return difference_of(column)(first, second)
 
     def table(self) -> pl.DataFrame:
         """Return one row a scenario and policy: every column over seeds with its 95 % interval.

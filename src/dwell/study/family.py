@@ -10,20 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from dwell.errors import SimulationError
 from dwell.study.intervals import CONFIDENCE
-from dwell.study.paired import PairedDifference, PairedMedian
+from dwell.study.paired import PairedDifference, PairedMedian, least_p
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Difference", "Family", "holm"]
+__all__ = ["Difference", "Family", "cannot_tell", "holm"]
 
-Comparative: TypeAlias = Literal["lower", "higher", "no difference shown"]
+#: ``lower``, ``higher``, ``no difference shown``, or what `cannot_tell` says.
+Comparative: TypeAlias = str
 Difference: TypeAlias = PairedDifference | PairedMedian
 
 
@@ -56,13 +57,14 @@ class Family:
     def verdicts(self) -> dict[str, Comparative]:
         """Where the first is lower or higher, with 95 % confidence in all of them together.
 
-        "No difference shown" is no proof that there is none: intervals say what is left open. With
-        n pairs and m comparisons nothing can be shown where 2 m / 2^n is above 5 %.
+        "No difference shown" is no proof that there is none: intervals say what is left open. Where
+        nothing can be shown, whatever the numbers are, `cannot_tell` says so.
         """
         words: dict[int, Comparative] = {-1: "lower", 1: "higher", 0: "no difference shown"}
-        adjusted = self.adjusted
+        adjusted, count = self.adjusted, len(self.comparisons)
         return {
-            name: words[item.direction if adjusted[name] <= 1 - CONFIDENCE else 0]
+            name: cannot_tell(item.n, count)
+            or words[item.direction if adjusted[name] <= 1 - CONFIDENCE else 0]
             for name, item in self.comparisons.items()
         }
 
@@ -93,6 +95,21 @@ class Family:
             for name, item in self.comparisons.items()
         ]
         return pl.DataFrame(rows, schema=_schema(), orient="row").fill_nan(None)
+
+
+def cannot_tell(seeds: int, comparisons: int = 1) -> str:
+    """Return ``cannot tell with 3 seeds`` where so many can show nothing; an empty text elsewhere.
+
+    Parameters
+    ----------
+    seeds : int
+        Pairs of every comparison.
+    comparisons : int
+        Of the family: the smallest of m p values is multiplied by m.
+    """
+    if comparisons * least_p(seeds) <= 1 - CONFIDENCE:
+        return ""
+    return f"cannot tell with {seeds} {'seed' if seeds == 1 else 'seeds'}"
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

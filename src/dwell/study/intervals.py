@@ -35,6 +35,7 @@ __all__ = [
     "mean_interval",
     "median_interval",
     "rule_of_three",
+    "share_difference_interval",
     "share_interval",
     "share_limits",
     "studentised_limits",
@@ -123,6 +124,51 @@ def share_interval(values: Values) -> Interval:
     if len(sample) < 2:
         return Interval(mean, math.nan, math.nan)
     return Interval(mean, *_share_limits(sample, (1 - CONFIDENCE) / 2))
+
+
+def share_difference_interval(
+    first: Values, second: Values, *, seed: int = RESAMPLING_SEED
+) -> Interval:
+    """Mean of the first shares less the second, over pairs, with its two-sided interval.
+
+    It is inside [-1, 1], and no narrower than what its parts leave open. Where one of them showed
+    the same in (nearly) all runs, the bootstrap has no limit for it on a side: what n runs did not
+    show of it is not in the differences either, whatever the other part adds to their spread.
+
+    Parameters
+    ----------
+    first, second : sequence of float
+        One a seed, in the same order, in [0, 1], at least one.
+    seed : int
+        Of the resamples.
+
+    Returns
+    -------
+    Interval
+        By the studentised bootstrap of the differences, each end farther away by what is open of
+        the parts there (the distance from a part's mean to its limit of `share_interval`, on a side
+        on which the bootstrap has none); or what every distribution on [-1, 1] allows, whichever is
+        narrower. NaN at the ends for a single pair.
+    """
+    one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    differences = one - other
+    count, mean = len(differences), float(differences.mean())
+    if count < 2:
+        return Interval(mean, math.nan, math.nan)
+    if _same(differences):
+        p = rule_of_three(count)
+        low, high = least, most = mean * (1 - p) - p, mean * (1 - p) + p
+    else:
+        tail = (1 - CONFIDENCE) / 2
+        p = _unseen(count, tail)
+        low, high = studentised_limits(differences, tail, seed=seed)
+        least = float(differences.min()) * (1 - p) - p
+        most = float(differences.max()) * (1 - p) + p
+    below, above = _open_sides(one)
+    other_below, other_above = _open_sides(other)
+    low = max(low - below - other_above, least, -1.0)
+    high = min(high + above + other_below, most, 1.0)
+    return Interval(mean, min(low, mean), max(high, mean))
 
 
 def share_limits(values: Values) -> tuple[float, float]:
@@ -308,6 +354,18 @@ def _share_limits(sample: Floats, tail: float) -> tuple[float, float]:
     return (
         min(max(low, least * (1 - p)), mean),
         max(min(high, most * (1 - p) + p), mean),
+    )
+
+
+def _open_sides(sample: Floats) -> tuple[float, float]:
+    """How far below and above its mean shares may lie where the bootstrap has no limit; else 0."""
+    mean, low, high = share_interval(sample)
+    if _same(sample):
+        return mean - low, high - mean
+    least, most = studentised_limits(sample, (1 - CONFIDENCE) / 2)
+    return (
+        mean - low if math.isinf(least) else 0.0,
+        high - mean if math.isinf(most) else 0.0,
     )
 
 

@@ -12,6 +12,7 @@ from dwell.study.intervals import (
     Interval,
     mean_interval,
     median_interval,
+    share_difference_interval,
     share_interval,
     share_limits,
 )
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from dwell.study.summary import Row
 
-__all__ = ["interval_of", "over_seeds"]
+__all__ = ["difference_of", "interval_of", "over_seeds"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -76,6 +77,13 @@ def interval_of(column: str) -> Callable[[Floats], Interval]:
     if column == "violation_rate" or column.startswith(("share_", "over_")):
         return share_interval
     return _not_negative if column in NOT_NEGATIVE or column.startswith("u_") else mean_interval
+
+
+def difference_of(column: str) -> Callable[[Floats, Floats], Interval]:
+    """Which interval the mean difference of a column of runs takes, between pairs of runs."""
+    if interval_of(column) is share_interval:
+        return share_difference_interval
+    return lambda first, second: mean_interval(first - second)
 
 
 def _not_negative(values: Floats) -> Interval:

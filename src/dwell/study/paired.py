@@ -24,11 +24,13 @@ from dwell.study.intervals import (
     Values,
     mean_interval,
     median_interval,
+    share_difference_interval,
 )
 
 __all__ = [
     "PairedDifference",
     "PairedMedian",
+    "least_p",
     "paired_difference",
     "paired_median",
     "sign_flip_p",
@@ -105,7 +107,7 @@ class PairedMedian:
 
 
 def paired_difference(
-    first: Values, second: Values, *, seed: int = RESAMPLING_SEED
+    first: Values, second: Values, *, shares: bool = False, seed: int = RESAMPLING_SEED
 ) -> PairedDifference:
     """Compare the means of two samples that are paired by seed.
 
@@ -113,13 +115,16 @@ def paired_difference(
     ----------
     first, second : sequence of float
         One a seed, in the same order, finite.
+    shares : bool
+        Whether they are shares, in [0, 1].
     seed : int
         Of resamples and of drawn flips: the same samples always give the same numbers.
 
     Returns
     -------
     PairedDifference
-        The interval is `mean_interval`'s, by the studentised bootstrap.
+        The interval is `mean_interval`'s, by the studentised bootstrap, of shares
+        `share_difference_interval`'s.
 
     Raises
     ------
@@ -135,7 +140,11 @@ def paired_difference(
                 "take paired_median for numbers that may be infinite"
             )
     differences = _differences(one, other)
-    mean, low, high = mean_interval(differences, seed=seed)
+    mean, low, high = (
+        share_difference_interval(one, other, seed=seed)
+        if shares
+        else mean_interval(differences, seed=seed)
+    )
     return PairedDifference(
         mean=mean,
         low=low,
@@ -173,6 +182,11 @@ def paired_median(first: Values, second: Values) -> PairedMedian:
         p=float(binomtest(below, below + above).pvalue) if below + above else 1.0,
         n=len(differences),
     )
+
+
+def least_p(pairs: int) -> float:
+    """Smallest p value that so many pairs can have, by the sign-flip test and the sign test."""
+    return min(1.0, 2.0 / 2.0**pairs)
 
 
 def sign_flip_p(differences: Values, *, seed: int = RESAMPLING_SEED) -> float:

@@ -20,9 +20,11 @@ from dwell.study.intervals import (
     Interval,
     mean_interval,
     median_interval,
+    share_difference_interval,
     share_interval,
     share_limits,
 )
+from dwell.study.over_seeds import difference_of
 
 __all__ = [
     "PAPER",
@@ -64,7 +66,7 @@ class Evidence:
         mine, theirs = self._values(policy, column), self._values(other, column, scenario)
         if mine is None or theirs is None or not np.isfinite([*mine, *theirs]).all():
             return None
-        return _sign(mean_interval(mine - theirs))
+        return _sign(difference_of(column)(mine, theirs))
 
     def saturated(self, policy: str, column: str) -> bool | None:
         """Whether a tier is at its utilisation cap, or above."""
@@ -291,7 +293,7 @@ def judge_placement(comparison: Comparison, prediction: Prediction, policy: str 
     together = np.minimum(together, 1.0)
     others = [name for name in shares if name not in prediction.dominant]
     rival = max(others, key=lambda name: shares[name].mean())
-    lead = mean_interval(together - shares[rival])
+    lead = share_difference_interval(together, shares[rival])
     share = share_interval(together)
     leads = _sign(lead)
     answer: Answer

@@ -169,6 +169,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **_shares(windows["placement"], tuple(problem.candidates)),
         "cost": _mean(windows["cost"]),
         "lost": int((~cycles["outcome"].is_in(["done", "in_flight"])).sum()),
+        "in_flight": int((cycles["outcome"] == "in_flight").sum()),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
         **_actuator(run.cycles, cycles, problem),

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.study.comparison import AIM
-from dwell.study.intervals import Interval, mean_interval, under
+from dwell.study.intervals import Interval, mean_interval, share_interval, under
 from dwell.study.paper.contrasts import interval, values
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
 
@@ -140,7 +140,7 @@ def judge(
     return Aim(
         regret=regret,
         rate=interval(runs, "violation_rate", mine),
-        reference_rate=mean_interval(reference),
+        reference_rate=share_interval(reference),
         more_moves=more,
         cost_said=_at_most(regret, OVER_REFERENCE),
         rate_said=_under(rates) if asked else "not asked",

@@ -291,7 +291,7 @@ class Seen:
     @property
     def alike(self) -> bool:
         """Whether nothing was shown."""
-        return set(self.said.values()) == {"no difference shown"}
+        return not {"lower", "higher"} & set(self.said.values())
 
 
 def verdict(seen: Sequence[Seen], *, equivalent: bool) -> Outcome:

@@ -352,9 +352,14 @@ def verdict(
     text = (
         f"Against ATP with tuned thresholds, {DTP} has a lower V_D in "
         f"{counted(len(lower), len(against), 'stress scenarios')} and a higher one in "
-        f"{len(higher)}; having both stages to move is better than either alone in {len(both)} of "
-        f"those {len(lower)}."
+        f"{len(higher)}"
     )
+    if lower:
+        text += (
+            "; having both stages to move is better than either alone in "
+            f"{len(both)} of those {len(lower)}"
+        )
+    text += "."
     still = _said(atp_family, f"{DTP}, {static}")
     evidence = [
         f"V_D of {DTP} less that of {TUNED}: lower in {len(lower)}"

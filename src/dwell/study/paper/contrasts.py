@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
 from dwell.study.family import Difference, Family
-from dwell.study.intervals import Interval, median_interval
+from dwell.study.intervals import Interval, median_interval, share_interval
 from dwell.study.over_seeds import interval_of
 from dwell.study.paired import paired_difference, paired_median
 
@@ -63,7 +63,7 @@ def contrast(runs: pl.DataFrame, column: str, pair: Contrast) -> Difference:
     first, second = (values(runs, column, labels) for labels in pair)
     if interval_of(column) is median_interval:
         return paired_median(first, second)
-    return paired_difference(first, second)
+    return paired_difference(first, second, shares=interval_of(column) is share_interval)
 
 
 def family_of(

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem, Scenario, Uniform
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
-from dwell.study.intervals import mean_interval
-from dwell.study.over_seeds import over_seeds
+from dwell.study.over_seeds import difference_of, over_seeds
 from dwell.study.paper.cell import dynamic_scenarios, steady_scenarios
 from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
@@ -263,7 +262,7 @@ def winners(runs: pl.DataFrame, metric: str, candidates: Sequence[str]) -> list[
             for name in candidates
         }
         order = sorted(candidates, key=lambda name: float(values[name].mean()))
-        margin = mean_interval(values[order[1]] - values[order[0]])
+        margin = difference_of(metric)(values[order[1]], values[order[0]])
         found.append(
             Cell(
                 str(scenario),

@@ -1,8 +1,8 @@
-"""Dwell and threshold: what they bound, what they buy in calm, and what they cost in reaction.
+"""Dwell and threshold: what they buy in calm, and what they cost in reaction.
 
 N_min windows without a decision after each move bound the migrations of K windows by
-⌊K / (N_min + 1)⌋, whatever the metrics do; that is a property of the rule and is checked in every
-run. What it buys is not: a policy that may not move cannot chatter, and cannot react either.
+⌊K / (N_min + 1)⌋, whatever the metrics do: a property of the rule, and no finding. What it buys is
+one: a policy that may not move cannot chatter, and cannot react either.
 
 Two settings beside them are tried: ``escape`` (an incumbent over a cap may leave early) and cold
 migrations (a moved task waits for its state and its start), which make every move dearer.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from dwell.model import FrozenDict, Problem
@@ -29,9 +29,9 @@ from dwell.study.paper.sentences import counted, listed, number, percent
 from dwell.study.study import Contender, Point, Study
 
 if TYPE_CHECKING:
-    import polars as pl
+    pass
 
-__all__ = ["Bounds", "chapter", "verdict"]
+__all__ = ["chapter", "verdict"]
 
 DWELLS = (0, 1, 3, 6, 12)
 THRESHOLDS = (0.0, 0.05, 0.2, 0.8)
@@ -222,68 +222,6 @@ def heavy(problem: Problem) -> Problem:
 # ------------------------------------------------------------------------------- reading
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """Migrations held against their bound, over many runs.
-
-    Parameters
-    ----------
-    runs, broken : int
-        How many there are, and how many migrate more often than the bound allows.
-    reached : int
-        How many migrate exactly as often.
-    """
-
-    runs: int
-    broken: int
-    reached: int
-
-
-@dataclass(frozen=True, slots=True)
-class Bounded:
-    """A run of the grid: its migrations, and the most that its dwell allows."""
-
-    scenario: str
-    min_dwell: int
-    migrations: int
-    bound: int
-
-
-def bound_of(windows: int, min_dwell: int) -> int:
-    """Most migrations in a run of so many windows from its begin: ⌊K / (N_min + 1)⌋."""
-    return windows // (min_dwell + 1)
-
-
-def against_bound(results: Sequence[StudyResult]) -> list[Bounded]:
-    """Return every run of the grid with its bound.
-
-    Migrations are counted after the warm-up, the bound is that of all windows of the run: a run
-    that breaks it has broken it for certain.
-    """
-    rows = []
-    for result in results:
-        warmup = result.study.points[0].problem.warmup_windows
-        for dwell, threshold in settings_of(result.study):
-            for scenario in result.study.scenarios:
-                labels = {"scenario": scenario, "policy": grid_name(dwell, threshold)}
-                migrations = values(result.runs, "migrations", labels)
-                windows = values(result.runs, "windows", labels)
-                rows += [
-                    Bounded(scenario, dwell, int(moved), bound_of(int(played) + warmup, dwell))
-                    for moved, played in zip(migrations, windows, strict=True)
-                ]
-    return rows
-
-
-def bounds(rows: Sequence[Bounded]) -> Bounds:
-    """Count the runs that break their bound, and those that reach it."""
-    return Bounds(
-        runs=len(rows),
-        broken=sum(row.migrations > row.bound for row in rows),
-        reached=sum(row.migrations == row.bound for row in rows),
-    )
-
-
 def _compared(
     results: Sequence[StudyResult], question: str, pairs: Callable[[str], Mapping[str, Contrast]]
 ) -> dict[str, Family]:
@@ -344,13 +282,11 @@ def of_cold(results: Sequence[StudyResult]) -> dict[str, Family]:
 # ------------------------------------------------------------------------------- verdict
 
 
-def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> Outcome:
-    """Answer whether hysteresis calms DTP within its bound, and at no price.
+def verdict(shown: Mapping[str, Mapping[str, Comparative]]) -> Outcome:
+    """Answer whether hysteresis calms DTP at no price.
 
     Parameters
     ----------
-    held : Bounds
-        Of all runs of the grid.
     shown : mapping of metric to mapping of scenario to verdict
         Of the cell's setting, against no hysteresis at all, for every one of `METRICS`.
     """
@@ -363,28 +299,21 @@ def verdict(held: Bounds, shown: Mapping[str, Mapping[str, Comparative]]) -> Out
         if said == "higher"
     ]
     answer: Answer
-    if held.broken:
-        answer = "no"
-    elif len(calmer) == scenarios and not worse:
+    if len(calmer) == scenarios and not worse:
         answer = "yes"
     elif calmer:
         answer = "in part"
     else:
         answer = "no" if worse else "not shown"
-    bound = (
-        f"The bound ⌊K/(N_min + 1)⌋ is broken in {held.broken} of {held.runs} runs"
-        if held.broken
-        else f"No run of {held.runs} migrates more often than ⌊K/(N_min + 1)⌋"
-    )
     prices = [
         f"{METRICS[metric]} is higher in {_where(shown[metric], 'higher')} and lower in "
         f"{_where(shown[metric], 'lower')}"
-        if set(shown[metric].values()) != {"no difference shown"}
+        if {"lower", "higher"} & set(shown[metric].values())
         else f"no difference in {METRICS[metric]} is shown"
         for metric in ("violation_rate", "cost")
     ]
     sentence = (
-        f"{bound} ({held.reached} reach it). Against no hysteresis at all, DTP as it is set in the "
+        "Against no hysteresis at all, DTP as it is set in the "
         f"cell is shown to migrate less in {counted(len(calmer), scenarios, 'scenarios')}; "
         f"{', and '.join(prices)}."
     )
@@ -404,7 +333,6 @@ def written(
     grid: Sequence[StudyResult], escape: Sequence[StudyResult], cold: Sequence[StudyResult]
 ) -> Chapter:
     """Write the chapter of finished runs."""
-    rows = against_bound(grid)
     calm = against_none(grid)
     words = SETTINGS[CELLS]
     of_cells = {
@@ -415,12 +343,12 @@ def written(
         }
         for metric, one in calm.items()
     }
-    outcome = verdict(bounds(rows), of_cells)
+    outcome = verdict(of_cells)
     early, late = of_escape(escape), of_cold(cold)
     numbers = grid_table(grid)
     return Chapter(
         slug="hysteresis",
-        title="Does hysteresis calm DTP, within its bound, without making it worse?",
+        title="Does hysteresis calm DTP without making it worse?",
         design=design(grid, escape, cold),
         answer=outcome.answer,
         verdict=outcome.verdict,
@@ -433,14 +361,13 @@ def written(
             *price_found(cold),
         ),
         tables=(
-            bounds_table(rows),
             numbers,
             difference_table(calm, slug="hysteresis-none", title="Hysteresis, less none at all"),
             difference_table(early, slug="hysteresis-escape", title="Escape on, less off"),
             difference_table(late, slug="hysteresis-cold", title="Cold migrations, less warm"),
         ),
         figures=(
-            grid_figure(numbers, "migrations", rows),
+            grid_figure(numbers, "migrations"),
             grid_figure(numbers, "regret"),
             grid_figure(numbers, "violation_rate"),
         ),
@@ -464,7 +391,7 @@ def design(
     return (
         f"DTP with the estimator corrected; N_min of {listed(str(one) for one in dwells)} times "
         f"Δ_min of {listed(f'{one:g}' for one in thresholds)}, {len(grid[0].study.seeds)} seeds of "
-        f"{lengths}. In every run migrations are held against ⌊K/(N_min + 1)⌋. Some settings are "
+        f"{lengths}. Some settings are "
         f"compared to none at all, paired by seed (sign-flip test, Holm over scenarios and "
         f"settings of a metric). Regret is against the reference in hindsight. Beside that, "
         f"escape on and off ({where(escape)}; {len(escape[0].study.seeds)} seeds; DTP with profile "
@@ -545,47 +472,6 @@ def price_found(cold: Sequence[StudyResult]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def bounds_table(rows: Sequence[Bounded]) -> Table:
-    """One row an N_min: migrations against their bound."""
-    import polars as pl
-
-    frame = (
-        pl.DataFrame([asdict(row) for row in rows])
-        .group_by("min_dwell", maintain_order=True)
-        .agg(
-            pl.len().alias("runs"),
-            pl.col("migrations").max().alias("most"),
-            pl.col("bound").min().alias("least_bound"),
-            (pl.col("migrations") / pl.col("bound")).max().alias("nearest"),
-            (pl.col("migrations") == pl.col("bound")).sum().alias("reached"),
-            (pl.col("migrations") > pl.col("bound")).sum().alias("broken"),
-        )
-    )
-    return Table(
-        slug="hysteresis-bound",
-        title="Migrations against ⌊K / (N_min + 1)⌋",
-        frame=frame,
-        units={
-            "min_dwell": "count",
-            "runs": "count",
-            "most": "count",
-            "least_bound": "count",
-            "nearest": "percent",
-            "reached": "count",
-            "broken": "count",
-        },
-        headings={
-            "min_dwell": "N_min",
-            "most": "most migrations",
-            "least_bound": "least bound",
-            "nearest": "nearest to its bound",
-            "reached": "runs at it",
-            "broken": "runs beyond it",
-        },
-        note="Every run of the grid, all scenarios and thresholds.",
-    )
-
-
 def grid_table(results: Sequence[StudyResult]) -> Table:
     """One row a scenario, dwell and threshold."""
     import polars as pl
@@ -618,8 +504,8 @@ def grid_table(results: Sequence[StudyResult]) -> Table:
     )
 
 
-def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) -> Figure:
-    """Return a metric over N_min, one line a Δ_min, and one for the bound of migrations."""
+def grid_figure(numbers: Table, metric: str) -> Figure:
+    """Return a metric over N_min, one line a Δ_min."""
     import polars as pl
 
     frame = numbers.frame.select(
@@ -631,8 +517,6 @@ def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) ->
         pl.col("min_dwell").alias("x"),
         *(pl.col(f"{metric}{end}").alias(f"y{end}") for end in ("", "_low", "_high")),
     )
-    if bounded:
-        frame = pl.concat([frame, _bound_lines(bounded)], how="diagonal_relaxed")
     return Figure(
         slug=f"hysteresis-{metric.replace('_', '-')}",
         title=f"{SHOWN[metric].capitalize()} over the dwell",
@@ -647,23 +531,5 @@ def grid_figure(numbers: Table, metric: str, bounded: Sequence[Bounded] = ()) ->
         y_unit=UNITS[metric],
         line_at=0.05 if metric == "violation_rate" else None,
         line_label="5 %" if metric == "violation_rate" else "",
-        log_y=bool(bounded),
         note=numbers.note,
-    )
-
-
-def _bound_lines(rows: Sequence[Bounded]) -> pl.DataFrame:
-    """Return the bound of each scenario's runs, as one more line."""
-    import polars as pl
-
-    return (
-        pl.DataFrame([asdict(row) for row in rows])
-        .group_by("scenario", "min_dwell", maintain_order=True)
-        .agg(pl.col("bound").max().cast(pl.Float64).alias("y"))
-        .select(
-            "scenario",
-            pl.lit("bound").alias("threshold"),
-            pl.col("min_dwell").alias("x"),
-            "y",
-        )
     )

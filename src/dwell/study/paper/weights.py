@@ -427,7 +427,7 @@ def steps_found(steps: Mapping[str, Family]) -> tuple[str, ...]:
     """Say which steps of one weight were shown to change a metric."""
     found = []
     for one in steps.values():
-        shown = {name: said for name, said in one.verdicts.items() if said != "no difference shown"}
+        shown = {name: said for name, said in one.verdicts.items() if said in ("lower", "higher")}
         named = "; ".join(f"{name} ({said})" for name, said in shown.items())
         found.append(
             f"One at a time, a change of {OUTPUTS[one.metric]} is shown in {len(shown)} of "
