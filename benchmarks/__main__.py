@@ -33,6 +33,7 @@ BENCHMARKS = {
     "lanes": ("lanes", "measure"),
     "share": ("live", "share"),
     "live-fleet": ("fleet_live", "measure"),
+    "restart": ("restart", "measure"),
 }
 
 

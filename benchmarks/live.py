@@ -193,12 +193,7 @@ def _cpu_s(process: psutil.Process) -> float:
 
 
 def _processes(cell: LightCell) -> dict[str, psutil.Process]:
-    found = {}
-    for top in cell.processes.values():
-        for process in (psutil.Process(top.pid), *psutil.Process(top.pid).children()):
-            words = process.cmdline()
-            if "--who" in words:
-                found[words[words.index("--who") + 1]] = process
+    found = {who: psutil.Process(pid) for who, pid in cell.pids().items()}
     for who, top in cell.processes.items():
         found[who] = psutil.Process(top.pid)
     return found

@@ -5,10 +5,12 @@ Its stages take no CPU, so that what is left is what the runtime itself takes.
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -213,6 +215,14 @@ class LightCell(Stageplay):
         data = self._observed.read_bytes()
         whole = len(data) - len(data) % RECORD.size
         return [Applied(*one) for one in RECORD.iter_unpack(data[:whole])]
+
+    def pids(self) -> dict[str, int]:
+        """Return the processes that the agents have started, by name."""
+        found = {}
+        for mark in self.folder.glob("*/*.pid"):
+            with suppress(OSError, ValueError):
+                found[mark.stem] = int(json.loads(mark.read_text())["pid"])
+        return found
 
     def said(self) -> dict[str, Any]:
         """Return what the controller says; nothing where it does not answer."""

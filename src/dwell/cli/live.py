@@ -91,7 +91,7 @@ def agent(
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     import dwell
-    from dwell.cli.process import command
+    from dwell.cli.process import server, words
     from dwell.live.cautions import find_cautions
     from dwell.live.node import run_agent
     from dwell.live.stage import load_function
@@ -111,7 +111,8 @@ def agent(
         problem,
         node,
         folder,
-        lambda who: command(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
+        server(cell.resolve()),
+        lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
         _until_told(),
         cpus=wanted,
         accelerator=read,

@@ -1,4 +1,7 @@
-"""What an agent starts: ``python -m dwell.cli.process --cell FILE --who NAME --state FOLDER``."""
+"""The processes of a cell: ``python -m dwell.cli.process --cell FILE --who NAME --state FOLDER``.
+
+With ``--serve`` it is the one that an agent has them forked from, which has done their imports.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +11,33 @@ import signal
 import sys
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from dwell.errors import DwellError
 
-__all__ = ["command", "main"]
+__all__ = ["main", "server", "words"]
 
 
-def command(
+def server(cell: Path) -> list[str]:
+    """Return the command of the process that those of a cell are forked from.
+
+    Parameters
+    ----------
+    cell : Path
+        File that it reads once, so that all that reading takes is imported.
+    """
+    return [sys.executable, "-m", "dwell.cli.process", "--cell", str(cell), "--serve"]
+
+
+def words(
     cell: Path,
     who: str,
     state: Path,
     cpus: Iterable[int] | None = None,
     priority: int | None = None,
 ) -> list[str]:
-    """Return the command of a process of a cell.
+    """Return the arguments of a process of a cell.
 
     Parameters
     ----------
@@ -35,45 +50,76 @@ def command(
     priority : int, optional
         Its real-time priority, 1 to 99.
     """
-    words = ["--cell", str(cell), "--state", str(state)]
+    found = ["--who", who, "--cell", str(cell), "--state", str(state)]
     if cpus is not None:
-        words += ["--cpus", ",".join(map(str, sorted(cpus)))]
+        found += ["--cpus", ",".join(map(str, sorted(cpus)))]
     if priority is not None:
-        words += ["--realtime", str(priority)]
-    return [sys.executable, "-m", "dwell.cli.process", "--who", who, *words]
+        found += ["--realtime", str(priority)]
+    return found
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the process until it is told to end; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell", type=Path, required=True)
-    parser.add_argument("--who", required=True)
-    parser.add_argument("--state", type=Path, required=True)
+    parser.add_argument("--serve", action="store_true")
+    parser.add_argument("--who", default="")
+    parser.add_argument("--state", type=Path, default=Path())
     parser.add_argument("--cpus", default="")
     parser.add_argument("--realtime", type=int, default=0)
     asked = parser.parse_args(arguments)
+    try:
+        if asked.serve:
+            return _serve(asked.cell)
+        _run(asked)
+    except DwellError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _serve(cell: Path) -> int:
+    """Import what every process needs, and fork; in a forked process, run it."""
+    from dwell.io import load
+    from dwell.live import leash, process  # noqa: F401
+    from dwell.live.launcher import serve
+    from dwell.profiling import memory  # noqa: F401
+
+    load(cell)
+    asked = serve()
+    if asked is None:
+        return 0
+    # Stages may look who they are.
+    sys.argv[1:] = asked
+    return main(asked)
+
+
+def _run(asked: argparse.Namespace) -> None:
+    _name(asked.who)
     _schedule(asked.who, asked.cpus, asked.realtime)
     stopped = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     # The user's stages lie beside their cell file.
     sys.path.insert(0, str(asked.cell.resolve().parent))
-    try:
-        from dwell.io import load
-        from dwell.live.leash import end_with_owner
-        from dwell.live.log import escape_output
-        from dwell.live.process import run_process
-        from dwell.profiling.memory import keep_memory
 
-        # What a user's code prints, and its exceptions, are shown on terminals.
-        escape_output()
-        keep_memory()
-        end_with_owner(stopped)
-        run_process(load(asked.cell), asked.who, asked.state, stopped)
-    except DwellError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+    from dwell.io import load
+    from dwell.live.leash import end_with_owner
+    from dwell.live.log import escape_output
+    from dwell.live.process import run_process
+    from dwell.profiling.memory import keep_memory
+
+    # What a user's code prints, and its exceptions, are shown on terminals.
+    escape_output()
+    keep_memory()
+    end_with_owner(stopped)
+    run_process(load(asked.cell), asked.who, asked.state, stopped)
+
+
+def _name(who: str) -> None:
+    """Have `ps -o comm` and `top` show who it is: the command line is that of the fork server."""
+    with suppress(OSError):
+        Path("/proc/self/comm").write_text(who)
 
 
 def _schedule(who: str, cpus: str, priority: int) -> None:

@@ -18,6 +18,7 @@ from dwell.live.cell import Cell
 from dwell.live.files import make_folder
 from dwell.live.group import own_group
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, take_turns
+from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.security import Security
@@ -37,7 +38,8 @@ def run_agent(
     problem: Problem,
     node: str,
     folder: Path,
-    command: Callable[[str], Sequence[str]],
+    program: Sequence[str],
+    words: Callable[[str], Sequence[str]],
     stopped: threading.Event,
     *,
     cpus: Iterable[int] | None = None,
@@ -53,8 +55,10 @@ def run_agent(
     node : str
     folder : Path
         Where they keep their files.
-    command : callable
-        Returns the command that starts a process, by its name.
+    program : sequence of str
+        Command of the process that the others are forked from (`ForkServer`).
+    words : callable
+        Returns what it is told to start a process, by the process's name.
     stopped : Event
     cpus : iterable of int, optional
         Those that the node may use.
@@ -85,11 +89,12 @@ def run_agent(
     security.remember(make_folder(folder))
     security.remind(say, stopped)
     transport = _listening(security, who, node)
-    supervisor = Supervisor(make_folder(folder), say, environment=environment)
+    launcher = ForkServer(program, environment)
+    supervisor = Supervisor(make_folder(folder), say, launcher=launcher)
     try:
         for role in wiring.on(node):
             if role.kind not in ("agent", "controller"):
-                supervisor.keep(role.who, command(role.who))
+                supervisor.keep(role.who, words(role.who))
         place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
         agent = Agent(place, supervisor, _cpu_count(problem, node, say), gauge)

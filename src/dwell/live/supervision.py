@@ -8,16 +8,16 @@ import math
 import os
 import shutil
 import signal
-import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import psutil
 
 from dwell.live.files import InFlight
+from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running
 from dwell.live.log import printable
 
 __all__ = ["Child", "Supervisor"]
@@ -56,7 +56,7 @@ class Child:
     who: str
     command: Sequence[str]
     folder: Path
-    process: subprocess.Popen[bytes] | None = None
+    process: Running | None = None
     adopted: psutil.Process | None = None
     starts: int = 0
     failures: int = 0
@@ -106,8 +106,8 @@ class Supervisor:
         Takes a line for the log of the agent.
     warm_s, growth_bytes, log_bytes
         From when on, and from what on, memory that grows is reported; length of a log.
-    environment : mapping of str to str, optional
-        Of the processes; this one's own if left out.
+    launcher : Launcher, optional
+        Starts the processes; runs their commands if left out.
     """
 
     def __init__(
@@ -118,15 +118,14 @@ class Supervisor:
         warm_s: float = WARM_S,
         growth_bytes: int = GROWTH_BYTES,
         log_bytes: int = LOG_BYTES,
-        environment: Mapping[str, str] | None = None,
+        launcher: Launcher | None = None,
     ) -> None:
         self.folder = folder
         self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
         self.children: list[Child] = []
         self._say = say
         self._oom_kills = _oom_kills()
-        given = os.environ if environment is None else environment
-        self._environment = {**given, "PYTHONUNBUFFERED": "1"}
+        self._launcher = Launcher() if launcher is None else launcher
 
     def keep(self, who: str, command: Sequence[str]) -> Child:
         """Have a process run from now on."""
@@ -140,8 +139,9 @@ class Supervisor:
 
     def step(self) -> None:
         """Look after every process once."""
+        ready = self._launcher.ready()
         for child in self.children:
-            if not self._alive(child) and time.monotonic() >= child.next_s:
+            if not self._alive(child) and ready and time.monotonic() >= child.next_s:
                 self._start(child)
 
     def _alive(self, child: Child) -> bool:
@@ -237,16 +237,7 @@ class Supervisor:
 
     def _run(self, child: Child) -> None:
         with child.log.open("ab") as log:
-            child.process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                child.command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env=self._environment,
-                # Ctrl-C in a terminal is for the agent; a session of its own would make each
-                # process one of the groups that share the CPU, whatever runs in it.
-                process_group=0,
-            )
+            child.process = self._launcher.start(child.command, log)
 
     def tend(self) -> None:
         """Look how much memory the processes have taken, and how much they have printed."""
@@ -320,6 +311,7 @@ class Supervisor:
             if child.process is not None:
                 child.process.wait()
             child.process = child.adopted = None
+        self._launcher.stop()
 
 
 def _signal(process: psutil.Process, number: int) -> None:
@@ -341,6 +333,8 @@ def _survivor(mark: Path) -> psutil.Process | None:
 
 
 def _reason(code: int) -> str:
+    if code == UNKNOWN_CODE:
+        return "has ended"
     if code < 0:
         try:
             return f"was killed by {signal.Signals(-code).name}"

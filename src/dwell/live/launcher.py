@@ -1,0 +1,322 @@
+"""Launchers: how an agent starts its node's processes.
+
+Imports are nearly all that the start of a process costs: about a second of a core, which those that
+run have to do without. So an agent has one process, the *fork server*, that does them once, and is
+asked to fork for each process that is to start. It opens no session, and neither Zenoh nor a user's
+stages are imported there: both start threads, which a fork does not copy.
+"""
+
+from __future__ import annotations
+
+import errno
+import gc
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import BinaryIO, Protocol
+
+import psutil
+
+__all__ = ["UNKNOWN_CODE", "ForkServer", "Launcher", "Running", "serve"]
+
+#: Exit code of a process whose fork server has died before it.
+UNKNOWN_CODE = 1 << 16
+LONGEST_BYTES = 1 << 16
+#: How long a fork may take on a machine that is full.
+PATIENCE_S = 10.0
+#: Time between two starts of a fork server.
+AGAIN_S = 1.0
+
+
+class Running(Protocol):
+    """A process that was started."""
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        ...
+
+    def poll(self) -> int | None:
+        """Return its exit code, negative for a signal; None while it runs."""
+        ...
+
+    def wait(self) -> int:
+        """Return its exit code when it has ended."""
+        ...
+
+
+class Launcher:
+    """Runs commands.
+
+    Parameters
+    ----------
+    environment : mapping of str to str, optional
+        Of the processes; this one's own if left out.
+    """
+
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
+        given = os.environ if environment is None else environment
+        self.environment = {**given, "PYTHONUNBUFFERED": "1"}
+
+    def ready(self) -> bool:
+        """Return whether `start` can be called; called again and again until it can."""
+        return True
+
+    def start(self, command: Sequence[str], log: BinaryIO) -> Running:
+        """Start a process that prints into a log.
+
+        Raises
+        ------
+        OSError
+            If it cannot be started.
+        """
+        return subprocess.Popen(  # noqa: S603 - our own interpreter and module
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=self.environment,
+            # Ctrl-C in a terminal is for the agent; a session of its own would make each
+            # process one of the groups that share the CPU, whatever runs in it.
+            process_group=0,
+        )
+
+    def stop(self) -> None:
+        """Take note that nothing will be started any more."""
+
+
+class ForkServer(Launcher):
+    """Has processes forked; a `command` is the words that `serve` returns in the new process.
+
+    The fork server ends with this process. Those that it has forked do not.
+
+    Parameters
+    ----------
+    program : sequence of str
+        Command of the fork server; it calls `serve` with its standard input.
+    environment : mapping of str to str, optional
+    """
+
+    def __init__(
+        self, program: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(environment)
+        self._program = list(program)
+        self._server: subprocess.Popen[bytes] | None = None
+        self._channel: socket.socket | None = None
+        self._serves = False
+        self._next_s = 0.0
+        self._codes: dict[int, int] = {}
+        self._watched: set[int] = set()
+
+    def ready(self) -> bool:
+        """Return whether it has done its imports; starts it where it does not run."""
+        if self._channel is None and time.monotonic() >= self._next_s:
+            self._begin()
+        self.hear()
+        return self._serves
+
+    def _begin(self) -> None:
+        self._next_s = time.monotonic() + AGAIN_S
+        channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._server = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                self._program, stdin=theirs.fileno(), env=self.environment, process_group=0
+            )
+        self._channel = channel
+
+    def start(self, command: Sequence[str], log: BinaryIO) -> Running:
+        """Have a process forked."""
+        deadline = time.monotonic() + PATIENCE_S
+        if self._channel is not None:
+            self._channel.settimeout(PATIENCE_S)
+            words = json.dumps(list(command)).encode()
+            socket.send_fds(self._channel, [words], [log.fileno()])
+        while self._channel is not None and (left_s := deadline - time.monotonic()) > 0:
+            told = self._receive(left_s)
+            if "forked" in told:
+                self._watched.add(told["forked"])
+                return _Forked(self, told["forked"])
+            if "refused" in told:
+                raise OSError(told["refused"], os.strerror(told["refused"]))
+        self._end()
+        raise OSError(errno.ECHILD, "the fork server does not answer")
+
+    def hear(self) -> None:
+        """Take in what the server has said since."""
+        while self._channel is not None and self._receive(0.0):
+            pass
+
+    def _receive(self, patience_s: float) -> dict[str, int]:
+        """Return the next message; an empty one if none comes, or the server has ended."""
+        if self._channel is None:
+            return {}
+        self._channel.settimeout(patience_s)
+        try:
+            data = self._channel.recv(LONGEST_BYTES)
+        except (BlockingIOError, TimeoutError):
+            return {}
+        except OSError:
+            data = b""
+        if not data:
+            self._end()
+            return {}
+        told: dict[str, int] = json.loads(data)
+        self._serves = True
+        if "code" in told:
+            self._codes[told["ended"]] = told["code"]
+        return told
+
+    def code(self, pid: int) -> int | None:
+        """Return the exit code of a process that was forked; None where it is not known (yet)."""
+        self.hear()
+        return self._codes.pop(pid, None)
+
+    def watches(self, pid: int) -> bool:
+        """Return whether the server that has forked a process is there, and will tell its end."""
+        return pid in self._watched
+
+    def _end(self) -> None:
+        channel, self._channel, self._serves = self._channel, None, False
+        self._watched.clear()
+        if channel is not None:
+            channel.close()
+        if self._server is not None:
+            self._server.kill()
+            self._server.wait()
+            self._server = None
+
+    def stop(self) -> None:
+        """End the server; what it has forked goes on."""
+        self._end()
+        self._next_s = float("inf")
+
+
+class _Forked:
+    """A process that a fork server has forked."""
+
+    def __init__(self, server: ForkServer, pid: int) -> None:
+        self.pid, self._server = pid, server
+        self._code: int | None = None
+        self._process: psutil.Process | None = None
+        with suppress(psutil.NoSuchProcess):
+            self._process = psutil.Process(pid)
+
+    def poll(self) -> int | None:
+        """Return its exit code, negative for a signal; None while it runs."""
+        if self._code is None:
+            self._code = self._server.code(self.pid)
+        if self._code is None and not self._server.watches(self.pid) and not self._alive():
+            self._code = UNKNOWN_CODE
+        return self._code
+
+    def _alive(self) -> bool:
+        if self._process is None:
+            return False
+        try:
+            return self._process.is_running() and self._process.status() != psutil.STATUS_ZOMBIE
+        except psutil.NoSuchProcess:
+            return False
+
+    def wait(self) -> int:
+        """Return its exit code when it has ended."""
+        while (code := self.poll()) is None:
+            time.sleep(0.005)
+        return code
+
+
+def serve(stdin: int = 0) -> list[str] | None:
+    """Fork whenever an agent asks for it.
+
+    Parameters
+    ----------
+    stdin : int
+        Descriptor of the socket that `ForkServer` has given as standard input.
+
+    Returns
+    -------
+    list of str, optional
+        In a process that has been forked, the words that it was asked for with; its output goes to
+        the log, and nothing else is left of the server's. None in the server, when the agent has
+        gone.
+    """
+    channel = socket.socket(fileno=os.dup(stdin))
+    empty = os.open(os.devnull, os.O_RDWR)
+    os.dup2(empty, stdin)
+    os.close(empty)
+    # No collection in a process that is forked looks at what there is now.
+    gc.collect()
+    gc.freeze()
+    woken, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+    try:
+        _tell(channel, {"serves": os.getpid()})
+        while True:
+            ready, _, _ = select.select([channel.fileno(), woken], [], [])
+            if woken in ready:
+                os.read(woken, LONGEST_BYTES)
+                _tell_of_ended(channel)
+            if channel.fileno() in ready and (words := _fork(channel)) is not None:
+                return words
+    except (EOFError, ConnectionError):
+        return None
+    finally:
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for descriptor in (woken, wake):
+            os.close(descriptor)
+        channel.close()
+
+
+def _tell(channel: socket.socket, what: Mapping[str, int]) -> None:
+    channel.sendall(json.dumps(what).encode())
+
+
+def _tell_of_ended(channel: socket.socket) -> None:
+    """Tell how processes have ended that were forked."""
+    with suppress(ChildProcessError):
+        while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
+            pid, status = ended
+            _tell(channel, {"ended": pid, "code": os.waitstatus_to_exitcode(status)})
+
+
+def _fork(channel: socket.socket) -> list[str] | None:
+    """Fork as a request says; returns its words in the new process.
+
+    Raises
+    ------
+    EOFError
+        If the agent has gone.
+    """
+    data, descriptors, _, _ = socket.recv_fds(channel, LONGEST_BYTES, 1)
+    if not data:
+        raise EOFError
+    (log,) = descriptors
+    try:
+        with warnings.catch_warnings():
+            # Of threads: OpenBLAS ends its own before a fork, and nothing else has any.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            pid = os.fork()
+    except OSError as error:
+        os.close(log)
+        _tell(channel, {"refused": error.errno or errno.EAGAIN})
+        return None
+    if pid:
+        os.close(log)
+        os.setpgid(pid, pid)
+        _tell(channel, {"forked": pid})
+        return None
+    for descriptor in (sys.stdout.fileno(), sys.stderr.fileno()):
+        os.dup2(log, descriptor)
+    os.close(log)
+    words: list[str] = json.loads(data)
+    return words
