@@ -157,7 +157,8 @@ def share_difference_interval(
         return Interval(mean, math.nan, math.nan)
     if _same(differences):
         p = rule_of_three(count)
-        low, high = least, most = mean * (1 - p) - p, mean * (1 - p) + p
+        low = high = mean
+        least, most = mean * (1 - p) - p, mean * (1 - p) + p
     else:
         tail = (1 - CONFIDENCE) / 2
         p = _unseen(count, tail)
