@@ -407,6 +407,16 @@ def test_nobody_answers(tmp_path: Path) -> None:
     assert invoke("live", "status", "--cell", made.file) == (1, "", f"error: {words}\n")
 
 
+def test_asking_for_the_status_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, dwell, dwell.cli.commands, dwell.live.visiting\n"
+        f"dwell.load({str(EXAMPLE / 'cell.yaml')!r})\n"
+        "print(*{'numpy', 'numba', 'polars', 'psutil', 'rich'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == []
+
+
 # ------------------------------------------------------------------------ before the start
 
 

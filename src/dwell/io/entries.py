@@ -132,7 +132,7 @@ def _unquoted(text: str) -> str:
 class Entry(BaseModel):
     """A mapping of a cell file: known keys only, and no conversions."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, defer_build=True)
 
 
 Value = Annotated[float, Number(bounds.VALUE)]

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 from dwell.errors import Fault, LiveError, TrustError
 from dwell.live.failures import start_thread
-from dwell.live.role import Place
 from dwell.live.transport.protocol import Transport
 from dwell.live.transport.zenoh import LONGEST_BYTES, ZenohSettings, ZenohTransport
 from dwell.live.wiring import Role, wire
@@ -24,6 +23,7 @@ from dwell.model import FrozenDict, Problem
 from dwell.trust import KEYS
 
 if TYPE_CHECKING:
+    from dwell.live.role import Place
     from dwell.trust.keyring import Keyring
 
 __all__ = ["INSECURE", "KEYS", "Security", "exposed"]
@@ -127,6 +127,8 @@ class Security:
 
     def place(self, who: str, node: str, transport: Transport, say: Callable[[str], None]) -> Place:
         """Return where a role runs that is just started."""
+        from dwell.live.role import Place
+
         seals = None
         if self.keyring is not None:
             from dwell.trust.signing import Seals

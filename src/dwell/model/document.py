@@ -8,8 +8,6 @@ import math
 from dataclasses import fields
 from typing import Any, TypeAlias
 
-import numpy as np
-
 from dwell.errors import Fault, ProblemError
 from dwell.model.fabric import Bursts, Link, Node, Quota
 from dwell.model.live import LiveSettings
@@ -95,6 +93,8 @@ def digest(trace: Trace) -> str:
     str
         The same for the same numbers on any machine, whatever the file's format.
     """
+    import numpy as np
+
     table = trace.table
     state = hashlib.sha256(np.ascontiguousarray(trace.values, "<f8").tobytes())
     state.update(np.ascontiguousarray(table.starts, "<i8").tobytes())

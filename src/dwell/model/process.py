@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
 
 from dwell.errors import Fault, TraceError
 from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, require
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 __all__ = [
     "AR1",
@@ -33,7 +34,7 @@ __all__ = [
     "require",
 ]
 
-Floats: TypeAlias = NDArray[np.float64]
+Floats: TypeAlias = "NDArray[np.float64]"
 
 # One nanosecond, in milliseconds.
 NS = 1e-6
@@ -69,6 +70,8 @@ class Constant:
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Return `size` copies; draws nothing from `rng`."""
+        import numpy as np
+
         return np.full(size, self.value)
 
 
@@ -119,6 +122,8 @@ class Normal:
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
+        import numpy as np
+
         values = rng.standard_normal(size)
         values *= self.std
         values += self.mean
@@ -149,6 +154,8 @@ class LogNormal:
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
+        import numpy as np
+
         mu, sigma = self.log_parameters
         values = rng.standard_normal(size)
         values *= sigma
@@ -237,6 +244,13 @@ class AR1:
         return LogNormal(self.mean, self.cv).marginal(rng, size)
 
 
+def _one_group() -> NDArray[np.int64]:
+    """Return the first rows of the groups of a file that is not grouped."""
+    import numpy as np
+
+    return np.zeros(1, np.int64)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TraceTable:
     """Columns of one file of measurements; every process that names the file shares its rows.
@@ -266,7 +280,7 @@ class TraceTable:
     file: str
     columns: dict[str, Floats]
     by: Literal["row", "time"] = "row"
-    starts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    starts: NDArray[np.int64] = field(default_factory=_one_group)
     time_ms: Floats | None = None
     wrap: bool = False
     group: str | tuple[str, ...] | None = None
@@ -299,6 +313,8 @@ class TraceTable:
         TraceError
             If no group is long enough and the trace does not wrap.
         """
+        import numpy as np
+
         ends = np.append(self.starts[1:], self.rows)
         if self.by == "row" or self.time_ms is None:
             return self._replay_rows(rng, len(release_ms), ends)
@@ -307,6 +323,8 @@ class TraceTable:
     def _replay_rows(
         self, rng: np.random.Generator, cycles: int, ends: NDArray[np.int64]
     ) -> NDArray[np.int64]:
+        import numpy as np
+
         if self.wrap:
             # The whole file is one loop, so that every row is used and groups keep their order.
             return (rng.integers(self.rows) + np.arange(cycles)) % self.rows
@@ -327,6 +345,8 @@ class TraceTable:
         time_ms: Floats,
         ends: NDArray[np.int64],
     ) -> NDArray[np.int64]:
+        import numpy as np
+
         spans = time_ms[ends - 1]
         if self.wrap:
             return self._wrap_time(rng, elapsed_ms, time_ms, spans, ends - self.starts)
@@ -356,6 +376,8 @@ class TraceTable:
         spans: Floats,
         counts: NDArray[np.int64],
     ) -> NDArray[np.int64]:
+        import numpy as np
+
         # A group lasts one mean row spacing (its own, or that of all) beyond its last row.
         gaps = counts - 1
         usual = spans.sum() / max(int(gaps.sum()), 1)
