@@ -87,6 +87,33 @@ def test_a_stage_that_fails_costs_its_cycle_and_is_named(
     assert world.stamper.placement == "LOC"
 
 
+@pytest.mark.parametrize(
+    ("declared", "length", "sent"),
+    [(0, 262_144, True), (0, 262_145, False), (100_000, 400_000, True), (100_000, 400_001, False)],
+)
+def test_an_output_may_be_four_times_as_long_as_declared_and_256_kb_anyway(
+    problem: Problem, declared: int, length: int, sent: bool
+) -> None:
+    class Wordy(Passing):
+        def process(self, inputs: Mapping[str, Message]) -> Message:
+            return Message(bytes(length))
+
+    flows = tuple(
+        replace(flow, payload_bytes=declared) if flow.source == "sensing" else flow
+        for flow in problem.pipeline.flows
+    )
+    pipeline = replace(problem.pipeline, flows=flows)
+    world = World(replace(problem, pipeline=pipeline), exec_ms=EXEC_MS, stages={"sensing": Wordy})
+    world.run(1_000)
+    complaints = world.worker("sensing@R1").place.complaints
+    if sent:
+        assert not complaints
+        return
+    assert not world.cycles
+    told = f"its output of {length} bytes is not sent: at most {length - 1} are; raise the flow's"
+    assert all(told in complaint for complaint in complaints)
+
+
 def test_what_went_wrong_stands_in_the_beats_for_a_while(problem: Problem) -> None:
     class Once(Moody):
         moods: ClassVar = {10: ValueError("no light")}

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from dwell.errors import Fault, LiveError, TrustError
 from dwell.live.failures import start_thread
 from dwell.live.transport.protocol import Transport
-from dwell.live.transport.zenoh import LONGEST_BYTES, ZenohSettings, ZenohTransport
-from dwell.live.wiring import Role, wire
+from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
+from dwell.live.wiring import Role, longest_message_bytes, wire
 from dwell.model import FrozenDict, Problem
 from dwell.trust import KEYS
 
@@ -32,8 +32,8 @@ __all__ = ["INSECURE", "KEYS", "Security", "exposed"]
 INSECURE = "DWELL_INSECURE"
 #: A certificate that ends soon is spoken of once a day.
 REMIND_S = 86_400.0
-#: How much longer a message may be than the cell file says of its flow or state.
-SPARE = 4
+#: People, and what watches, that a process is connected to besides the cell's processes.
+VISITORS_AT_ONCE = 8
 #: Of people, and of what runs where the controller does.
 VISITORS = ("operator", "observer", "controller")
 
@@ -118,12 +118,14 @@ class Security:
             If there is no such process, or a port is taken.
         """
         wiring = wire(self.problem, protocol=self._protocol)
-        return ZenohTransport(wiring.entry(who), self._settings())
+        # Those of before may be there still when everybody starts again.
+        most_peers = 2 * wiring.peers(who) + VISITORS_AT_ONCE
+        return ZenohTransport(wiring.entry(who), self._settings(most_peers))
 
     def visit(self, who: str, to: str) -> ZenohTransport:
         """Open a session of somebody who is no part of the cell, to a process that is."""
         wiring = wire(self.problem, protocol=self._protocol)
-        return ZenohTransport(wiring.visitor(who, to), self._settings())
+        return ZenohTransport(wiring.visitor(who, to), self._settings(VISITORS_AT_ONCE))
 
     def place(self, who: str, node: str, transport: Transport, say: Callable[[str], None]) -> Place:
         """Return where a role runs that is just started."""
@@ -167,15 +169,14 @@ class Security:
     def _protocol(self) -> str:
         return "tcp" if self.keyring is None else "tls"
 
-    def _settings(self) -> ZenohSettings:
-        pipeline = self.problem.pipeline
-        said = [flow.payload_bytes for flow in pipeline.flows]
-        said += [task.state_bytes for task in pipeline.tasks.values()]
-        longest_bytes = max(LONGEST_BYTES, SPARE * max(said, default=0))
-        if self.keyring is None:
-            return ZenohSettings(longest_bytes=longest_bytes)
-        more = FrozenDict(_tls(self.problem, self.keyring))
-        return ZenohSettings(longest_bytes=longest_bytes, more=more)
+    def _settings(self, most_peers: int) -> ZenohSettings:
+        tls = {} if self.keyring is None else _tls(self.problem, self.keyring)
+        return ZenohSettings(
+            longest_bytes=longest_message_bytes(self.problem, "images"),
+            longest_control_bytes=longest_message_bytes(self.problem, "control"),
+            most_peers=most_peers,
+            more=FrozenDict(tls),
+        )
 
 
 def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:

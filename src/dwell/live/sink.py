@@ -12,6 +12,7 @@ from dwell.live.payloads import read_payload
 from dwell.live.role import Place, Pulse
 from dwell.live.stage import Actuator, Message
 from dwell.live.transport.protocol import Sample
+from dwell.live.wiring import longest_bytes
 
 __all__ = ["Highest", "Sink"]
 
@@ -80,6 +81,10 @@ class Sink:
             return
         header = self.place.header(sample)
         if header is None or header.source != self.task:
+            return
+        if len(sample.payload) > longest_bytes(0):
+            told = f"a command of {len(sample.payload)} bytes; at most {longest_bytes(0)} are taken"
+            self.place.complain(LiveError(f"{sample.key}: {told}"))
             return
         group_ns = self.group_clock()
         outcome = self._gate(header, now_ns)

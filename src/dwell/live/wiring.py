@@ -6,12 +6,14 @@ itself and all come to the same answer.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Literal, TypeAlias
 
 from dwell.errors import LiveError
+from dwell.live.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.transport.protocol import Lane
 from dwell.model import Flow, FrozenDict, Problem
 
@@ -28,6 +30,8 @@ __all__ = [
     "Wire",
     "Wiring",
     "lane_of",
+    "longest_bytes",
+    "longest_message_bytes",
     "roles",
     "session_of",
     "wire",
@@ -42,6 +46,10 @@ Session: TypeAlias = Literal["control", "images", "local"]
 SESSIONS: tuple[Session, ...] = ("control", "images", "local")
 #: Flows with at least this much declared go over the lane `images`.
 IMAGE_BYTES = 16_384
+#: How much longer a payload may be than the cell file says.
+SPARE = 4
+#: Of a message: its key, its signature, and what Zenoh writes with it.
+ENVELOPE_BYTES = 4_096
 #: A process listens on its first port for `control`, and on the next ones for the other sessions.
 PORTS_PER_ROLE = len(SESSIONS)
 
@@ -199,6 +207,11 @@ class Wiring:
         pairs = (one, other), (other, one)
         return frozenset(wire.session for wire in self.wires if (wire.source, wire.target) in pairs)
 
+    def peers(self, who: str) -> int:
+        """How many processes one is connected to, in the session with most of them."""
+        counts = Counter(w.session for w in self.wires if who in (w.source, w.target))
+        return max(counts.values(), default=0)
+
     def hears(self, source: str, target: str, lane: Lane, key: str) -> bool:
         """Whether what one process puts can reach another at all."""
         entry = self.entry(source)
@@ -309,6 +322,33 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
 def lane_of(declared_bytes: int) -> Lane:
     """Lane of what a cell file declares that many bytes for: a flow, or a task's state."""
     return "images" if declared_bytes >= IMAGE_BYTES else "control"
+
+
+def longest_bytes(declared_bytes: int) -> int:
+    """Longest payload that is sent, and taken, where a cell file declares that many bytes.
+
+    Parameters
+    ----------
+    declared_bytes : int
+        Of a flow, or of a task's state; 0 for a command, of which nothing is declared.
+    """
+    return max(SPARE * declared_bytes, MAX_CONTROL_BYTES)
+
+
+def longest_message_bytes(problem: Problem, session: Session) -> int:
+    """Longest message that anybody in a cell sends in a session: headers and key are in it.
+
+    Parameters
+    ----------
+    problem : Problem
+    session : str
+    """
+    pipeline = problem.pipeline
+    declared = [flow.payload_bytes for flow in pipeline.flows]
+    declared += [task.state_bytes for task in pipeline.tasks.values()]
+    lane: Lane = "control" if session == "control" else "images"
+    longest = max((longest_bytes(size) for size in declared if lane_of(size) == lane), default=0)
+    return max(longest, MAX_CONTROL_BYTES) + MAX_HEADER_BYTES + ENVELOPE_BYTES
 
 
 def session_of(entry: Entry, lane: Lane, key: str) -> Session:

@@ -27,7 +27,7 @@ from dwell.live.role import Place, Pulse
 from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import Message, Stage, Stateful
 from dwell.live.transport.protocol import Lane, Sample
-from dwell.live.wiring import lane_of
+from dwell.live.wiring import SPARE, lane_of, longest_bytes
 
 __all__ = ["Job", "Worker"]
 
@@ -201,6 +201,11 @@ class Worker:
         self._lanes: dict[str, Lane] = {
             flow.target: lane_of(flow.payload_bytes) for flow in problem.pipeline.outputs(task)
         }
+        #: Of what it sends, and of what it takes from the tasks before it.
+        outputs = problem.pipeline.outputs(task)
+        self._longest_output = {f.target: longest_bytes(f.payload_bytes) for f in outputs}
+        self._longest_state = longest_bytes(problem.pipeline.tasks[task].state_bytes)
+        self._longest_input = {flow.source: longest_bytes(flow.payload_bytes) for flow in flows}
         self._state_lane = lane_of(problem.pipeline.tasks[task].state_bytes)
         self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
         #: What is read at a job's start and after the stage was called; a stage that is said to use
@@ -281,6 +286,11 @@ class Worker:
         if header.source == STAMPER and self._source is not None:
             self._source.stamped(header, now_ns)
             return
+        longest = self._longest_input.get(header.source, 0)
+        if len(sample.payload) > longest:
+            what = f"{len(sample.payload)} bytes from {header.source}; at most {longest} are taken"
+            self.place.complain(LiveError(f"{self.task} on {self.place.node}: {what}"))
+            return
         complete = self._joins[kind].add(header, sample.payload, now_ns)
         if complete is None:
             return
@@ -327,6 +337,11 @@ class Worker:
         state = decode(sample.header, State)
         if state.task != self.task:
             raise LiveError(f"a state of {state.task} came to {self.task}")
+        if len(sample.payload) > self._longest_state:
+            told = (
+                f"a state of {len(sample.payload)} bytes; at most {self._longest_state} are taken"
+            )
+            raise LiveError(f"{self.task}: {told}")
         if state.number:
             self._restoring = state, sample.payload
         elif self._checkpoint is None or (state.run, state.cycle) > (
@@ -381,6 +396,10 @@ class Worker:
             data = bytes(stage.snapshot())
         except Exception as error:  # the user's code
             self._failed(f"snapshot() failed ({type(error).__name__}: {error})")
+            return
+        if len(data) > self._longest_state:
+            told = _too_long(f"its state of {len(data)}", self._longest_state, "state_bytes")
+            self._failed(told)
             return
         header = encode(State(run, cycle, self.task, place.node, number))
         place.transport.put(place.keys.state(self.task, to), data, header, lane=self._state_lane)
@@ -556,10 +575,19 @@ class Worker:
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)
         if self.is_sink:
-            if mine or not self._stateful:
+            longest = longest_bytes(0)
+            if len(data) > longest:
+                told = _too_long(f"its command of {len(data)}", longest)
+                self._failed(f"cycle {stamp.cycle}: {told}")
+            elif mine or not self._stateful:
                 place.transport.put(place.keys.command(self.task), data, head)
         elif job.shadow or mine:
             for target, node, to in destinations:
+                longest = self._longest_output[target]
+                if len(data) > longest:
+                    told = _too_long(f"its output of {len(data)}", longest, "the flow's bytes")
+                    self._failed(f"cycle {stamp.cycle}: {told}")
+                    continue
                 key = place.keys.inputs(target, node, to)
                 place.transport.put(key, data, head, lane=self._lanes[target])
             self._checkpoint_due(job)
@@ -605,3 +633,8 @@ class Worker:
         self._now_ns = max(self._now_ns, now_ns)
         due_ns = self.pulse.wake(now_ns)
         return due_ns if self._source is None else min(due_ns, self._source.due_ns)
+
+
+def _too_long(what: str, longest: int, declared: str = "") -> str:
+    more = f"; raise {declared}, {SPARE} times which may be sent" if declared else ""
+    return f"{what} bytes is not sent: at most {longest} are{more}"

@@ -206,10 +206,10 @@ def test_a_server_of_another_authority_is_not_spoken_to(
     port = free_ports(3)
     listen = {"control": Locator("127.0.0.1", port, "tls")}
     entry = Entry(Role(STAMPER, "R1", "stamper"), listen, {})  # type: ignore[arg-type]
-    more = security(problem, other.folder, STAMPER)._settings()
+    more = security(problem, other.folder, STAMPER)._settings(8)
     pretender = ZenohTransport(entry, more)
     try:
-        settings = security(problem, authority.folder, "agent@R2")._settings()
+        settings = security(problem, authority.folder, "agent@R2")._settings(8)
         end = {"control": (Locator("127.0.0.1", port, "tls"),)}
         agent = ZenohTransport(Entry(Role("agent@R2", "R2", "agent"), {}, end), settings)  # type: ignore[arg-type]
         try:

@@ -106,9 +106,12 @@ class ZenohSettings:
         Payloads from here on go through shared memory where they stay on the node.
     pool_bytes : int
         Shared memory for payloads under way from one process.
-    longest_bytes : int
-        Of a message that arrives in fragments; a longer one is dropped. A peer can have a process
-        keep that much, no more, for each connection and priority.
+    longest_bytes, longest_control_bytes : int
+        Of a message that arrives in fragments, in a session for payloads and in `control`; of a
+        longer one what has come is dropped, with the connection. A peer can have a process keep
+        that much for each of its connections, of 8 priorities and 2 reliabilities.
+    most_peers : int
+        Processes that a session is connected to at most.
     more : mapping of str to object
         Further settings of Zenoh by path, as ``transport/link/tls/root_ca_certificate``.
     """
@@ -123,6 +126,8 @@ class ZenohSettings:
     shared_bytes: int = 100_000
     pool_bytes: int = 16 << 20
     longest_bytes: int = LONGEST_BYTES
+    longest_control_bytes: int = LONGEST_BYTES
+    most_peers: int = 1_000
     more: Mapping[str, object] = field(default_factory=FrozenDict)
 
 
@@ -504,7 +509,10 @@ def _configuration(entry: Entry, name: Session, settings: ZenohSettings) -> dict
         f"{queue}/congestion_control/drop/max_wait_before_drop_fragments": (
             settings.drop_fragments_after_us
         ),
-        "transport/link/rx/max_message_size": settings.longest_bytes,
+        "transport/link/rx/max_message_size": (
+            settings.longest_control_bytes if name == "control" else settings.longest_bytes
+        ),
+        "transport/unicast/max_sessions": settings.most_peers,
         "transport/shared_memory/enabled": name == "local",
         # Payloads are put there by `_Pool`, with a plain copy where it is full.
         "transport/shared_memory/transport_optimization/enabled": False,
