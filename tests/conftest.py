@@ -6,11 +6,16 @@ themselves: real processes whose faults and deadlines are counted, and ports tha
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Under nohup, and in the background of a shell, SIGINT is ignored, and so it would be by all
+# processes that tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("dwell", deadline=None)
 settings.load_profile("dwell")

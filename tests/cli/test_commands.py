@@ -139,7 +139,7 @@ def test_check_prints_every_fault_with_its_line(cell: Path) -> None:
         ),
         (
             "E: {exec_ms: 2}}}",
-            "E: {exec_ms: 37.5}}}\ncontroller: {guard_cycles: 3, fallbacks: [LOC]}",
+            "E: {exec_ms: 37.5, workers: 2}}}\ncontroller: {guard_cycles: 3, fallbacks: [LOC]}",
             ("controller.guard_cycles: 3 is tight for OFF", "40.5 ms", "40.0 ms"),
         ),
         (
@@ -200,7 +200,7 @@ def test_cycles_on_their_way_when_a_run_ends_are_told_apart_from_lost_ones(cell:
 
 
 def test_no_warning_about_a_guard_that_is_off_or_has_nowhere_to_go(cell: Path) -> None:
-    slow = SMALL.replace("E: {exec_ms: 2}}}", "E: {exec_ms: 37.5}}}")
+    slow = SMALL.replace("E: {exec_ms: 2}}}", "E: {exec_ms: 37.5, workers: 2}}}")
     for controller in ("", "controller: {fallbacks: [OFF]}\n"):
         cell.write_text(slow + controller, encoding="utf-8")
         assert call("check", cell).stderr == ""
@@ -291,6 +291,52 @@ def test_a_wrong_argument_changes_nothing(
     for word in words:
         assert word in result.stderr
     assert [path.name for path in cell.parent.iterdir()] == ["small.yaml"]
+
+
+def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
+    words = ("run", cell, "--windows", "5", "--out", "kept")
+    assert call(*words).exit_code == 0
+    assert call(*words).exit_code == 0, "the same run again"
+    other = call(*words, "--seed", "2")
+    assert (other.exit_code, other.stdout) == (2, "")
+    assert "kept holds another run" in other.stderr
+    assert dwell.open_run("kept").meta["seed"] == 1
+    assert call(*words, "--seed", "2", "--force").exit_code == 0
+    assert dwell.open_run("kept").meta["seed"] == 2
+
+
+def test_a_study_given_to_run_is_called_one(cell: Path) -> None:
+    Path("study.yaml").write_text("dwell-study: 1\ncell: small.yaml\n", encoding="utf-8")
+    result = call("run", "study.yaml")
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert "dwell study" in result.stderr
+
+
+def test_unknown_names_are_listed_once(cell: Path) -> None:
+    result = call("run", cell, "--scenario", "xyzzy")
+    assert result.exit_code == 2
+    assert result.stderr.count("baseline") == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("E: {exec_ms: 2}", "E: {exec_ms: 30}", "plan takes 30 ms a job on E"),
+        ("to: plan}", "to: plan, bytes: 160000}", "64 Mbit/s over R->E, which carries 20"),
+    ],
+)
+def test_check_warns_of_stages_and_links_that_cannot_keep_up(
+    cell: Path, old: str, new: str, words: str
+) -> None:
+    assert old in SMALL
+    text = SMALL.replace("delay_ms: 1}", "delay_ms: 1, rate_mbps: 20}")
+    cell.write_text(text, encoding="utf-8")
+    assert call("check", cell).stderr == ""
+    cell.write_text(text.replace(old, new), encoding="utf-8")
+    result = call("check", cell)
+    assert result.exit_code == 0
+    assert words in result.stderr
 
 
 def test_a_folder_that_cannot_be_written_is_a_failure(

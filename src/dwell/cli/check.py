@@ -66,6 +66,8 @@ def check_cell(
 def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield what is allowed in a cell but seldom meant."""
     yield from _overloads(problem, profile)
+    yield from _slow_stages(problem, profile)
+    yield from _full_links(problem)
     yield from _over_caps(problem, profile)
     yield from _false_alarms(problem, profile)
     yield from _late_releases(problem)
@@ -81,6 +83,51 @@ def _overloads(problem: Problem, profile: Profile) -> Iterator[Fault]:
                     f"candidates.{name}",
                     f"its own work takes {share:.0%} of the cores of {node}: it can never keep "
                     "pace; place less there, or give the node more cores",
+                )
+
+
+def _slow_stages(problem: Problem, profile: Profile) -> Iterator[Fault]:
+    """Yield stages that take longer for a job than their workers have."""
+    pipeline, nodes = problem.pipeline, problem.fabric.nodes
+    for candidate, placement in problem.candidates.items():
+        for task in pipeline.tasks.values():
+            node, execution = nodes[placement[task.name]], task.on[placement[task.name]]
+            if profile.own[candidate][node.name] > 1:
+                continue
+            mean_ms = execution.exec_ms.expectation
+            if task.scale is not None:
+                mean_ms *= pipeline.scales[task.scale].expectation
+            if execution.accelerator is None:
+                cpu = node.cores if node.quota is None else min(node.cores, node.quota.cpu)
+                mean_ms *= max(1.0, execution.threads / cpu)
+            if mean_ms > execution.workers * pipeline.period_ms:
+                yield Fault(
+                    f"candidates.{candidate}",
+                    f"{task.name} takes {mean_ms:.4g} ms a job on {node.name}, a job comes every "
+                    f"{pipeline.period_ms:.4g} ms, and workers are {execution.workers}: it can "
+                    f"never keep pace; raise tasks.{task.name}.on.{node.name}.workers",
+                )
+
+
+def _full_links(problem: Problem) -> Iterator[Fault]:
+    """Yield candidates that send more over a link than it carries, repetitions included."""
+    pipeline, links = problem.pipeline, problem.fabric.links
+    for candidate, placement in problem.candidates.items():
+        sent_bytes = dict.fromkeys(links, 0.0)
+        for flow in pipeline.flows:
+            name = f"{placement[flow.source]}->{placement[flow.target]}"
+            if name in links:
+                link = links[name]
+                attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
+                sent_bytes[name] += attempts * flow.payload_bytes
+        for name, count in sent_bytes.items():
+            mbps = 8e-3 * count / pipeline.period_ms
+            if mbps > links[name].rate_mbps:
+                yield Fault(
+                    f"candidates.{candidate}",
+                    f"it sends {mbps:.4g} Mbit/s over {name}, which carries "
+                    f"{links[name].rate_mbps:.4g}: messages wait ever longer; send less, or "
+                    "raise rate_mbps",
                 )
 
 

@@ -160,12 +160,17 @@ def run(
     guard: Annotated[
         bool, typer.Option("--guard", help="Let the robots' guard move to a fallback by itself.")
     ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace another run in the folder.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Simulate a policy on a scenario, save the run, sum it up."""
     from dwell.cli.run import Request, run_cell
 
-    request = Request(cell, scenario, policy, estimator, seed, windows, out, traces, jobs, guard)
+    request = Request(
+        cell, scenario, policy, estimator, seed, windows, out, traces, jobs, guard, force
+    )
     if not run_cell(request, as_json=as_json):
         raise typer.Exit(FAILED)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ import dwell
 from dwell.cli.output import print_json, working
 from dwell.errors import RunError
 from dwell.model import Problem
-from dwell.record import require_free
+from dwell.record import Run, require_free
 from dwell.study.summary import STRETCHES, Row, summarise
 
 __all__ = ["Request", "run_cell"]
@@ -35,6 +36,7 @@ class Request:
     traces: Path | None
     jobs: bool
     guard: bool = False
+    force: bool = False
 
 
 def run_cell(request: Request, *, as_json: bool) -> bool:
@@ -65,6 +67,8 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
             jobs=request.jobs,
             guard=request.guard,
         )
+        if not request.force:
+            _require_same(folder, result)
         try:
             result.save(folder)
         except RunError as error:
@@ -85,6 +89,20 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
         typer.echo(_summary(problem, request, policy, measured))
         typer.echo(f"\nsaved to {folder}")
     return True
+
+
+def _require_same(folder: Path, result: Run) -> None:
+    """Raise a RunError where a folder holds another run: other than this one made again."""
+    if not (folder / "run.json").is_file():
+        return
+
+    def record(run: Run) -> dict[str, Any]:
+        return {key: value for key, value in run.meta.items() if key != "versions"}
+
+    if record(dwell.open_run(folder)) != json.loads(json.dumps(record(result))):
+        raise RunError(
+            f"{folder} holds another run; choose another folder, or say --force to replace it"
+        )
 
 
 def _folder(problem: Problem, scenario: str, policy: str, seed: int) -> Path:

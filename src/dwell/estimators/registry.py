@@ -11,7 +11,7 @@ from dwell.estimators.profile import Profile
 from dwell.estimators.protocol import Estimator
 from dwell.estimators.scaling import Scaling
 from dwell.estimators.shadow import Shadow
-from dwell.model.meaning import nearest
+from dwell.model.meaning import nearest_of
 from dwell.model.problem import Problem
 
 __all__ = ["REGISTRY", "by_name", "name_in_run"]
@@ -34,10 +34,8 @@ def by_name(name: str, problem: Problem) -> Estimator:
         If there is none of that name; the message lists the known ones.
     """
     if name not in REGISTRY:
-        known = ", ".join(REGISTRY)
-        raise ProblemError(
-            f"unknown estimator {name!r}; {nearest(name, REGISTRY)} (estimators here: {known})"
-        )
+        hint = nearest_of(name, REGISTRY, "estimators")
+        raise ProblemError(f"unknown estimator {name!r}; {hint}")
     return REGISTRY[name](problem)
 
 

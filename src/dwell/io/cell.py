@@ -49,6 +49,9 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
     text = read_yaml(source, faults)
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
+    if isinstance(text, dict) and "dwell-study" in text and "dwell" not in text:
+        faults.add("dwell-study", "this is a study, not a cell; run it by `dwell study FILE`")
+        raise faults.error()
     folder = Path(source).parent if traces is None else Path(traces)
     return read_problem(text, faults, folder, Path(source).stem or "cell")
 

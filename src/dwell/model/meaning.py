@@ -27,7 +27,7 @@ from dwell.model.scenario import (
 if TYPE_CHECKING:
     from dwell.model.problem import ControllerSettings
 
-__all__ = ["Parts", "find_faults", "nearest", "too_many_shadows"]
+__all__ = ["Parts", "find_faults", "nearest", "nearest_of", "too_many_shadows"]
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -67,6 +67,13 @@ def nearest(word: str, known: Iterable[str]) -> str:
     if match:
         return f"did you mean {match[0]!r}?"
     return f"known: {', '.join(names)}" if names else "none is declared"
+
+
+def nearest_of(word: str, known: Iterable[str], what: str) -> str:
+    """Return a remedy for an unknown name, with all known ones, each said once."""
+    names = list(known)
+    hint = nearest(word, names)
+    return f"{hint} ({what} here: {', '.join(names)})" if hint.startswith("did") else hint
 
 
 def find_faults(parts: Parts) -> list[Fault]:

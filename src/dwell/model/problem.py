@@ -22,7 +22,7 @@ from dwell.model.bounds import (
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.live import LiveSettings
-from dwell.model.meaning import Parts, find_faults, nearest
+from dwell.model.meaning import Parts, find_faults, nearest_of
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
@@ -243,7 +243,6 @@ class Problem:
             If there is none of that name; the message lists the known ones.
         """
         if name not in self.scenarios:
-            known = ", ".join(self.scenarios)
-            hint = nearest(name, self.scenarios)
-            raise ProblemError(f"unknown scenario {name!r}; {hint} (scenarios here: {known})")
+            hint = nearest_of(name, self.scenarios, "scenarios")
+            raise ProblemError(f"unknown scenario {name!r}; {hint}")
         return self.scenarios[name]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from dwell.errors import PolicyError
-from dwell.model.meaning import nearest
+from dwell.model.meaning import nearest_of
 from dwell.model.problem import Problem
 from dwell.policies.atp import ATP
 from dwell.policies.atp_thresholds import ATPThresholds, Pair, find_pairs
@@ -42,9 +42,7 @@ def by_name(name: str, problem: Problem) -> Policy:
     if name in problem.candidates:
         return Static(candidates=problem.candidates, initial=name, objective=problem.objective)
     known = [*REGISTRY, *problem.candidates]
-    raise PolicyError(
-        f"unknown policy {name!r}; {nearest(name, known)} (policies here: {', '.join(known)})"
-    )
+    raise PolicyError(f"unknown policy {name!r}; {nearest_of(name, known, 'policies')}")
 
 
 def _dtp(problem: Problem) -> DTP:
