@@ -11,9 +11,11 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import psutil
 import pytest
 from rich.console import Console
@@ -25,7 +27,7 @@ from dwell.errors import LiveError
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.report.phases import Disturbed, disturbed
-from dwell.testbed.playing import make_folder
+from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import Change, changes_of
 from dwell.trust import KEYS
 from tests.report.live_runs import PERIOD_NS, live_run
@@ -149,6 +151,24 @@ def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path
     assert played["at_s"] == pytest.approx(10 * PERIOD_NS / 1e9, abs=1e-3)
     assert played["for_s"] == pytest.approx(51 * PERIOD_NS / 1e9, abs=1e-3)
     assert "tracking" not in run.meta
+
+
+@pytest.mark.parametrize("full", [("R1",), ("R1", "R2"), ()])
+def test_a_machine_that_was_full_while_nothing_disturbed_it_is_warned_of(
+    problem: Problem, full: tuple[str, ...]
+) -> None:
+    run = live_run(played=[{"at_s": 0.5, "for_s": 0.4}])
+    # E is full only while it is stressed: in the windows that begin at 0.33 and 0.73 s.
+    used = {
+        "u_R1": [1.0 if "R1" in full else 0.9] * 6,
+        "u_E": [0.3, 0.99, 0.99, 0.3, 0.3, 0.3],
+        "u_R2": [1.0 if "R2" in full else 0.9] * 6,
+    }
+    windows = run.windows.with_columns(**{name: pl.Series(of) for name, of in used.items()})
+    small = replace(problem, window_cycles=10)
+    tables = {"cycles": run.cycles, "windows": windows, "decisions": run.decisions}
+    warnings = crowded(dwell.Run(run.meta, tables), small)
+    assert [warning.partition(" ")[0] for warning in warnings] == list(full)
 
 
 def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:

@@ -22,7 +22,7 @@ from dwell.demo.world import World
 from dwell.errors import LiveError
 from dwell.live.visiting import Visitor
 from dwell.model import Problem
-from dwell.record import Run, open_run
+from dwell.record import Run, open_run, seal_run
 from dwell.report import run_html
 from dwell.report.facts import Facts
 from dwell.report.phase_rows import PhaseRow, phase_rows
@@ -34,6 +34,7 @@ from dwell.testbed.playing import (
     Played,
     begun,
     come_up,
+    crowded,
     interruptible,
     longest_run,
     make_folder,
@@ -95,6 +96,7 @@ def play(
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
     run = told.note(folder, **told.tracking(folder))
+    run = seal_run(folder, warnings=crowded(run, problem))
     _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
     if interrupted:
         raise typer.Exit(INTERRUPTED)
@@ -226,6 +228,7 @@ def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bo
                 "lost": lost,
                 "migrations": migrations,
                 "guard_moves": len(guard),
+                "warnings": run.meta["warnings"],
                 "phases": [row._asdict() for row in phases],
                 "run": folder,
                 "report": report,
@@ -238,6 +241,8 @@ def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bo
     )
     if phases:
         typer.echo(f"{_table(phases)}\n")
+    for warning in run.meta["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"run: {folder}")
     typer.echo(f"report: {report}" if report else "no report: the run ended within its warm-up")
 

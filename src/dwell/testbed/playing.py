@@ -26,6 +26,7 @@ __all__ = [
     "Played",
     "begun",
     "come_up",
+    "crowded",
     "interruptible",
     "longest_run",
     "make_folder",
@@ -38,6 +39,8 @@ Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
 
 #: Time between two looks at a cell.
 LOOK_S = 0.5
+#: Utilisation of a node that is full, as far as counters of 10 ms can tell.
+FULL = 0.97
 START_S = 30.0
 
 
@@ -113,6 +116,42 @@ def begun(run: Run) -> tuple[int, int] | None:
     if not isinstance(origin_ns, int) or cycles.is_empty():
         return None
     return origin_ns, origin_ns + int(cycles["release_ns"][-1])
+
+
+def crowded(run: Run, problem: Problem) -> list[str]:
+    """Return warnings of nodes that were full although nothing disturbed them.
+
+    Parameters
+    ----------
+    run : Run
+        One that was played: its meta say when it was disturbed.
+    problem : Problem
+
+    Returns
+    -------
+    list of str
+        One a node whose utilisation was 97 % or more in most of the windows without a disturbance.
+    """
+    span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    played = [(item["at_s"], item["at_s"] + item["for_s"]) for item in run.meta.get("played", ())]
+    released_s = run.cycles["release_ns"] / 1e9
+    windows = run.windows.filter(~run.windows["warmup"])
+    begun_s = released_s.gather(windows["first_cycle"])
+    calm = [
+        all(at_s + span_s < begin_s or end_s < at_s for begin_s, end_s in played)
+        for at_s in begun_s
+    ]
+    found = []
+    for node in problem.fabric.nodes:
+        used = [share for share, mine in zip(windows[f"u_{node}"], calm, strict=True) if mine]
+        full = sum(share >= FULL for share in used)
+        if 2 * full > len(used):
+            found.append(
+                f"{node} was full ({FULL:.0%} busy or more) in {full} of {len(used)} windows in "
+                "which nothing was to disturb it: this machine has too little for the cell, and "
+                "what was missed says little about placements"
+            )
+    return found
 
 
 @contextmanager
