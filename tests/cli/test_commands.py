@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from typer.testing import CliRunner, Result
 
 import dwell
 from dwell.cli.commands import app
 from dwell.cli.demo import find_examples
 from dwell.errors import ProblemError, RunError
+from dwell.model.document import to_document
 from dwell.record import Run
 
 ROOT = Path(__file__).parents[2]
@@ -204,6 +206,26 @@ def test_no_warning_about_a_guard_that_is_off_or_has_nowhere_to_go(cell: Path) -
     for controller in ("", "controller: {fallbacks: [OFF]}\n"):
         cell.write_text(slow + controller, encoding="utf-8")
         assert call("check", cell).stderr == ""
+
+
+@pytest.mark.parametrize(("grace_ms", "warned"), [(59, True), (60, False)])
+def test_a_cell_with_stages_is_warned_of_closing_before_its_guard_acts(
+    cell: Path, grace_ms: int, warned: bool
+) -> None:
+    """Before it has hosts, and so before anything is started."""
+    document = to_document(dwell.load(cell))
+    document["controller"] = {
+        **document.get("controller", {}),
+        "fallbacks": ["OFF"],
+        "guard_cycles": 3,
+        "close_grace_ms": grace_ms,
+    }
+    cell.write_text(yaml.safe_dump(document), encoding="utf-8")
+    assert "close_grace_ms" not in call("check", cell).stderr
+    for name, task in document["tasks"].items():
+        task["run"] = f"stages:{name}"
+    cell.write_text(yaml.safe_dump(document), encoding="utf-8")
+    assert ("warning: controller.close_grace_ms: 59" in call("check", cell).stderr) is warned
 
 
 def test_examples_are_without_faults_and_warnings() -> None:

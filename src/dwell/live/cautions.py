@@ -13,13 +13,13 @@ __all__ = ["find_cautions"]
 def find_cautions(problem: Problem) -> Iterator[Fault]:
     """Yield what a live cell does not do as its file says, or not as well as it could.
 
-    Of a cell without hosts, which is none, nothing.
+    Of one that is for the simulator alone, with neither hosts nor stages, nothing.
 
     Parameters
     ----------
     problem : Problem
     """
-    if problem.live.hosts:
+    if problem.live.hosts or any(task.run for task in problem.pipeline.tasks.values()):
         yield from _side_by_side(problem)
         yield from _early_closes(problem)
 
