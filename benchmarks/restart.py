@@ -37,8 +37,8 @@ UNUSED = ("perception@E", "planning@E", "perception@E.shadow")
 USED = ("perception@R1", "planning@R2")
 OBSERVED_S = 10.0
 HEALTHY_CYCLES = 50
-#: How much later than it was sent the last beat of the process before may be heard.
-LATE_MS = 100
+#: How long after it was sent the last beat of the process before may be heard, over the detour.
+LATE_MS = 400
 #: A busy machine takes long for everything.
 PATIENCE_S = 120.0
 
