@@ -36,11 +36,16 @@ def test_with_an_objective_costs_are_recorded() -> None:
     assert policy.decide(observed=qos()).costs == {}
 
 
-def test_it_stays_where_the_guard_moved_the_cell_until_it_starts_again() -> None:
+def test_it_wants_back_from_where_somebody_else_has_moved_the_cell() -> None:
     policy = Static(candidates=CANDIDATES, initial="SO")
-    policy.adopt("LOC")
+    for k in range(3):
+        policy.adopt("LOC")
+        assert policy.incumbent == "LOC"
+        decision = policy.decide(observed=qos())
+        assert (decision.name, decision.migrated, decision.reason) == ("SO", True, "migrate"), k
     decision = policy.decide(observed=qos())
-    assert (decision.name, decision.migrated) == ("LOC", False)
+    assert (decision.name, decision.migrated, decision.dwell) == ("SO", False, 1)
+    policy.adopt("LOC")
     policy.start(problem())
     decision = policy.decide(observed=qos())
     assert (decision.name, decision.migrated, decision.dwell) == ("SO", False, 1)

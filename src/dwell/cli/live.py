@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
@@ -355,8 +355,8 @@ def told(status: dict[str, Any]) -> list[str]:
     ]
     if status["fallback"]:
         extras.append("moved there by the guard")
-    if status["wanted"]:
-        extras.append(f"to leave for {status['wanted']} once that is proven")
+    if proving := status["proving"]:
+        extras.append(proof(proving))
     if status["drained"]:
         extras.append(f"without {', '.join(status['drained'])}")
     if status["refused"]:
@@ -381,6 +381,11 @@ def told(status: dict[str, Any]) -> list[str]:
         note = f"  {process['note']}" if process["note"] else ""
         lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
     return lines
+
+
+def proof(proving: Mapping[str, Any]) -> str:
+    """Return in words how far a proof is."""
+    return "proving {candidate}: {done} of {needed} cycles".format_map(proving)
 
 
 def _by_process(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import typer
 
+from dwell.cli.live import proof
 from dwell.model import Problem
 from dwell.report.palette import Palette
 from dwell.report.phases import Disturbed
@@ -370,9 +371,9 @@ class Screen:
         elif status.get("headline"):
             remark.append(status["headline"], "bold red")
         elif status.get("fallback"):
-            wanted = status.get("wanted")
-            proving = f"; proving {wanted}" if wanted else ""
-            remark.append(f"where the guard has put it{proving}", f"bold {HELD}")
+            proving = status.get("proving")
+            told = f"; {proof(proving)}" if proving else ""
+            remark.append(f"where the guard has put it{told}", f"bold {HELD}")
         elif status.get("moving_to"):
             remark.append(f"moving to {status['moving_to']}", GREY)
         elif look.window.get("reason"):

@@ -417,10 +417,14 @@ class Probation:
             self._count += 1
             self._silence.complete(cycle)
 
+    def done(self, now_ns: int) -> int:
+        """Return how many probes count by now, at most h."""
+        self._look(now_ns)
+        return min(self._count, self.needed)
+
     def proven(self, candidate: str, now_ns: int) -> bool:
         """Whether an order for a candidate may leave the fallback."""
-        self._look(now_ns)
-        return candidate == self.wanted and self._count >= self.needed
+        return self.done(now_ns) == self.needed and candidate == self.wanted
 
     def _look(self, now_ns: int, *, also_now: bool = True) -> None:
         """Begin to count anew where the patience has ended."""

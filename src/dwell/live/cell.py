@@ -75,6 +75,8 @@ class _Move:
     order: Order | None = None
     sent_ns: int = 0
     refused: str = ""
+    # Whether its order has been refused for now, and is to be asked for anew.
+    anew: bool = False
 
 
 class Cell:
@@ -214,6 +216,7 @@ class Cell:
         )
         self._unwritten = True
         move, self._move = self._move, None
+        self.refused = ""
         if not by_guard:
             if self.windows is not None:
                 if move is None or move.name == placement:
@@ -261,13 +264,15 @@ class Cell:
             # A stamp says where the cell is, and not who has moved it.
             self.controller.on_fallback = False
         self.held = answer
-        if not mine or move is None:
+        if self._move is None and answer.proven and answer.proven != held.proven:
+            self._obey(now_ns)
+        if not mine or move is None or move is not self._move:
             return
         self.refused = answer.refused
         if answer.refused:
-            move.refused = answer.refused
-            if not answer.refused.startswith(("not ready", "not proven")):
-                self._give_up()
+            move.refused, move.anew = answer.refused, True
+            if not answer.refused.startswith("not ready"):
+                self._give_up(now_ns)
         elif move.phase == "fork":
             self._ask_for_states(move, answer)
 
@@ -281,15 +286,28 @@ class Cell:
         self._number += 1
         return self._number
 
-    def _order(self, placement: str) -> Order:
-        """Return an order; whatever it is for, it says what a migration under way forks."""
-        held = self.held
+    def _order(self, placement: str, now_ns: int) -> Order:
+        """Return an order; whatever it is for, it says what is forked, and what is to be proven."""
+        held, move = self.held, self._move
         run, term = (held.run, held.term) if held is not None else (0, 0)
-        move = self._move
-        want = self.controller.wanted or ("" if move is None else move.name)
         fraction = self.controller.shadow_fraction
         forks = () if move is None else move.forks
+        want = self._wish(now_ns) if move is None else move.name
         return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
+
+    def _wish(self, now_ns: int) -> str:
+        """Return what the guard's fallback shall be left for: people's choice, else the policy's.
+
+        It lasts until the cell is there, whatever windows close and orders are given up meanwhile:
+        without it the stamper counts its probes anew.
+        """
+        held, wanted = self.held, self.controller.wanted
+        if held is None or not held.fallback:
+            return ""
+        chosen = self._allowed(held.placement, now_ns)
+        if self.pinned or chosen != held.placement:
+            return "" if chosen == held.placement else chosen
+        return wanted if wanted is not None and self._clear(wanted) else ""
 
     def _begin(self, name: str, now_ns: int, *, decided: bool = False) -> None:
         """Begin a migration, that the policy has decided or somebody asked for."""
@@ -316,11 +334,11 @@ class Cell:
             return
         if move.order is None:
             placement = move.name if move.phase == "order" else ""
-            move.order = self._order(placement)
-        elif self.refused:
+            move.order = self._order(placement, now_ns)
+        elif move.anew:
             # An order that was refused for now is asked for anew; one without answer, again.
-            move.order = self._order(move.order.placement)
-            self.refused = ""
+            move.order = self._order(move.order.placement, now_ns)
+            move.anew = False
         self._send(move.order)
 
     def _ask_for_states(self, move: _Move, held: Accepted) -> None:
@@ -342,12 +360,12 @@ class Cell:
         if restored.failed:
             self.place.complain(LiveError(restored.failed))
             move.refused = restored.failed
-            self._give_up()
+            self._give_up(now_ns)
         elif not move.awaited:
             move.phase, move.order = "order", None
             self._push(move, now_ns)
 
-    def _give_up(self) -> None:
+    def _give_up(self, now_ns: int) -> None:
         """A migration has not come about: the cell is where it was."""
         move, held = self._move, self.held
         self._move = None
@@ -358,7 +376,7 @@ class Cell:
         if self.windows is not None:
             self.windows.refused((move.refused if move is not None else "") or "no answer")
         if move is not None and move.forks:
-            self._send(self._order(""))
+            self._send(self._order("", now_ns))
 
     # ------------------------------------------------------------------------- windows
 
@@ -379,13 +397,13 @@ class Cell:
         move = self._move
         if move is not None:
             if now_ns - move.since_ns > PATIENCE_NS:
-                self._give_up()
+                self._give_up(now_ns)
             elif now_ns - move.sent_ns >= RESEND_NS:
                 self._push(move, now_ns)
         if now_ns >= self._ask_ns:
             self._ask_ns = now_ns + ASK_NS
             # Also says that this controller is there, and what it would have proven.
-            self._send(self._order("") if self.held is not None else self._hello())
+            self._send(self._order("", now_ns) if self.held is not None else self._hello())
         wakes = [self.pulse.wake(now_ns), self._ask_ns]
         if due_ns is not None:
             wakes.append(due_ns)
@@ -407,7 +425,7 @@ class Cell:
         held = self.held
         if self._move is not None:
             # The order before has not come about within a whole window.
-            self._give_up()
+            self._give_up(now_ns)
         # Of a window that was mostly not heard of, what was heard says little.
         last = windows.last
         if held is None or last is None or 2 * last.heard < self.place.problem.window_cycles:
@@ -415,14 +433,13 @@ class Cell:
             return
         wanted = self.controller.close(closed, proven=held.proven or None)
         self._window, self._window_ns = self._shown(last), now_ns
-        target = self._allowed(wanted)
-        if self.place.problem.live.mode == "advise" and not self.pinned:
+        target = self._allowed(wanted, now_ns)
+        if held.fallback and target != held.proven:
             target = held.placement
         if target != wanted:
             self.controller.resume(held.placement, fallback=held.fallback)
             if self.place.problem.live.mode == "control":
-                pinned = f"pinned to {self.pinned}" if self.pinned else ""
-                windows.overruled(pinned or f"{', '.join(sorted(self.drained))} drained")
+                windows.overruled(self._overruled())
         if target != held.placement:
             self._begin(target, now_ns, decided=target == wanted)
 
@@ -432,22 +449,38 @@ class Cell:
         if self.windows is not None:
             self._recorder.append(self.windows.rows(), origin_ns=self.windows.origin_ns)
 
-    def _allowed(self, wanted: str) -> str:
+    def _allowed(self, wanted: str, now_ns: int) -> str:
         """Return what people let the policy have."""
-        held = self.held
+        held, problem = self.held, self.place.problem
         if self.pinned:
             return self.pinned
-        candidates = self.place.problem.candidates
-
-        def clear(name: str) -> bool:
-            return not self.drained.intersection(candidates[name].values())
-
-        if not self.drained or clear(wanted):
+        if held is not None and problem.live.mode == "advise":
+            wanted = held.placement
+        if self._clear(wanted):
             return wanted
-        if held is not None and clear(held.placement):
+        if held is not None and self._clear(held.placement):
             return held.placement
-        order = (*self.place.problem.controller.fallbacks, *candidates)
-        return next((name for name in order if clear(name)), wanted)
+        probed = (held.probed,) if held is not None and held.probed else ()
+        order = (*probed, *problem.controller.fallbacks, *problem.candidates)
+        clear: list[str] = [name for name in order if self._clear(name)]
+        return next((name for name in clear if self._staffed(name, now_ns)), clear[0])
+
+    def _clear(self, name: str) -> bool:
+        """Whether a candidate needs no node that is drained."""
+        return not self.drained.intersection(self.place.problem.candidates[name].values())
+
+    def _staffed(self, name: str, now_ns: int) -> bool:
+        """Whether all workers of a candidate were heard lately, and ready."""
+        hearing, silent_ns = self.pulse.hearing, silent_after_ns(self.place.problem)
+        workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].items()]
+        beats = [hearing.last(who) for who in workers if hearing.fresh(who, now_ns, silent_ns)]
+        return len(beats) == len(workers) and all(beat is not None and beat.ready for beat in beats)
+
+    def _overruled(self) -> str:
+        """Return why a decision is not followed."""
+        if self.pinned:
+            return f"pinned to {self.pinned}"
+        return f"{', '.join(sorted(self.drained))} drained" if self.drained else "not proven"
 
     def _shown(self, last: LiveWindow) -> dict[str, Any]:
         """Return the last window as people look at it."""
@@ -495,13 +528,20 @@ class Cell:
                 self.drained.discard(ask.about)
             case _:
                 return f"unknown question {ask.what!r}"
-        held = self.held
-        under_way = None if self._move is None else self._move.name
-        if held is not None:
-            target = self._allowed(held.placement)
-            if target not in (held.placement, under_way):
-                self._begin(target, now_ns)
+        self._obey(now_ns)
         return ""
+
+    def _obey(self, now_ns: int) -> None:
+        """Begin to move where people want the cell; from a fallback, once that is proven."""
+        held = self.held
+        if held is None:
+            return
+        target = self._allowed(held.placement, now_ns)
+        under_way = None if self._move is None else self._move.name
+        if held.fallback and target != held.proven:
+            return
+        if target not in (held.placement, under_way):
+            self._begin(target, now_ns)
 
     def _drain(self, node: str) -> str:
         problem = self.place.problem
@@ -517,7 +557,7 @@ class Cell:
 
     def status(self, now_ns: int) -> dict[str, Any]:
         """Return how the cell is, as plain values."""
-        held = self.held
+        held, move = self.held, self._move
         began_ns = now_ns if self._began_ns is None else self._began_ns
         age_ms = round((now_ns - self._window_ns) / 1e6, 1)
         found = {
@@ -533,7 +573,8 @@ class Cell:
             "wanted": self.controller.wanted,
             "pinned": self.pinned or None,
             "drained": sorted(self.drained),
-            "moving_to": self._move.name if self._move is not None else None,
+            "proving": self._proving(now_ns),
+            "moving_to": move.name if move is not None and not move.refused else None,
             "refused": self.refused or None,
             "migrations": self.migrations,
             "guard_moves": self.guard_moves,
@@ -546,6 +587,15 @@ class Cell:
         }
         health, headline = diagnose(self.place.problem, found)
         return {"health": health, "headline": headline, **found}
+
+    def _proving(self, now_ns: int) -> dict[str, Any] | None:
+        """Return how far the proof is that the guard's fallback is waiting for."""
+        held, wish = self.held, self._wish(now_ns)
+        if held is None or not wish or self._move is not None:
+            return None
+        needed = held.needed or self.place.problem.controller.probe_cycles
+        done = held.probes if held.probed == wish else 0
+        return {"candidate": wish, "done": done, "needed": needed}
 
     def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:
         """Return what is known of everybody that was ever heard."""

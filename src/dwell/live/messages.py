@@ -450,6 +450,10 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Highest number of an order that was carried out.
     resting : bool
         Whether the guard rests after its own move.
+    probed : str
+        Candidate that probes are sent through, so that the guard's fallback can be left for it.
+    probes, needed : int
+        Probes that count by now, and how many have to: `needed` are enough.
     """
 
     number: Count
@@ -463,6 +467,9 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     proven: Annotated[str, msgspec.Meta(max_length=120)] = ""
     newest: Count = 0
     resting: bool = False
+    probed: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    probes: Count = 0
+    needed: Count = 0
 
 
 T = TypeVar("T", bound=msgspec.Struct)

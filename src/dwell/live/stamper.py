@@ -230,19 +230,7 @@ class Stamper:
             refused = self._refusal(order, now_ns)
             if not refused:
                 self._accept(order)
-            answer = Accepted(
-                order.number,
-                order.controller,
-                refused,
-                self.run,
-                self.term,
-                self.placement,
-                self._next,
-                self.guard.on_fallback,
-                self._proven(now_ns),
-                self._newest,
-                self.guard.resting,
-            )
+            answer = self._answer(order, refused, now_ns)
             self._answered = order.controller, order.number, answer
         self.place.put_twice(self.place.keys.accepted(), answer)
 
@@ -251,9 +239,24 @@ class Stamper:
         """The next cycle to be stamped: one that other nodes know already is."""
         return self.cycle + (self._ahead is not None)
 
-    def _proven(self, now_ns: int) -> str:
-        wanted = self.probation.wanted if self.guard.on_fallback else None
-        return wanted if wanted and self.probation.proven(wanted, now_ns) else ""
+    def _answer(self, order: Order, refused: str, now_ns: int) -> Accepted:
+        probed = (self.probation.wanted if self.guard.on_fallback else None) or ""
+        return Accepted(
+            order.number,
+            order.controller,
+            refused,
+            self.run,
+            self.term,
+            self.placement,
+            self._next,
+            self.guard.on_fallback,
+            probed if self.probation.proven(probed, now_ns) else "",
+            self._newest,
+            self.guard.resting,
+            probed,
+            self.probation.done(now_ns) if probed else 0,
+            self.probation.needed,
+        )
 
     def _refusal(self, order: Order, now_ns: int) -> str:
         """Return why an order is not accepted, or nothing."""
@@ -280,7 +283,8 @@ class Stamper:
             return f"not ready: {', '.join(sorted(missing))} not heard"
         if self.guard.on_fallback and not self.probation.proven(order.placement, now_ns):
             self.probation.want(order.placement)
-            return f"not proven: {self.probation!r}"
+            done, needed = self.probation.done(now_ns), self.probation.needed
+            return f"not proven: {done} of {needed} cycles through {order.placement}"
         return ""
 
     def _misfork(self, order: Order) -> str:

@@ -78,7 +78,7 @@ Row: TypeAlias = tuple[object, ...]
 
 def sends_shadows(controller: Controller) -> bool:
     """Whether cycles may be sent through alternatives: to measure them, or to prove them."""
-    return controller.shadow_fraction > 0 or controller.guarded
+    return bool(controller.shadow_fraction or controller.problem.controller.fallbacks)
 
 
 def columns_of(controller: Controller) -> Columns:

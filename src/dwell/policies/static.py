@@ -15,7 +15,9 @@ __all__ = ["Static"]
 
 
 class Static:
-    """Stays on its candidate whatever happens; every decision is a hold.
+    """Wants its candidate whatever happens; every decision is a hold there.
+
+    Where somebody else has moved the cell, every decision is for the way back.
 
     Parameters
     ----------
@@ -57,11 +59,11 @@ class Static:
         self._incumbent.begin(self.initial)
 
     def adopt(self, name: str) -> None:
-        """Stay on `name` from now on: somebody else moved the cell there."""
+        """Take over `name` as the incumbent: somebody else moved the cell there."""
         self._incumbent.adopt(name)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
-        """Hold.
+        """Hold, or return to the candidate.
 
         Raises
         ------
@@ -72,4 +74,6 @@ class Static:
         costs = NOT_PRICED
         if self._pricing is not None and estimates is not None:
             costs = self._pricing.estimated(estimates, self._incumbent.name)
+        if self._incumbent.name != self.initial:
+            return self._incumbent.move(self.initial, "migrate", costs)
         return self._incumbent.stay("hold", costs)
