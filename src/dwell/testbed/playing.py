@@ -134,11 +134,13 @@ def crowded(run: Run, problem: Problem) -> list[str]:
     """
     span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
     played = [(item["at_s"], item["at_s"] + item["for_s"]) for item in run.meta.get("played", ())]
-    released_s = run.cycles["release_ns"] / 1e9
+    released_s = dict(zip(run.cycles["cycle"], run.cycles["release_ns"] / 1e9, strict=True))
     windows = run.windows.filter(~run.windows["warmup"])
-    begun_s = released_s.gather(windows["first_cycle"])
+    # Of a window whose first cycle is missing from the record nothing is said.
+    begun_s = [released_s.get(cycle) for cycle in windows["first_cycle"]]
     calm = [
-        all(at_s + span_s < begin_s or end_s < at_s for begin_s, end_s in played)
+        at_s is not None
+        and all(at_s + span_s < begin_s or end_s < at_s for begin_s, end_s in played)
         for at_s in begun_s
     ]
     found = []
