@@ -264,7 +264,7 @@ def _result_row(comparison: Comparison, palette: Palette, scenario: str, policy:
 def _pair(interval: Interval, measure: Measure, *, best: bool = False) -> list[Cell]:
     """Return a number and its error as two cells, so that columns of numbers align."""
     written = write_interval(interval, measure)
-    return [Cell(written.value, "num best" if best else "num"), Cell(written.error, "err")]
+    return [Cell(written.value, "num best" if best else "num"), Cell(escape(written.error), "err")]
 
 
 def _named(palette: Palette, policy: str) -> str:
