@@ -9,6 +9,10 @@ of the model, and the checker then has to find out what it is there for.
 A stamp says where the cell is, and not who has moved it: a controller that hears of a new term by a
 stamp takes it for the guard's doing unless it has ordered that very move, and may have forgotten it
 even then. Answers say it.
+
+A controller that wants to leave a fallback says so again and again, and probes count for as long as
+that is what it says. Those that are needed take longer than a window, and than an order is waited
+for: where that matters, the controller speaks after each of them.
 """
 
 from __future__ import annotations
@@ -38,7 +42,10 @@ RULES = {
     "charge": "a second controller is refused while the first one is in charge",
     "book": "a stamper that starts again knows its term and placement",
     "answer": "an answer that it was no move of the guard ends the wait for a proof",
+    "wish": "what is wanted is said until the cell is there, whatever is given up meanwhile",
 }
+#: Probes that come through before an order is given up, or a window closes: fewer than are needed.
+PATIENCE = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,8 @@ class Limits:
         proof.
     controllers : int
         How many say something.
+    probes : int
+        How many are needed. Where it is 1 somebody always wants to leave.
     """
 
     fires: int = 2
@@ -65,6 +74,7 @@ class Limits:
     lapses: int = 1
     whims: int = 0
     controllers: int = len(CONTROLLERS)
+    probes: int = 1
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -87,8 +97,12 @@ class Told:
 
 
 ALL, LIMITS = Rules(), Limits()
-#: Two controllers of one mind, and one that changes it.
-CASES = LIMITS, Limits(fires=2, lapses=0, whims=1, controllers=1)
+#: Two controllers of one mind, one that changes it, and one whose proof takes long.
+CASES = (
+    LIMITS,
+    Limits(fires=2, lapses=0, whims=1, controllers=1),
+    Limits(fires=2, lapses=0, controllers=1, probes=3),
+)
 NOTHING = Told(0, "", False)
 
 
@@ -103,7 +117,15 @@ class State:
     charge : str
         Controller that is in charge.
     probed : frozenset of int
-        Terms in which a probe has come through; word of it may arrive at any time.
+        Terms in which enough probes have come through; word of it may arrive at any time.
+    wish : bool
+        Whether the stamper has been told to send probes.
+    count : int
+        Probes that have come through since then, while they are not enough.
+    tried : int
+        How many of them since the controller has last begun to want what it wants.
+    spoken : bool
+        Whether the controller has said what it wants since the last of them.
     proof : frozenset of int
         Terms of the probes that the stamper has heard of.
     told : frozenset of Told
@@ -130,6 +152,10 @@ class State:
     lapses: int = 0
     whims: int = 0
     done: frozenset[Order] = frozenset()
+    wish: bool = False
+    count: int = 0
+    tried: int = 0
+    spoken: bool = False
 
 
 def initial() -> State:
@@ -145,7 +171,9 @@ def good(state: State) -> bool:
 def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Iterator[Step[State]]:
     """Return everything that may happen next."""
     yield from _faults(state, rules, limits)
-    yield from _stamper(state, rules)
+    yield from _stamper(state, rules, limits)
+    if limits.probes > 1 and state.now.fallback:
+        yield from _speaks(state, rules)
     for index, name in enumerate(CONTROLLERS[: limits.controllers]):
         yield from _controller(state, rules, limits, index, name)
 
@@ -154,7 +182,13 @@ def _moved(state: State, rules: Rules, placement: str, *, fallback: bool) -> Sta
     term = state.now.term + 1 if rules.holds("new term") else state.now.term
     now = Told(term, placement, fallback)
     proof = frozenset[int]() if rules.holds("fresh proof") else state.proof
-    return replace(state, now=now, told=state.told | {now}, proof=proof)
+    moved = replace(state, now=now, told=state.told | {now}, proof=proof)
+    return _forgets(moved)
+
+
+def _forgets(state: State) -> State:
+    """The stamper has no wish, and has counted nothing."""
+    return replace(state, wish=False, count=0, tried=0, spoken=False)
 
 
 def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
@@ -164,7 +198,7 @@ def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]
         yield Step("the guard moves the cell", replace(fired, fires=state.fires + 1), fault=True)
     if state.crashes < limits.crashes:
         once = replace(state, crashes=state.crashes + 1)
-        reborn = replace(once, charge="", proof=frozenset())
+        reborn = _forgets(replace(once, charge="", proof=frozenset()))
         if not rules.holds("book"):
             first = Told(1, WANTED, False)
             reborn = replace(reborn, now=first)
@@ -184,16 +218,37 @@ def _set(values: tuple[Item, ...], index: int, value: Item) -> tuple[Item, ...]:
 # -------------------------------------------------------------------------------- stamper
 
 
-def _stamper(state: State, rules: Rules) -> Iterator[Step[State]]:
+def _stamper(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
     term = state.now.term
     if state.now.fallback and term not in state.probed:
-        yield Step("a probe comes through", replace(state, probed=state.probed | {term}))
+        if limits.probes == 1:
+            yield Step("a probe comes through", replace(state, probed=state.probed | {term}))
+        elif state.wish and state.spoken:
+            yield Step("a probe comes through", _probe(state, limits))
     for probed in state.probed - state.proof:
         if state.now.fallback and (probed == term or not rules.holds("fresh proof")):
             heard = replace(state, proof=state.proof | {probed})
             yield Step(f"a probe of term {probed} is heard of", heard)
     for order in state.orders:
         yield _arrives(state, rules, order)
+
+
+def _probe(state: State, limits: Limits) -> State:
+    count, tried = state.count + 1, min(state.tried + 1, PATIENCE)
+    if count == limits.probes:
+        return _forgets(replace(state, probed=state.probed | {state.now.term}))
+    return replace(state, count=count, tried=tried, spoken=False)
+
+
+def _speaks(state: State, rules: Rules) -> Iterator[Step[State]]:
+    """The controller says what it wants, and is heard; word that is lost is none."""
+    if state.now.term in state.probed:
+        return
+    if state.tried == PATIENCE and not rules.holds("wish"):
+        yield Step("the controller has given up, and says so", _forgets(state))
+    elif not state.spoken:
+        told = replace(state, wish=True, spoken=True)
+        yield Step("the controller says that it wants to leave", told)
 
 
 def _arrives(state: State, rules: Rules, order: Order) -> Step[State]:
