@@ -34,6 +34,7 @@ __all__ = [
     "TierNodes",
     "TierUtilisation",
     "busiest",
+    "censored",
     "cost",
     "excess",
     "hamming",
@@ -202,6 +203,17 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
     if not math.isfinite(J):
         raise MetricError(f"J is {J!r} for {qos}; a metric is too large for its weight and target")
     return J
+
+
+def censored(used: Metric, own: Metric) -> bool | NDArray[np.bool_]:
+    """Whether a node is saturated and others have a part of it, so that their load is hidden.
+
+    Parameters
+    ----------
+    used, own : float, or array of shape (windows, nodes)
+        Busy share of the cores, and the cell's own share with its shadow jobs.
+    """
+    return (used >= SATURATED) & (own < SATURATED)
 
 
 def busiest(qos: QoS) -> float:

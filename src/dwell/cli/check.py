@@ -12,6 +12,7 @@ import typer
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, ProblemError
 from dwell.estimators import Profile
+from dwell.estimators.profile import mean_ms
 from dwell.io import load
 from dwell.live.cautions import find_cautions
 from dwell.model import Problem, Trace
@@ -94,16 +95,14 @@ def _slow_stages(problem: Problem, profile: Profile) -> Iterator[Fault]:
             node, execution = nodes[placement[task.name]], task.on[placement[task.name]]
             if profile.own[candidate][node.name] > 1:
                 continue
-            mean_ms = execution.exec_ms.expectation
-            if task.scale is not None:
-                mean_ms *= pipeline.scales[task.scale].expectation
+            job_ms = mean_ms(pipeline, task, execution)
             if execution.accelerator is None:
                 cpu = node.cores if node.quota is None else min(node.cores, node.quota.cpu)
-                mean_ms *= max(1.0, execution.threads / cpu)
-            if mean_ms > execution.workers * pipeline.period_ms:
+                job_ms *= max(1.0, execution.threads / cpu)
+            if job_ms > execution.workers * pipeline.period_ms:
                 yield Fault(
                     f"candidates.{candidate}",
-                    f"{task.name} takes {mean_ms:.4g} ms a job on {node.name}, a job comes every "
+                    f"{task.name} takes {job_ms:.4g} ms a job on {node.name}, a job comes every "
                     f"{pipeline.period_ms:.4g} ms, and workers are {execution.workers}: it can "
                     f"never keep pace; raise tasks.{task.name}.on.{node.name}.workers",
                 )

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ns, utilisation
-from dwell.cost import SATURATED, excess, hamming, price, tier_nodes
+from dwell.cost import SATURATED, censored, excess, hamming, price, tier_nodes
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
 from dwell.estimators import by_name as estimator_by_name
@@ -510,8 +510,7 @@ def static_columns(
     by_node = {node: used[:, i] for i, node in enumerate(controller.nodes)}
     seen["cost"] = _priced(problem, seen["l95_ms"], seen["violation_rate"], by_node, 0.0)
     # No other candidate is ever active, so that none is known to leave a full node less than full.
-    censored = (used >= SATURATED) & (own < SATURATED)
-    foreign = np.where(censored, 1.0, np.maximum(used - own, 0.0))
+    foreign = np.where(censored(used, own), 1.0, np.maximum(used - own, 0.0))
     estimated: dict[str, dict[str, NDArray[np.generic]]] = {}
     for candidate, placement in problem.candidates.items():
         l95_ms, violation_rate, busy = seen["l95_ms"], seen["violation_rate"], by_node

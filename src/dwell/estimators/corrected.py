@@ -38,7 +38,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import SATURATED
+from dwell.cost import censored
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, message_of
 from dwell.estimators.paths import longest_path, seen_windows, steps_of
@@ -299,7 +299,7 @@ class Corrected:
         for name, node in self.problem.fabric.nodes.items():
             used = observed.utilisation[name]
             least = max(used - own[name], 0.0)
-            hidden = used >= SATURATED and own[name] < SATURATED
+            hidden = censored(used, own[name])
             most = math.inf if hidden else least
             before_least, before_most = self._foreign[name]
             changed = least - before_most > LOAD_STEP or before_least - most > LOAD_STEP

@@ -38,13 +38,13 @@ from dwell.errors import MetricError
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.model.fabric import Link, Node
 from dwell.model.frozen import FrozenDict
-from dwell.model.pipeline import Execution, Flow, Task
+from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import Process, Trace, require
 from dwell.model.qos import QoS
 
-__all__ = ["Profile", "SampleCycles"]
+__all__ = ["Profile", "SampleCycles", "mean_ms"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -174,22 +174,12 @@ class SampleCycles:
             if execution.accelerator is None:
                 held = min(execution.threads, node.cores)
                 work_ms[node.name] += (
-                    self._mean_ms(task, execution) * _stretch(execution, node) * held
+                    mean_ms(pipeline, task, execution) * _stretch(execution, node) * held
                 )
         return {
             name: work / (pipeline.period_ms * nodes[name].capacity)
             for name, work in work_ms.items()
         }
-
-    def _mean_ms(self, task: Task, execution: Execution) -> float:
-        """Mean execution time, scale included, without sampling error."""
-        process = execution.exec_ms
-        if task.scale is None:
-            return process.expectation
-        scale = self.problem.pipeline.scales[task.scale]
-        if isinstance(process, Trace) and isinstance(scale, Trace) and process.table is scale.table:
-            return float((process.values * scale.values).mean())
-        return process.expectation * scale.expectation
 
     def executed(self, task_name: str, node_name: str) -> Floats:
         """Execution times of a task on a node that runs nothing else."""
@@ -248,6 +238,17 @@ class SampleCycles:
         digest = hashlib.blake2b(f"profile/{name}".encode(), digest_size=16).digest()
         words = tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=words))
+
+
+def mean_ms(pipeline: Pipeline, task: Task, execution: Execution) -> float:
+    """Mean execution time of a task, scale included, without sampling error, milliseconds."""
+    process = execution.exec_ms
+    if task.scale is None:
+        return process.expectation
+    scale = pipeline.scales[task.scale]
+    if isinstance(process, Trace) and isinstance(scale, Trace) and process.table is scale.table:
+        return float((process.values * scale.values).mean())
+    return process.expectation * scale.expectation
 
 
 def _stretch(execution: Execution, node: Node) -> float:

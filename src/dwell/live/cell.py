@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
-from dwell.live.health import diagnose, silent_after_ns
+from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.messages import (
     Accepted,
     Answer,
@@ -36,8 +36,6 @@ __all__ = ["Cell", "Recorder"]
 #: Time between two looks at the stamper, and two sendings of an order that is not answered.
 ASK_NS = 250_000_000
 RESEND_NS = 40_000_000
-#: Time after which a migration that does not come about is given up.
-PATIENCE_NS = 2_000_000_000
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
 

@@ -22,14 +22,14 @@ from dwell.live.agent import AGENT_BEAT
 from dwell.live.wiring import Role, roles
 from dwell.model import Problem
 
-__all__ = ["Health", "diagnose", "silent_after_ns", "window_late_ns"]
+__all__ = ["PATIENCE_NS", "Health", "diagnose", "silent_after_ns", "window_late_ns"]
 
 Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
 
 #: Nobody is called silent sooner: a machine that is busy is no fault.
 LEAST_NS = 1_000_000_000
-#: A migration that does not come about delays a window by so much.
-MOVE_NS = 2_000_000_000
+#: Time after which a migration that does not come about is given up; it delays a window as long.
+PATIENCE_NS = 2_000_000_000
 #: Faults of single processes that the headline names.
 NAMED = 3
 
@@ -58,7 +58,7 @@ def window_late_ns(problem: Problem) -> int:
     problem : Problem
     """
     window_ms = problem.window_cycles * problem.pipeline.period_ms
-    return round((2 * window_ms + problem.controller.close_grace_ms) * 1e6) + MOVE_NS
+    return round((2 * window_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
 
 
 def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str | None]:

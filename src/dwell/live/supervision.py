@@ -334,7 +334,7 @@ def _survivor(mark: Path) -> psutil.Process | None:
 
 def _reason(code: int) -> str:
     if code == UNKNOWN_CODE:
-        return "has ended"
+        return ENDED
     if code < 0:
         try:
             return f"was killed by {signal.Signals(-code).name}"

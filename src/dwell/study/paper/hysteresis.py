@@ -13,7 +13,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from dwell.model import FrozenDict, Problem
 from dwell.study.engine import StudyResult
@@ -27,9 +26,6 @@ from dwell.study.paper.differences import difference_table, families
 from dwell.study.paper.running import Runner, Scale
 from dwell.study.paper.sentences import counted, listed, number, percent
 from dwell.study.study import Contender, Point, Study
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["chapter", "verdict"]
 
@@ -313,8 +309,8 @@ def verdict(shown: Mapping[str, Mapping[str, Comparative]]) -> Outcome:
         for metric in ("violation_rate", "cost")
     ]
     sentence = (
-        "Against no hysteresis at all, DTP as it is set in the "
-        f"cell is shown to migrate less in {counted(len(calmer), scenarios, 'scenarios')}; "
+        "Against no hysteresis at all, DTP as it is set in the cell is shown to migrate less in "
+        f"{counted(len(calmer), scenarios, 'scenarios')}; "
         f"{', and '.join(prices)}."
     )
     return Outcome(answer, sentence)
@@ -391,9 +387,9 @@ def design(
     return (
         f"DTP with the estimator corrected; N_min of {listed(str(one) for one in dwells)} times "
         f"Δ_min of {listed(f'{one:g}' for one in thresholds)}, {len(grid[0].study.seeds)} seeds of "
-        f"{lengths}. Some settings are "
-        f"compared to none at all, paired by seed (sign-flip test, Holm over scenarios and "
-        f"settings of a metric). Regret is against the reference in hindsight. Beside that, "
+        f"{lengths}. Some settings are compared to none at all, paired by seed (sign-flip test, "
+        "Holm over scenarios and settings of a metric). Regret is against the reference in "
+        "hindsight. Beside that, "
         f"escape on and off ({where(escape)}; {len(escape[0].study.seeds)} seeds; DTP with profile "
         f"and with corrected), and cold migrations against warm ones ({where(cold)}; "
         f"{len(cold[0].study.seeds)} seeds; {listed(MOVERS)}): a moved task takes "
