@@ -13,6 +13,9 @@ even then. Answers say it.
 A controller that wants to leave a fallback says so again and again, and probes count for as long as
 that is what it says. Those that are needed take longer than a window, and than an order is waited
 for: where that matters, the controller speaks after each of them.
+
+Nobody lies here. What is damaged or made up is held back where it leaps (`dwell.live.continuity`);
+a true message that is held back is one that was lost or came late, and such the model has.
 """
 
 from __future__ import annotations

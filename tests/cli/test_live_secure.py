@@ -8,12 +8,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import dwell
 from dwell.cli.live import environment
 from dwell.live.keys import Keys
-from dwell.live.messages import Order, encode
+from dwell.live.messages import Order, Stamped, encode
 from dwell.live.security import INSECURE, Security
 from dwell.live.wiring import Role, wire
 from tests.cli.test_live import EXAMPLE, PATIENCE_S, RealCell, invoke
@@ -194,6 +195,32 @@ def test_orders_of_others_move_nothing(cell: SecureCell) -> None:
         assert ("order: not signed by controller" in cell.log("R1", "stamper@R1")) == gets_through
     after = cell.until(lambda status: status["window"])
     assert (after["term"], after["placement"]) == (status["term"], "SO")
+
+
+def test_false_stamps_with_the_stampers_keys_end_no_decisions(cell: SecureCell) -> None:
+    before = cell.until(lambda status: status["window"])
+    entry = wire(cell.problem).entry(f"controller@{cell.problem.controller_node}")
+    stamp = Stamped(before["run"], 0, before["term"], before["placement"], time.monotonic_ns())
+    false = (
+        msgspec.structs.replace(stamp, cycle=1 << 40),
+        msgspec.structs.replace(stamp, cycle=1 << 40, term=before["term"] + (1 << 20)),
+        msgspec.structs.replace(stamp, cycle=1 << 40, run=before["run"] + 1),
+    )
+    with Intruder(entry.listen["control"].port, tls(cell.host / "R1")) as intruder:
+        for number, message in enumerate(false, before["disbelieved"] + 1):
+            limit_s = time.monotonic() + PATIENCE_S
+            heard = 0
+            while heard < number and time.monotonic() < limit_s:
+                intruder.put(Keys(cell.problem.name).stamped(), encode(message))
+                time.sleep(0.2)
+                heard = cell.until(lambda _: True)["disbelieved"]
+            assert heard >= number
+    after = cell.until(lambda now: now["window"]["number"] >= before["window"]["number"] + 3)
+    assert (after["run"], after["placement"]) == (before["run"], before["placement"])
+    assert after["guard_moves"] == before["guard_moves"]
+    assert cell.as_("operator", "live", "pin", "LOC")[0] == 0
+    cell.until(lambda status: status["placement"] == "LOC")
+    assert "are believed (damaged, or made up)" in cell.logs
 
 
 def test_the_run_is_a_run_and_no_log_has_a_secret(cell: SecureCell) -> None:

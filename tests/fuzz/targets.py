@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 import dwell
 from dwell.errors import LiveError, TrustError
 from dwell.live import messages
+from dwell.live.cell import Cell
 from dwell.live.keys import Keys
 from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Completion, Header, Order, encode
 from dwell.live.payloads import read_payload
@@ -32,7 +34,7 @@ from dwell.trust.roster import Roster
 from dwell.trust.signing import Seals
 from tests.live.small_world import Bench, Passing, World
 
-__all__ = ["KINDS", "NODES", "TARGETS", "ReachedError", "seeds"]
+__all__ = ["KINDS", "NODES", "TARGETS", "FrozenError", "ReachedError", "seeds"]
 
 NODES = ("R1", "E", "R2")
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
@@ -201,6 +203,60 @@ def reach_sealed_roles(data: bytes) -> None:
         raise ReachedError(f"{before} has become {after}")
 
 
+def keep_deciding(data: bytes) -> None:
+    """A message to the controller that is whole, but for some numbers; then true ones follow.
+
+    A byte chooses the message; then come a byte for each field and eight for what it is to be.
+    """
+    world = _deciding()
+    cell = next(role for role in world.roles.values() if isinstance(role, Cell))
+    key, true = _next_messages(world, cell)[data[0] % 3 if data else 0]
+    found = msgspec.to_builtins(true)
+    stamp = found[0] if isinstance(true, Completion) else found
+    for at in range(1, len(data) - 8, 9):
+        place = data[at] % len(stamp)
+        if type(stamp[place]) is int:
+            stamp[place] = int.from_bytes(data[at + 1 : at + 9], "big") >> 2
+    cell.receive(Sample(key, msgspec.msgpack.encode(found)), world.network.now_ns)
+    before = cell.status(world.network.now_ns)["windows"]
+    world.run(1_500)
+    status = cell.status(world.network.now_ns)
+    if status["windows"] < before + 2 or status["term"] != world.stamper.term:
+        # What follows begins with one that still decides.
+        _deciding.cache_clear()
+        raise FrozenError(
+            f"{found} ended the decisions: {status['windows'] - before} windows since"
+        )
+
+
+class FrozenError(AssertionError):
+    """After a message the controller has closed no window any more, or is in another term."""
+
+
+@cache
+def _deciding() -> World:
+    """A cell whose controller closes a window every 10 cycles."""
+    problem = dwell.load("examples/canonical.yaml")
+    quick = replace(problem, window_cycles=10, warmup_windows=0)
+    found = World(quick, exec_ms=EXEC_MS, policy="SO")
+    found.run(1_000)
+    return found
+
+
+def _next_messages(world: World, cell: Cell) -> list[tuple[str, msgspec.Struct]]:
+    """What the controller may hear next: a stamp, a completion, an answer."""
+    stamper, now_ns = world.stamper, world.network.now_ns
+    who = stamper.run, stamper.cycle, stamper.term, stamper.placement
+    keys = Keys(world.problem.name)
+    done = Completion(messages.Stamp(*who, now_ns), "control", now_ns, "actuated", (), "R2")
+    told = cell._number, cell.name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle
+    return [
+        (keys.stamped(), messages.Stamped(*who, now_ns)),
+        (keys.done("control"), done),
+        (keys.accepted(), messages.Accepted(*told)),
+    ]
+
+
 def _hear(world: World, data: bytes) -> None:
     key = _keys()[int.from_bytes(data[:2], "big") % len(_keys())]
     length = int.from_bytes(data[2:4], "big")
@@ -221,6 +277,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "roster": read_roster,
     "roles": reach_roles,
     "sealed": reach_sealed_roles,
+    "decisions": keep_deciding,
 }
 
 
@@ -275,6 +332,15 @@ def seeds(name: str) -> list[bytes]:
             b"struct:Plan": msgspec.msgpack.encode(Plan("a", [(1.0, 2.0)])),
         }
         return [bytes([len(kind)]) + kind + data for kind, data in kinds.items()]
+    if name == "decisions":
+        # Each number of each message, a little and much higher than it may be.
+        values = (7, 1 << 22, 1 << 42, (1 << 63) - 1, (1 << 64) - 1)
+        return [
+            bytes([kind, place]) + value.to_bytes(8, "big")
+            for kind in range(3)
+            for place in (range(7) if kind == 2 else (0, 1, 2, 4))
+            for value in values
+        ]
     if name == "seal":
         data = encode(Order(1, "me", 1, 1, "SO"))
         return [bytes(64) + data, _seals()["E"].seal("order", data)]

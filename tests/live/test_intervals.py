@@ -101,12 +101,12 @@ def test_the_best_round_trip_counts_until_it_is_old() -> None:
 def test_a_cycle_ends_with_its_last_sink_and_copies_change_nothing() -> None:
     intervals = Intervals("stamper@R1", {"arm", "gripper"})
     intervals.hear(beat(100 * S + 10 * MS, 100 * S, 0), 14 * MS)
-    intervals.completed(done(5), 40 * MS, direct=True)
-    intervals.completed(done(5), 60 * MS, direct=False)
+    intervals.completed(done(5), 40 * MS, newest=5, direct=True)
+    intervals.completed(done(5), 60 * MS, newest=5, direct=False)
     assert intervals.news() == ()
-    intervals.completed(done(5, "gripper"), 50 * MS, direct=True)
-    intervals.completed(done(5, "gripper"), 70 * MS, direct=True)
-    intervals.completed(done(5, "nobody"), 80 * MS, direct=True)
+    intervals.completed(done(5, "gripper"), 50 * MS, newest=5, direct=True)
+    intervals.completed(done(5, "gripper"), 70 * MS, newest=5, direct=True)
+    intervals.completed(done(5, "nobody"), 80 * MS, newest=5, direct=True)
     assert intervals.news() == ((5, 48 * MS),)
     assert intervals.news() == ()
 
@@ -114,7 +114,7 @@ def test_a_cycle_ends_with_its_last_sink_and_copies_change_nothing() -> None:
 def test_cycles_that_never_complete_take_no_memory() -> None:
     intervals = Intervals("stamper@R1", {"arm", "gripper"})
     for cycle in range(10_000):
-        intervals.completed(done(cycle), cycle, direct=True)
+        intervals.completed(done(cycle), cycle, newest=cycle, direct=True)
     assert len(intervals._waiting) <= 256
-    intervals.completed(done(3, "gripper"), 1, direct=True)  # long ago
+    intervals.completed(done(3, "gripper"), 1, newest=10_000, direct=True)  # long ago
     assert 3 not in intervals._waiting

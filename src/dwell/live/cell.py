@@ -13,12 +13,14 @@ from typing import Any, Literal, Protocol, TypeAlias
 from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
+from dwell.live.continuity import Continuity
 from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.messages import (
     Accepted,
     Answer,
     Ask,
     Beat,
+    Completion,
     Order,
     Restored,
     Snapshot,
@@ -36,6 +38,8 @@ __all__ = ["Cell", "Recorder"]
 #: Time between two looks at the stamper, and two sendings of an order that is not answered.
 ASK_NS = 250_000_000
 RESEND_NS = 40_000_000
+#: Stamps in a row that say that the cell has been moved, where no answer says so.
+TOLD = 3
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
 
@@ -102,6 +106,13 @@ class Cell:
         self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
         self._keys = place.keys
         self.held: Accepted | None = None
+        # The cycles that are believed; and the numbers of the last orders that were sent before the
+        # newest cycle, and before the term that holds, were heard of.
+        self.continuity = Continuity(place.period_ns)
+        self._cycle_asked = self._term_asked = 0
+        # What a stamp says of a term that nobody has confirmed, and how many in a row.
+        self._rumour: tuple[tuple[int, int, str], int] | None = None
+        self._doubted_until_ns: int | None = None
         self.refused = ""
         self.pinned = ""
         self.drained: set[str] = set()
@@ -131,6 +142,8 @@ class Cell:
         self._take(sample, now_ns)
         windows, move = self.windows, self._move
         due_ns = None if windows is None else windows.due_ns(now_ns)
+        if self._rumour is not None:
+            due_ns = self._ask_ns if due_ns is None else min(due_ns, self._ask_ns)
         if move is None:
             return due_ns
         again_ns = move.sent_ns + RESEND_NS
@@ -154,7 +167,9 @@ class Cell:
                 case "stamped":
                     self._stamped(decode(sample.payload, Stamped), now_ns)
                 case "done" | "ended" if windows is not None:
-                    windows.completed(self.place.completion(sample), now_ns)
+                    done = self.place.completion(sample)
+                    if self._goes_on(done, now_ns):
+                        windows.completed(done, now_ns)
                 case "load" if windows is not None:
                     windows.loaded(self.place.load(sample))
                 case "accepted":
@@ -188,26 +203,70 @@ class Cell:
                 f"({', '.join(known)}); the nodes' cell files differ"
             )
 
+    def _goes_on(self, told: Stamped | Completion, now_ns: int) -> bool:
+        """Whether a cycle goes on from those before it; complains of the first that does not."""
+        stamped = isinstance(told, Stamped)
+        stamp = told if isinstance(told, Stamped) else told.stamp
+        if not stamped and not stamp.term:
+            # A source's guess counts where the stamper has released such a cycle.
+            return True
+        continuity, cycle = self.continuity, (stamp.run, stamp.cycle)
+        newest, ahead = continuity.newest, continuity.ahead(now_ns)
+        held = self.held
+        terms = 0 if held is None or held.run != stamp.run else stamp.term - held.term
+        if terms <= ahead and continuity.takes(cycle, now_ns, alone=not stamped):
+            if continuity.newest == cycle != newest:
+                self._cycle_asked = self._number
+            return True
+        who = self.place.stamper[1] if isinstance(told, Stamped) else f"{told.sink}@{told.node}"
+        if terms > ahead:
+            continuity.leaps += 1
+        if self._doubted_until_ns is None or now_ns >= self._doubted_until_ns:
+            self.place.complain(
+                LiveError(
+                    f"{who} speaks of run {stamp.run}, cycle {stamp.cycle}, term {stamp.term}, "
+                    f"after {newest} and term {held.term if held is not None else None}; at most "
+                    f"{ahead} more are believed (damaged, or made up)"
+                )
+            )
+        self._doubted_until_ns = now_ns + REPEATED_NS
+        return False
+
     def _stamped(self, stamp: Stamped, now_ns: int) -> None:
         self._require_candidate(stamp.placement)
         held = self.held
+        if held is None or not self._goes_on(stamp, now_ns):
+            return
         if self.windows is not None:
             self.windows.stamped(stamp, now_ns)
             self.windows.measured(stamp.run, stamp.intervals)
-        if held is None or stamp.run < held.run or (stamp.run, stamp.term) <= (held.run, held.term):
+        if (stamp.run, stamp.term) <= (held.run, held.term):
+            self._rumour = None
             return
         move = self._move
         ours = (
             move is not None
             and move.order is not None
+            and stamp.run == held.run
             and stamp.term == move.order.term + 1
             and stamp.placement == move.name
         )
-        self._now_at(stamp.run, stamp.term, stamp.placement, by_guard=not ours)
+        rumour = stamp.run, stamp.term, stamp.placement
+        if not ours:
+            known, count = self._rumour or (None, 0)
+            count = count + 1 if known == rumour else 1
+            self._rumour = rumour, count
+            if count < TOLD:
+                if count == 1:
+                    # The answer says who has moved the cell, too.
+                    self._ask_ns = now_ns
+                return
+        self._now_at(*rumour, by_guard=not ours)
 
     def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
         """Take note of the placement that holds since a term began."""
-        held = self.held
+        held, self._rumour = self.held, None
+        self._term_asked = self._number
         before = held.placement if held is not None else placement
         self.held = Accepted(
             *(0, self.name, "", run, term, placement, 0), fallback=by_guard, resting=by_guard
@@ -234,6 +293,7 @@ class Cell:
 
     def _begin_run(self, answer: Accepted) -> None:
         """Begin where the stamper says that the cell is."""
+        self._term_asked = self._number
         self.controller.resume(answer.placement, fallback=answer.fallback)
         resume = self._recorder.open(answer.run)
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
@@ -245,15 +305,18 @@ class Cell:
         if answer.controller != self.name:
             return
         self._require_candidate(answer.placement)
-        # One that asked before had a clock that is ahead of this one.
-        self._number = max(self._number, answer.newest)
+        if answer.number > self._number:
+            raise LiveError(f"an answer to order {answer.number}, which was never sent")
         held = self.held
         if held is None:
             self._begin_run(answer)
+        elif not self._corrected(answer, held, now_ns):
             return
-        if (answer.run, answer.term) < (held.run, held.term):
+        # One that asked before had a clock that is ahead of this one.
+        self._number = max(self._number, answer.newest)
+        if held is None:
             return
-        move = self._move
+        held, move = self.held or held, self._move
         mine = move is not None and move.order is not None and answer.number == move.order.number
         if (answer.run, answer.term) > (held.run, held.term):
             # What was accepted may be an order before the one that waits for its answer.
@@ -273,6 +336,47 @@ class Cell:
                 self._give_up(now_ns)
         elif move.phase == "fork":
             self._ask_for_states(move, answer)
+
+    def _corrected(self, answer: Accepted, held: Accepted, now_ns: int) -> bool:
+        """Believe the stamper's own word over what was heard before; False where it is an old one.
+
+        An answer to an order that was sent after something was heard is later than that: where it
+        says less, what was heard was wrong.
+        """
+        if (answer.run, answer.term) < (held.run, held.term):
+            if answer.number <= self._term_asked:
+                return False
+            self._take_back(answer)
+        self._rumour = None
+        continuity, windows = self.continuity, self.windows
+        newest, upcoming = continuity.newest, (answer.run, answer.cycle)
+        ahead = continuity.ahead(now_ns)
+        if newest is None or newest[0] < answer.run or answer.cycle > newest[1] + ahead:
+            continuity.believe((answer.run, answer.cycle - 1), now_ns)
+            self._cycle_asked = self._number
+        elif upcoming <= newest and answer.number > self._cycle_asked:
+            self.place.complain(
+                LiveError(f"the stamper has not stamped cycle {newest[1]}; {answer.cycle} is next")
+            )
+            continuity.believe((answer.run, answer.cycle - 1), now_ns)
+            self._cycle_asked = self._number
+            if windows is not None:
+                windows.forget(answer.run, answer.cycle)
+        return True
+
+    def _take_back(self, answer: Accepted) -> None:
+        """What was believed of the term was wrong: the cell is where it was."""
+        self.place.complain(
+            LiveError(
+                f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
+            )
+        )
+        self.held, self._move = answer, None
+        self._term_asked = self._number
+        self.controller.resume(answer.placement, fallback=answer.fallback)
+        self._unwritten = True
+        if self.windows is not None:
+            self.windows.refused(f"the stamper says that {answer.placement} holds")
 
     def _send(self, order: Order) -> None:
         if self.place.stamper[1] in self.pulse.strangers:
@@ -576,6 +680,7 @@ class Cell:
             "refused": self.refused or None,
             "migrations": self.migrations,
             "guard_moves": self.guard_moves,
+            "disbelieved": self.continuity.leaps,
             "window": {**self._window, "age_ms": age_ms} if self._window else {},
             **(self.windows.status() if self.windows is not None else {}),
             "processes": self._processes(now_ns),

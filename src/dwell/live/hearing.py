@@ -6,8 +6,9 @@ that a node learns of links that it is no end of, and clocks can be compared (se
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from dwell.live.continuity import LATENESS_NS, Retreat
 from dwell.live.messages import Beat, Heard
 
 __all__ = ["Hearing"]
@@ -21,6 +22,7 @@ class _Voice:
     at_ns: int
     direct_ns: int | None = None
     direct_beat_ns: int = 0
+    retreat: Retreat = field(default_factory=Retreat)
 
 
 class Hearing:
@@ -43,23 +45,22 @@ class Hearing:
         """Take a beat in; False if it is no news: an older one, or its second copy."""
         if beat.who == self.who:
             return False
-        voice = self._voices.get(beat.who)
-        if direct:
-            news = voice is None or (beat.life, beat.sent_ns) > (
-                voice.beat.life,
-                voice.direct_beat_ns,
-            )
-        else:
-            news = voice is None or (beat.life, beat.sent_ns) > (
-                voice.beat.life,
-                voice.beat.sent_ns,
-            )
-        if not news:
-            return False
+        voice, order = self._voices.get(beat.who), (beat.life, beat.sent_ns)
         if voice is None:
             voice = self._voices[beat.who] = _Voice(beat, now_ns)
-        if (beat.life, beat.sent_ns) > (voice.beat.life, voice.beat.sent_ns):
-            voice.beat, voice.at_ns = beat, now_ns
+        else:
+            last = voice.beat.life, voice.beat.sent_ns
+            news = order > ((last[0], voice.direct_beat_ns) if direct else last)
+            if order > last:
+                voice.retreat.advanced()
+                voice.beat, voice.at_ns = beat, now_ns
+            elif (
+                direct and order < (last[0], last[1] - LATENESS_NS) and voice.retreat.behind(*order)
+            ):
+                # A connection keeps the order: what was believed was false.
+                voice.beat, voice.at_ns = beat, now_ns
+            elif not news:
+                return False
         if direct:
             voice.direct_ns, voice.direct_beat_ns = now_ns, beat.sent_ns
         return True

@@ -67,7 +67,6 @@ class Intervals:
         self._best: dict[str, _Best] = {}
         self._waiting: dict[int, _Waiting] = {}
         self._news: list[tuple[int, int]] = []
-        self._newest = -1
 
     def hear(self, beat: Beat, now_ns: int) -> None:
         """Learn from a beat that came directly how far its node is."""
@@ -83,19 +82,19 @@ class Intervals:
         round_trip_ns = None if best is None else best.value_ns
         return None if round_trip_ns is None else round_trip_ns // 2
 
-    def completed(self, done: Completion, now_ns: int, *, direct: bool) -> None:
+    def completed(self, done: Completion, now_ns: int, *, newest: int, direct: bool) -> None:
         """Take in a sink's completion, or its second copy.
 
         Of a cycle that was first heard of over the detour the way back is not known: it has no
-        interval.
+        interval. Nor has one beyond the last `MOST_WAITING` up to `newest`, the last that may
+        have been sent: such a number is old or false.
         """
         cycle = done.stamp.cycle
         waiting = self._waiting.get(cycle)
         if waiting is None:
-            if cycle <= self._newest - MOST_WAITING:
+            if not newest - MOST_WAITING < cycle <= newest:
                 return
             waiting = self._waiting[cycle] = _Waiting()
-            self._newest = max(self._newest, cycle)
             if len(self._waiting) > MOST_WAITING:
                 del self._waiting[min(self._waiting)]
         if done.sink in waiting.said or done.sink not in self._sinks:

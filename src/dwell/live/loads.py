@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.live.continuity import Retreat
 from dwell.live.messages import Load
 
 __all__ = ["NodeLoad", "ProcessLoads"]
@@ -34,20 +35,23 @@ class NodeLoad:
         self._total: deque[Floats] = deque(maxlen=KEPT)
         self._life = -1
         self._read = np.zeros(3)
+        self._retreat = Retreat()
 
     def report(self, load: Load) -> None:
         """Take a report in; copies and late ones change nothing."""
+        last_ns = self._at_ns[-1] if self._at_ns else -1
+        if (load.life, load.at_ns) <= (self._life, last_ns):
+            if not self._retreat.behind(load.life, load.at_ns):
+                return
+            self._life = -1
+        self._retreat.advanced()
         read = np.array((load.busy_ns, load.own_ns, load.shadow_ns), np.float64)
-        if load.life < self._life:
-            return
-        if load.life == self._life and self._at_ns and load.at_ns <= self._at_ns[-1]:
-            return
         total = self._total[-1] if self._total else np.zeros(4)
         if load.life == self._life:
             busy_ns = max(load.accelerator, 0.0) * (load.at_ns - self._at_ns[-1])
             total = total + np.append(np.maximum(read - self._read, 0.0), busy_ns)
-        elif self._at_ns and load.at_ns <= self._at_ns[-1]:
-            # Not only the agent began anew, but its node's clock.
+        elif load.at_ns <= last_ns:
+            # Not only the agent began anew, but its node's clock; or that instant was false.
             self._at_ns.clear()
             self._total.clear()
         self._life, self._read = load.life, read

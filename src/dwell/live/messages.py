@@ -42,6 +42,9 @@ MAX_CONTROL_BYTES = 262_144
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+#: Number of an order that is believed to have been carried out: a quarter of the range is left for
+#: those that follow, whatever one message says.
+Passed: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=3 << 60)]
 #: CPU time; -1 where it is not known.
 Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)]
 Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-(1 << 62), lt=1 << 62)]
@@ -465,7 +468,7 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     cycle: Count
     fallback: bool = False
     proven: Annotated[str, msgspec.Meta(max_length=120)] = ""
-    newest: Count = 0
+    newest: Passed = 0
     resting: bool = False
     probed: Annotated[str, msgspec.Meta(max_length=120)] = ""
     probes: Count = 0

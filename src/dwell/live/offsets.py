@@ -24,6 +24,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
+from dwell.live.continuity import Retreat
 from dwell.live.messages import Beat
 
 __all__ = ["UNBOUNDED_NS", "Instant", "Offsets"]
@@ -66,10 +67,14 @@ _Interval: TypeAlias = tuple[int | None, int | None]
 class _Pair:
     """What clock b is ahead of clock a, as an interval that moves with a's time."""
 
-    __slots__ = ("anchors", "breaks", "fastest", "high_ns", "low_ns", "slowest", "t_ns")
+    __slots__ = (
+        *("_retreat", "anchors", "breaks", "fastest"),
+        *("high_ns", "low_ns", "slowest", "t_ns"),
+    )
 
     def __init__(self) -> None:
         self.breaks = -1
+        self._retreat = Retreat()
         self._begin(0)
 
     def _begin(self, t_ns: int) -> None:
@@ -105,6 +110,12 @@ class _Pair:
         """Bring the interval and an upper bound at `t_ns` to the same instant, the later one."""
         if not self.known:
             self.t_ns = t_ns
+        if t_ns < self.t_ns - MEMORY_NS:
+            if self._retreat.behind(t_ns):
+                # No message is that late: the instant that was believed was false.
+                self._begin(t_ns)
+        else:
+            self._retreat.advanced()
         if t_ns >= self.t_ns:
             self._advance(t_ns)
             return value_ns

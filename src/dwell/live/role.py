@@ -377,11 +377,9 @@ class Pulse:
             return None
         self.strangers.pop(beat.who, None)
         direct = sample.key.startswith(self._prefix[0])
-        if self.hearing.hear(beat, now_ns, direct=direct):
-            return beat
         if direct:
             self._look_for_rival(beat)
-        return None
+        return beat if self.hearing.hear(beat, now_ns, direct=direct) else None
 
     def _is_copy(self, sample: Sample) -> bool:
         """Whether a beat is the copy of the last that came directly, or of one of its own."""

@@ -9,6 +9,7 @@ from typing import Protocol
 from dwell.control import shadow_stamps
 from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
+from dwell.live.continuity import RESERVED
 from dwell.live.group import UNKNOWN
 from dwell.live.intervals import Intervals
 from dwell.live.keys import CONTROLLER
@@ -28,8 +29,6 @@ from dwell.live.transport.protocol import Sample
 
 __all__ = ["Book", "Entry", "Stamper"]
 
-#: Cycle numbers that are reserved at a time; after a restart the rest of them stays unused.
-RESERVED = 1_024
 #: Time after which a controller that is silent is in charge no more.
 LEASE_NS = 1_000_000_000
 #: Time that a new run waits for its placement; then it begins on any fallback that is whole.
@@ -164,7 +163,7 @@ class Stamper:
                     self._completed(done, now_ns)
                     if word == "done" and done.stamp.run == self.run:
                         direct = self.place.keys.came_directly(sample.key)
-                        self.intervals.completed(done, now_ns, direct=direct)
+                        self.intervals.completed(done, now_ns, newest=self.cycle, direct=direct)
         except LiveError as error:
             self.place.complain(error)
 

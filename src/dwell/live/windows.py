@@ -276,6 +276,17 @@ class LiveWindows:
         """What the controller decided last will not be ordered."""
         self._refused[len(self._controller.log.decisions) - 1] = why
 
+    def forget(self, run: int, cycle: int) -> None:
+        """Take a cycle, and those after it, for never released: what told of them was wrong."""
+        key = run, cycle
+        self._line = [known for known in self._line if known.key < key]
+        for known in [known for known in self._by_key if known >= key]:
+            del self._by_key[known]
+        last = max(self._by_key.values(), key=lambda known: known.key, default=None)
+        self._newest = None if last is None else (last, last.stamped_ns)
+        self._newest_done = min(self._newest_done, (run, cycle - 1))
+        self._beginning = None
+
     def _note(self, stamp: Stamp, at_ns: int | None) -> LiveCycle | None:
         key = stamp.run, stamp.cycle
         known = self._by_key.get(key)
@@ -475,7 +486,8 @@ class LiveWindows:
         self._beginning = None
         while len(self._recorded) > self._kept:
             old = self._recorded.popleft()
-            del self._by_key[old.key]
+            if self._by_key.get(old.key) is old:
+                del self._by_key[old.key]
             self._in_flight.pop(old.row, None)
             if old.window is not None:
                 self._windows.pop(old.window, None)
