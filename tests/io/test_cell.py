@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
+from dwell.errors import ProblemError
 from dwell.io import from_document, load
 from dwell.model import (
     AR1,
@@ -152,6 +153,17 @@ def test_a_cell_without_a_name_has_that_of_its_file(tmp_path: Path) -> None:
 )
 def test_degenerate_cells_are_valid(more: dict[str, Any]) -> None:
     assert from_document({**LEAST, **more})
+
+
+def test_a_candidate_of_a_file_places_no_anchored_task(tmp_path: Path) -> None:
+    path = tmp_path / "arm.yaml"
+    placed = {**LEAST, "candidates": {"LOC": {"t": "n"}}}
+    path.write_text(yaml.safe_dump(placed))
+    with pytest.raises(ProblemError, match=r"candidates\.LOC\.t.*anchored to n, .*leave it out"):
+        load(path)
+    # Records of earlier versions do.
+    assert from_document(placed) == from_document(LEAST)
+    assert to_document(from_document(placed))["candidates"] == {"LOC": {}}
 
 
 def test_every_key_reaches_the_model() -> None:

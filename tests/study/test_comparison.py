@@ -10,7 +10,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from dwell import simulate
-from dwell.errors import DwellError, PolicyError, ProblemError, SimulationError
+from dwell.errors import DwellError, MetricError, PolicyError, ProblemError, SimulationError
 from dwell.policies import Static
 from dwell.study import Comparison, compare
 from dwell.study.intervals import mean_interval, share_limits
@@ -168,3 +168,30 @@ def test_wrong_requests_are_refused(
     right = {"scenarios": ("baseline",), "policies": ("LOC",), "seeds": (1,), "windows": 4}
     with pytest.raises(error, match=message):
         compare(PROBLEM, **{**right, **wrong}, processes=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "message"),
+    [
+        (("baseline", "LOC", "violaton_rate"), MetricError, "metric 'violaton_rate'; did you mean"),
+        (
+            ("baselin", "LOC", "cost"),
+            SimulationError,
+            "scenario 'baselin'; did you mean 'baseline'",
+        ),
+        (("baseline", "LOK", "cost"), PolicyError, "policy 'LOK'; did you mean 'LOC'"),
+        (("baseline", "LOC", "policy"), MetricError, "unknown metric 'policy'; "),
+    ],
+)
+def test_what_is_misspelt_gets_the_nearest_name_once(
+    comparison: Comparison, asked: tuple[str, str, str], error: type[DwellError], message: str
+) -> None:
+    scenario, policy, column = asked
+    for ask in (
+        lambda: comparison.values(*asked),
+        lambda: comparison.interval(*asked),
+        lambda: comparison.difference(scenario, (policy, "SO"), column),
+    ):
+        with pytest.raises(error, match=message) as caught:
+            ask()
+        assert str(caught.value).count("violation_rate") <= 1

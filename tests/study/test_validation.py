@@ -244,6 +244,15 @@ class TestWhatCounts:
         found = read_measured("run", run, problem)
         assert list(found.problem.candidates) == ["LOC", "SO"]
 
+    def test_candidates_of_earlier_records_name_anchored_tasks(self) -> None:
+        problem = make_problem()
+        fewer = {name: problem.candidates[name] for name in ("LOC", "SO")}
+        run = simulate(replace(problem, candidates=fewer), policy="dtp", seed=1, windows=6)
+        placed = {name: dict(placement) for name, placement in fewer.items()}
+        recorded = {**run.meta["problem"], "candidates": placed}
+        found = read_measured("run", with_meta(run, problem=recorded), problem).problem
+        assert found.candidates == read_measured("run", run, problem).problem.candidates == fewer
+
     def test_where_it_began_and_its_fallbacks_come_with_a_runs_candidates(self) -> None:
         problem = make_problem()
         settings = replace(problem.controller, initial="LOC", fallbacks=("LOC", "HYB"))

@@ -86,11 +86,14 @@ class Assembly:
         Less the sources at fault.
     faults : Faults
         Holds the faults so far, takes those found here.
+    anchored : bool
+        Whether a candidate may name anchored tasks where they are.
     """
 
     entry: CellEntry
     tables: Tables
     faults: Faults
+    anchored: bool = False
 
     def problem(self, name: str) -> Problem | None:
         """Return the problem, or None beside at least one fault.
@@ -129,6 +132,8 @@ class Assembly:
             reserved=POLICIES,
             live=live,
         )
+        if not self.anchored:
+            self._refuse_anchored(candidates, tasks)
         self._judge(parts)
         if timing is None or objective is None or controller is None or live is None:
             return None
@@ -437,6 +442,19 @@ class Assembly:
         return self.faults.attempt("", LiveSettings, **values)
 
     # --------------------------------------------------------------------------- meaning
+
+    def _refuse_anchored(
+        self, candidates: Mapping[str, Mapping[str, str]], tasks: Mapping[str, Task | None]
+    ) -> None:
+        """Add a fault for every anchored task that a candidate places where it is anyway."""
+        for name, moves in candidates.items():
+            for task_name, node in moves.items():
+                task = tasks.get(task_name)
+                if task is not None and task.anchored and node in task.on:
+                    self.faults.add(
+                        f"candidates.{name}.{task_name}",
+                        f"{task_name} is anchored to {node}, in every candidate; leave it out",
+                    )
 
     def _judge(self, parts: Parts) -> None:
         """Add the faults of meaning, but for those that other faults cause."""

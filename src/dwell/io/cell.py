@@ -64,6 +64,9 @@ def from_document(
 ) -> Problem:
     """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
 
+    A candidate may name anchored tasks, too, as the documents of earlier versions do; a cell file
+    may not.
+
     Parameters
     ----------
     document : mapping
@@ -82,7 +85,7 @@ def from_document(
     ProblemError
         With every fault found.
     """
-    return read_problem(document, Faults(source), Path(folder), "cell")
+    return read_problem(document, Faults(source), Path(folder), "cell", anchored=True)
 
 
 def read_problem(
@@ -91,6 +94,8 @@ def read_problem(
     folder: Path,
     name: str,
     known: dict[object, Tables] | None = None,
+    *,
+    anchored: bool = False,
 ) -> Problem:
     """Read a document into a Problem.
 
@@ -106,6 +111,8 @@ def read_problem(
         For a cell that does not name itself.
     known : dict, optional
         Traces that were read for documents like this one; takes those that are read now.
+    anchored : bool
+        Whether a candidate may name anchored tasks where they are.
 
     Raises
     ------
@@ -122,7 +129,7 @@ def read_problem(
     declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
     if declared not in known:
         known[declared] = read_traces(entry, folder, faults)
-    problem = Assembly(entry, known[declared], faults).problem(name)
+    problem = Assembly(entry, known[declared], faults, anchored=anchored).problem(name)
     if problem is None or faults:
         raise faults.error()
     return problem

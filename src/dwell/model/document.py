@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any, TypeAlias
 
@@ -13,6 +14,7 @@ from dwell.model.fabric import Bursts, Link, Node, Quota
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Execution, Task
+from dwell.model.placement import Placement
 from dwell.model.problem import ControllerSettings, Problem
 from dwell.model.process import DRAWN, Constant, Process, Trace
 from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
@@ -68,7 +70,10 @@ def to_document(problem: Problem) -> Document:
             "scales": {
                 name: _process(f"scales.{name}", scale) for name, scale in pipeline.scales.items()
             },
-            "candidates": {name: dict(placement) for name, placement in problem.candidates.items()},
+            "candidates": {
+                name: _relocated(placement, pipeline.tasks)
+                for name, placement in problem.candidates.items()
+            },
             "scenarios": {
                 name: [_disturbance(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
                 for name, items in problem.scenarios.items()
@@ -148,6 +153,10 @@ def _bursts(path: str, bursts: Bursts | None, **more: object) -> Document | None
 def _quota(quota: Quota) -> Document:
     more = {"slack_ms": quota.slack_ms or None, "tick_ms": quota.tick_ms or None}
     return _filled({"cpu": quota.cpu, "period_ms": quota.period_ms, **more})
+
+
+def _relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
+    return {name: node for name, node in placement.items() if not tasks[name].anchored}
 
 
 def _node(node: Node) -> Document:

@@ -9,7 +9,7 @@ from typing import TypeVar
 from dwell.errors import PolicyError
 from dwell.model.bounds import Bound
 from dwell.model.frozen import FrozenDict
-from dwell.model.meaning import nearest
+from dwell.model.meaning import nearest_of
 from dwell.model.placement import Placement
 from dwell.model.qos import Decision, Reason
 
@@ -58,8 +58,8 @@ def check_name(field: str, name: str | None, candidates: Mapping[str, Placement]
         return next(iter(candidates))
     if name not in candidates:
         raise PolicyError(
-            f"{field} is {name!r}, which is no candidate; {nearest(str(name), candidates)} "
-            f"(candidates here: {', '.join(candidates)})"
+            f"{field} is {name!r}, which is no candidate; "
+            f"{nearest_of(str(name), candidates, 'candidates')}"
         )
     return name
 

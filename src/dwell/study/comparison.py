@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.errors import MetricError, PolicyError, SimulationError
 from dwell.model import Problem
+from dwell.model.meaning import nearest
 from dwell.study.engine import Progress, play_in_memory
 from dwell.study.intervals import Interval
 from dwell.study.over_seeds import difference_of, interval_of, over_seeds
@@ -79,9 +81,23 @@ class Comparison:
         return tuple(name for name in self.policies if name in self.problem.candidates)
 
     def values(self, scenario: str, policy: str, column: str) -> Floats:
-        """One number a seed, in the order of the seeds."""
+        """Return one number a seed, in the order of the seeds.
+
+        Raises
+        ------
+        SimulationError, PolicyError, MetricError
+            If there is no such scenario, policy or column of `runs`.
+        """
         import polars as pl
 
+        metrics = [name for name, kind in self.runs.schema.items() if kind.is_numeric()]
+        for kind, what, name, known in (
+            (SimulationError, "scenario", scenario, self.scenarios),
+            (PolicyError, "policy", policy, self.policies),
+            (MetricError, "metric", column, metrics),
+        ):
+            if name not in known:
+                raise kind(f"unknown {what} {name!r}; {nearest(name, known)}")
         mine = self.runs.filter((pl.col("scenario") == scenario) & (pl.col("policy") == policy))
         return mine[column].cast(pl.Float64).to_numpy()
 

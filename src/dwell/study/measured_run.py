@@ -293,12 +293,15 @@ def _with_candidates(problem: Problem, theirs: Document, own: Document) -> Probl
     With them come where it began, and the fallbacks. A candidate that the cell has under this name
     with other nodes is refused.
     """
-    candidates = theirs.get("candidates", {})
+    tasks = problem.pipeline.tasks
+    # Records of earlier versions name anchored tasks, too.
+    candidates = {
+        name: {task: node for task, node in nodes.items() if not tasks[task].anchored}
+        for name, nodes in theirs.get("candidates", {}).items()
+    }
     for name, nodes in candidates.items():
-        if name in own and dict(nodes) != dict(own[name]):
-            raise RunError(
-                f"candidate {name} was {dict(nodes)} in the run; in the cell {own[name]}"
-            )
+        if name in own and nodes != own[name]:
+            raise RunError(f"candidate {name} was {nodes} in the run; in the cell {own[name]}")
     if list(candidates) == list(own):
         return problem
     settings = theirs.get("controller", {})
@@ -307,7 +310,8 @@ def _with_candidates(problem: Problem, theirs: Document, own: Document) -> Probl
         initial=settings.get("initial"),
         fallbacks=tuple(settings.get("fallbacks") or ()),
     )
-    placed = {name: Placement(nodes) for name, nodes in candidates.items()}
+    anchored = {name: next(iter(task.on)) for name, task in tasks.items() if task.anchored}
+    placed = {name: Placement({**anchored, **nodes}) for name, nodes in candidates.items()}
     return replace(problem, candidates=placed, controller=controller)
 
 
