@@ -1,0 +1,1 @@
+"""What a rearrangement of the code must not change; see README.md."""

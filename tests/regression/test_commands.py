@@ -1,0 +1,10 @@
+"""Every command with its arguments, options and helps is the one that was written down."""
+
+from __future__ import annotations
+
+from tests.regression.commands import FILE, surface
+
+
+def test_the_command_line_is_the_one_that_was_written_down() -> None:
+    """`python -m tests.regression commands` writes it again."""
+    assert surface().splitlines() == FILE.read_text(encoding="utf-8").splitlines()

@@ -1,0 +1,39 @@
+"""The paper's study gives the means that were written down: one chapter, at the scale of a look.
+
+All chapters take minutes: `dwell study paper --quick`, then `python -m tests.regression paper
+FOLDER` writes `paper-quick.csv` again, for `git diff` to show.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+from polars.testing import assert_frame_equal
+from typer.testing import CliRunner
+
+from dwell.cli.commands import app
+from tests.regression.paper import FULL, KEYS, METRICS, QUICK, means, read
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_means_of_a_chapter_are_those_that_were_written_down(tmp_path: Path) -> None:
+    words = ["study", "paper", "--quick", "--chapter", "table", "--out", str(tmp_path / "out")]
+    words += ["--examples", str(ROOT / "examples")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    found = means([tmp_path / "out" / "runs" / "table"])
+    known = read(QUICK).filter(pl.col("study") == "table").fill_null("")
+    assert known.height == 45
+    assert_frame_equal(found, known, check_dtypes=False, rel_tol=1e-7)
+
+
+def test_what_was_written_down_is_whole() -> None:
+    quick, full = read(QUICK), read(FULL)
+    for frame in (quick, full):
+        assert frame.columns == [*KEYS, "seeds", *METRICS]
+        assert not frame.select(KEYS).is_duplicated().any()
+    # A full study goes beyond a look; it asks the same.
+    assert set(quick["study"]) == set(full["study"])
+    assert full.height > 2 * quick.height
