@@ -221,7 +221,8 @@ def keep_deciding(data: bytes) -> None:
     before = cell.status(world.network.now_ns)["windows"]
     world.run(1_500)
     status = cell.status(world.network.now_ns)
-    if status["windows"] < before + 2 or status["term"] != world.stamper.term:
+    here = world.stamper.run, world.stamper.term
+    if status["windows"] < before + 2 or (status["run"], status["term"]) != here:
         # What follows begins with one that still decides.
         _deciding.cache_clear()
         raise FrozenError(
@@ -230,7 +231,7 @@ def keep_deciding(data: bytes) -> None:
 
 
 class FrozenError(AssertionError):
-    """After a message the controller has closed no window any more, or is in another term."""
+    """After a message the controller closes no window any more, or is in another run or term."""
 
 
 @cache
