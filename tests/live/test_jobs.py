@@ -20,9 +20,10 @@ from dwell.live.group import ControlGroup, Counts, own_group
 from dwell.live.loads import ProcessLoads
 from dwell.live.recording import RunRecorder
 from dwell.live.sink import Sink
-from dwell.live.tables import columns_of, job_columns
+from dwell.live.tables import columns_of
 from dwell.live.windows import Resume, Rows
 from dwell.model import Problem
+from dwell.record import column_types
 from tests.live.small_world import MS, MemoryRecorder, World
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
@@ -73,7 +74,7 @@ def world_of(problem: Problem, policy: str, **more: object) -> World:
 
 def frames(problem: Problem, rows: Rows | dict[str, list[tuple[object, ...]]]) -> pl.DataFrame:
     """Return the jobs as a table."""
-    names = list(job_columns(problem)["jobs"])
+    names = [*column_types("jobs", problem, ["live"])]
     return pl.DataFrame(rows["jobs"], schema=names, orient="row")
 
 
@@ -198,7 +199,7 @@ def test_shadow_jobs_are_told_apart(problem: Problem) -> None:
 def test_what_processes_take_is_kept_by_window(problem: Problem) -> None:
     world = world_of(problem, "LOC")
     world.run(4_000)
-    names = list(job_columns(problem)["processes"])
+    names = [*column_types("processes", problem, ["live"])]
     found = pl.DataFrame(world.recorder.rows["processes"], schema=names, orient="row")
     agents = {f"agent@{node}" for node in problem.fabric.nodes}
     assert set(found["process"]) == {*agents, "controller@E"}

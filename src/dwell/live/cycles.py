@@ -19,11 +19,11 @@ from dwell.control import NEVER_NS, Evidence, Instants
 from dwell.live.messages import Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.model import Problem
+from dwell.record import Values
 
 __all__ = ["Ledger", "LiveCycle"]
 
 Ints: TypeAlias = NDArray[np.int64]
-Row: TypeAlias = tuple[object, ...]
 
 UNKNOWN = -1
 #: Shadow completions remembered of one cycle.
@@ -295,8 +295,8 @@ class Ledger:
         execution = None if task is None else task.on.get(hop.node)
         return execution is not None and execution.accelerator is None
 
-    def jobs(self, cycle: LiveCycle) -> list[Row]:
-        """Rows of ``jobs``: all that is known to have become ready for a cycle or its shadow."""
+    def jobs(self, cycle: LiveCycle) -> list[Values]:
+        """Return rows of ``jobs``: all known to have become ready for a cycle or its shadow."""
         found: dict[tuple[bool, str, str], Hop] = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
         told = [(hop, False) for hop in cycle.hops]
@@ -313,7 +313,7 @@ class Ledger:
             hop = found[key]
             handover_ns = self._handover_ns(cycle, hop, found, shadow=key[0])
             ending_ns = UNKNOWN if key[0] else self._ending_ns(cycle, hop)
-            rows.append(self._job_row(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
+            rows.append(self._job_values(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
         return [row for row in rows if row is not None]
 
     def _handover_ns(
@@ -340,9 +340,9 @@ class Ledger:
             return UNKNOWN
         return _between(hop.group_ns[1], done.group_ns)
 
-    def _job_row(
+    def _job_values(
         self, cycle: LiveCycle, hop: Hop, around_ns: tuple[int, int], *, shadow: bool
-    ) -> Row | None:
+    ) -> Values | None:
         ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
         if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
             return None
@@ -350,14 +350,29 @@ class Ledger:
             # Its stamp may have been there before the cycle began.
             offset_ns = round(self._pipeline.tasks[hop.task].offset_ms * 1e6)
             ready_ns = max(ready_ns, cycle.at_ns + offset_ns)
-        who = cycle.row, hop.task, hop.node, ready_ns
-        if hop.ended_ns == UNKNOWN:
-            return (*who, None, None, "replaced", shadow, *(5 * (None,)))
+        handover_ns, ending_ns = around_ns
+        ended = hop.ended_ns != UNKNOWN
         start_ns = max(self._since_origin(cycle, hop.node, hop.started_ns), ready_ns)
-        end_ns = max(self._since_origin(cycle, hop.node, hop.ended_ns), start_ns)
-        counts = hop.cpu_ns, hop.others_ns, hop.outside_ns, *around_ns
-        spent = (None if ns == UNKNOWN else ns for ns in counts)
-        return (*who, start_ns, end_ns, "done", shadow, *spent)
+        counted_ns = {
+            "cpu_ns": hop.cpu_ns,
+            "others_ns": hop.others_ns,
+            "outside_ns": hop.outside_ns,
+            "handover_ns": handover_ns,
+            "ending_ns": ending_ns,
+        }
+        return {
+            "cycle": cycle.row,
+            "task": hop.task,
+            "node": hop.node,
+            "ready_ns": ready_ns,
+            "start_ns": start_ns if ended else None,
+            "end_ns": (
+                max(self._since_origin(cycle, hop.node, hop.ended_ns), start_ns) if ended else None
+            ),
+            "outcome": "done" if ended else "replaced",
+            "shadow": shadow,
+            **{name: ns if ended and ns != UNKNOWN else None for name, ns in counted_ns.items()},
+        }
 
     # ----------------------------------------------------------------------- evidence
 

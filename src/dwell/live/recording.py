@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dwell.control import Controller
 from dwell.errors import RunError, UnwritableError
-from dwell.live.tables import columns_of, job_columns
+from dwell.live.tables import columns_of
 from dwell.live.windows import Resume, Rows
 from dwell.model import Problem
 from dwell.model.document import to_document
@@ -95,8 +95,7 @@ class RunRecorder:
         In a further folder where a controller before has sealed it, or another one writes it, or it
         is of another cell file; also where it has rows, and has to be new.
         """
-        more = job_columns(self.problem) if self.jobs else {}
-        columns = {**columns_of(self.controller), **more}
+        columns = columns_of(self.controller, jobs=self.jobs)
         for count in range(1, MOST_FOLDERS + 1):
             suffix = f"-{count}" if count > 1 else ""
             folder = self.out / f"{self.problem.name}-{run}{suffix}"

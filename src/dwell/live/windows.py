@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import bisect
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -30,8 +30,16 @@ from dwell.live.cycles import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.tables import Row, cycle_row, decision_rows, sends_shadows, window_row
+from dwell.live.tables import (
+    columns_of,
+    cycle_values,
+    decision_values,
+    rows_of,
+    sends_shadows,
+    window_values,
+)
 from dwell.model import Problem
+from dwell.record import Row, Values
 
 __all__ = ["LiveWindow", "LiveWindows", "Resume", "Rows"]
 
@@ -145,6 +153,7 @@ class LiveWindows:
         self._loads = {node: NodeLoad() for node in problem.fabric.nodes}
         self._processes = ProcessLoads()
         self._keeps_jobs = resume.jobs
+        self._columns = columns_of(controller, jobs=resume.jobs)
         # First cycle whose jobs are not recorded yet, and windows whose processes are not.
         self._next_jobs = resume.cycle
         self._unwritten: deque[LiveWindow] = deque()
@@ -529,38 +538,44 @@ class LiveWindows:
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
                 self._changed[row] = cycle
-        cycles = [self._cycle_row(self._changed[row]) for row in sorted(self._changed)]
+        cycles = [self._cycle_values(self._changed[row]) for row in sorted(self._changed)]
         windows = [
-            self._window_row(self._windows[number])
+            self._window_values(self._windows[number])
             for number in sorted(self._changed_windows)
             if number in self._windows
         ]
         log, begin = self._controller.log.decisions, self._decisions_taken
         undecided = None if last else self._open_decision
         self._decisions_taken = end = len(log) if undecided is None else undecided
-        decisions = [(log[row], self._refused.pop(row, None)) for row in range(begin, end)]
+        decisions = [
+            decision_values(
+                self._controller, log[row], self._refused.pop(row, None), self._first_window
+            )
+            for row in range(begin, end)
+        ]
         # What is recorded is not kept: a controller runs for months.
         log[begin:end] = [()] * len(decisions)
         self._changed.clear()
         self._changed_windows.clear()
-        return {
+        values: dict[str, Iterable[Values]] = {
             "cycles": cycles,
             "windows": windows,
-            "decisions": decision_rows(decisions, self._first_window),
-            **(self._job_rows(last=last) if self._keeps_jobs else {}),
+            "decisions": decisions,
+            **(self._job_values(last=last) if self._keeps_jobs else {}),
         }
+        return {name: rows_of(self._columns[name], of) for name, of in values.items()}
 
-    def _job_rows(self, *, last: bool) -> Rows:
+    def _job_values(self, *, last: bool) -> Mapping[str, Iterable[Values]]:
         end = self._next_row if last else self._next_row - self._size
         ready = [cycle for cycle in self._recorded if self._next_jobs <= cycle.row < end]
         self._next_jobs = max(self._next_jobs, end)
-        processes: list[Row] = []
+        processes: list[Values] = []
         while self._unwritten and (last or self._unwritten[0].cycles[-1].row < end):
-            processes += self._process_rows(self._unwritten.popleft())
-        jobs = [row for cycle in ready for row in self._ledger.jobs(cycle)]
+            processes += self._process_values(self._unwritten.popleft())
+        jobs = [values for cycle in ready for values in self._ledger.jobs(cycle)]
         return {"jobs": jobs, "processes": processes}
 
-    def _process_rows(self, window: LiveWindow) -> Iterable[Row]:
+    def _process_values(self, window: LiveWindow) -> Iterable[Values]:
         first = window.cycles[0]
         for node in self.problem.fabric.nodes:
             begin_ns, end_ns = (
@@ -568,7 +583,13 @@ class LiveWindows:
                 for at_ns in (first.at_ns, window.close_ns)
             )
             spent = self._processes.between(node, begin_ns, end_ns)
-            yield from ((window.number, who, node, round(spent[who])) for who in sorted(spent))
+            for who in sorted(spent):
+                yield {
+                    "window": window.number,
+                    "process": who,
+                    "node": node,
+                    "cpu_ns": round(spent[who]),
+                }
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""
@@ -600,21 +621,22 @@ class LiveWindows:
             return "replaced"
         return "dropped" if cycle.key < self._newest_done else "in_flight"
 
-    def _cycle_row(self, cycle: LiveCycle) -> Row:
+    def _cycle_values(self, cycle: LiveCycle) -> Values:
         cycle.outcome = self._outcome(cycle)
         if cycle.outcome == "in_flight":
             self._in_flight[cycle.row] = cycle
         else:
             self._in_flight.pop(cycle.row, None)
-        return cycle_row(cycle, missed=cycle.missed(self._deadline_ns))
+        return cycle_values(cycle, missed=cycle.missed(self._deadline_ns))
 
-    def _window_row(self, window: LiveWindow) -> Row:
+    def _window_values(self, window: LiveWindow) -> Values:
         cycles = window.cycles
         place = window.number - self._first_window
         seen = self._controller.log.seen
         latency_ns = np.array([cycle.latency_ns for cycle in cycles], np.int64)
-        return window_row(
+        return window_values(
             window,
+            self._controller.nodes,
             warmup=window.number < self.problem.warmup_windows,
             l95_ms=float(final_l95_ms(latency_ns)),
             missed=sum(cycle.missed(self._deadline_ns) for cycle in cycles),

@@ -1,15 +1,38 @@
-"""The Run: tables, open, save; the journal of one that is still going on."""
+"""The Run: its schema, tables, open, save; the journal of one that is still going on."""
 
-from dwell.record.journal import Columns, Journal
-from dwell.record.run import OUTCOMES, SCHEMA_VERSION, Run, open_run, require_free, seal_run
+from dwell.record.journal import Journal
+from dwell.record.run import Run, open_run, require_free, seal_run
+from dwell.record.schema import (
+    OUTCOME_SENTENCES,
+    OUTCOMES,
+    REASON_SENTENCES,
+    SCHEMA_VERSION,
+    Columns,
+    Feature,
+    Row,
+    Types,
+    Values,
+    column_types,
+    frame_of,
+    row_of,
+)
 
 __all__ = [
     "OUTCOMES",
+    "OUTCOME_SENTENCES",
+    "REASON_SENTENCES",
     "SCHEMA_VERSION",
     "Columns",
+    "Feature",
     "Journal",
+    "Row",
     "Run",
+    "Types",
+    "Values",
+    "column_types",
+    "frame_of",
     "open_run",
     "require_free",
+    "row_of",
     "seal_run",
 ]

@@ -25,20 +25,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import RunError, UnwritableError
+from dwell.record.schema import TABLES, Columns, Types, polars_schema
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["JOURNAL", "Columns", "Journal", "Recovered", "read_journal"]
+__all__ = ["JOURNAL", "Journal", "Recovered", "read_journal"]
 
 JOURNAL = "journal.bin"
 
-#: Type of every column of every table: a name of Polars', or the categories of an Enum.
-Columns: TypeAlias = Mapping[str, Mapping[str, str | Sequence[str]]]
 Rows: TypeAlias = Mapping[str, Sequence[Sequence[Any]]]
 
-#: Tables whose first column numbers the rows; a row that comes again replaces the one before.
-NUMBERED = ("cycles", "windows")
+NUMBERED = tuple(name for name, table in TABLES.items() if table.numbered)
 TYPES = ("Int64", "Float64", "Boolean", "String")
 
 MARK = b"\xd3DJ1"
@@ -120,7 +118,7 @@ def _content(text: bytes) -> dict[str, Any]:
 class _Table:
     """Rows of one table as they come, kept as columns."""
 
-    def __init__(self, name: str, columns: Mapping[str, str | Sequence[str]]) -> None:
+    def __init__(self, name: str, columns: Types) -> None:
         self.name, self.columns = name, columns
         self.rows: list[Sequence[object]] = []
         self.chunks: list[pl.DataFrame] = []
@@ -133,10 +131,7 @@ class _Table:
     def _pack(self) -> None:
         import polars as pl
 
-        schema = {
-            name: getattr(pl, kind) if isinstance(kind, str) else pl.Enum(kind)
-            for name, kind in self.columns.items()
-        }
+        schema = polars_schema(self.columns)
         try:
             self.chunks.append(pl.DataFrame(self.rows, schema=schema, orient="row"))
         except (pl.exceptions.PolarsError, TypeError, ValueError, OverflowError) as error:
@@ -457,7 +452,7 @@ class Journal:
             self._descriptor = -1
 
 
-def _require_types(columns: Mapping[str, Mapping[str, str | Sequence[str]]]) -> None:
+def _require_types(columns: Columns) -> None:
     for table, kinds in columns.items():
         for name, kind in kinds.items():
             if isinstance(kind, str) and kind not in TYPES:

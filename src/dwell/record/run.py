@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import RunError
 from dwell.record.journal import JOURNAL, Journal, read_journal
+from dwell.record.schema import SCHEMA_VERSION, TABLES
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["OUTCOMES", "SCHEMA_VERSION", "Run", "open_run", "require_free", "seal_run"]
+__all__ = ["Run", "open_run", "require_free", "seal_run"]
 
-SCHEMA_VERSION = 1
-OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down")
-TABLES = ("cycles", "windows", "decisions")
-MORE_TABLES = ("jobs", "processes")
+ALWAYS = tuple(name for name, table in TABLES.items() if not table.on_request)
+ON_REQUEST = tuple(name for name, table in TABLES.items() if table.on_request)
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
@@ -202,7 +201,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     file = folder / "run.json"
     if (folder / JOURNAL).is_file() and not file.is_file():
         found = read_journal(folder)
-        missing = [name for name in TABLES if name not in found.tables]
+        missing = [name for name in ALWAYS if name not in found.tables]
         if missing:
             raise RunError(f"{folder / JOURNAL}: no run, without {', '.join(missing)}")
         return Run(found.meta, found.tables)
@@ -217,11 +216,11 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         raise RunError(
             f"{file}: schema_version is {version!r}; this version reads up to {SCHEMA_VERSION}"
         )
-    missing = [name for name in TABLES if not (folder / f"{name}.parquet").is_file()]
+    missing = [name for name in ALWAYS if not (folder / f"{name}.parquet").is_file()]
     if missing:
         raise RunError(f"{folder}: incomplete run, without {', '.join(missing)}")
-    more = [name for name in MORE_TABLES if (folder / f"{name}.parquet").is_file()]
-    names = [*TABLES, *more]
+    more = [name for name in ON_REQUEST if (folder / f"{name}.parquet").is_file()]
+    names = [*ALWAYS, *more]
     return Run(meta, {name: _reader(folder / f"{name}.parquet") for name in names})
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
 from dwell.report import live_facts, run_figures
 from dwell.report.drawing import draw
 from dwell.report.facts import Facts
@@ -47,20 +48,6 @@ MOST_ROWS = 40
 WORST = 10
 # Shares of a node's cores below this are not told.
 LEAST_SHOWN = 5e-4
-REASONS = {
-    "dwell": "too soon after the last migration",
-    "hold": "no other placement promised enough",
-    "migrate": "another placement promised more than the least improvement",
-    "capped": "the cheapest placement within the caps; a cheaper one was over a cap",
-    "infeasible": "every placement was over a cap, and those nearest to it were compared",
-    "guard": "the robot moved by itself",
-}
-OUTCOMES = {
-    "dropped": "a message or an input was lost",
-    "replaced": "a newer one took its place",
-    "node_down": "a node was down",
-    "in_flight": "unfinished at the end",
-}
 
 
 def run_html(run: Run) -> str:
@@ -204,8 +191,8 @@ def _lost(cycles: pl.DataFrame) -> str:
         f"{_count(outcomes[name], 'cycle')} because {why}"
         if name != "in_flight"
         else f"{_count(outcomes[name], 'cycle')} {why}"
-        for name, why in OUTCOMES.items()
-        if outcomes.get(name)
+        for name, why in OUTCOME_SENTENCES.items()
+        if name != "done" and outcomes.get(name)
     ]
     if not found:
         return "Every cycle finished."
@@ -333,7 +320,7 @@ def _decisions(
     counts = dict(decisions["reason"].cast(str).value_counts().rows())
     yield items(
         f"`{name}`, {_count(counts[name], 'time')}: {text}"
-        for name, text in REASONS.items()
+        for name, text in REASON_SENTENCES.items()
         if counts.get(name)
     )
     moves = decisions.filter(decisions["migrated"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
@@ -17,8 +17,8 @@ from dwell.control import (
     static_columns,
 )
 from dwell.kernels import layout as k
-from dwell.model import REASONS, Problem
-from dwell.record import OUTCOMES
+from dwell.model import Problem
+from dwell.record import OUTCOMES, Feature, frame_of
 from dwell.sim.arrays import Arrays
 from dwell.sim.realisation import Realisation
 
@@ -49,6 +49,11 @@ class Played:
     controller: Controller
     arrays: Arrays
     first: Ints
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """What the run has that not every run has, beside what its estimator says."""
+        return ("shadows",) if len(self.arrays.tables.cells) > 1 else ()
 
     @property
     def rows(self) -> Ints:
@@ -146,7 +151,9 @@ def _cycles(played: Played) -> pl.DataFrame:
     latency, compute, network = (
         table[0, :count] for table in (tables.latency_ns, tables.compute_ns, tables.network_ns)
     )
-    frame = pl.DataFrame(
+    frame = frame_of(
+        "cycles",
+        played.problem,
         {
             "cycle": np.arange(count),
             "release_ns": played.realisation.release_ns[:count],
@@ -157,7 +164,7 @@ def _cycles(played: Played) -> pl.DataFrame:
             "compute_ns": compute,
             "queue_ns": latency - compute - network,
             "network_ns": network,
-        }
+        },
     )
     parts = ("latency_ns", "compute_ns", "queue_ns", "network_ns")
     done = pl.col("latency_ns") < NEVER_NS
@@ -165,12 +172,12 @@ def _cycles(played: Played) -> pl.DataFrame:
 
 
 def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
-    import polars as pl
-
     problem = played.problem
     stamps = played.by_window(played.arrays.tables.stamps[0])
     count = len(played.first)
-    return pl.DataFrame(
+    return frame_of(
+        "windows",
+        problem,
         {
             "window": np.arange(count),
             "first_cycle": played.first,
@@ -184,14 +191,15 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
             **_shadow_columns(played),
-        }
-    ).with_columns(pl.col("seen_l95_ms", "seen_violation_rate", "cost").fill_nan(None))
+        },
+        played.features,
+    )
 
 
 def _shadow_columns(played: Played) -> dict[str, NDArray[np.generic]]:
     """What shadow jobs cost in each window: cycles sent twice, bytes, and share of the cores."""
     tables = played.arrays.tables
-    if len(tables.cells) < 2:
+    if not played.features:
         return {}
     controller = played.controller
     used = controller.utilisation(played.closed_windows())[:, 2]
@@ -240,24 +248,12 @@ def _seen(played: Played) -> dict[str, Floats]:
     }
 
 
-def _decision_frame(columns: Mapping[str, object], candidates: tuple[str, ...]) -> pl.DataFrame:
-    import polars as pl
-
-    return pl.DataFrame(columns).with_columns(
-        pl.col("incumbent", "placement").cast(pl.Enum(candidates)),
-        pl.col("reason").cast(pl.Enum(REASONS)),
-        pl.col("window", "dwell").cast(pl.Int64),
-        pl.col("migrated", "^eligible_.*$").cast(pl.Boolean),
-        pl.col("delta_j", "^j_.*$", "^est_.*$", "^excess_.*$").cast(pl.Float64).fill_nan(None),
-    )
-
-
 def _decisions(controller: Controller) -> pl.DataFrame:
-    candidates = tuple(controller.problem.candidates)
     names = controller.decision_columns
     rows = controller.log.decisions
     columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
-    return _decision_frame(columns, candidates)
+    features: tuple[Feature, ...] = ("support",) if controller.supports else ()
+    return frame_of("decisions", controller.problem, columns, features)
 
 
 def _static_decisions(
@@ -284,7 +280,7 @@ def _static_decisions(
     for column in ("eligible", "excess"):
         for name in candidates:
             columns[f"{column}_{name}"] = estimated[name][column]
-    return _decision_frame(columns, candidates)
+    return frame_of("decisions", controller.problem, columns)
 
 
 def _log_running(played: Played, log: Ints) -> None:
@@ -314,7 +310,9 @@ def _jobs(played: Played) -> pl.DataFrame:
     cycle, cell, task = np.nonzero(log[:, :, :, k.LOG_READY].transpose(1, 0, 2) >= 0)
     picked = log[cell, cycle, task]
     ended = picked[:, k.LOG_END] >= 0
-    return pl.DataFrame(
+    return frame_of(
+        "jobs",
+        problem,
         {
             "cycle": cycle,
             "task": _names(task, tasks),
@@ -324,7 +322,8 @@ def _jobs(played: Played) -> pl.DataFrame:
             "end_ns": pl.Series(picked[:, k.LOG_END]),
             "outcome": _names(np.where(ended, outcome[cell, cycle, task], 0), OUTCOMES),
             **({"shadow": cell > 0} if cells > 1 else {}),
-        }
+        },
+        played.features,
     ).with_columns(
         pl.when(pl.col("start_ns") >= 0).then(pl.col("start_ns")),
         pl.when(pl.col("end_ns") >= 0).then(pl.col("end_ns")),
