@@ -25,7 +25,6 @@ from dwell.cli import live_demo
 from dwell.cli.live_view import Lines, Look, Screen
 from dwell.errors import LiveError
 from dwell.model import Problem
-from dwell.model.document import to_document
 from dwell.report.phases import Disturbed, disturbed
 from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import Change, changes_of
@@ -49,8 +48,7 @@ def problem() -> Problem:
 
 @pytest.fixture
 def plan(problem: Problem) -> list[Disturbed]:
-    tiers = {name: node.tier for name, node in problem.fabric.nodes.items()}
-    return disturbed(to_document(problem)["scenarios"]["demo"], tiers)
+    return disturbed(problem.scenario("demo"), problem.fabric)
 
 
 def status(window: int, **more: Any) -> dict[str, Any]:
@@ -157,7 +155,7 @@ def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path
 def test_a_machine_that_was_full_while_nothing_disturbed_it_is_warned_of(
     problem: Problem, full: tuple[str, ...]
 ) -> None:
-    run = live_run(played=[{"at_s": 0.5, "for_s": 0.4}])
+    run = live_run(played=[{"node": "E", "at_s": 0.5, "for_s": 0.4}])
     # E is full only while it is stressed: in the windows that begin at 0.33 and 0.73 s.
     used = {
         "u_R1": [1.0 if "R1" in full else 0.9] * 6,

@@ -7,13 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 
 import dwell
-from dwell.errors import RunError
+from dwell.errors import RunError, TraceError
+from dwell.io import from_document
+from dwell.model import NodeDisturbance
+from dwell.model.document import to_document
 from dwell.record import SCHEMA_VERSION, Run, open_run
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 META = {"kind": "simulated", "cell": "small", "seed": 1, "problem": {"period_ms": 40.0}}
 
 
@@ -263,3 +268,85 @@ def test_a_damaged_table_is_told_when_it_is_asked_for(tmp_path: Path) -> None:
     assert run.windows.height == 1
     with pytest.raises(RunError, match=r"cycles\.parquet"):
         _ = run.cycles
+
+
+def test_a_run_has_the_cell_that_it_is_a_run_of(tmp_path: Path) -> None:
+    for example in ("canonical", "fan-in", "cloud", "live/cell"):
+        problem = dwell.load(EXAMPLES / f"{example}.yaml")
+        meta = {"kind": "simulated", "problem": to_document(problem)}
+        run = open_run(Run(meta, tables()).save(tmp_path / problem.name))
+        assert run.problem == problem
+        assert run.problem is run.problem
+
+
+def test_a_recorded_cell_names_its_traces_without_their_files(tmp_path: Path) -> None:
+    (tmp_path / "times.csv").write_text("edge,gap\n4.0,900.0\n6.0,1100.0\n", encoding="utf-8")
+
+    def trace(column: str) -> dict[str, object]:
+        return {"trace": {"file": "times.csv", "column": column, "wrap": True}}
+
+    document = to_document(dwell.load(EXAMPLES / "canonical.yaml"))
+    document["tasks"]["perception"]["on"]["E"]["exec_ms"] = trace("edge")
+    document["nodes"]["E"]["bursts"] = {"every_ms": trace("gap"), "for_ms": 5.0, "threads": 1}
+    document["scenarios"]["rare"] = [
+        {
+            "node": "E",
+            "stress_threads": 1,
+            "episodes": {"name": "rare", "every_s": trace("gap"), "for_s": 1.0},
+        }
+    ]
+    problem = from_document(document, folder=tmp_path)
+    run = dwell.simulate(problem, scenario="rare", policy="SO", seed=1, windows=2)
+    folder = run.save(tmp_path / "run")
+    (tmp_path / "times.csv").unlink()
+    found = open_run(folder).problem
+    assert to_document(found) == to_document(problem)
+    process = found.pipeline.tasks["perception"].on["E"].exec_ms
+    with pytest.raises(TraceError, match=r"times\.csv: a run's record names this trace"):
+        _ = process.expectation
+    with pytest.raises(TraceError, match=r"times\.csv: a run's record names this trace"):
+        process.marginal(np.random.default_rng(1), 3)
+
+
+@pytest.mark.parametrize(
+    ("problem", "message"),
+    [
+        (None, "does not say which cell it ran"),
+        ("canonical", "does not say which cell it ran"),
+        ({"dwell": 1, "period_ms": 40.0}, "record of the cell cannot be read: .*nodes"),
+    ],
+)
+def test_a_cell_that_cannot_be_read_is_one_error(problem: object, message: str) -> None:
+    run = Run({"problem": problem}, tables())
+    with pytest.raises(RunError, match=message):
+        _ = run.problem
+
+
+def test_disturbances_are_those_of_the_scenario_or_as_they_were_played() -> None:
+    problem = dwell.load(EXAMPLES / "canonical.yaml")
+    meta = {"problem": to_document(problem), "scenario": "network-impairment"}
+    planned = Run(meta, tables())
+    assert planned.played is None
+    assert planned.disturbances == problem.scenario("network-impairment") != ()
+    assert Run({**meta, "scenario": "baseline"}, tables()).disturbances == ()
+    assert Run({**meta, "scenario": "unknown"}, tables()).disturbances == ()
+    played = [
+        {"node": "E", "stress_threads": 2, "at_s": -3.0, "for_s": 1.0},
+        {"node": "E", "stress_threads": 2, "at_s": -0.5, "for_s": 2.0},
+        {"node": "R1", "stress_threads": 1, "at_s": 4.0, "for_s": 1.5},
+        {"link": "R1->E", "down": True, "at_s": 5.0, "for_s": 0.0},
+    ]
+    told = Run({**meta, "played": played}, tables())
+    assert told.disturbances == (
+        NodeDisturbance("E", at_s=0.0, for_s=1.5, stress_threads=2),
+        NodeDisturbance("R1", at_s=4.0, for_s=1.5, stress_threads=1),
+    )
+    assert Run({**meta, "played": []}, tables()).disturbances == ()
+
+
+def test_what_was_played_on_no_node_of_the_cell_is_an_error() -> None:
+    problem = dwell.load(EXAMPLES / "canonical.yaml")
+    played = [{"node": "X", "stress_threads": 2, "at_s": 1.0, "for_s": 1.0}]
+    run = Run({"problem": to_document(problem), "played": played}, tables())
+    with pytest.raises(RunError, match="unknown node 'X'"):
+        _ = run.played

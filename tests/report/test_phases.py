@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.model import (
+    Constant,
+    Disturbance,
+    Episodes,
+    Fabric,
+    LinkDisturbance,
+    Node,
+    NodeDisturbance,
+    Normal,
+    Scenario,
+)
 from dwell.report.phases import CALM, Disturbed, disturbed, phases
 
-TIERS = {"R1": "robot", "E": "edge"}
-SCENARIO: list[dict[str, Any]] = [
-    {"node": "R1", "stress_threads": 2, "at_s": 6.0, "for_s": 22.0},
-    {"link": "R1->E", "add_delay_ms": {"normal": {"mean": 25.0, "std": 5.0}}, "loss": 0.02,
-     "at_s": 42.01, "for_s": 22.0},
-    {"link": "E->R1", "add_delay_ms": {"normal": {"mean": 25.0, "std": 5.0}}, "loss": 0.02,
-     "at_s": 42.04, "for_s": 22.0},
-    {"node": "E", "stress_threads": 2, "at_s": 78.0},
-]  # fmt: skip
+FABRIC = Fabric({"R1": Node("R1", "robot"), "E": Node("E", "edge")}, {})
+DELAY = Normal(25.0, 5.0)
+SCENARIO: Scenario = (
+    NodeDisturbance("R1", stress_threads=2, at_s=6.0, for_s=22.0),
+    LinkDisturbance("R1", "E", at_s=42.01, for_s=22.0, add_delay_ms=DELAY, loss=0.02),
+    LinkDisturbance("E", "R1", at_s=42.04, for_s=22.0, add_delay_ms=DELAY, loss=0.02),
+    NodeDisturbance("E", stress_threads=2, at_s=78.0),
+)
 
 
 def test_both_ways_of_a_link_are_one_disturbance() -> None:
-    assert [(one.kind, one.what) for one in disturbed(SCENARIO, TIERS)] == [
+    assert [(one.kind, one.what) for one in disturbed(SCENARIO, FABRIC)] == [
         ("robot stress", "R1: 2 busy threads"),
         ("network impairment", "E–R1: +25 ms, loss 2 %"),
         ("edge stress", "E: 2 busy threads"),
@@ -31,22 +40,23 @@ def test_both_ways_of_a_link_are_one_disturbance() -> None:
 
 
 def test_what_is_down_or_has_a_rate_is_told_so() -> None:
-    items: list[dict[str, Any]] = [
-        {"node": "E", "down": True},
-        {"link": "R1->E", "rate_mbps": 5.0},
-        {"link": "R1->E"},
+    items: list[Disturbance] = [
+        NodeDisturbance("E", down=True),
+        LinkDisturbance("R1", "E", rate_mbps=5.0),
+        LinkDisturbance("R1", "E"),
     ]
-    told = {(one.kind, one.what) for one in disturbed(items, TIERS)}
+    told = {(one.kind, one.what) for one in disturbed(items, FABRIC)}
     assert ("edge outage", "E: down") in told
     assert ("network impairment", "E–R1: 5 Mbit/s") in told
 
 
 def test_episodes_are_left_out() -> None:
-    assert disturbed([{"node": "E", "stress_threads": 1, "episodes": {}}], TIERS) == []
+    episodes = Episodes("rare", Constant(5.0), Constant(1.0))
+    assert disturbed([NodeDisturbance("E", stress_threads=1, episodes=episodes)], FABRIC) == []
 
 
 def test_phases_begin_and_end_with_what_is_on() -> None:
-    found = phases(disturbed(SCENARIO, TIERS), 116.0)
+    found = phases(disturbed(SCENARIO, FABRIC), 116.0)
     assert [phase.name for phase in found] == [
         CALM, "robot stress", CALM, "network impairment", CALM, "edge stress",
     ]  # fmt: skip

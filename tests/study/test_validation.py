@@ -299,13 +299,26 @@ def refusals() -> Iterator[tuple[str, Callable[[Run], Run], str]]:
 
         return changed
 
+    def part_with(part: str, **more: object) -> Callable[[Run], Run]:
+        def changed(run: Run) -> Run:
+            problem = run.meta["problem"]
+            return with_meta(run, problem={**problem, part: {**problem[part], **more}})
+
+        return changed
+
+    def with_a_task(run: Run) -> Run:
+        larger = part_with("tasks", log={"on": {"E": {"exec_ms": 1.0}}})(run).meta["problem"]
+        flow = {"from": "perception", "to": "log", "bytes": 10}
+        return with_meta(run, problem={**larger, "flows": [*larger["flows"], flow]})
+
     def played(run: Run) -> Run:
         return with_meta(run, played=[{"node": "R1", "stress_threads": 7, "at_s": 1, "for_s": 2}])
 
     yield "name", problem_with(name="other"), "another cell: name is 'other', not 'small'"
     yield "period", problem_with(period_ms=40.0), "period_ms is 40.0, not 33.0"
-    yield "nodes", problem_with(nodes={}), "its nodes are none, not E, R1, R2"
-    yield "tasks", problem_with(tasks={}), "its tasks are none, not control, perception"
+    yield "nodes", part_with("nodes", X={"tier": "robot"}), "its nodes are E, R1, R2, X, not E, R1"
+    yield "tasks", with_a_task, "its tasks are control, log, perception, planning, sensing, not"
+    yield "unreadable", problem_with(nodes={}), "the cell cannot be read: nodes: none is declared"
     yield "quota", node_with(quota={"cpu": 0.4, "period_ms": 4.0}), "nodes.R1.quota was"
     yield "cores", node_with(cores=2), "nodes.R1.cores was 2 in the run and is 4 in the cell"
     yield "scenario", lambda run: with_meta(run, scenario="storm"), "scenario 'storm' is not in"

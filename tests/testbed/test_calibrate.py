@@ -404,7 +404,7 @@ def test_bad_input_is_refused_all_at_once(
     bare = dwell.simulate(truth, seed=1, windows=3, policy="LOC").save(tmp_path / "bare")
     other = observed(truth, nominal, "LOC")
     other.meta["problem"]["window_cycles"] = 20
-    other.meta["problem"]["nodes"]["X"] = {}
+    other.meta["problem"]["nodes"]["X"] = {"tier": "robot"}
     others = other.save(tmp_path / "other")
     with pytest.raises(RunError) as caught:
         calibrate(nominal, [bare, others, tmp_path / "none"], tmp_path / "out.yaml")

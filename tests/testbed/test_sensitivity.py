@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import cast
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.testbed.measured import Disturbed, Measured, Visit
 from dwell.testbed.sensitivity import LEAST_POINTS, TOGETHER, sensitivities, usual_of
+from tests.study.cell import make_problem
 
+CELL = to_document(replace(make_problem(), warmup_windows=0))
 SEE, FIND = ("see", "R1"), ("find", "E")
 JOBS = 20
 
@@ -51,12 +53,13 @@ def measured(
         none_ms = np.zeros(len(jobs))
         visits[site] = Visit(stage_ms, stage_ms, none_ms, np.arange(len(jobs)), jobs)
     meta = {
+        "problem": CELL,
         "testbed": {"nodes": {"R1": {"cpus": [0]}, "E": {"cpus": [1]}}},
         "pressure": {"windows": rows},
     }
     return Measured(
         name=name,
-        run=cast("Run", SimpleNamespace(meta=meta)),
+        run=Run(meta, {}),
         disturbed=Disturbed(frozenset(stressed), frozenset(), frozenset(stressed)),
         placement="",
         windows=windows,

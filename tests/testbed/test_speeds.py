@@ -11,11 +11,12 @@ import dwell
 from dwell.io import from_document
 from dwell.model import Problem, Trace
 from dwell.model.document import to_document
+from dwell.record import Run
 from dwell.testbed.speeds import Usual, at_speed_of, slowed, window_work_ms, work_ms
 from tests.study.cell import make_problem
 
 META = {
-    "problem": {"warmup_windows": 1},
+    "problem": to_document(replace(make_problem(), warmup_windows=1)),
     "testbed": {"nodes": {"R1": {"cpus": [0]}, "E": {"cpus": [1]}, "R2": {"cpus": [0]}}},
     "pressure": {
         "excluded": [2],
@@ -28,6 +29,7 @@ META = {
         ],
     },
 }
+RUN = Run(META, {})
 
 
 @pytest.fixture
@@ -48,14 +50,14 @@ def replayed(tmp_path: Path) -> Problem:
 
 
 def test_windows_that_do_not_count_say_nothing_of_the_speed() -> None:
-    assert work_ms(META) == pytest.approx({"R1": 0.15, "E": 0.2, "R2": 0.15})
-    assert work_ms({"pressure": META["pressure"]}) == {}
-    assert work_ms({}) == {}
-    assert window_work_ms(META)["R2"] == {1: 0.1, 3: 0.2}
+    assert work_ms(RUN) == pytest.approx({"R1": 0.15, "E": 0.2, "R2": 0.15})
+    assert work_ms(Run({"pressure": META["pressure"]}, {})) == {}
+    assert work_ms(Run({}, {})) == {}
+    assert window_work_ms(RUN)["R2"] == {1: 0.1, 3: 0.2}
 
 
 def test_what_was_measured_takes_longer_and_keeps_its_rows(replayed: Problem) -> None:
-    slow = at_speed_of(META, replayed, Usual({"R1": 0.1, "X": 1.0}))
+    slow = at_speed_of(RUN, replayed, Usual({"R1": 0.1, "X": 1.0}))
     on = slow.pipeline.tasks["perception"].on
     robot, edge = on["R1"].exec_ms, on["E"].exec_ms
     link = next(iter(slow.fabric.links.values())).delay_ms
@@ -75,7 +77,7 @@ def test_what_was_measured_takes_longer_and_keeps_its_rows(replayed: Problem) ->
 
 def test_a_stage_follows_the_speed_as_much_as_it_was_seen_to(replayed: Problem) -> None:
     usual = Usual({"R1": 0.1, "E": 0.1}, {("perception", "R1"): 2.0, ("perception", "E"): 0.0})
-    on = at_speed_of(META, replayed, usual).pipeline.tasks["perception"].on
+    on = at_speed_of(RUN, replayed, usual).pipeline.tasks["perception"].on
     robot, edge = on["R1"].exec_ms, on["E"].exec_ms
     assert isinstance(robot, Trace)
     assert isinstance(edge, Trace)

@@ -110,15 +110,11 @@ class _Told(Played):
 
     def planned(self) -> list[Disturbed]:
         """Return what is to be played, as it is shown."""
-        return self._disturbed(self.plan())
+        return disturbed(self.plan(), self.problem.fabric)
 
     def on(self) -> list[Disturbed]:
         """Return what is on now, as it is shown."""
-        return self._disturbed(self.active())
-
-    def _disturbed(self, items: Sequence[Mapping[str, Any]]) -> list[Disturbed]:
-        tiers = {name: node.tier for name, node in self.problem.fabric.nodes.items()}
-        return disturbed(items, tiers)
+        return disturbed(self.active(), self.problem.fabric)
 
     def tracking(self, folder: Path) -> dict[str, object]:
         """Return what is to be said of the run's tracking error."""

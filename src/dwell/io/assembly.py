@@ -55,9 +55,10 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import require
+from dwell.model.frozen import FrozenDict
 from dwell.model.meaning import Parts, find_faults
 from dwell.model.problem import POLICIES
-from dwell.model.process import DRAWN
+from dwell.model.process import DRAWN, UnreadTrace
 
 __all__ = ["Assembly"]
 
@@ -82,8 +83,8 @@ class Assembly:
     ----------
     entry : CellEntry
         Less what is at fault.
-    tables : dict of Source to TraceTable
-        Less the sources at fault.
+    tables : dict of Source to TraceTable, optional
+        Less the sources at fault; where None, traces are named and not read.
     faults : Faults
         Holds the faults so far, takes those found here.
     anchored : bool
@@ -91,7 +92,7 @@ class Assembly:
     """
 
     entry: CellEntry
-    tables: Tables
+    tables: Tables | None
     faults: Faults
     anchored: bool = False
 
@@ -171,7 +172,10 @@ class Assembly:
     def _process(self, entry: ProcessEntry, path: str) -> Process:
         if entry.constant is not None:
             return Constant(entry.constant)
-        if entry.trace is not None:
+        if entry.trace is not None and self.tables is None:
+            declaration = entry.trace.model_dump(exclude_none=True)
+            return UnreadTrace(FrozenDict(declaration))
+        if entry.trace is not None and self.tables is not None:
             table = self.tables.get(Source.of(entry.trace))
             return Trace(table, entry.trace.column) if table is not None else STAND_IN
         for name, kind in DRAWN.items():

@@ -19,7 +19,7 @@ from dwell.model import Problem
 if TYPE_CHECKING:
     from dwell.io.traces import Tables
 
-__all__ = ["from_document", "load", "read_problem"]
+__all__ = ["from_document", "from_record", "load", "read_problem"]
 
 
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
@@ -86,6 +86,38 @@ def from_document(
         With every fault found.
     """
     return read_problem(document, Faults(source), Path(folder), "cell", anchored=True)
+
+
+def from_record(document: Mapping[str, object]) -> Problem:
+    """Read the cell that a run's record has, as `dwell.model.document.to_document` made it.
+
+    Its traces are named, and not read: the record has none of their data, and where their files
+    are it does not say.
+
+    Parameters
+    ----------
+    document : mapping
+        Of this version of Dwell, or of an older one, whose candidates name anchored tasks, too.
+
+    Returns
+    -------
+    Problem
+        With an `UnreadTrace` for every trace.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
+    from dwell.io.assembly import Assembly
+    from dwell.io.structure import CELL, read_structure
+
+    faults = Faults()
+    entry = read_structure(document, faults, CELL)
+    problem = Assembly(entry, None, faults, anchored=True).problem("cell")
+    if problem is None or faults:
+        raise faults.error()
+    return problem
 
 
 def read_problem(

@@ -16,11 +16,18 @@ from dwell.model.objective import Objective
 from dwell.model.pipeline import Execution, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import ControllerSettings, Problem
-from dwell.model.process import DRAWN, Constant, Process, Trace
+from dwell.model.process import DRAWN, Constant, Process, Trace, UnreadTrace
 from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
 from dwell.model.servo import Servo
 
-__all__ = ["VERSION", "digest", "fingerprint", "objective_document", "to_document"]
+__all__ = [
+    "VERSION",
+    "digest",
+    "disturbance_document",
+    "fingerprint",
+    "objective_document",
+    "to_document",
+]
 
 # Version of the cell file.
 VERSION = 1
@@ -118,6 +125,8 @@ def _process(path: str, process: Process) -> float | Document:
         return process.value
     if isinstance(process, Trace):
         return {"trace": _trace(process)}
+    if isinstance(process, UnreadTrace):
+        return {"trace": dict(process.declaration)}
     name = NAMES.get(type(process))
     if name is None:
         known = ", ".join(("constant", *NAMES.values(), "trace"))
@@ -227,6 +236,11 @@ def _execution(task: Task, node: str, execution: Execution) -> Document:
             "after_ms": execution.after_ms or None,
         }
     )
+
+
+def disturbance_document(item: Disturbance) -> Document:
+    """Return an item of a scenario as a cell file has it, the ways of a link apart."""
+    return _disturbance("", item)
 
 
 def _disturbance(path: str, item: Disturbance) -> Document:

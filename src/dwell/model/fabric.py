@@ -27,7 +27,7 @@ from dwell.model.bounds import (
 )
 from dwell.model.frozen import FrozenDict, require_names
 from dwell.model.objective import TIERS, Tier
-from dwell.model.process import Constant, Process
+from dwell.model.process import Constant, Process, require_mean
 
 __all__ = ["SCHEDULERS", "Bursts", "Fabric", "Link", "Node", "Quota", "Scheduler"]
 
@@ -50,9 +50,7 @@ class Bursts:
 
     def __post_init__(self) -> None:
         for path, process in (("every_ms", self.every_ms), ("for_ms", self.for_ms)):
-            mean = process.expectation
-            bound = f"a process whose mean is {BURST_MEAN}"
-            require(BURST_MEAN.holds(mean), path, mean, bound)
+            require_mean(BURST_MEAN, path, process)
         FOREIGN_THREADS.check("threads", self.threads)
 
 

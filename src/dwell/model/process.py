@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
 
 from dwell.errors import Fault, TraceError
-from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, require
+from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, Bound, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,7 +31,9 @@ __all__ = [
     "Trace",
     "TraceTable",
     "Uniform",
+    "UnreadTrace",
     "require",
+    "require_mean",
 ]
 
 Floats: TypeAlias = "NDArray[np.float64]"
@@ -423,6 +425,57 @@ class Trace:
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` recorded values independently."""
         return self.values[rng.integers(self.table.rows, size=size)]
+
+
+@dataclass(frozen=True, slots=True)
+class UnreadTrace:
+    """A trace that the record of a run names, and whose data are not in the record.
+
+    Parameters
+    ----------
+    declaration : mapping of str to object
+        As a cell file has it, with the digest of the data.
+    """
+
+    declaration: Mapping[str, object]
+
+    @property
+    def expectation(self) -> float:
+        """Not known.
+
+        Raises
+        ------
+        TraceError
+            Always.
+        """
+        raise self._unread()
+
+    def marginal(self, rng: np.random.Generator, size: int) -> Floats:
+        """Not known.
+
+        Raises
+        ------
+        TraceError
+            Always.
+        """
+        raise self._unread()
+
+    def _unread(self) -> TraceError:
+        message = "a run's record names this trace and has no data of it; load the cell's file"
+        return TraceError([Fault(str(self.declaration["file"]), message)])
+
+
+def require_mean(bound: Bound, path: str, process: Process) -> None:
+    """Require a process to have a mean within a bound; that of a trace without data is not known.
+
+    Raises
+    ------
+    ProblemError
+        If it is outside.
+    """
+    if not isinstance(process, UnreadTrace):
+        mean = process.expectation
+        require(bound.holds(mean), path, mean, f"a process whose mean is {bound}")
 
 
 #: The cell file's words for the processes that are drawn by their parameters, the fields' names.

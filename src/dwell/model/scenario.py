@@ -20,7 +20,7 @@ from dwell.model.bounds import (
     RATE_MBPS,
     require,
 )
-from dwell.model.process import Process
+from dwell.model.process import Process, require_mean
 
 __all__ = [
     "MAX_LAYERS",
@@ -31,6 +31,7 @@ __all__ = [
     "LinkDisturbance",
     "NodeDisturbance",
     "Scenario",
+    "is_always_on",
 ]
 
 # Equal steps in which a ramp reaches its full strength. Their number has that many binary digits,
@@ -60,9 +61,7 @@ class Episodes:
 
     def __post_init__(self) -> None:
         for path, process in (("every_s", self.every_s), ("for_s", self.for_s)):
-            mean = process.expectation
-            bound = f"a process whose mean is {EPISODE_MEAN_S}"
-            require(EPISODE_MEAN_S.holds(mean), f"episodes.{path}", mean, bound)
+            require_mean(EPISODE_MEAN_S, f"episodes.{path}", process)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +136,12 @@ class LinkDisturbance:
 
 Disturbance: TypeAlias = NodeDisturbance | LinkDisturbance
 Scenario: TypeAlias = tuple[Disturbance, ...]
+
+
+def is_always_on(item: Disturbance) -> bool:
+    """Whether a disturbance is on, at its full strength, from the first cycle to the last."""
+    whole = item.at_s == 0 and math.isinf(item.for_s)
+    return whole and item.episodes is None and not item.ramp_s
 
 
 def _check_time(item: Disturbance) -> None:

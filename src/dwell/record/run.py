@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from dwell.errors import RunError
+from dwell.errors import ProblemError, RunError
+from dwell.model import Problem, Scenario
 from dwell.record.journal import JOURNAL, Journal, read_journal
 from dwell.record.schema import SCHEMA_VERSION, TABLES
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 __all__ = ["Run", "open_run", "require_free", "seal_run"]
 
 ALWAYS = tuple(name for name, table in TABLES.items() if not table.on_request)
+#: Scenario by which a cell has the disturbances as they were played.
+PLAYED = "played"
 ON_REQUEST = tuple(name for name, table in TABLES.items() if table.on_request)
 
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
@@ -49,6 +53,61 @@ class Run:
             table = table()
             self._tables[name] = table
         return table
+
+    @cached_property
+    def problem(self) -> Problem:
+        """The cell that it is a run of; traces are named, their data are elsewhere.
+
+        Raises
+        ------
+        RunError
+            If the run does not say it, or it cannot be read.
+        """
+        return self._cell_with({})
+
+    @cached_property
+    def played(self) -> Scenario | None:
+        """Disturbances as they were played, from the first release on; None where it says none.
+
+        Such a run was disturbed as its scenario has it.
+
+        Raises
+        ------
+        RunError
+            If what the run says of them, or of its cell, cannot be read.
+        """
+        told = self.meta.get("played")
+        if not isinstance(told, list):
+            return None
+        items = [item for item in told if isinstance(item, Mapping)]
+        within = [_from_the_start(item) for item in items if _end_s(item) > max(_at_s(item), 0.0)]
+        scenarios = {PLAYED: within}
+        return self._cell_with({"scenarios": scenarios}).scenarios[PLAYED]
+
+    @property
+    def disturbances(self) -> Scenario:
+        """What was done to nodes and links: as it was played, else as its scenario has it.
+
+        Raises
+        ------
+        RunError
+            If the run's record of it cannot be read.
+        """
+        if self.played is not None:
+            return self.played
+        return self.problem.scenarios.get(str(self.meta.get("scenario")), ())
+
+    def _cell_with(self, changes: Mapping[str, object]) -> Problem:
+        from dwell.io import from_record
+
+        told = self.meta.get("problem")
+        if not isinstance(told, Mapping):
+            raise RunError("its record does not say which cell it ran")
+        try:
+            return from_record({**told, **changes})
+        except ProblemError as error:
+            why = "; ".join(str(error).splitlines())
+            raise RunError(f"its record of the cell cannot be read: {why}") from None
 
     @property
     def cycles(self) -> pl.DataFrame:
@@ -140,6 +199,22 @@ class Run:
         finally:
             shutil.rmtree(draft, ignore_errors=True)
         return target
+
+
+def _at_s(item: Mapping[str, Any]) -> float:
+    return float(item.get("at_s", 0.0))
+
+
+def _end_s(item: Mapping[str, Any]) -> float:
+    return _at_s(item) + float(item.get("for_s", math.inf))
+
+
+def _from_the_start(item: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a disturbance that was played without its part before the first release."""
+    if _at_s(item) >= 0:
+        return dict(item)
+    shorter = {"for_s": _end_s(item)} if "for_s" in item else {}
+    return {**item, "at_s": 0.0, **shorter}
 
 
 def require_free(path: str | os.PathLike[str]) -> None:

@@ -24,7 +24,7 @@ class Facts(NamedTuple):
     cell, scenario, policy, estimator, seed : str
         As text; a dash where there is none.
     candidates : mapping of str to mapping of str to str
-        Node of every task that can move, or of every task.
+        Node of every task.
     nodes : tuple of str
     period_ms, deadline_ms : float
     window_cycles : int
@@ -61,34 +61,32 @@ class Facts(NamedTuple):
         Raises
         ------
         RunError
-            If its record lacks the problem it was made from.
+            If its record lacks the problem it was made from, or that cannot be read.
         """
         meta = run.meta
         try:
-            problem = meta["problem"]
-            scenario = problem.get("scenarios", {}).get(meta.get("scenario"), ())
-            tiers = {name: str(node["tier"]) for name, node in problem["nodes"].items()}
-            return cls(
-                kind=str(meta.get("kind", "simulated")),
-                cell=str(problem["name"]),
-                scenario=str(meta.get("scenario") or "–"),
-                policy=str(meta.get("policy") or "–"),
-                estimator=str(meta.get("estimator") or "–"),
-                seed="–" if meta.get("seed") is None else str(meta["seed"]),
-                candidates=problem["candidates"],
-                nodes=tuple(problem["nodes"]),
-                period_ms=float(problem["period_ms"]),
-                deadline_ms=float(problem["deadline_ms"]),
-                window_cycles=int(problem["window_cycles"]),
-                versions=meta.get("versions", {}),
-                disturbed=tuple(disturbed(meta.get("played", scenario), tiers)),
-                tracking=Tracking.of(meta),
-                recovered=meta.get("recovered", {}),
-            )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            problem, disturbances = run.problem, run.disturbances
+        except RunError as error:
             raise RunError(
-                f"this run cannot be reported: its record of the problem is incomplete ({error!r})"
+                f"this run cannot be reported: its record of the problem is incomplete ({error})"
             ) from None
+        return cls(
+            kind=str(meta.get("kind", "simulated")),
+            cell=problem.name,
+            scenario=str(meta.get("scenario") or "–"),
+            policy=str(meta.get("policy") or "–"),
+            estimator=str(meta.get("estimator") or "–"),
+            seed="–" if meta.get("seed") is None else str(meta["seed"]),
+            candidates=problem.candidates,
+            nodes=tuple(problem.fabric.nodes),
+            period_ms=problem.pipeline.period_ms,
+            deadline_ms=problem.pipeline.deadline_ms,
+            window_cycles=problem.window_cycles,
+            versions=meta.get("versions", {}),
+            disturbed=tuple(disturbed(disturbances, problem.fabric)),
+            tracking=Tracking.of(meta),
+            recovered=meta.get("recovered", {}),
+        )
 
     @property
     def policy_name(self) -> str:

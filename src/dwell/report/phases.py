@@ -4,8 +4,22 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from dwell.model import (
+    AR1,
+    Constant,
+    Disturbance,
+    Exponential,
+    Fabric,
+    Gamma,
+    LinkDisturbance,
+    LogNormal,
+    NodeDisturbance,
+    Normal,
+    Process,
+)
 
 __all__ = ["CALM", "Disturbed", "Phase", "disturbed", "phases"]
 
@@ -14,8 +28,6 @@ CALM = "baseline"
 NETWORK = "network impairment"
 #: Decimals of seconds: what began and ended together did so within a tenth.
 DIGITS = 1
-
-Item: TypeAlias = Mapping[str, Any]
 
 
 class Disturbed(NamedTuple):
@@ -51,27 +63,27 @@ class Phase(NamedTuple):
     end_s: float
 
 
-def disturbed(scenario: Iterable[Item], tiers: Mapping[str, str]) -> list[Disturbed]:
+def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed]:
     """Return what a scenario did, links that were disturbed together as one.
 
     Parameters
     ----------
-    scenario : iterable of mapping
-        As in a cell file. Those that come in episodes are left out: when they came was drawn.
-    tiers : mapping of str to str
-        Of the nodes.
+    scenario : iterable of Disturbance
+        Those that come in episodes are left out: when they came was drawn.
+    fabric : Fabric
+        Whose nodes say their tiers.
     """
     found: dict[tuple[float, float, str, str], tuple[float, float, list[str]]] = {}
     for item in scenario:
-        if item.get("episodes") is not None:
+        if item.episodes is not None:
             continue
-        begin_s = float(item.get("at_s", 0.0))
-        length_s = item.get("for_s")
-        end_s = begin_s + (math.inf if length_s is None else float(length_s))
-        link = item.get("link")
-        what = _on_node(item) if link is None else _on_link(item)
-        kind = _stress(item, tiers) if link is None else NETWORK
-        who = str(item["node"]) if link is None else "–".join(sorted(str(link).split("->")))
+        begin_s, end_s = item.at_s, item.at_s + item.for_s
+        if isinstance(item, NodeDisturbance):
+            who, what = item.node, _on_node(item)
+            kind = f"{fabric.nodes[who].tier} {'outage' if item.down else 'stress'}"
+        else:
+            who, what = "–".join(sorted((item.source, item.target))), _on_link(item)
+            kind = NETWORK
         together = round(begin_s, DIGITS), round(end_s, DIGITS), kind, what
         *_, mine = found.setdefault(together, (begin_s, end_s, []))
         if who not in mine:
@@ -82,40 +94,33 @@ def disturbed(scenario: Iterable[Item], tiers: Mapping[str, str]) -> list[Distur
     ]
 
 
-def _stress(item: Item, tiers: Mapping[str, str]) -> str:
-    return f"{tiers.get(str(item['node']), 'node')} {'outage' if item.get('down') else 'stress'}"
-
-
-def _on_node(item: Item) -> str:
-    if item.get("down"):
+def _on_node(item: NodeDisturbance) -> str:
+    if item.down:
         return "down"
-    threads = int(item.get("stress_threads", 0))
+    threads = item.stress_threads
     return f"{threads} busy thread{'' if threads == 1 else 's'}"
 
 
-def _on_link(item: Item) -> str:
-    if item.get("down"):
+def _on_link(item: LinkDisturbance) -> str:
+    if item.down:
         return "down"
     parts = []
-    if item.get("add_delay_ms") is not None:
-        mean_ms = _mean(item["add_delay_ms"])
+    if item.add_delay_ms is not None:
+        mean_ms = _declared_mean(item.add_delay_ms)
         parts.append("more delay" if mean_ms is None else f"+{mean_ms:g} ms")
-    if item.get("loss"):
-        parts.append(f"loss {100 * float(item['loss']):g} %")
-    rate = item.get("rate_mbps")
-    if rate is not None and math.isfinite(float(rate)):
-        parts.append(f"{float(rate):g} Mbit/s")
+    if item.loss:
+        parts.append(f"loss {100 * item.loss:g} %")
+    if item.rate_mbps < math.inf:
+        parts.append(f"{item.rate_mbps:g} Mbit/s")
     return ", ".join(parts) or "disturbed"
 
 
-def _mean(process: object) -> float | None:
-    """Return the mean that a process says it has."""
-    if isinstance(process, int | float):
-        return float(process)
-    if isinstance(process, Mapping):
-        for values in process.values():
-            if isinstance(values, Mapping) and isinstance(values.get("mean"), int | float):
-                return float(values["mean"])
+def _declared_mean(process: Process) -> float | None:
+    """Return the mean that a process is declared with; None where it is declared otherwise."""
+    if isinstance(process, Constant):
+        return process.value
+    if isinstance(process, AR1 | Exponential | Gamma | LogNormal | Normal):
+        return process.mean
     return None
 
 

@@ -9,11 +9,11 @@ how many that takes.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
+from dwell.model.scenario import is_always_on
 from dwell.study.campaign import Measured
 from dwell.study.family import Family
 from dwell.study.intervals import CONFIDENCE
@@ -68,11 +68,7 @@ def fault_scenarios(problem: Problem, names: Sequence[str]) -> tuple[str, ...]:
 
 def is_steady(problem: Problem, names: Sequence[str]) -> bool:
     """Whether what is disturbed in scenarios is so from the first cycle to the last."""
-    return all(
-        item.at_s == 0 and math.isinf(item.for_s) and item.episodes is None and not item.ramp_s
-        for name in names
-        for item in problem.scenario(name)
-    )
+    return all(is_always_on(item) for name in names for item in problem.scenario(name))
 
 
 def _only(problem: Problem, scenario: str, kind: type) -> bool:

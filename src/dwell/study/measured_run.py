@@ -18,7 +18,7 @@ import numpy as np
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.model import Placement, Problem
-from dwell.model.document import to_document
+from dwell.model.document import disturbance_document, to_document
 from dwell.model.scenario import Disturbance, Scenario
 from dwell.policies.registry import by_name
 from dwell.study.predicting import Asked
@@ -124,10 +124,11 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
         not have, settings that differ.
     """
     meta = run.meta
-    recorded = meta.get("problem")
-    if not isinstance(recorded, Mapping):
-        raise RunError(f"{name}: its record does not say which cell it ran")
-    own = json.loads(json.dumps(to_document(problem)))
+    try:
+        recorded = _document(run.problem)
+    except RunError as error:
+        raise RunError(f"{name}: {error}") from None
+    own = _document(problem)
     faults = [*_other_cell(recorded, own)]
     scenario = str(meta.get("scenario") or "")
     if scenario not in problem.scenarios:
@@ -138,15 +139,15 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
     try:
         excluded = excluded_windows(meta)
         estimator = name_in_run(meta)
-        policy, problem = _policy(meta, recorded, own, problem)
+        policy, problem = _policy(run, recorded, own, problem)
         warmup = int(run.windows["warmup"].sum())
-        items = _as_played(meta, recorded, own, problem, scenario, run)
+        items = _as_played(recorded, own, problem, scenario, run)
         problem = replace(
             problem,
             warmup_windows=warmup,
             scenarios={**problem.scenarios, scenario: items},
         )
-        problem = at_speed_of(meta, problem, usual or Usual())
+        problem = at_speed_of(run, problem, usual or Usual())
         if policy not in problem.candidates:
             excluded = _with_consequences(
                 excluded, problem.controller.min_dwell, run.windows.height
@@ -221,24 +222,29 @@ def _numbered(item: object) -> tuple[Any, Any]:
 # ------------------------------------------------------------------------------------- the cell
 
 
+def _document(problem: Problem) -> Document:
+    document: Document = json.loads(json.dumps(to_document(problem)))
+    return document
+
+
 def _other_cell(theirs: Document, own: Document) -> Iterator[str]:
     """Yield in what two cells differ, calibration aside."""
     for field in ("name", "period_ms", "deadline_ms", "window_cycles"):
-        if theirs.get(field) != own[field]:
-            was, now = theirs.get(field), own[field]
+        if theirs[field] != own[field]:
+            was, now = theirs[field], own[field]
             yield f"it is a run of another cell: {field} is {was!r}, not {now!r}"
     for field in ("nodes", "tasks"):
-        there, here = theirs.get(field, {}), own[field]
+        there, here = theirs[field], own[field]
         if set(there) != set(here):
             was, now = _names(there), _names(here)
             yield f"it is a run of another cell: its {field} are {was}, not {now}"
-    for name in own["nodes"].keys() & theirs.get("nodes", {}).keys():
+    for name in own["nodes"].keys() & theirs["nodes"].keys():
         there, here = theirs["nodes"][name], own["nodes"][name]
         for field in NODE_FIELDS:
             was, now = there.get(field), here.get(field)
             if _allowance(was) != _allowance(now):
                 yield f"nodes.{name}.{field} was {was!r} in the run and is {now!r} in the cell"
-    for name in own["tasks"].keys() & theirs.get("tasks", {}).keys():
+    for name in own["tasks"].keys() & theirs["tasks"].keys():
         there, here = theirs["tasks"][name], own["tasks"][name]
         if there.get("input") != here.get("input"):
             was, now = there.get("input"), here.get("input")
@@ -262,64 +268,58 @@ def _names(values: Any) -> str:
 # ----------------------------------------------------------------------------------- the policy
 
 
-def _policy(
-    meta: Mapping[str, Any], theirs: Document, own: Document, problem: Problem
-) -> tuple[str, Problem]:
+def _policy(run: Run, theirs: Document, own: Document, problem: Problem) -> tuple[str, Problem]:
     """Return the policy's name, and the problem with the candidates that the run had."""
-    told = str(meta.get("policy") or "")
+    told = str(run.meta.get("policy") or "")
     head = re.split(r"[(\s]", told, maxsplit=1)[0]
     if head == "Static":
         found = re.search(r"initial='([^']+)'", told)
-        name = found.group(1) if found else str(theirs.get("controller", {}).get("policy"))
+        name = found.group(1) if found else run.problem.controller.policy
     else:
         name = POLICIES.get(head, told)
-    problem = _with_candidates(problem, theirs, own["candidates"])
+    problem = _with_candidates(problem, run.problem)
     policy = by_name(name, problem)
     if name in problem.candidates:
         return name, problem
     if told != head and repr(policy) != told:
         raise RunError(f"policy was {told}; by the cell it would be {policy!r}")
-    if theirs.get("objective") != own["objective"]:
+    if theirs["objective"] != own["objective"]:
         raise RunError(
-            f"policy {name} had another objective than the cell's: {theirs.get('objective')}, "
+            f"policy {name} had another objective than the cell's: {theirs['objective']}, "
             f"not {own['objective']}"
         )
     return name, problem
 
 
-def _with_candidates(problem: Problem, theirs: Document, own: Document) -> Problem:
+def _with_candidates(problem: Problem, recorded: Problem) -> Problem:
     """Return the problem with a run's candidates: what could be chosen, or tried, is its own.
 
     With them come where it began, and the fallbacks. A candidate that the cell has under this name
     with other nodes is refused.
     """
-    tasks = problem.pipeline.tasks
-    # Records of earlier versions name anchored tasks, too.
-    candidates = {
-        name: {task: node for task, node in nodes.items() if not tasks[task].anchored}
-        for name, nodes in theirs.get("candidates", {}).items()
-    }
-    for name, nodes in candidates.items():
-        if name in own and nodes != own[name]:
-            raise RunError(f"candidate {name} was {nodes} in the run; in the cell {own[name]}")
-    if list(candidates) == list(own):
+    for name, placement in recorded.candidates.items():
+        if name in problem.candidates and placement != problem.candidates[name]:
+            was, now = _moving(placement, problem), _moving(problem.candidates[name], problem)
+            raise RunError(f"candidate {name} was {was} in the run; in the cell {now}")
+    if list(recorded.candidates) == list(problem.candidates):
         return problem
-    settings = theirs.get("controller", {})
     controller = replace(
         problem.controller,
-        initial=settings.get("initial"),
-        fallbacks=tuple(settings.get("fallbacks") or ()),
+        initial=recorded.controller.initial,
+        fallbacks=recorded.controller.fallbacks,
     )
-    anchored = {name: next(iter(task.on)) for name, task in tasks.items() if task.anchored}
-    placed = {name: Placement({**anchored, **nodes}) for name, nodes in candidates.items()}
-    return replace(problem, candidates=placed, controller=controller)
+    return replace(problem, candidates=recorded.candidates, controller=controller)
+
+
+def _moving(placement: Placement, problem: Problem) -> dict[str, str]:
+    tasks = problem.pipeline.tasks
+    return {task: node for task, node in placement.items() if not tasks[task].anchored}
 
 
 # --------------------------------------------------------------------------------- the scenario
 
 
 def _as_played(
-    meta: Mapping[str, Any],
     theirs: Document,
     own: Document,
     problem: Problem,
@@ -328,32 +328,28 @@ def _as_played(
 ) -> Scenario:
     """Return the cell's scenario with the times at which its disturbances were played."""
     items, written = problem.scenario(name), own["scenarios"].get(name, [])
-    played = meta.get("played")
-    if played is None:
-        if theirs.get("scenarios", {}).get(name, []) != written:
+    if run.played is None:
+        if theirs["scenarios"].get(name, []) != written:
             raise RunError(f"scenario {name!r} was another one in the run than it is in the cell")
         return items
-    left = list(zip(items, map(_timeless, written), strict=True))
+    left = [(item, _timeless(item)) for item in items]
     end_s = _end_s(run.cycles)
     found: list[Disturbance] = []
-    for told in played:
-        match = next((pair for pair in left if pair[1] == _timeless(told)), None)
+    for item in run.played:
+        match = next((pair for pair in left if pair[1] == _timeless(item)), None)
         if match is None:
-            raise RunError(f"{json.dumps(told)} was played, which scenario {name!r} does not have")
+            told = json.dumps(disturbance_document(item))
+            raise RunError(f"{told} was played, which scenario {name!r} does not have")
         left.remove(match)
-        begin_s = float(told.get("at_s", 0.0))
-        until_s = begin_s + float(told.get("for_s", math.inf))
-        if until_s <= 0:
-            continue
-        begin_s = max(begin_s, 0.0)
         # What was on to the end of a run had no end within it.
-        for_s = math.inf if until_s >= end_s else until_s - begin_s
-        found.append(replace(match[0], at_s=begin_s, for_s=for_s))
+        for_s = math.inf if item.at_s + item.for_s >= end_s else item.for_s
+        found.append(replace(match[0], at_s=item.at_s, for_s=for_s))
     return tuple(found)
 
 
-def _timeless(item: Document) -> dict[str, Any]:
-    return {key: value for key, value in item.items() if key not in ("at_s", "for_s")}
+def _timeless(item: Disturbance) -> dict[str, Any]:
+    document = disturbance_document(item)
+    return {key: value for key, value in document.items() if key not in ("at_s", "for_s")}
 
 
 def _end_s(cycles: pl.DataFrame) -> float:

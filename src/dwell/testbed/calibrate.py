@@ -447,7 +447,7 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
         estimator = name_in_run(one.run.meta)
     except RunError:
         return None
-    problem = at_speed_of(one.run.meta, replace(problem, warmup_windows=2), usual)
+    problem = at_speed_of(one.run, replace(problem, warmup_windows=2), usual)
     windows = min(max(one.windows, 50), CHECK_WINDOWS)
     real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
     played = simulate_realisation(problem, real, policy=one.placement, estimator=estimator)

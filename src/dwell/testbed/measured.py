@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import RunError
-from dwell.model import Problem
+from dwell.model import LinkDisturbance, Problem
+from dwell.model.scenario import is_always_on
 from dwell.testbed.hops import LEAST_JOBS
 from dwell.testbed.speeds import work_ms
 
@@ -24,8 +25,6 @@ __all__ = ["Disturbed", "Measured", "Visit", "look_at", "usable"]
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
-#: What a disturbance has that is not there all the time.
-SOMETIMES = ("at_s", "for_s", "episodes", "ramp_s")
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
 
@@ -48,36 +47,27 @@ class Disturbed:
     stressed: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, meta: Mapping[str, Any]) -> Disturbed:
+    def of(cls, run: Run) -> Disturbed:
         """Read a run's record.
 
         Raises
         ------
         RunError
-            If its scenario is not among those of its cell.
+            If its scenario is not among those of its cell, or the cell cannot be read.
         """
-        scenario = str(meta.get("scenario") or "baseline")
-        scenarios = meta["problem"].get("scenarios") or {}
+        scenario = str(run.meta.get("scenario") or "baseline")
+        scenarios = run.problem.scenarios
         if scenario not in scenarios and scenario not in ("baseline", "live"):
             raise RunError(f"scenario {scenario!r} is none of the cell's; what was it?")
         nodes, links, stressed = set(), set(), set()
-        for item in (*scenarios.get(scenario, ()), *_played(meta)):
-            if "node" in item:
-                nodes.add(str(item["node"]))
-                if item.get("stress_threads") and not any(item.get(key) for key in SOMETIMES):
-                    stressed.add(str(item["node"]))
-            if "link" in item:
-                source, _, target = str(item["link"]).partition("->")
-                links.add((source, target))
-                if item.get("both_ways"):
-                    links.add((target, source))
+        for item in (*scenarios.get(scenario, ()), *(run.played or ())):
+            if isinstance(item, LinkDisturbance):
+                links.add((item.source, item.target))
+                continue
+            nodes.add(item.node)
+            if item.stress_threads and is_always_on(item):
+                stressed.add(item.node)
         return cls(frozenset(nodes), frozenset(links), frozenset(stressed))
-
-
-def _played(meta: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
-    played = meta.get("played")
-    found = played if isinstance(played, Sequence) and not isinstance(played, str) else ()
-    return (item for item in found if isinstance(item, Mapping))
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +218,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
     return Measured(
         name=name,
         run=run,
-        disturbed=Disturbed.of(run.meta),
+        disturbed=Disturbed.of(run),
         placement=placements.pop() if len(placements) == 1 else "",
         windows=windows.height,
         cycles=windows.height * size,
@@ -244,7 +234,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
         handovers_ms=handovers_ms,
         beside=_while_jobs_ran(own.filter(~pl.col("accompanied")), "others_ns"),
         outside=_while_jobs_ran(own, "outside_ns"),
-        work_ms=work_ms(run.meta),
+        work_ms=work_ms(run),
         delays_ms=_delays(own, problem),
         begins_ms=_begins(own, run, problem) | sources,
         ends_ms=_ends(own, run, problem) | endings_ms,
@@ -252,14 +242,18 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
 
 
 def _require_same(name: str, run: Run, problem: Problem) -> None:
-    theirs = run.meta.get("problem")
-    if not isinstance(theirs, Mapping):
-        raise RunError(f"{name}: its record does not say which cell it ran")
+    try:
+        theirs = run.problem
+    except RunError as error:
+        raise RunError(f"{name}: {error}") from None
     faults = [
-        f"{name}: its {what} are {', '.join(sorted(theirs.get(what, {})))}, those of the cell "
+        f"{name}: its {what} are {', '.join(sorted(was))}, those of the cell "
         f"{', '.join(sorted(own))}"
-        for what, own in (("tasks", problem.pipeline.tasks), ("nodes", problem.fabric.nodes))
-        if set(theirs.get(what, {})) != set(own)
+        for what, was, own in (
+            ("tasks", set(theirs.pipeline.tasks), set(problem.pipeline.tasks)),
+            ("nodes", set(theirs.fabric.nodes), set(problem.fabric.nodes)),
+        )
+        if was != own
     ]
     sites = run.jobs.select("task", "node").unique().cast(dict.fromkeys(("task", "node"), str))
     faults += [
@@ -267,12 +261,12 @@ def _require_same(name: str, run: Run, problem: Problem) -> None:
         for task, node in sites.iter_rows()
         if not faults and node not in problem.pipeline.tasks[task].on
     ]
-    for field_name, here in (
-        ("window_cycles", problem.window_cycles),
-        ("period_ms", problem.pipeline.period_ms),
+    for field_name, there, here in (
+        ("window_cycles", theirs.window_cycles, problem.window_cycles),
+        ("period_ms", theirs.pipeline.period_ms, problem.pipeline.period_ms),
     ):
-        if theirs.get(field_name) != here:
-            faults.append(f"{name}: {field_name} was {theirs.get(field_name)}, not {here}")
+        if there != here:
+            faults.append(f"{name}: {field_name} was {there}, not {here}")
     if faults:
         raise RunError("\n".join(faults))
 

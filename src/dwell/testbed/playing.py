@@ -15,8 +15,8 @@ from typing import Any, NoReturn, TypeAlias
 
 from dwell.errors import DwellError, LiveError
 from dwell.live.hosting import clock_of
-from dwell.model import Problem
-from dwell.model.document import to_document
+from dwell.model import Disturbance, Problem, Scenario
+from dwell.model.document import disturbance_document
 from dwell.record import Run, open_run, seal_run
 from dwell.testbed.timeline import Change
 
@@ -70,19 +70,14 @@ class Played:
         instants = self.begun_ns if change.begins else self.ended_ns
         instants[id(change.item)] = clock_of(self.problem)()
 
-    def disturbances(self) -> list[tuple[object, Mapping[str, Any]]]:
-        """Return the scenario's items, each as the cell file has it."""
-        written = to_document(self.problem)["scenarios"].get(self.scenario, [])
-        return list(zip(self.problem.scenario(self.scenario), written, strict=True))
-
-    def plan(self) -> list[Mapping[str, Any]]:
+    def plan(self) -> Scenario:
         """Return what is to be played."""
-        return [written for _, written in self.disturbances()]
+        return self.problem.scenario(self.scenario)
 
-    def active(self) -> list[Mapping[str, Any]]:
+    def active(self) -> list[Disturbance]:
         """Return what is on now."""
         on = self.begun_ns.keys() - self.ended_ns.keys()
-        return [written for item, written in self.disturbances() if id(item) in on]
+        return [item for item in self.plan() if id(item) in on]
 
     def note(self, folder: Path, **more: object) -> Run:
         """Tell the run, whose time begins with the first release.
@@ -100,11 +95,11 @@ class Played:
             origin_ns, end_ns = span
             notes["played"] = [
                 {
-                    **written,
+                    **disturbance_document(item),
                     "at_s": round((begun_ns - origin_ns) / 1e9, 3),
                     "for_s": round((self.ended_ns.get(id(item), end_ns) - begun_ns) / 1e9, 3),
                 }
-                for item, written in self.disturbances()
+                for item in self.plan()
                 if (begun_ns := self.begun_ns.get(id(item))) is not None
             ]
         return seal_run(folder, **notes, **more)
@@ -133,7 +128,7 @@ def crowded(run: Run, problem: Problem) -> list[str]:
         One a node whose utilisation was 97 % or more in most of the windows without a disturbance.
     """
     span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
-    played = [(item["at_s"], item["at_s"] + item["for_s"]) for item in run.meta.get("played", ())]
+    played = [(item.at_s, item.at_s + item.for_s) for item in run.played or ()]
     released_s = dict(zip(run.cycles["cycle"], run.cycles["release_ns"] / 1e9, strict=True))
     windows = run.windows.filter(~run.windows["warmup"])
     # Of a window whose first cycle is missing from the record nothing is said.

@@ -26,7 +26,7 @@ from dwell.errors import LiveError
 from dwell.live.leash import OWNER
 from dwell.live.visiting import Visitor
 from dwell.model import Host, LinkDisturbance, NodeDisturbance, Normal, Problem
-from dwell.model.document import to_document
+from dwell.model.document import disturbance_document
 from dwell.policies import by_name
 from dwell.record import open_run, seal_run
 from dwell.testbed.inventory import Inventory
@@ -369,12 +369,12 @@ def _note(
     """Tell the run what was played, by this computer's clock since the run was seen to begin."""
     release_ns = open_run(folder).cycles["release_ns"]
     end_s = float(release_ns[-1]) / 1e9 if len(release_ns) else 0.0
-    written = to_document(problem)["scenarios"].get(scenario, [])
     played = []
-    for item, entry in zip(problem.scenario(scenario), written, strict=True):
+    for item in problem.scenario(scenario):
         begun_s = instants.get((id(item), True))
         if begun_s is not None:
             ended_s = instants.get((id(item), False), max(end_s, begun_s))
             for_s = round(ended_s - begun_s, 3)
-            played.append({**entry, "at_s": round(begun_s, 3), "for_s": for_s})
+            times = {"at_s": round(begun_s, 3), "for_s": for_s}
+            played.append({**disturbance_document(item), **times})
     seal_run(folder, scenario=scenario, seed=seed, played=played)

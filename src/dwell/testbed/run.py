@@ -217,7 +217,7 @@ def spans_of(run: Run, played: Played) -> list[Span]:
 def _stressed(played: Played, begin_ns: int, end_ns: int) -> Mapping[str, float]:
     """Return the capacity of nodes with as many foreign threads as cores all the time."""
     found: dict[str, float] = {}
-    for item, _ in played.disturbances():
+    for item in played.plan():
         if not isinstance(item, NodeDisturbance):
             continue
         node = played.problem.fabric.nodes[item.node]
@@ -236,8 +236,7 @@ def summary(run: Run) -> dict[str, Any]:
     pressure = run.meta.get("pressure") or {}
     excluded = set(pressure.get("excluded", ()))
     kept = windows.filter(~windows["window"].is_in(sorted(excluded)))
-    nodes = run.meta["problem"]["nodes"]
-    means = {node: _mean(kept[f"u_{node}"].mean()) for node in nodes}
+    means = {node: _mean(kept[f"u_{node}"].mean()) for node in run.problem.fabric.nodes}
     return {
         "windows": windows.height,
         "excluded": len(excluded),

@@ -57,7 +57,7 @@ def sensitivities(measured: Sequence[Measured]) -> dict[SiteName, float]:
 
     points: dict[SiteName, list[tuple[Floats, Floats]]] = {}
     for one in measured:
-        probed = window_work_ms(one.run.meta)
+        probed = window_work_ms(one.run)
         for site, visit in one.visits.items():
             node = site[1]
             if node in probed and node not in one.disturbed.nodes:

@@ -22,6 +22,7 @@ from dwell.model.process import TraceTable
 
 if TYPE_CHECKING:
     from dwell.model import Execution, Process
+    from dwell.record import Run
 
 __all__ = ["Usual", "at_speed_of", "slowed", "window_work_ms", "work_ms"]
 
@@ -74,25 +75,25 @@ class Usual:
         return float(factor ** self.sensitivity.get((task, node), 1.0))
 
 
-def work_ms(meta: Mapping[str, Any]) -> dict[str, float]:
+def work_ms(run: Run) -> dict[str, float]:
     """CPU time of a probe's piece of work on every node's CPUs, the median of windows that count.
 
     Parameters
     ----------
-    meta : mapping
-        Of a run. Without ``testbed``, or without what its probes did, nothing is known.
+    run : Run
+        Where its meta say no ``testbed``, or not what its probes did, nothing is known.
     """
-    windows = window_work_ms(meta)
+    windows = window_work_ms(run)
     return {node: median(of.values()) for node, of in windows.items() if of}
 
 
-def window_work_ms(meta: Mapping[str, Any]) -> dict[str, dict[int, float]]:
+def window_work_ms(run: Run) -> dict[str, dict[int, float]]:
     """CPU time of a probe's piece of work on every node's CPUs, by window of those that count."""
-    pressure, testbed = meta.get("pressure"), meta.get("testbed")
+    pressure, testbed = run.meta.get("pressure"), run.meta.get("testbed")
     if not isinstance(pressure, Mapping) or not isinstance(testbed, Mapping):
         return {}
     excluded = set(pressure.get("excluded", ()))
-    warmup = int(meta.get("problem", {}).get("warmup_windows", 0))
+    warmup = run.problem.warmup_windows
     rows = {
         int(row["window"]): row["work_ms"]
         for row in pressure.get("windows", ())
@@ -109,18 +110,17 @@ def window_work_ms(meta: Mapping[str, Any]) -> dict[str, dict[int, float]]:
     return found
 
 
-def at_speed_of(meta: Mapping[str, Any], problem: Problem, usual: Usual) -> Problem:
+def at_speed_of(run: Run, problem: Problem, usual: Usual) -> Problem:
     """Return a cell on CPUs as fast as they were in a run.
 
     Parameters
     ----------
-    meta : mapping
-        Of the run.
+    run : Run
     problem : Problem
     usual : Usual
         Where the cell was measured.
     """
-    return slowed(problem, usual.factors(work_ms(meta)), usual.sensitivity)
+    return slowed(problem, usual.factors(work_ms(run)), usual.sensitivity)
 
 
 def slowed(
