@@ -94,6 +94,16 @@ class NodeDisturbance:
         _check_time(self)
         FOREIGN_THREADS.check("stress_threads", self.stress_threads)
 
+    @property
+    def end_s(self) -> float:
+        """When it ends, seconds; infinite where it lasts."""
+        return self.at_s + self.for_s
+
+    @property
+    def place(self) -> str:
+        """The node's name."""
+        return self.node
+
 
 @dataclass(frozen=True, slots=True)
 class LinkDisturbance:
@@ -122,9 +132,19 @@ class LinkDisturbance:
         RATE_MBPS.check("rate_mbps", self.rate_mbps)
 
     @property
+    def end_s(self) -> float:
+        """When it ends, seconds; infinite where it lasts."""
+        return self.at_s + self.for_s
+
+    @property
     def link(self) -> str:
         """``R1->E``."""
         return f"{self.source}->{self.target}"
+
+    @property
+    def place(self) -> str:
+        """The link's name."""
+        return self.link
 
     @property
     def layers(self) -> int:

@@ -77,7 +77,7 @@ def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed
     for item in scenario:
         if item.episodes is not None:
             continue
-        begin_s, end_s = item.at_s, item.at_s + item.for_s
+        begin_s, end_s = item.at_s, item.end_s
         if isinstance(item, NodeDisturbance):
             who, what = item.node, _on_node(item)
             kind = f"{fabric.nodes[who].tier} {'outage' if item.down else 'stress'}"

@@ -342,7 +342,7 @@ def _as_played(
             raise RunError(f"{told} was played, which scenario {name!r} does not have")
         left.remove(match)
         # What was on to the end of a run had no end within it.
-        for_s = math.inf if item.at_s + item.for_s >= end_s else item.for_s
+        for_s = math.inf if item.end_s >= end_s else item.for_s
         found.append(replace(match[0], at_s=item.at_s, for_s=for_s))
     return tuple(found)
 

@@ -99,9 +99,8 @@ def _on(
     """Return what is done to a node or link, with the share of the time in which it is."""
     found: list[tuple[Disturbance, float]] = []
     for item in items:
-        target = item.node if isinstance(item, NodeDisturbance) else item.link
-        overlap = min(item.at_s + item.for_s, end_s) - max(item.at_s, begin_s)
-        if target != name or item.down or overlap <= 0:
+        overlap = min(item.end_s, end_s) - max(item.at_s, begin_s)
+        if item.place != name or item.down or overlap <= 0:
             continue
         share = overlap / (end_s - begin_s)
         if item.episodes is not None:

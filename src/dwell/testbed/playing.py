@@ -128,7 +128,7 @@ def crowded(run: Run, problem: Problem) -> list[str]:
         One a node whose utilisation was 97 % or more in most of the windows without a disturbance.
     """
     span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
-    played = [(item.at_s, item.at_s + item.for_s) for item in run.played or ()]
+    played = [(item.at_s, item.end_s) for item in run.played or ()]
     released_s = dict(zip(run.cycles["cycle"], run.cycles["release_ns"] / 1e9, strict=True))
     windows = run.windows.filter(~run.windows["warmup"])
     # Of a window whose first cycle is missing from the record nothing is said.

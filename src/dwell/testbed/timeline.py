@@ -67,14 +67,14 @@ def changes_of(problem: Problem, scenario: str, *, outages: bool = False) -> lis
     found = []
     for item in items:
         found.append(Change(item.at_s, item, begins=True))
-        if item.at_s + item.for_s < math.inf:
-            found.append(Change(item.at_s + item.for_s, item, begins=False))
+        if item.end_s < math.inf:
+            found.append(Change(item.end_s, item, begins=False))
     # What ends makes room for what begins at the same time.
     return sorted(found, key=lambda change: (change.at_s, change.begins))
 
 
 def _unplayable(item: Disturbance, *, outages: bool) -> Iterable[str]:
-    where = item.node if isinstance(item, NodeDisturbance) else item.link
+    where = item.place
     if item.down and not outages:
         yield f"{where} cannot be taken down here"
     if item.episodes is not None:
@@ -87,7 +87,7 @@ def _two_delays(items: Sequence[LinkDisturbance]) -> Iterable[str]:
     """Faults of links that would get two extra delays at a time: they have one process for them."""
     delays = [item for item in items if item.add_delay_ms is not None]
     for one, other in combinations(delays, 2):
-        apart = one.at_s + one.for_s <= other.at_s or other.at_s + other.for_s <= one.at_s
+        apart = one.end_s <= other.at_s or other.end_s <= one.at_s
         if one.link == other.link and not apart:
             yield f"{one.link} gets two extra delays at the same time; give it their sum"
 
@@ -103,10 +103,7 @@ def threads_on(node: str, on: Iterable[Disturbance]) -> int:
 
 def is_down(where: str, on: Iterable[Disturbance]) -> bool:
     """Whether a node, or a link (``R1->E``), is down while some disturbances are on."""
-    return any(
-        item.down and where == (item.node if isinstance(item, NodeDisturbance) else item.link)
-        for item in on
-    )
+    return any(item.down and item.place == where for item in on)
 
 
 def link_with(link: Link, on: Iterable[Disturbance]) -> Conditions:

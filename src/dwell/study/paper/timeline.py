@@ -150,7 +150,7 @@ def _spans(run: Run, problem: Problem, scenario: str) -> pl.DataFrame:
     rows: dict[tuple[float, float, str], None] = {}
     for item in problem.scenario(scenario):
         if item.episodes is None and item.at_s < edges[-1]:
-            begin, end = np.interp((item.at_s, item.at_s + item.for_s), edges, windows)
+            begin, end = np.interp((item.at_s, item.end_s), edges, windows)
             rows[float(begin), float(end), _named(item)] = None
     schema = {"begin": pl.Float64, "end": pl.Float64, "label": pl.String}
     return pl.DataFrame(list(rows), schema=schema, orient="row")
