@@ -83,3 +83,18 @@ def test_everything_is_pinned_by_hash() -> None:
         assert pins, path
         assert all("--hash=sha256:" in pin for pin in pins), path
         assert "://" not in text, path
+
+
+@pytest.mark.parametrize("folder", ["src", "docs", "examples", "README.md", "CHANGELOG.md"])
+def test_nobody_is_told_to_install_the_strangers_package(folder: str) -> None:
+    """`dwell` on the package index is somebody else's; ours is `dwell-placement`."""
+    suffixes = {".py", ".md", ".yaml", ".ipynb", ".toml"}
+    place = ROOT / folder
+    files = [place] if place.is_file() else [p for p in place.rglob("*") if p.suffix in suffixes]
+    assert files
+    pattern = re.compile(
+        r"(?:pip|uv|pipx|poetry)[a-z ]* (?:install|add) [^\n`]*?\bdwell(?!-placement)\b"
+    )
+    for file in files:
+        found = pattern.search(file.read_text(encoding="utf-8"))
+        assert found is None, f"{file.relative_to(ROOT)}: {found}"

@@ -20,7 +20,11 @@ __all__ = [
     "TraceError",
     "TrustError",
     "UnwritableError",
+    "installing",
 ]
+
+#: Name of the distribution: `dwell` on the package index is somebody else's.
+DISTRIBUTION = "dwell-placement"
 
 
 class DwellError(Exception):
@@ -122,3 +126,8 @@ class LiveError(DwellError, RuntimeError):
 
 class TrustError(DwellError, ValueError):
     """A key, a certificate or a list of them is missing, not valid, or not who it should be."""
+
+
+def installing(extra: str) -> str:
+    """Return the command that installs what an extra brings, for a message that misses it."""
+    return f"pip install '{DISTRIBUTION}[{extra}]'"

@@ -108,7 +108,7 @@ def test_without_the_package_a_cluster_is_out_of_reach(
     monkeypatch.setitem(sys.modules, "distributed", None)
     result = call("study", study, "--dask", "tcp://127.0.0.1:8786")
     assert result.exit_code == 1
-    assert "pip install 'dwell[dask]'" in result.stderr
+    assert "pip install 'dwell-placement[dask]'" in result.stderr
 
 
 def test_many_points_do_not_fill_the_screen(study: Path) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from dwell.cli.live import environment
 from dwell.cli.output import aligned, print_json
-from dwell.errors import Fault, LiveError, ProblemError, TrustError
+from dwell.errors import Fault, LiveError, ProblemError, TrustError, installing
 from dwell.live.cautions import find_cautions
 from dwell.live.security import Security, exposed
 from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
@@ -68,7 +68,7 @@ def check_node(
 def _packages() -> Iterator[Fault]:
     for module, package in PACKAGES.items():
         if importlib.util.find_spec(module) is None:
-            yield Fault("", f"{package} is not installed; pip install 'dwell[live]'")
+            yield Fault("", f"{package} is not installed; {installing('live')}")
 
 
 def _security(

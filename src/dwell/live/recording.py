@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
+from dwell import __version__
 from dwell.control import Controller
 from dwell.errors import RunError, UnwritableError
 from dwell.live.tables import columns_of
@@ -178,7 +179,7 @@ class RunRecorder:
         return journal.folder
 
     def _meta(self) -> dict[str, object]:
-        packages = ("dwell", "numpy", "eclipse-zenoh")
+        packages = ("numpy", "eclipse-zenoh")
         return {
             "kind": "live",
             "cell": self.problem.name,
@@ -186,6 +187,7 @@ class RunRecorder:
             **self.controller.described(),
             "problem": to_document(self.problem),
             "versions": {
+                "dwell": __version__,
                 **{name: importlib.metadata.version(name) for name in packages},
                 "python": platform.python_version(),
             },

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dwell.errors import Fault, LiveError, TrustError
+from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.failures import start_thread
 from dwell.live.transport.protocol import Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
@@ -192,7 +192,7 @@ def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:
     try:
         from dwell.trust.keyring import Keyring
     except ImportError:
-        raise TrustError("keys need cryptography; pip install 'dwell[live]'") from None
+        raise TrustError(f"keys need cryptography; {installing('live')}") from None
     names = {"visitor": ("operator", "observer"), "controller": ("controller",)}
     places = [folder]
     for name in names.get(role.kind, (role.node,)):

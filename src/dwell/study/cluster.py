@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, TypeVar
 
-from dwell.errors import SimulationError
+from dwell.errors import SimulationError, installing
 
 __all__ = ["spread_on_dask"]
 
@@ -80,7 +80,7 @@ def _distributed() -> Any:
     except ImportError:
         raise SimulationError(
             "a Dask cluster needs the package `distributed`, which is not installed; "
-            "pip install 'dwell[dask]'"
+            f"{installing('dask')}"
         ) from None
 
 

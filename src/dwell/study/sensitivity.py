@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.errors import SimulationError
+from dwell.errors import SimulationError, installing
 from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED, Floats
 
 if TYPE_CHECKING:
@@ -310,7 +310,6 @@ def _salib() -> tuple[Callable[..., Floats], Callable[..., Mapping[str, Floats]]
         from SALib.sample import sobol as sampling
     except ImportError as error:
         raise SimulationError(
-            "Sobol indices need SALib, which is not installed; "
-            'install the extra "sobol": pip install "dwell[sobol]"'
+            f"Sobol indices need SALib, which is not installed; {installing('sobol')}"
         ) from error
     return sampling.sample, analysis.analyze

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from dwell.errors import LiveError
+from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
 from dwell.live.transport.expressions import require_expression, require_key
 from dwell.live.transport.lingering import Connections
@@ -161,7 +161,7 @@ class ZenohTransport:
         try:
             import zenoh
         except ImportError:
-            raise LiveError("Zenoh is not installed; pip install 'dwell[live]'") from None
+            raise LiveError(f"Zenoh is not installed; {installing('live')}") from None
         self.entry = entry
         self.settings = settings or ZenohSettings()
         self._zenoh = zenoh
