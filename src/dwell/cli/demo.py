@@ -83,7 +83,9 @@ def find_examples(given: Path | None) -> Path:
     """
     if given is not None:
         return given
-    places = (Path(dwell.__file__).parents[2] / "examples", Path("examples"))
+    package = Path(dwell.__file__).parent
+    # Of a wheel, of a checkout, and here.
+    places = (package / "examples", package.parents[1] / "examples", Path("examples"))
     for place in places:
         if (place / CANONICAL).is_file():
             return place
