@@ -323,6 +323,10 @@ def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
     assert (other.exit_code, other.stdout) == (2, "")
     assert "kept holds another run" in other.stderr
     assert dwell.open_run("kept").meta["seed"] == 1
+    # So many windows can not be drawn: the folder is looked at before.
+    more = call("run", cell, "--windows", str(1 << 32), "--out", "kept")
+    assert (more.exit_code, more.stdout) == (2, "")
+    assert "kept holds another run" in more.stderr
     assert call(*words, "--seed", "2", "--force").exit_code == 0
     assert dwell.open_run("kept").meta["seed"] == 2
 

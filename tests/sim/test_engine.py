@@ -37,9 +37,10 @@ from dwell.model import (
     Uniform,
 )
 from dwell.model.document import to_document
+from dwell.model.problem import ESTIMATORS, POLICIES
 from dwell.policies import DTP
 from dwell.record import Run
-from dwell.sim import Phase
+from dwell.sim import Phase, describe
 from tests.generate import MS, make_problem
 
 ROOT = Path(__file__).parents[2]
@@ -404,6 +405,25 @@ def test_the_callers_policy_is_not_changed(canonical: Problem) -> None:
         )
         assert_same(first, second)
         assert pickle.dumps(policy) == before
+
+
+@pytest.mark.parametrize("guard", [False, True])
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_run_is_described_before_it_is_played(
+    canonical: Problem, estimator: str, guard: bool
+) -> None:
+    for policy in (*POLICIES, "SO"):
+        asked: dict[str, Any] = {
+            "scenario": "edge-cpu-stress",
+            "policy": policy,
+            "estimator": estimator,
+            "seed": 3,
+            "windows": 6,
+            "guard": guard,
+        }
+        assert describe(canonical, **asked) == dwell.simulate(canonical, **asked).meta
+    with pytest.raises(ProblemError, match="did you mean 'edge-cpu-stress'"):
+        describe(canonical, scenario="edge-cpu-stres", seed=1)
 
 
 def test_names_are_decisions(canonical: Problem) -> None:

@@ -14,7 +14,7 @@ from polars.testing import assert_frame_equal
 
 import dwell.sim
 from dwell import draw, simulate, simulate_realisation
-from dwell.errors import SimulationError
+from dwell.errors import MetricError, SimulationError
 from dwell.io.study_paths import with_settings
 from dwell.model import FrozenDict, Problem
 from dwell.study import Contender, Point, Study, StudyResult, compare, run_study
@@ -137,6 +137,15 @@ def test_the_table_has_one_row_a_group(result: StudyResult) -> None:
     assert {"cost", "cost_low", "cost_high", "regret", "seeds"} <= set(table.columns)
     assert table["seeds"].unique().to_list() == [3]
     assert "best_static" not in result.table().columns
+
+
+def test_a_metric_that_no_run_has_gets_the_nearest_name(result: StudyResult) -> None:
+    with pytest.raises(MetricError) as caught:
+        result.table(["cost", "violaton_rate"])
+    hint = "unknown metric 'violaton_rate'; did you mean 'violation_rate'?"
+    assert str(caught.value) == hint
+    with pytest.raises(MetricError, match="unknown metric 'scenario'"):
+        result.table(["scenario"])
 
 
 # ------------------------------------------------------------------------- contenders, judging

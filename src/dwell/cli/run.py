@@ -16,7 +16,8 @@ import dwell
 from dwell.cli.output import print_json, working
 from dwell.errors import RunError
 from dwell.model import Problem
-from dwell.record import Run, require_free
+from dwell.record import require_free
+from dwell.sim import describe
 from dwell.study.summary import STRETCHES, Row, summarise
 
 __all__ = ["Request", "run_cell"]
@@ -56,6 +57,8 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
     policy = request.policy or problem.controller.policy
     folder = request.out or _folder(problem, request.scenario, policy, request.seed)
     require_free(folder)
+    if not request.force:
+        _require_same(folder, problem, request, policy)
     with working(f"simulating {request.windows} windows"):
         result = dwell.simulate(
             problem,
@@ -67,8 +70,6 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
             jobs=request.jobs,
             guard=request.guard,
         )
-        if not request.force:
-            _require_same(folder, result)
         try:
             result.save(folder)
         except RunError as error:
@@ -91,15 +92,22 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
     return True
 
 
-def _require_same(folder: Path, result: Run) -> None:
+def _require_same(folder: Path, problem: Problem, request: Request, policy: str) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
-
-    def record(run: Run) -> dict[str, Any]:
-        return {key: value for key, value in run.meta.items() if key != "versions"}
-
-    if record(dwell.open_run(folder)) != json.loads(json.dumps(record(result))):
+    asked = describe(
+        problem,
+        scenario=request.scenario,
+        policy=policy,
+        estimator=request.estimator,
+        seed=request.seed,
+        windows=request.windows,
+        guard=request.guard,
+    )
+    kept = dwell.open_run(folder).meta
+    # Versions of software make no other run.
+    if {**kept, "versions": None} != {**json.loads(json.dumps(asked)), "versions": None}:
         raise RunError(
             f"{folder} holds another run; choose another folder, or say --force to replace it"
         )

@@ -1,7 +1,7 @@
 """The simulator: scenario to realisation, realisation through the kernels, kernels to a Run."""
 
 from dwell.sim.drawing import draw
-from dwell.sim.engine import simulate, simulate_realisation
+from dwell.sim.engine import describe, simulate, simulate_realisation
 from dwell.sim.realisation import LinkSegment, NodeChange, Phase, Realisation
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "NodeChange",
     "Phase",
     "Realisation",
+    "describe",
     "draw",
     "simulate",
     "simulate_realisation",

@@ -37,7 +37,7 @@ from dwell.sim.guard import Watch
 from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.tables import Played, make_tables
 
-__all__ = ["play", "simulate", "simulate_realisation"]
+__all__ = ["describe", "play", "simulate", "simulate_realisation"]
 
 
 def simulate(
@@ -111,8 +111,44 @@ def simulate_realisation(
         # Until the first probe is sent a shadow changes nothing, so that this repeats what has been
         # played. Drawing shadows for every run that may want probes would cost all runs more.
         played = _play(problem, realisation, policy, estimator, jobs, guard, by_window, shadow=True)
-    meta = _meta(problem, realisation, played.controller, guard=guard)
+    meta = _meta(
+        problem,
+        played.controller,
+        scenario=realisation.scenario,
+        seed=realisation.seed,
+        windows=realisation.windows,
+        guard=guard,
+    )
     return Run(meta, make_tables(played, jobs=jobs))
+
+
+def describe(
+    problem: Problem,
+    *,
+    scenario: str = "baseline",
+    policy: MinimalPolicy | str | None = None,
+    estimator: Estimator | str | None = None,
+    seed: int,
+    windows: int = 300,
+    guard: bool = False,
+) -> dict[str, Any]:
+    """Return what the record of a run would say of it, without playing it (see `simulate`).
+
+    Returns
+    -------
+    dict
+        ``meta`` of the Run that `simulate` makes of these arguments, ready for JSON, provided that
+        a policy that is an object keeps nothing of what it saw in its `repr` and parameters.
+
+    Raises
+    ------
+    ProblemError, PolicyError
+        If something named is unknown.
+    """
+    problem.scenario(scenario)
+    controller = Controller(problem, policy, estimator)
+    meta = _meta(problem, controller, scenario=scenario, seed=seed, windows=windows, guard=guard)
+    return Run(meta, {}).meta
 
 
 class _ProbesWantedError(Exception):
@@ -444,16 +480,22 @@ def _evidence(
 
 
 def _meta(
-    problem: Problem, realisation: Realisation, controller: Controller, *, guard: bool
+    problem: Problem,
+    controller: Controller,
+    *,
+    scenario: str,
+    seed: int | None,
+    windows: int,
+    guard: bool,
 ) -> dict[str, Any]:
     return {
         "kind": "simulated",
         "cell": problem.name,
-        "scenario": realisation.scenario,
+        "scenario": scenario,
         **controller.described(),
         "guard": guard and controller.guarded,
-        "seed": realisation.seed,
-        "windows": realisation.windows,
+        "seed": seed,
+        "windows": windows,
         "problem": to_document(problem),
         "versions": {
             "dwell": __version__,

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.errors import MetricError, PolicyError, SimulationError
+from dwell.errors import PolicyError, SimulationError
 from dwell.model import Problem
 from dwell.model.meaning import nearest
 from dwell.study.engine import Progress, play_in_memory
 from dwell.study.intervals import Interval
-from dwell.study.over_seeds import difference_of, interval_of, over_seeds
+from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
 from dwell.study.player import Example, Player
 from dwell.study.software import versions
 from dwell.study.study import Contender, Point, Study
@@ -90,16 +90,14 @@ class Comparison:
         """
         import polars as pl
 
-        metrics = [name for name, kind in self.runs.schema.items() if kind.is_numeric()]
         for kind, what, name, known in (
             (SimulationError, "scenario", scenario, self.scenarios),
             (PolicyError, "policy", policy, self.policies),
-            (MetricError, "metric", column, metrics),
         ):
             if name not in known:
                 raise kind(f"unknown {what} {name!r}; {nearest(name, known)}")
         mine = self.runs.filter((pl.col("scenario") == scenario) & (pl.col("policy") == policy))
-        return mine[column].cast(pl.Float64).to_numpy()
+        return metric_values(mine, column)
 
     def interval(self, scenario: str, policy: str, column: str) -> Interval:
         """Return a column over seeds: its mean, or its median where it may be infinite."""

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.errors import MetricError
+from dwell.model.meaning import nearest
 from dwell.study.intervals import (
     Interval,
     mean_interval,
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 
     from dwell.study.summary import Row
 
-__all__ = ["difference_of", "interval_of", "over_seeds"]
+__all__ = ["difference_of", "interval_of", "metric_values", "over_seeds"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -50,6 +52,11 @@ def over_seeds(
         The keys, ``seeds``, and for each column x: ``x``, ``x_low`` and ``x_high`` (see
         `interval_of`; null ends where one seed gives none); with the violation rate, also its
         one-sided limits ``violation_rate_at_least`` and ``violation_rate_at_most``.
+
+    Raises
+    ------
+    MetricError
+        If a column is none of `runs`, or holds text.
     """
     import polars as pl
 
@@ -60,10 +67,10 @@ def over_seeds(
     for labels, mine in runs.group_by(keys, maintain_order=True):
         row: Row = {**dict(zip(keys, labels, strict=True)), "seeds": mine.height}
         for column in columns:
-            over = interval_of(column)(_floats(mine, column))
+            over = interval_of(column)(metric_values(mine, column))
             row |= {column: over.value, f"{column}_low": over.low, f"{column}_high": over.high}
         if "violation_rate" in columns:
-            at_least, at_most = share_limits(_floats(mine, "violation_rate"))
+            at_least, at_most = share_limits(metric_values(mine, "violation_rate"))
             row["violation_rate_at_least"] = at_least
             row["violation_rate_at_most"] = at_most
         rows.append(row)
@@ -91,7 +98,28 @@ def _not_negative(values: Floats) -> Interval:
     return Interval(mean, max(low, 0.0), high)
 
 
-def _floats(runs: pl.DataFrame, column: str) -> Floats:
+def metric_values(runs: pl.DataFrame, metric: str) -> Floats:
+    """Return a column of runs, one number a run.
+
+    Parameters
+    ----------
+    runs : DataFrame
+        One row a run.
+    metric : str
+        Name of a column that holds no text.
+
+    Returns
+    -------
+    ndarray, shape (runs,)
+
+    Raises
+    ------
+    MetricError
+        If there is no such column; with the nearest name.
+    """
     import polars as pl
 
-    return runs[column].cast(pl.Float64).to_numpy()
+    known = [name for name, kind in runs.schema.items() if kind != pl.String]
+    if metric not in known:
+        raise MetricError(f"unknown metric {metric!r}; {nearest(metric, known)}")
+    return runs[metric].cast(pl.Float64).to_numpy()
