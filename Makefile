@@ -87,7 +87,7 @@ sbom: $(VENV)/tools/release ## Write what is pinned to dist/sbom.json (CycloneDX
 
 lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to the newest)
 	$(COMPILE) --group uv --output-file requirements/uv.txt
-	$(COMPILE) pyproject.toml --output-file requirements/runtime.txt
+	$(COMPILE) pyproject.toml --extra report --extra sim --output-file requirements/runtime.txt
 	$(COMPILE) pyproject.toml --all-extras --group dev --constraint requirements/runtime.txt \
 		--output-file requirements/dev.txt
 	$(COMPILE) --group fuzz --output-file requirements/fuzz.txt

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from dwell.errors import FURTHER, OPTIONAL, missing_package
 
 ROOT = Path(__file__).parents[1]
 DISTRIBUTIONS = packages_distributions()
@@ -66,7 +69,48 @@ def project() -> dict[str, Any]:
 def test_the_package_uses_what_it_declares_and_no_more(project: dict[str, Any]) -> None:
     declared = project["project"]["dependencies"]
     extras = project["project"]["optional-dependencies"].values()
-    assert imported("src") == named([*declared, *(one for extra in extras for one in extra)])
+    groups = [project["dependency-groups"][name] for name in ("demo", "sobol")]
+    all_of_them = [*declared, *(one for extra in [*extras, *groups] for one in extra)]
+    assert imported("src") == named(all_of_them) - {project["project"]["name"]}
+
+
+def test_every_extra_names_the_packages_that_messages_say_it_brings(
+    project: dict[str, Any],
+) -> None:
+    extras = project["project"]["optional-dependencies"]
+    for module, (_, extra) in OPTIONAL.items():
+        distributions = {plain(name) for name in DISTRIBUTIONS[module]}
+        assert distributions & named(extras[extra]), (module, extra)
+
+
+@pytest.mark.parametrize("module", sorted({*OPTIONAL, *FURTHER}))
+def test_what_is_missing_is_named_with_the_line_that_installs_it(module: str) -> None:
+    error = missing_package(ModuleNotFoundError("", name=f"{module}.part"))
+    assert error is not None
+    assert "pip install" in str(error)
+
+
+def test_a_module_that_is_not_ours_is_no_missing_package() -> None:
+    assert missing_package(ModuleNotFoundError("", name="stages")) is None
+
+
+@pytest.mark.parametrize("module", ["numba", "polars"])
+def test_a_simulation_without_a_package_says_how_to_get_it(module: str, tmp_path: Path) -> None:
+    """In a process of its own: this one has imported them."""
+    script = (
+        f"import sys; sys.modules[{module!r}] = None; from dwell.cli import main; "
+        "main(['run', 'canonical.yaml', '--windows', '2', '--out', sys.argv[1]])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "out"],
+        cwd=ROOT / "examples",
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith("is not installed; pip install 'dwell-placement[sim]'\n")
+    assert "Traceback" not in done.stderr
 
 
 def test_the_tests_use_what_their_group_has(project: dict[str, Any]) -> None:

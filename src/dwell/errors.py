@@ -21,10 +21,26 @@ __all__ = [
     "TrustError",
     "UnwritableError",
     "installing",
+    "missing_package",
 ]
 
 #: Name of the distribution: `dwell` on the package index is somebody else's.
 DISTRIBUTION = "dwell-placement"
+
+#: By module: the package that brings it, and the extra that brings the package.
+OPTIONAL = {
+    "cryptography": ("cryptography", "live"),
+    "distributed": ("distributed", "dask"),
+    "matplotlib": ("Matplotlib", "report"),
+    "msgspec": ("msgspec", "live"),
+    "numba": ("Numba", "sim"),
+    "polars": ("Polars", "sim"),
+    "psutil": ("psutil", "live"),
+    "scipy": ("SciPy", "sim"),
+    "zenoh": ("Zenoh", "live"),
+}
+#: By module: a package that no extra brings.
+FURTHER = {"SALib": "salib", "cv2": "opencv-python-headless", "osqp": "osqp"}
 
 
 class DwellError(Exception):
@@ -131,3 +147,24 @@ class TrustError(DwellError, ValueError):
 def installing(extra: str) -> str:
     """Return the command that installs what an extra brings, for a message that misses it."""
     return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def missing_package(error: ModuleNotFoundError) -> DwellError | None:
+    """Return the error that names an optional package and the command that installs it.
+
+    Parameters
+    ----------
+    error : ModuleNotFoundError
+
+    Returns
+    -------
+    DwellError or None
+        None where the module is none of an optional package of Dwell's.
+    """
+    module = (error.name or "").partition(".")[0]
+    if module in OPTIONAL:
+        package, extra = OPTIONAL[module]
+        return DwellError(f"{package} is not installed; {installing(extra)}")
+    if module in FURTHER:
+        return DwellError(f"{module} is not installed; pip install {FURTHER[module]}")
+    return None

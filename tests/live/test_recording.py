@@ -57,6 +57,15 @@ for _ in range(400):
     world.run(100)
 """
 
+#: The same, where Polars is not installed; it ends its run.
+WITHOUT_POLARS = (
+    "import sys\nsys.modules['polars'] = None\n"
+    + RECORDER.replace("lambda line: None", "lambda line: print(line, file=sys.stderr)").replace(
+        "range(400)", "range(100)"
+    )
+    + "cell._recorder.finish()\n"
+)
+
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 
@@ -295,3 +304,19 @@ def test_damage_is_found_by_its_checksum_and_told(killed: tuple[Path, int], tmp_
     found = json.loads(CliRunner().invoke(app, words).stdout)
     assert found["recovered"]["damaged_places"] == 1
     assert len(found["lost"]) >= 2
+
+
+def test_without_polars_a_run_stays_a_journal_that_is_read_elsewhere(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_POLARS, tmp_path],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("stays a journal") == 1
+    assert "pip install 'dwell-placement[sim]'" in done.stderr
+    (folder,) = tmp_path.iterdir()
+    assert [path.name for path in folder.iterdir()] == [JOURNAL]
+    run = open_run(folder)
+    assert run.windows.height == len(done.stdout.split()) > 0

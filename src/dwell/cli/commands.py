@@ -22,6 +22,7 @@ from dwell.errors import (
     ProfileError,
     RunError,
     TrustError,
+    missing_package,
 )
 
 __all__ = ["app"]
@@ -51,6 +52,12 @@ class Commands(TyperGroup):
             located = isinstance(error, ProblemError) and error.source is not None
             typer.echo(str(error) if located else f"error: {error}", err=True)
             raise typer.Exit(WRONG if isinstance(error, MISTAKES) else FAILED) from None
+        except ModuleNotFoundError as error:
+            missing = missing_package(error)
+            if missing is None:
+                raise
+            typer.echo(f"error: {missing}", err=True)
+            raise typer.Exit(FAILED) from None
         except BrokenPipeError:
             raise
         except OSError as error:

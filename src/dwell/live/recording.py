@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dwell import __version__
 from dwell.control import Controller
-from dwell.errors import RunError, UnwritableError
+from dwell.errors import RunError, UnwritableError, installing
 from dwell.live.tables import columns_of
 from dwell.live.windows import Resume, Rows
 from dwell.model import Problem
@@ -176,6 +176,14 @@ class RunRecorder:
             seal_run(journal.folder)
         except RunError as error:
             self._say(f"error: {error}; what there is stays in its journal")
+        except ModuleNotFoundError as error:
+            if error.name != "polars":
+                raise
+            self._say(
+                f"{journal.folder}: stays a journal, for Polars is not installed here; with "
+                f"{installing('sim')}, this writes its tables: python -c "
+                '"import sys; from dwell.record import seal_run; seal_run(sys.argv[1])" FOLDER'
+            )
         return journal.folder
 
     def _meta(self) -> dict[str, object]:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.errors import SimulationError, installing
+from dwell.errors import SimulationError
 from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED, Floats
 
 if TYPE_CHECKING:
@@ -304,12 +304,12 @@ def _problem(parameters: Sequence[Parameter]) -> dict[str, object]:
 
 
 def _salib() -> tuple[Callable[..., Floats], Callable[..., Mapping[str, Floats]]]:
-    """Return SALib's sampler and estimator; it is an extra."""
+    """Return SALib's sampler and estimator; no extra brings it."""
     try:
         from SALib.analyze import sobol as analysis
         from SALib.sample import sobol as sampling
     except ImportError as error:
         raise SimulationError(
-            f"Sobol indices need SALib, which is not installed; {installing('sobol')}"
+            "Sobol indices need SALib, which is not installed; pip install salib"
         ) from error
     return sampling.sample, analysis.analyze
