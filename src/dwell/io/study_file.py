@@ -22,7 +22,8 @@ from dwell.io.study_paths import SETTINGS, put, steps_of
 from dwell.io.wording import as_read
 from dwell.model import Problem
 from dwell.model.meaning import LONGEST_NAME, NAME, nearest
-from dwell.model.problem import ESTIMATORS, POLICIES
+from dwell.model.problem import ESTIMATORS
+from dwell.policies.registry import names as policy_names
 
 if TYPE_CHECKING:
     from dwell.io.study_entries import StudyEntry
@@ -376,7 +377,7 @@ class _Reading:
     def _check_names(self, policy: DeclaredPolicy, problem: Problem) -> None:
         """Check that the names that a policy gives are known."""
         path = f"policies.{policy.name}"
-        known = [*POLICIES, *problem.candidates]
+        known = [*policy_names(), *problem.candidates]
         if policy.policy not in known:
             hint = nearest(policy.policy, known)
             shown = f"unknown policy {policy.policy!r}; {hint}"

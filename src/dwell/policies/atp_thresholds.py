@@ -17,7 +17,7 @@ sides are over a threshold it moves to and fro, held back by the dwell alone.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from dwell.cost import TierUtilisation
 from dwell.errors import PolicyError
@@ -125,6 +125,38 @@ class ATPThresholds:
         check_parameter("robot", self.robot, THRESHOLD)
         check_parameter("edge", self.edge, THRESHOLD)
         self._incumbent = Incumbent(self.candidates, self.initial)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make a policy that toggles one task: the heaviest, of pairs with the initial candidate.
+
+        Raises
+        ------
+        PolicyError
+            If no two candidates differ in exactly one task.
+        """
+        pairs = find_pairs(problem.candidates, problem.objective.tiers)
+
+        def robot_time_ms(pair: Pair) -> float:
+            task = problem.pipeline.tasks[pair.task]
+            on_robot = task.on[problem.candidates[pair.local][pair.task]]
+            scale = 1.0 if task.scale is None else problem.pipeline.scales[task.scale].expectation
+            return on_robot.exec_ms.expectation * scale
+
+        # The heaviest stage is the one worth offloading; max() keeps the first of equals.
+        pair = max(
+            pairs,
+            key=lambda pair: (problem.initial in pair[:2], robot_time_ms(pair)),
+            default=None,
+        )
+        return cls(
+            candidates=problem.candidates,
+            initial=problem.initial,
+            objective=problem.objective,
+            local=pair.local if pair else None,
+            offload=pair.offload if pair else None,
+            min_dwell=problem.controller.min_dwell,
+        )
 
     def __repr__(self) -> str:
         return (

@@ -23,6 +23,7 @@ advantage, there are fewer than A / threshold migrations.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Self
 
 from dwell.model.bounds import CUSUM_MEMORY, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
@@ -83,6 +84,16 @@ class Cusum:
         self._pricing = Pricing(self.candidates, objective)
         self._incumbent = Incumbent(self.candidates, self.initial)
         self._sums = dict.fromkeys(self.candidates, 0.0)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        return cls(
+            candidates=problem.candidates,
+            initial=problem.initial,
+            objective=problem.objective,
+            slack=problem.controller.min_improvement,
+        )
 
     def __repr__(self) -> str:
         return (

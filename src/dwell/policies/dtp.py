@@ -23,6 +23,7 @@ bounds on migrations do not hold then.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Self
 
 from dwell.cost import excess
 from dwell.errors import MetricError
@@ -86,6 +87,18 @@ class DTP:
         self.escape = escape
         self._pricing = Pricing(self.candidates, objective)
         self._incumbent = Incumbent(self.candidates, self.initial)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        return cls(
+            candidates=problem.candidates,
+            initial=problem.initial,
+            objective=problem.objective,
+            min_dwell=problem.controller.min_dwell,
+            min_improvement=problem.controller.min_improvement,
+            escape=problem.controller.escape,
+        )
 
     def __repr__(self) -> str:
         return (

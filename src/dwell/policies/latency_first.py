@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Self
 
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
@@ -47,6 +48,15 @@ class LatencyFirst:
         self.objective = objective
         self._pricing = None if objective is None else Pricing(self.candidates, objective)
         self._incumbent = Incumbent(self.candidates, self.initial)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        return cls(
+            candidates=problem.candidates,
+            initial=problem.initial,
+            objective=problem.objective,
+        )
 
     def __repr__(self) -> str:
         return f"LatencyFirst(initial={self.initial!r})"

@@ -1,25 +1,112 @@
-"""Policies by the names that a cell file and the command line use."""
+"""Policies by the names that a cell file and the command line use.
+
+Each policy of ours is declared here, and nowhere else by name. The declarations load without the
+classes: these are imported when a policy is made. Another package adds a policy by an entry point
+of the group ``dwell.policies``; its class is imported only when that policy is asked for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import PolicyError
 from dwell.model.meaning import nearest_of
-from dwell.model.problem import Problem
-from dwell.policies.atp import ATP
-from dwell.policies.atp_thresholds import ATPThresholds, Pair, find_pairs
-from dwell.policies.cusum import Cusum
-from dwell.policies.dtp import DTP
-from dwell.policies.latency_first import LatencyFirst
-from dwell.policies.protocol import Policy
-from dwell.policies.static import Static
-from dwell.policies.work_function import WorkFunction
 
-__all__ = ["REGISTRY", "by_name"]
+if TYPE_CHECKING:
+    from dwell.model.problem import Problem
+    from dwell.policies.protocol import Policy
 
-Toggled = TypeVar("Toggled", bound=ATPThresholds)
+__all__ = ["GROUP", "REGISTRY", "PolicyEntry", "by_name", "estimates", "name_of_class", "names"]
+
+#: Group of the entry points by which other packages add policies.
+GROUP = "dwell.policies"
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyEntry:
+    """A policy of ours.
+
+    Parameters
+    ----------
+    path : str
+        ``module:Class``; the class has a ``from_problem``.
+    label : str
+        The name in tables and figures.
+    colour : str
+        Of its lines: ``#rrggbb``, the same on light and dark pages, or ``ink`` or ``muted``, which
+        a page gives values to.
+    sentence : str
+        What it does, for the legend of a report; empty where it is a variant of another policy.
+    variant_of : str
+        The policy whose label, colour and sentence it shares; empty where it has its own.
+    estimates : bool
+        Whether the policy reads the estimates of candidates that do not run.
+    """
+
+    path: str
+    label: str
+    colour: str
+    sentence: str = ""
+    variant_of: str = ""
+    estimates: bool = True
+
+
+#: The policies of ours by name, in the order in which messages list them.
+REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
+    {
+        "dtp": PolicyEntry(
+            "dwell.policies.dtp:DTP",
+            "DTP",
+            "ink",
+            "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
+            "once the dwell time is over and the improvement large enough.",
+        ),
+        "atp": PolicyEntry(
+            "dwell.policies.atp:ATP",
+            "ATP",
+            "#e69f00",
+            "ATP moves one task to the edge and back, where a threshold on L95 or utilisation is "
+            "exceeded and the other side costs less latency, utilisation and switching.",
+        ),
+        "atp-thresholds": PolicyEntry(
+            "dwell.policies.atp_thresholds:ATPThresholds",
+            "ATP",
+            "#e69f00",
+            variant_of="atp",
+            estimates=False,
+        ),
+        "latency-first": PolicyEntry(
+            "dwell.policies.latency_first:LatencyFirst",
+            "Latency-first",
+            "#56b4e9",
+            "Latency-first takes the placement with the lowest estimated L95, always.",
+        ),
+        "work-function": PolicyEntry(
+            "dwell.policies.work_function:WorkFunction",
+            "Work-function",
+            "muted",
+            "Work-function follows the optimum in hindsight over all windows so far, one "
+            "window late.",
+        ),
+        "cusum": PolicyEntry(
+            "dwell.policies.cusum:Cusum",
+            "CUSUM",
+            "#b8a800",
+            "CUSUM adds up what another placement would have saved, window after window, and "
+            "moves once that is enough; it has no dwell time.",
+        ),
+    }
+)
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all policies: ours, then those of installed packages by name."""
+    return (*REGISTRY, *sorted(_installed()))
 
 
 def by_name(name: str, problem: Problem) -> Policy:
@@ -34,89 +121,56 @@ def by_name(name: str, problem: Problem) -> Policy:
     Raises
     ------
     PolicyError
-        If there is none of that name (the message lists the known ones), or the problem has no
-        candidates that the policy could work with.
+        If there is none of that name (the message lists the known ones), the problem has no
+        candidates that the policy could work with, or the package that declares the policy cannot
+        be imported.
     """
     if name in REGISTRY:
-        return REGISTRY[name](problem)
+        module, _, attribute = REGISTRY[name].path.partition(":")
+        return _made(getattr(import_module(module), attribute), problem)
     if name in problem.candidates:
-        return Static(candidates=problem.candidates, initial=name, objective=problem.objective)
-    known = [*REGISTRY, *problem.candidates]
+        static = import_module("dwell.policies.static").Static
+        return cast(
+            "Policy",
+            static(candidates=problem.candidates, initial=name, objective=problem.objective),
+        )
+    installed = _installed()
+    if name in installed:
+        return _made(_loaded(installed[name]), problem)
+    known = [*names(), *problem.candidates]
     raise PolicyError(f"unknown policy {name!r}; {nearest_of(name, known, 'policies')}")
 
 
-def _dtp(problem: Problem) -> DTP:
-    return DTP(
-        candidates=problem.candidates,
-        initial=problem.initial,
-        objective=problem.objective,
-        min_dwell=problem.controller.min_dwell,
-        min_improvement=problem.controller.min_improvement,
-        escape=problem.controller.escape,
-    )
+def estimates(name: str) -> bool:
+    """Return whether a policy reads estimates; one that is not of ours is taken to do so."""
+    return name not in REGISTRY or REGISTRY[name].estimates
 
 
-def _toggled(kind: type[Toggled], problem: Problem) -> Toggled:
-    """Make a policy that toggles one task: the heaviest, of pairs with the initial candidate."""
-    pairs = find_pairs(problem.candidates, problem.objective.tiers)
-
-    def robot_time_ms(pair: Pair) -> float:
-        task = problem.pipeline.tasks[pair.task]
-        on_robot = task.on[problem.candidates[pair.local][pair.task]]
-        scale = 1.0 if task.scale is None else problem.pipeline.scales[task.scale].expectation
-        return on_robot.exec_ms.expectation * scale
-
-    # The heaviest stage is the one worth offloading; max() keeps the first of equals.
-    pair = max(
-        pairs,
-        key=lambda pair: (problem.initial in pair[:2], robot_time_ms(pair)),
-        default=None,
-    )
-    return kind(
-        candidates=problem.candidates,
-        initial=problem.initial,
-        objective=problem.objective,
-        local=pair.local if pair else None,
-        offload=pair.offload if pair else None,
-        min_dwell=problem.controller.min_dwell,
-    )
+def name_of_class(kind: str) -> str | None:
+    """Return the name of the policy of ours whose class is called ``kind``; None where none is."""
+    for name, entry in REGISTRY.items():
+        if entry.path.partition(":")[2] == kind:
+            return name
+    return None
 
 
-def _atp(problem: Problem) -> ATP:
-    return _toggled(ATP, problem)
+def _installed() -> dict[str, EntryPoint]:
+    """Return the policies of other packages; none takes a name of ours."""
+    return {one.name: one for one in entry_points(group=GROUP) if one.name not in REGISTRY}
 
 
-def _atp_thresholds(problem: Problem) -> ATPThresholds:
-    return _toggled(ATPThresholds, problem)
+def _loaded(entry: EntryPoint) -> Any:
+    try:
+        return entry.load()
+    except Exception as error:
+        package = entry.dist.name if entry.dist is not None else "an unnamed package"
+        raise PolicyError(
+            f"policy {entry.name!r} of the package {package} ({entry.value}) cannot be imported: "
+            f"{type(error).__name__}: {error}"
+        ) from error
 
 
-def _latency_first(problem: Problem) -> LatencyFirst:
-    return LatencyFirst(
-        candidates=problem.candidates, initial=problem.initial, objective=problem.objective
-    )
-
-
-def _work_function(problem: Problem) -> WorkFunction:
-    return WorkFunction(
-        candidates=problem.candidates, initial=problem.initial, objective=problem.objective
-    )
-
-
-def _cusum(problem: Problem) -> Cusum:
-    return Cusum(
-        candidates=problem.candidates,
-        initial=problem.initial,
-        objective=problem.objective,
-        slack=problem.controller.min_improvement,
-    )
-
-
-#: Makers by name; the same names as ``dwell.model.problem.POLICIES``.
-REGISTRY: dict[str, Callable[[Problem], Policy]] = {
-    "dtp": _dtp,
-    "atp": _atp,
-    "atp-thresholds": _atp_thresholds,
-    "latency-first": _latency_first,
-    "work-function": _work_function,
-    "cusum": _cusum,
-}
+def _made(kind: Any, problem: Problem) -> Policy:
+    """Make a policy by its class's ``from_problem``, else without arguments."""
+    make = getattr(kind, "from_problem", None)
+    return cast("Policy", kind() if make is None else make(problem))

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from operator import add
+from typing import Self
 
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
@@ -97,6 +98,15 @@ class WorkFunction:
         )
         self._incumbent = Incumbent(self.candidates, self.initial)
         self._work = self._distances[self._index[self.initial]]
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        return cls(
+            candidates=problem.candidates,
+            initial=problem.initial,
+            objective=problem.objective,
+        )
 
     def __repr__(self) -> str:
         return f"WorkFunction(initial={self.initial!r})"

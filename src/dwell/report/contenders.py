@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dwell.model import Problem
+from dwell.policies.registry import REGISTRY
 from dwell.report.method import placements
 from dwell.report.palette import Palette, contended
 from dwell.report.wording import OURS, shown_contender
@@ -13,15 +14,7 @@ __all__ = ["POLICIES", "describe_contenders", "palette_of"]
 
 #: By the family of the policy.
 POLICIES = {
-    "dtp": "DTP is the paper's Algorithm 1: it moves to the placement with the lowest estimated J "
-    "once the dwell time is over and the improvement large enough.",
-    "atp": "ATP moves one task to the edge and back, where a threshold on L95 or utilisation is "
-    "exceeded and the other side costs less latency, utilisation and switching.",
-    "latency-first": "Latency-first takes the placement with the lowest estimated L95, always.",
-    "work-function": "Work-function follows the optimum in hindsight over all windows so far, one "
-    "window late.",
-    "cusum": "CUSUM adds up what another placement would have saved, window after window, and "
-    "moves once that is enough; it has no dwell time.",
+    **{name: one.sentence for name, one in REGISTRY.items() if not one.variant_of},
     "clairvoyant": "Clairvoyant is no policy but a reference: it knows what every placement, run "
     "alone, costs in every window to come, and plays the cheapest sequence.",
     "best static": "Best static is no policy either: of the placements that never move, the one "

@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
+from dwell.policies.registry import REGISTRY
+
 __all__ = [
     "BELIEFS",
     "FAMILIES",
@@ -53,11 +55,11 @@ DASHES: tuple[Dashes, ...] = (SOLID, DASHED, DOTTED, (0, (5, 1.5, 1.2, 1.5)), (0
 
 #: Hues of the policies that move, from the back of the placements'.
 FAMILIES = {
-    "dtp": INK,
-    "atp": "#e69f00",
-    "latency-first": "#56b4e9",
-    "work-function": MUTED,
-    "cusum": "#b8a800",
+    **{
+        name: {"ink": INK, "muted": MUTED}.get(one.colour, one.colour)
+        for name, one in REGISTRY.items()
+        if not one.variant_of
+    },
     "clairvoyant": MUTED,
     "best static": MUTED,
 }

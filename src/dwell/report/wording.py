@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from dwell.policies.registry import REGISTRY
 from dwell.report.palette import contended
 from dwell.study import Interval
 
@@ -27,11 +28,7 @@ __all__ = [
 
 #: By the family of the policy.
 NAMES = {
-    "dtp": "DTP",
-    "atp": "ATP",
-    "latency-first": "Latency-first",
-    "work-function": "Work-function",
-    "cusum": "CUSUM",
+    **{name: one.label for name, one in REGISTRY.items() if not one.variant_of},
     "clairvoyant": "Clairvoyant",
     "best static": "Best static",
 }

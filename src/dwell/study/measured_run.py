@@ -20,7 +20,7 @@ from dwell.estimators.registry import name_in_run
 from dwell.model import Placement, Problem
 from dwell.model.document import disturbance_document, to_document
 from dwell.model.scenario import Disturbance, Scenario
-from dwell.policies.registry import by_name
+from dwell.policies.registry import by_name, name_of_class
 from dwell.study.predicting import Asked
 from dwell.testbed.speeds import Usual, at_speed_of
 
@@ -33,15 +33,6 @@ __all__ = ["MeasuredRun", "excluded_windows", "read_measured"]
 
 Document: TypeAlias = Mapping[str, Any]
 
-#: Policies by the name of their class, which is what a run's record says.
-POLICIES = {
-    "DTP": "dtp",
-    "ATP": "atp",
-    "ATPThresholds": "atp-thresholds",
-    "LatencyFirst": "latency-first",
-    "WorkFunction": "work-function",
-    "Cusum": "cusum",
-}
 NODE_FIELDS = ("tier", "cores", "scheduler", "accelerators", "quota")
 
 
@@ -276,7 +267,7 @@ def _policy(run: Run, theirs: Document, own: Document, problem: Problem) -> tupl
         found = re.search(r"initial='([^']+)'", told)
         name = found.group(1) if found else run.problem.controller.policy
     else:
-        name = POLICIES.get(head, told)
+        name = name_of_class(head) or told
     problem = _with_candidates(problem, run.problem)
     policy = by_name(name, problem)
     if name in problem.candidates:

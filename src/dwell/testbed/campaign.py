@@ -21,7 +21,7 @@ from dwell.io.sources import digest_of
 from dwell.io.study_paths import with_settings
 from dwell.model import Problem
 from dwell.model.document import to_document
-from dwell.policies.registry import REGISTRY, by_name
+from dwell.policies.registry import by_name, estimates, names
 from dwell.testbed.trace_names import rename_traces
 
 __all__ = [
@@ -36,8 +36,6 @@ __all__ = [
 ]
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
-#: Policies that estimate nothing: with the profile no shadow jobs load their nodes.
-BLIND = ("atp-thresholds",)
 #: Folder of a campaign with the trace files of its cell.
 TRACES = "traces"
 #: Parts of this package that a measurement depends on.
@@ -216,10 +214,11 @@ def entrant(problem: Problem, name: str) -> Entrant:
         If it is neither a policy nor a candidate of the cell.
     """
     policy, plus, estimator = name.partition("+")
-    if policy not in REGISTRY and policy not in problem.candidates:
+    if policy not in names() and policy not in problem.candidates:
         by_name(policy, problem)
     if not plus:
-        blind = policy in BLIND or policy in problem.candidates
+        # With the profile no shadow jobs load the nodes.
+        blind = not estimates(policy) or policy in problem.candidates
         estimator = "profile" if blind else problem.controller.estimator
     known = Entrant(name, policy, estimator)
     try:
