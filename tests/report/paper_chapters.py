@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from dwell.study.paper.chapter import Chapter, Figure, Panel, Table
+from dwell.study.chapter import Chapter, Figure, Panel, Table
 
 __all__ = ["ASKED", "POLICIES", "SCENARIOS", "every_kind", "figures", "main_table", "one_of"]
 

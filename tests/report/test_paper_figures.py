@@ -21,7 +21,7 @@ from dwell.report.look import Look
 from dwell.report.palette import INK, MUTED, RAMP
 from dwell.report.panels import Place, Scale, folded, legend_lines, parted, scale_of
 from dwell.report.svg import drawn, in_page, pdf_file, svg_file
-from dwell.study.paper.chapter import Figure, FigureKind, Panel
+from dwell.study.chapter import Figure, FigureKind, Panel
 from tests.report.paper_chapters import STATICS, every_kind, figures, one_of
 from tests.study.cell import make_problem
 

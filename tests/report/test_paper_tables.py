@@ -12,7 +12,7 @@ import pytest
 from dwell.report import chapter_tables
 from dwell.report.look import Look
 from dwell.report.wording import OURS
-from dwell.study.paper.chapter import Table
+from dwell.study.chapter import Table
 from tests.report.pages import Page
 from tests.report.paper_chapters import POLICIES, SCENARIOS, every_kind, main_table
 from tests.study.cell import make_problem

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dwell.report.units import labelled, measure_of, write, write_over_seeds
 from dwell.study import Interval
-from dwell.study.paper.chapter import Unit
+from dwell.study.chapter import Unit
 
 UNITS: tuple[Unit, ...] = ("count", "number", "percent", "change", "ms", "cost", "p")
 

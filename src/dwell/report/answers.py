@@ -7,7 +7,7 @@ from html import escape
 
 from dwell.report.look import Look
 from dwell.report.page import Cell, marked, table
-from dwell.study.paper.chapter import Answer, Chapter
+from dwell.study.chapter import Answer, Chapter
 
 __all__ = ["answers", "beginning"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from dwell.report.scales import is_wide
 from dwell.study import AIM
 from dwell.study.campaign import Measured
-from dwell.study.paper.chapter import Figure, Table, Unit
+from dwell.study.chapter import Figure, Table, Unit
 
 if TYPE_CHECKING:
     import polars as pl

@@ -23,7 +23,7 @@ from dwell.report.svg import inline
 from dwell.report.wording import listed, percent, shown_contender, shown_scenario, write_number
 from dwell.study.campaign import Measured
 from dwell.study.campaign_questions import is_steady, main_table, needed_pairs, questions
-from dwell.study.paper.chapter import Chapter, Figure
+from dwell.study.chapter import Chapter, Figure
 
 __all__ = ["campaign_html", "counted_windows", "limits_of"]
 

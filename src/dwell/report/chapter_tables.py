@@ -16,7 +16,7 @@ from dwell.report.panels import floats
 from dwell.report.units import labelled, measure_of, write, write_over_seeds
 from dwell.report.wording import OURS, SYMBOL, Measure, Written
 from dwell.study import Interval
-from dwell.study.paper.chapter import Figure, Table, Unit
+from dwell.study.chapter import Figure, Table, Unit
 
 if TYPE_CHECKING:
     import polars as pl

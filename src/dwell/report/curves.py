@@ -32,7 +32,7 @@ from dwell.report.scales import set_log_ticks
 from dwell.report.svg import new_figure
 from dwell.report.units import labelled
 from dwell.study import AIM
-from dwell.study.paper.chapter import Figure
+from dwell.study.chapter import Figure
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -14,14 +14,14 @@ from dwell.report.panels import floats
 from dwell.report.svg import new_figure
 from dwell.report.window_timeline import draw_timeline
 from dwell.report.winner_map import draw_map
-from dwell.study.paper.chapter import Figure
+from dwell.study.chapter import Figure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from matplotlib.figure import Figure as Canvas
 
-    from dwell.study.paper.chapter import FigureKind
+    from dwell.study.chapter import FigureKind
 
 __all__ = ["draw"]
 

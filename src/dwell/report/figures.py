@@ -15,7 +15,7 @@ from dwell.report.svg import inline, new_figure
 from dwell.report.timeline import run_timeline
 from dwell.report.wording import Measure, shown_contender, shown_scenario
 from dwell.study import Comparison
-from dwell.study.paper.chapter import Figure, Unit
+from dwell.study.chapter import Figure, Unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dwell.model import Problem
 from dwell.report.palette import BELIEFS, FAMILIES, VARIANTS, Palette, Style, contended, ramp_styles
 from dwell.report.wording import shown_contender, shown_in_sentence, shown_scenario
-from dwell.study.paper.chapter import Chapter, Figure
+from dwell.study.chapter import Chapter, Figure
 
 if TYPE_CHECKING:
     import polars as pl

@@ -25,7 +25,7 @@ from dwell.report.panels import (
     spread,
 )
 from dwell.report.svg import new_figure
-from dwell.study.paper.chapter import Figure
+from dwell.study.chapter import Figure
 
 if TYPE_CHECKING:
     import polars as pl

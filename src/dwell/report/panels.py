@@ -16,7 +16,7 @@ from dwell.report.palette import INK
 from dwell.report.scales import set_log_ticks
 from dwell.report.svg import WIDTH
 from dwell.report.units import factor, labelled
-from dwell.study.paper.chapter import Figure, Panel
+from dwell.study.chapter import Figure, Panel
 
 if TYPE_CHECKING:
     import polars as pl

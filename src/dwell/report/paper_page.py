@@ -21,7 +21,7 @@ from dwell.report.page import (
     section,
 )
 from dwell.report.wording import listed, shown_scenario, write_number
-from dwell.study.paper.chapter import Chapter
+from dwell.study.chapter import Chapter
 from dwell.study.paper.running import HELD_OUT, Scale
 
 __all__ = ["Made", "paper_html"]

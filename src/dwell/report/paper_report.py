@@ -16,7 +16,7 @@ from dwell.report.drawing import draw
 from dwell.report.look import Look
 from dwell.report.paper_page import Made, paper_html
 from dwell.report.svg import drawn, in_page, pdf_file, svg_file
-from dwell.study.paper.chapter import Chapter, Figure
+from dwell.study.chapter import Chapter, Figure
 from dwell.study.paper.running import Scale
 from dwell.study.software import versions
 

@@ -13,7 +13,7 @@ from dwell.report.drawing import draw
 from dwell.report.look import Look
 from dwell.report.palette import INK, MUTED, PAPER, PARTS
 from dwell.report.svg import inline, new_figure
-from dwell.study.paper.chapter import Figure
+from dwell.study.chapter import Figure
 from dwell.study.summary import latency_ms
 
 if TYPE_CHECKING:

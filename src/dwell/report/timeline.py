@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.study import AIM
-from dwell.study.paper.chapter import Figure, Panel
+from dwell.study.chapter import Figure, Panel
 
 if TYPE_CHECKING:
     import polars as pl

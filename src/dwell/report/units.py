@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from dwell.report.wording import Measure, Written, write_interval, write_number
 from dwell.study import Interval
-from dwell.study.paper.chapter import Unit
+from dwell.study.chapter import Unit
 
 __all__ = ["factor", "labelled", "measure_of", "write", "write_over_seeds"]
 

@@ -29,7 +29,7 @@ from dwell.report.panels import (
 from dwell.report.scales import is_wide
 from dwell.report.svg import new_figure
 from dwell.report.units import labelled
-from dwell.study.paper.chapter import Figure
+from dwell.study.chapter import Figure
 
 if TYPE_CHECKING:
     import polars as pl

@@ -12,7 +12,7 @@ from dwell.report.palette import INK, MUTED, PAPER
 from dwell.report.panels import Place, floats, keys, legend, legend_lines, parted
 from dwell.report.svg import WIDTH, new_figure
 from dwell.report.units import labelled, write
-from dwell.study.paper.chapter import Figure
+from dwell.study.chapter import Figure
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

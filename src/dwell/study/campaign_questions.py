@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
 from dwell.model.scenario import is_always_on
 from dwell.study.campaign import Measured
+from dwell.study.chapter import Answer, Chapter, Outcome, Table
 from dwell.study.family import Family
 from dwell.study.intervals import CONFIDENCE
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paired import PairedDifference
-from dwell.study.paper.chapter import Answer, Chapter, Outcome, Table
 from dwell.study.paper.concurrent import HEADINGS, MAIN
 from dwell.study.paper.contrasts import Contrast, contrast
 from dwell.study.paper.differences import centre, difference_table, shown_as

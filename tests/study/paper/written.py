@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dwell.study.chapter import Answer, Outcome
 from dwell.study.paper import Chapter
-from dwell.study.paper.chapter import Answer, Outcome
 
 __all__ = ["check_written", "told"]
 

@@ -31,12 +31,12 @@ from typing import TYPE_CHECKING
 from dwell.cost import hamming
 from dwell.io.study_paths import with_settings
 from dwell.model import FrozenDict, Placement, Problem
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.engine import StudyResult
 from dwell.study.family import Comparative, Family
 from dwell.study.intervals import mean_interval
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import RANDOM, present
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families

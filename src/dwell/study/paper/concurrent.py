@@ -16,10 +16,10 @@ import numpy as np
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.policies import ATP
 from dwell.policies.atp_thresholds import Pair, find_pairs
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import centre, difference_table, families, shown_as

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from dwell.study.chapter import Table, Unit
 from dwell.study.family import Family
-from dwell.study.paper.chapter import Table, Unit
 from dwell.study.paper.contrasts import Contrast, family_of
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem, Scenario, Uniform
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import difference_of, over_seeds
 from dwell.study.paper.cell import dynamic_scenarios, steady_scenarios
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import centre, difference_table, families, shown_as

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from dwell.model import Problem
 from dwell.policies import Cusum
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.hindsight import Hindsight
@@ -27,7 +28,6 @@ from dwell.study.paper.aims import (
     parts_of,
 )
 from dwell.study.paper.cell import dynamic_scenarios, steady_scenarios
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast, family_of, interval
 from dwell.study.paper.differences import centre, difference_table

@@ -15,11 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from dwell.model import FrozenDict, Problem
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.engine import StudyResult
 from dwell.study.family import Comparative, Family
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import by_length
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import difference_table, families

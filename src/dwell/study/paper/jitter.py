@@ -30,13 +30,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import Constant, FrozenDict, Link, LogNormal, Problem, Process, Uniform
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.comparison import AIM
 from dwell.study.engine import PARAMETER, StudyResult
 from dwell.study.family import Comparative, Family
 from dwell.study.intervals import Interval, median_interval, under
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import present
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast, family_of, values
 from dwell.study.paper.differences import centre, difference_table, families

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias, cast
 
 from dwell.errors import DwellError, SimulationError
 from dwell.model import Problem
-from dwell.study.paper.chapter import Chapter
+from dwell.study.chapter import Chapter
 from dwell.study.paper.running import Runner, Scale, Show
 
 if TYPE_CHECKING:

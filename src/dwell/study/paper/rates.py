@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dwell.study.chapter import Figure, Table
 from dwell.study.comparison import AIM
-from dwell.study.paper.chapter import Figure, Table
 from dwell.study.paper.sentences import number
 
 __all__ = ["rates_figure"]

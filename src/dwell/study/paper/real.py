@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from dwell.errors import SimulationError
 from dwell.model import Problem
+from dwell.study.chapter import Answer, Chapter, Outcome, Table, Unit
 from dwell.study.comparison import AIM
 from dwell.study.demo import longest_run
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import under
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paper.chapter import Answer, Chapter, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families, shown_as

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Normal, Placement, Problem, Scenario
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.comparison import AIM
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paired import paired_difference
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import centre, difference_table, families, shown_as

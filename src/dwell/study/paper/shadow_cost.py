@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dwell.model import Problem
+from dwell.study.chapter import Table, Unit
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import mean_interval
-from dwell.study.paper.chapter import Table, Unit
 from dwell.study.paper.contrasts import Contrast, family_of, values
 from dwell.study.paper.running import Scale
 from dwell.study.paper.sentences import counted, number, percent, points

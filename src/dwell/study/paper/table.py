@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from dwell.model import FrozenDict, Problem
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.comparison import AIM, Comparison
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import Verdict, under
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paper.cell import steady_scenarios
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.paper.contenders import PAPERS_DTP, believing, statics
 from dwell.study.paper.contrasts import Contrast, values
 from dwell.study.paper.differences import difference_table, families, shown_as

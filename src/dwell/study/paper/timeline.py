@@ -8,9 +8,9 @@ import numpy as np
 
 from dwell.cost import hamming, price, tier_nodes
 from dwell.model import Disturbance, NodeDisturbance, Problem, QoS
+from dwell.study.chapter import Figure, Panel
 from dwell.study.comparison import AIM
 from dwell.study.hindsight import Hindsight
-from dwell.study.paper.chapter import Figure, Panel
 from dwell.study.reference import play_alone
 from dwell.study.study import Contender
 

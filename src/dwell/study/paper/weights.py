@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import FrozenDict, Problem
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table
 from dwell.study.engine import StudyResult
 from dwell.study.family import Family
 from dwell.study.intervals import Interval
 from dwell.study.paper.cell import RANDOM, STEADY, TIMETABLE, by_length
-from dwell.study.paper.chapter import Answer, Chapter, Figure, Outcome, Table
 from dwell.study.paper.contenders import believing
 from dwell.study.paper.contrasts import Contrast
 from dwell.study.paper.differences import difference_table, families

@@ -1,4 +1,4 @@
-"""Chapter: one question of a study, its design, what came out, and a verdict in a sentence.
+"""Tables, figures and chapters of a page: the data, and which of its columns means what.
 
 Chapters hold data and what is to be seen in them, never a drawing: `dwell.report` draws.
 """
