@@ -19,12 +19,12 @@ import yaml
 
 import dwell
 from benchmarks.timing import ROOT
-from dwell.demo.stageplay import Stageplay, on_this_machine
+from dwell.demo.loopback import Loopback, on_this_machine
 from dwell.errors import LiveError
 from dwell.live.messages import Header, decode
+from dwell.live.operator_client import OperatorClient
 from dwell.live.stage import Message
 from dwell.live.transport.protocol import Sample
-from dwell.live.visiting import Visitor
 from dwell.live.worker import Worker
 from dwell.model import Problem
 
@@ -179,7 +179,7 @@ class Applied:
     at_ns: int
 
 
-class LightCell(Stageplay):
+class LightCell(Loopback):
     """A cell of `document` on this machine; a context manager that waits until it runs."""
 
     def __init__(self, found: dict[str, Any], folder: Path, *, links: bool = False) -> None:
@@ -193,7 +193,7 @@ class LightCell(Stageplay):
         """Start it; returns when its commands are applied."""
         super().__enter__()
         try:
-            self.visitor = Visitor(self.problem)
+            self.visitor = OperatorClient(self.problem)
             self.wait_for("commands", lambda: len(self.applied()) > 10)
             self.wait_for("the controller", lambda: self.said().get("placement") is not None)
         except BaseException:

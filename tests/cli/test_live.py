@@ -24,8 +24,8 @@ import dwell
 from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.cli.commands import app
 from dwell.errors import LiveError
-from dwell.live.leash import OWNER
-from dwell.live.visiting import Visitor
+from dwell.live.operator_client import OperatorClient
+from dwell.live.parent_death import OWNER
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 
@@ -144,7 +144,7 @@ class RealCell:
         """Ask for the status until something holds."""
         limit_s = time.monotonic() + PATIENCE_S
         found: dict[str, Any] = {}
-        with Visitor(self.problem, self.environment) as visitor:
+        with OperatorClient(self.problem, self.environment) as visitor:
             while time.monotonic() < limit_s:
                 try:
                     found = visitor.ask("status", patience_s=1.0)
@@ -398,7 +398,7 @@ def test_a_run_folder_that_is_full_from_the_start_keeps_nobody_from_deciding(
 def test_nobody_answers(tmp_path: Path) -> None:
     made = RealCell(tmp_path)
     words = "no controller of cell 'light-follower' answers; is `dwell controller` running on E?"
-    with Visitor(made.problem) as visitor, pytest.raises(LiveError, match=re.escape(words)):
+    with OperatorClient(made.problem) as visitor, pytest.raises(LiveError, match=re.escape(words)):
         visitor.ask("status", patience_s=0.2)
     code, stdout, stderr = invoke("live", "status", "--json", "--cell", made.file)
     found = json.loads(stdout)
@@ -409,7 +409,7 @@ def test_nobody_answers(tmp_path: Path) -> None:
 
 def test_asking_for_the_status_imports_nothing_heavy() -> None:
     code = (
-        "import sys, dwell, dwell.cli.commands, dwell.live.visiting\n"
+        "import sys, dwell, dwell.cli.commands, dwell.live.operator_client\n"
         f"dwell.load({str(EXAMPLE / 'cell.yaml')!r})\n"
         "print(*{'numpy', 'numba', 'polars', 'psutil', 'rich'} & set(sys.modules))"
     )

@@ -10,7 +10,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from dwell.report.wording import shown_policy
+from dwell.report.formatting import shown_policy
 from tests.cli.test_commands import SMALL, call
 from tests.cli.test_process import interrupt_at_first_sign
 

@@ -10,7 +10,7 @@ import yaml
 
 import dwell
 from dwell.chaos.faults import Fault, How
-from dwell.chaos.ground import Ground, environment_of
+from dwell.chaos.harness import Harness, environment_of
 from dwell.chaos.light_cell import (
     GUARD_CYCLES,
     HOMES,
@@ -24,7 +24,7 @@ from dwell.chaos.stage import OnLoopback
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond
 from dwell.chaos.strike import strike as strike_by
-from dwell.demo.stageplay import on_this_machine
+from dwell.demo.loopback import on_this_machine
 
 __all__ = [
     "FAULTS",
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 
-class RealCell(Ground):
+class RealCell(Harness):
     """A cell on this machine whose controller wants to be at one place."""
 
     def __init__(self, home: str, folder: Path, *, standby: bool = True, seed: int = 0) -> None:

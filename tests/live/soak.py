@@ -27,10 +27,10 @@ import psutil
 import yaml
 
 import dwell
-from dwell.chaos.ground import Ground, environment_of
+from dwell.chaos.harness import Harness, environment_of
 from dwell.chaos.light_cell import PERIOD_MS, document, exec_ms
 from dwell.chaos.stage import OnLoopback
-from dwell.demo.stageplay import on_this_machine
+from dwell.demo.loopback import on_this_machine
 from dwell.errors import DwellError, LiveError
 
 HOME = "SO"
@@ -131,14 +131,14 @@ def table(rows: Rows, minutes: float) -> tuple[list[str], bool]:
 # ---------------------------------------------------------------------------------- cell
 
 
-def _cell(folder: Path) -> Ground:
+def _cell(folder: Path) -> Harness:
     folder.mkdir(parents=True)
     written = folder / "written.yaml"
     cell = document(HOME) | {"name": "soak", "window_cycles": WINDOW_CYCLES}
     written.write_text(yaml.safe_dump(cell))
     problem = on_this_machine(dwell.load(written))
     environment = environment_of(folder, exec_ms(HOME))
-    return Ground(OnLoopback(problem, folder, seed=1, environment=environment), home=HOME)
+    return Harness(OnLoopback(problem, folder, seed=1, environment=environment), home=HOME)
 
 
 def look(processes: Mapping[str, psutil.Process]) -> dict[str, dict[str, float]]:
@@ -195,7 +195,7 @@ def soak(path: Path, minutes: float, every_s: float) -> None:
             print(f"{share:.2%} of the cycles were actuated in {lasted_s / 60:.1f} minutes")
 
 
-def _actuated(cell: Ground) -> int:
+def _actuated(cell: Harness) -> int:
     cell.actuations.look()
     return len(cell.actuations.applied)
 

@@ -12,7 +12,7 @@ import pytest
 import dwell
 from dwell.live.cell import Cell
 from dwell.live.continuity import COMPANY, RESERVED, Continuity, Retreat
-from dwell.live.hearing import Hearing
+from dwell.live.failure_detector import FailureDetector
 from dwell.live.intervals import Intervals
 from dwell.live.keys import Keys
 from dwell.live.loads import NodeLoad
@@ -341,7 +341,7 @@ def beat(life: int, sent_ns: int, *heard: Heard) -> Beat:
 @pytest.mark.parametrize("false", [(1, HUGE * S), (HUGE, 0), (HUGE, HUGE * S)])
 @pytest.mark.parametrize("direct", [True, False])
 def test_one_false_beat_silences_nobody_for_ever(false: tuple[int, int], direct: bool) -> None:
-    hearing = Hearing("controller@R1", S)
+    hearing = FailureDetector("controller@R1", S)
     hearing.hear(beat(1, 0), 0)
     hearing.hear(beat(*false), 1, direct=direct)
     for n in range(1, 10):
@@ -353,7 +353,7 @@ def test_one_false_beat_silences_nobody_for_ever(false: tuple[int, int], direct:
 
 
 def test_late_beats_over_the_detour_are_no_news() -> None:
-    hearing = Hearing("controller@R1", S)
+    hearing = FailureDetector("controller@R1", S)
     hearing.hear(beat(1, 100), 100)
     assert not any(hearing.hear(beat(1, n), 100 + n, direct=False) for n in range(50))
 

@@ -12,9 +12,9 @@ import pytest
 
 import dwell
 from dwell.live.agent import Agent
-from dwell.live.bundle import LONGEST_MESSAGE, MOST_MESSAGES, Bundle
 from dwell.live.loads import MOST_PROCESSES, ProcessLoads
 from dwell.live.messages import MAX_CONTROL_BYTES, Carried, Stamped, decode, encode
+from dwell.live.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBatch
 from dwell.live.role import MAX_COMPLAINTS
 from dwell.live.transport.protocol import Sample
 from dwell.live.worker import MAX_JOINS
@@ -150,7 +150,7 @@ def test_a_bundle_is_always_short_enough_to_be_read() -> None:
     draw = random.Random(1)
     for newest in (False, True):
         for length in (0, 100, LONGEST_MESSAGE):
-            bundle = Bundle(newest=newest)
+            bundle = RelayBatch(newest=newest)
             for number in range(3 * MOST_MESSAGES):
                 key = f"done/{number % draw.choice([3, 5_000])}"
                 bundle.add(key, bytes(draw.randint(0, length)))
@@ -158,7 +158,7 @@ def test_a_bundle_is_always_short_enough_to_be_read() -> None:
             assert 0 < len(kept) <= MOST_MESSAGES
             assert 2 * len(encode(Carried(tuple(kept)))) <= MAX_CONTROL_BYTES
             assert not bundle.taken()
-    bundle = Bundle(newest=True)
+    bundle = RelayBatch(newest=True)
     for payload in (b"old", b"new"):
         assert bundle.add("beat/E/a", payload)
     assert bundle.taken() == [("beat/E/a", b"new")]

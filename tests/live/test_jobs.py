@@ -16,7 +16,7 @@ import dwell
 from dwell.live import payloads
 from dwell.live.agent import CpuCount
 from dwell.live.cell import Cell
-from dwell.live.group import ControlGroup, Counts, own_group
+from dwell.live.control_group import ControlGroup, Counts, own_group
 from dwell.live.loads import ProcessLoads
 from dwell.live.recording import RunRecorder
 from dwell.live.sink import Sink

@@ -15,7 +15,7 @@ from dwell.estimators import Profile
 from dwell.io.faults import Faults
 from dwell.io.yaml_text import read_yaml
 from dwell.model import Problem, Trace
-from dwell.model.meaning import NAME
+from dwell.model.semantics import NAME
 from dwell.profiling.cell_yaml import cell_yaml
 from dwell.profiling.measure import Settings, measure_task
 from dwell.profiling.profile_file import Measurement, write_profile

@@ -8,8 +8,8 @@ import pytest
 
 from dwell.errors import RunError
 from dwell.report import run_html
-from dwell.report.facts import Facts
 from dwell.report.phase_rows import phase_rows
+from dwell.report.run_header import RunHeader
 from dwell.report.timeline import GUARD, MIGRATIONS, run_timeline
 from dwell.report.tracking import Tracking
 from tests.report.live_runs import PERIOD_NS, live_run
@@ -29,7 +29,7 @@ def test_it_says_what_was_played_and_what_every_phase_showed() -> None:
     page = Page(run_html(run))
     assert "Live, scenario “Demo”" in page.text
     assert "edge stress (E: 2 busy threads)" in page.text
-    calm, stress, after = phase_rows(run, Facts.of(run))
+    calm, stress, after = phase_rows(run, RunHeader.of(run))
     assert (calm.name, stress.name, after.name) == ("baseline", "edge stress", "baseline")
     assert (stress.migrations, stress.guard_moves) == (1, 1)
     assert stress.shares == {"SO": 10 / 11, "LOC": 1 / 11}

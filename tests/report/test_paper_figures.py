@@ -17,9 +17,9 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure as Canvas
 
 from dwell.report.drawing import draw
-from dwell.report.look import Look
 from dwell.report.palette import INK, MUTED, RAMP
 from dwell.report.panels import Place, Scale, folded, legend_lines, parted, scale_of
+from dwell.report.style import PageStyle
 from dwell.report.svg import drawn, in_page, pdf_file, svg_file
 from dwell.study.chapter import Figure, FigureKind, Panel
 from tests.report.paper_chapters import STATICS, every_kind, figures, one_of
@@ -31,11 +31,11 @@ SEVEN = ("LOC", "SO", "HYB", "REV", "ALT", "FAR", "OUT")
 
 
 @pytest.fixture(scope="module")
-def look() -> Look:
-    return Look.of(make_problem(), every_kind())
+def look() -> PageStyle:
+    return PageStyle.of(make_problem(), every_kind())
 
 
-def drawing(figure: Figure, look: Look) -> ElementTree.Element:
+def drawing(figure: Figure, look: PageStyle) -> ElementTree.Element:
     """Draw a figure as it stands in a page."""
     return ElementTree.fromstring(in_page(drawn(draw(figure, look), figure.slug), figure.title))
 
@@ -57,14 +57,14 @@ def with_frame(figure: Figure, rows: list[dict[str, object]], **changes: object)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_figure_without_numbers_says_so(kind: FigureKind, look: Look) -> None:
+def test_a_figure_without_numbers_says_so(kind: FigureKind, look: PageStyle) -> None:
     figure = one_of(kind)
     empty = replace(figure, frame=figure.frame.clear())
     assert "Nothing to show" in texts(drawing(empty, look))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_one_point_of_one_series_is_a_figure(kind: FigureKind, look: Look) -> None:
+def test_one_point_of_one_series_is_a_figure(kind: FigureKind, look: PageStyle) -> None:
     figure = one_of(kind)
     one = replace(figure, frame=figure.frame.head(1), spans=None)
     assert "Nothing to show" not in texts(drawing(one, look))
@@ -112,7 +112,7 @@ def rough(kind: FigureKind) -> Figure:
 @pytest.mark.parametrize("kind", KINDS)
 def test_rough_data_makes_a_figure(kind: FigureKind) -> None:
     figure = rough(kind)
-    look = Look.of(make_problem(), [replace(every_kind()[0], figures=(rough("map"), figure))])
+    look = PageStyle.of(make_problem(), [replace(every_kind()[0], figures=(rough("map"), figure))])
     element = drawing(figure, look)
     assert element.get("aria-label") == "Rough & <ready>"
     shown = texts(element)
@@ -122,7 +122,7 @@ def test_rough_data_makes_a_figure(kind: FigureKind) -> None:
 
 
 @pytest.mark.parametrize("kind", ["intervals", "lines", "bars"])
-def test_one_seed_has_no_intervals(kind: FigureKind, look: Look) -> None:
+def test_one_seed_has_no_intervals(kind: FigureKind, look: PageStyle) -> None:
     figure = one_of(kind)
     frame = figure.frame.filter(figure.frame[figure.facet or ""] == "baseline")
     bare = frame.drop("y_low", "y_high")
@@ -134,7 +134,7 @@ def test_one_seed_has_no_intervals(kind: FigureKind, look: Look) -> None:
 # ------------------------------------------------------------------------------ what they show
 
 
-def test_names_with_many_series_have_a_panel_each(look: Look) -> None:
+def test_names_with_many_series_have_a_panel_each(look: PageStyle) -> None:
     figure = next(figure for figure in figures() if figure.slug == "regret")
     canvas = draw(figure, look)
     assert [ax.get_title(loc="left") for ax in canvas.axes] == [
@@ -148,7 +148,7 @@ def test_names_with_many_series_have_a_panel_each(look: Look) -> None:
     assert labels == ["DTP (profile)", "DTP (shadow)", "DTP (scaling)", "DTP (corrected)"]
 
 
-def test_the_level_is_marked_and_named(look: Look) -> None:
+def test_the_level_is_marked_and_named(look: PageStyle) -> None:
     figure = one_of("intervals")
     canvas = draw(figure, look)
     for ax in canvas.axes:
@@ -156,7 +156,7 @@ def test_the_level_is_marked_and_named(look: Look) -> None:
     assert "dashed: 5 %" in texts(drawing(figure, look))
 
 
-def test_nothing_has_an_open_mark_on_a_logarithmic_axis(look: Look) -> None:
+def test_nothing_has_an_open_mark_on_a_logarithmic_axis(look: PageStyle) -> None:
     rows: list[dict[str, object]] = [
         {"policy": name, "y": y} for name, y in zip(STATICS, (0.0, 0.02, 0.9), strict=True)
     ]
@@ -171,7 +171,7 @@ def test_nothing_has_an_open_mark_on_a_logarithmic_axis(look: Look) -> None:
     assert "open marks: less" in texts(drawing(figure, look))
 
 
-def test_shares_of_placements_are_stacked_to_the_whole(look: Look) -> None:
+def test_shares_of_placements_are_stacked_to_the_whole(look: PageStyle) -> None:
     figure = next(figure for figure in figures() if figure.slug == "shares")
     for ax in draw(figure, look).axes:
         bars = [patch for patch in ax.patches if patch.get_width() > 0]  # type: ignore[attr-defined]
@@ -180,7 +180,7 @@ def test_shares_of_placements_are_stacked_to_the_whole(look: Look) -> None:
         assert len({round(bar.get_y(), 6) for bar in bars}) == 6  # type: ignore[attr-defined]
 
 
-def test_measures_are_told_apart_by_their_filling(look: Look) -> None:
+def test_measures_are_told_apart_by_their_filling(look: PageStyle) -> None:
     figure = one_of("bars")
     some = figure.frame.filter(
         (figure.frame["scenario"] == "step") & (figure.frame["output"] == "V_D")
@@ -190,7 +190,7 @@ def test_measures_are_told_apart_by_their_filling(look: Look) -> None:
     assert filled == [1.0, 0.0] * 5
 
 
-def test_bars_begin_at_zero_on_a_linear_axis(look: Look) -> None:
+def test_bars_begin_at_zero_on_a_linear_axis(look: PageStyle) -> None:
     rows: list[dict[str, object]] = [
         {"x": str(i), "part": "a", "y": y} for i, y in enumerate((0.001, 0.002, 9.0))
     ]
@@ -200,7 +200,7 @@ def test_bars_begin_at_zero_on_a_linear_axis(look: Look) -> None:
     assert ax.get_xlim()[0] <= 0
 
 
-def test_a_map_names_its_winners_and_hatches_what_is_marked(look: Look) -> None:
+def test_a_map_names_its_winners_and_hatches_what_is_marked(look: PageStyle) -> None:
     figure = one_of("map")
     one = figure.frame.filter(figure.frame["stress"] == "2 threads on R1")
     (ax,) = draw(replace(figure, frame=one, facet=None), look).axes
@@ -212,7 +212,7 @@ def test_a_map_names_its_winners_and_hatches_what_is_marked(look: Look) -> None:
     assert "wins by nothing" in shown
 
 
-def test_a_distribution_shows_what_is_left(look: Look) -> None:
+def test_a_distribution_shows_what_is_left(look: PageStyle) -> None:
     grid = np.linspace(1, 100, 50)
     frame = pl.DataFrame({"x": grid, "y": grid / 100}).with_columns(policy=pl.lit("LOC"))
     figure = replace(one_of("ecdf"), frame=frame, facet=None)
@@ -223,7 +223,7 @@ def test_a_distribution_shows_what_is_left(look: Look) -> None:
     assert ax.get_yscale() == "log"
 
 
-def test_a_timeline_shows_placements_disturbances_and_levels(look: Look) -> None:
+def test_a_timeline_shows_placements_disturbances_and_levels(look: PageStyle) -> None:
     figure = one_of("timeline")
     canvas = draw(figure, look)
     strip, happened, rates, tails, costs = canvas.axes
@@ -244,7 +244,7 @@ def test_a_timeline_shows_placements_disturbances_and_levels(look: Look) -> None
     assert counted == [int((placed == name).sum()) for name in STATICS]
 
 
-def test_panels_may_have_measures_of_their_own(look: Look) -> None:
+def test_panels_may_have_measures_of_their_own(look: PageStyle) -> None:
     figure = next(figure for figure in figures() if figure.slug == "steps")
     first, second = draw(figure, look).axes
     assert first.get_xlabel() == "change of V_D (points); dashed: no change"
@@ -252,7 +252,7 @@ def test_panels_may_have_measures_of_their_own(look: Look) -> None:
     assert first.get_xlim() != second.get_xlim()
 
 
-def test_panels_of_very_different_size_have_scales_of_their_own(look: Look) -> None:
+def test_panels_of_very_different_size_have_scales_of_their_own(look: PageStyle) -> None:
     rows: list[dict[str, object]] = [
         {"facet": facet, "x": x, "series": "LOC", "y": y * (x + 1)}
         for facet, y in (("small", 1.0), ("large", 100.0))
@@ -267,7 +267,7 @@ def test_panels_of_very_different_size_have_scales_of_their_own(look: Look) -> N
     assert first.get_ylim() == second.get_ylim()
 
 
-def test_a_figure_may_be_parted_twice(look: Look) -> None:
+def test_a_figure_may_be_parted_twice(look: PageStyle) -> None:
     figure = one_of("bars")
     assert figure.facet_row is not None
     grid = parted(figure, look, 5)
@@ -337,7 +337,7 @@ def test_a_scale_knows_what_it_cannot_show() -> None:
 
 
 @pytest.fixture(scope="module")
-def canvas(look: Look) -> Canvas:
+def canvas(look: PageStyle) -> Canvas:
     rows: list[dict[str, object]] = [
         {"x": x, "series": str(x), "y": y}
         for x, y in ((0.001, 0.5), (0.002, 0.7), (0.004, 0.9), (0.008, 1.1))
@@ -372,7 +372,7 @@ def test_a_file_stands_alone_on_white(canvas: Canvas) -> None:
     assert "sans-serif" in data
 
 
-def test_symbols_have_an_index_in_a_pdf_too(look: Look) -> None:
+def test_symbols_have_an_index_in_a_pdf_too(look: PageStyle) -> None:
     rows: list[dict[str, object]] = [{"x": x, "series": "S1", "y": 0.5} for x in ("α_L", "α_V")]
     figure = Figure("f", "t", "bars", pl.DataFrame(rows), "x", "y", "series", y_label="V_D")
     canvas = draw(figure, look)

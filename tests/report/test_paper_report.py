@@ -14,7 +14,7 @@ from polars.testing import assert_frame_equal
 
 from dwell.errors import SimulationError
 from dwell.report import paper_report
-from dwell.report.wording import OURS
+from dwell.report.formatting import OURS
 from dwell.study.chapter import Chapter, Figure, Table
 from dwell.study.paper.running import Scale
 from tests.report.pages import Page

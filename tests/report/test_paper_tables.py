@@ -10,8 +10,8 @@ import polars as pl
 import pytest
 
 from dwell.report import chapter_tables
-from dwell.report.look import Look
-from dwell.report.wording import OURS
+from dwell.report.formatting import OURS
+from dwell.report.style import PageStyle
 from dwell.study.chapter import Table
 from tests.report.pages import Page
 from tests.report.paper_chapters import POLICIES, SCENARIOS, every_kind, main_table
@@ -38,8 +38,8 @@ ROUGH = Table(
 
 
 @pytest.fixture(scope="module")
-def look() -> Look:
-    return Look.of(make_problem(), every_kind())
+def look() -> PageStyle:
+    return PageStyle.of(make_problem(), every_kind())
 
 
 def page(html: str) -> Page:
@@ -49,7 +49,7 @@ def page(html: str) -> Page:
 # --------------------------------------------------------------------------------------- page
 
 
-def test_rows_of_one_scenario_stand_under_its_name(look: Look) -> None:
+def test_rows_of_one_scenario_stand_under_its_name(look: PageStyle) -> None:
     html = chapter_tables.html(main_table(), look, main=True)
     assert html.count('<tr class="group">') == len(SCENARIOS)
     text = page(html).text
@@ -58,7 +58,7 @@ def test_rows_of_one_scenario_stand_under_its_name(look: Look) -> None:
     assert html.count("</tr>") == 1 + len(SCENARIOS) * (1 + len(POLICIES))
 
 
-def test_all_rows_of_a_table_have_as_many_columns(look: Look) -> None:
+def test_all_rows_of_a_table_have_as_many_columns(look: PageStyle) -> None:
     for table in (main_table(), ROUGH):
         html = chapter_tables.html(table, look)
         widths = set()
@@ -68,14 +68,14 @@ def test_all_rows_of_a_table_have_as_many_columns(look: Look) -> None:
         assert len(widths) == 1
 
 
-def test_numbers_have_intervals_and_words_their_colour(look: Look) -> None:
+def test_numbers_have_intervals_and_words_their_colour(look: PageStyle) -> None:
     html = chapter_tables.html(main_table(), look)
     assert re.search(r'<td class="num">[\d.]+</td><td class="err">\[[\d.]+, [\d.]+\]</td>', html)
     assert '<span class="good nowrap">under</span>' in html
     assert '<span class="bad nowrap">over</span>' in html
 
 
-def test_what_is_no_number_is_a_dash(look: Look) -> None:
+def test_what_is_no_number_is_a_dash(look: PageStyle) -> None:
     text = page(chapter_tables.html(ROUGH, look)).text
     assert "–" in text
     assert "∞" in text
@@ -85,14 +85,14 @@ def test_what_is_no_number_is_a_dash(look: Look) -> None:
     assert "What is 5 % & more." in text
 
 
-def test_long_tables_are_folded_unless_they_are_what_a_chapter_is_about(look: Look) -> None:
+def test_long_tables_are_folded_unless_they_are_what_a_chapter_is_about(look: PageStyle) -> None:
     table = main_table()
     assert "<details>" in chapter_tables.html(table, look)
     assert "45 rows" in chapter_tables.html(table, look)
     assert "<details>" not in chapter_tables.html(table, look, main=True)
 
 
-def test_what_shows_atp_says_what_it_is(look: Look) -> None:
+def test_what_shows_atp_says_what_it_is(look: PageStyle) -> None:
     assert OURS in page(chapter_tables.html(main_table(), look)).text
     frame = main_table().frame.filter(pl.col("policy") != "atp")
     without = replace(main_table(), frame=frame)
@@ -100,7 +100,7 @@ def test_what_shows_atp_says_what_it_is(look: Look) -> None:
     assert chapter_tables.noted(replace(main_table(), note=OURS), look).count(OURS) == 1
 
 
-def test_an_empty_table_has_its_head(look: Look) -> None:
+def test_an_empty_table_has_its_head(look: PageStyle) -> None:
     empty = replace(main_table(), frame=main_table().frame.clear())
     html = chapter_tables.html(empty, look)
     assert "policy" in page(html).text
@@ -153,7 +153,7 @@ def check(latex: str) -> list[list[str]]:
     return rows
 
 
-def test_latex_is_whole_whatever_stands_in_it(look: Look) -> None:
+def test_latex_is_whole_whatever_stands_in_it(look: PageStyle) -> None:
     rows = check(chapter_tables.latex(ROUGH, look, "chapter-rough"))
     assert rows[0] == [r"n\_a \& m\%e", r"x (\%)", "p (Holm)", "yes"]
     assert rows[1] == [
@@ -167,7 +167,7 @@ def test_latex_is_whole_whatever_stands_in_it(look: Look) -> None:
     assert len(rows) == 1 + ROUGH.frame.height
 
 
-def test_latex_has_every_number_with_the_ends_of_its_interval(look: Look) -> None:
+def test_latex_has_every_number_with_the_ends_of_its_interval(look: PageStyle) -> None:
     table = main_table()
     latex = chapter_tables.latex(table, look, "table")
     rows = check(latex)
@@ -183,7 +183,7 @@ def test_latex_has_every_number_with_the_ends_of_its_interval(look: Look) -> Non
     assert r"\usepackage{booktabs,graphicx}" in latex
 
 
-def test_every_table_of_the_chapters_is_whole(look: Look) -> None:
+def test_every_table_of_the_chapters_is_whole(look: PageStyle) -> None:
     tables = [table for chapter in every_kind() for table in chapter.tables]
     long = replace(main_table(), frame=pl.concat([main_table().frame] * 3))
     for table in (*tables, long):

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from dwell.errors import LiveError, ProblemError
-from dwell.live.leash import OWNER
+from dwell.live.parent_death import OWNER
 from dwell.model import LinkDisturbance, NodeDisturbance, Normal
 from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inventory
 from dwell.testbed.real_hosts import RealHosts, require_commands

@@ -14,7 +14,7 @@ import pytest
 import dwell
 from dwell.errors import LiveError, TrustError
 from dwell.io import from_document
-from dwell.live.leash import OWNER
+from dwell.live.parent_death import OWNER
 from dwell.live.security import INSECURE, Security
 from dwell.live.wiring import Role
 from dwell.model import Problem

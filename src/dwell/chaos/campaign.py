@@ -17,7 +17,7 @@ import yaml
 import dwell
 from dwell.chaos.disk import may_mount
 from dwell.chaos.faults import Fault, Means, bound_of, faults_of
-from dwell.chaos.ground import STARVING_THREADS, Ground, environment_of
+from dwell.chaos.harness import STARVING_THREADS, Harness, environment_of
 from dwell.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.chaos.observer import Observer
 from dwell.chaos.stage import OnHosts, OnLoopback, Stage
@@ -25,10 +25,10 @@ from dwell.chaos.stages import APPLY
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond, strike
 from dwell.chaos.timeline import Planned, planned
-from dwell.demo.stageplay import on_this_machine
+from dwell.demo.loopback import on_this_machine
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
-from dwell.testbed.bed import Bed
+from dwell.testbed.netns_testbed import NetnsTestbed
 
 __all__ = ["Campaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]
 
@@ -75,7 +75,7 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
     def stage(number: int) -> tuple[Stage, str | None]:
         problem, folder, environment, home = _cell(cell, out, number, quotas=True)
         beside = None if cell is None else cell.parent
-        bed = Bed(
+        bed = NetnsTestbed(
             *(problem, folder),
             name=f"chaos{os.getpid() % 10_000}",
             seed=seed,
@@ -255,7 +255,7 @@ class Campaign:
         """Have one cell go through faults; returns the next fault where the cell is past help."""
         stage, home = self._staging(number)
         with ExitStack() as stack:
-            cell = stack.enter_context(Ground(stage, home=home, disks=self._disks))
+            cell = stack.enter_context(Harness(stage, home=home, disks=self._disks))
             observer = stack.enter_context(Observer(stage, stage.folder / "cell.yaml"))
             while True:
                 one = first or next(plan, None)
@@ -271,7 +271,7 @@ class Campaign:
             self.result.wrong += [f"record: {wrong}" for wrong in _unread(cell)]
         return None
 
-    def _one(self, cell: Ground, observer: Observer, one: Planned, stalls: StallDetector) -> bool:
+    def _one(self, cell: Harness, observer: Observer, one: Planned, stalls: StallDetector) -> bool:
         """Have a fault befall a cell; returns whether the cell can go on."""
         fault = one.fault
         outcome = Outcome(fault.name, self._seed, one.phase)
@@ -302,7 +302,7 @@ class Campaign:
         self._keep(cell, one, outcome)
         return usable
 
-    def _keep(self, cell: Ground, one: Planned, outcome: Outcome) -> None:
+    def _keep(self, cell: Harness, one: Planned, outcome: Outcome) -> None:
         wrong = list(outcome.wrong)
         if outcome.stall_ms >= cell.problem.pipeline.period_ms and outcome.late:
             self.result.stalled += 1
@@ -318,7 +318,7 @@ class Campaign:
         for what in wrong:
             self._say(f"    VIOLATION {what}; again: {again}")
 
-    def _count(self, cell: Ground, observer: Observer) -> None:
+    def _count(self, cell: Harness, observer: Observer) -> None:
         for kind, count in observer.judge.counts.items():
             self.result.heard[kind] = self.result.heard.get(kind, 0) + count
         self.result.actuated += len(cell.actuations.applied)
@@ -339,7 +339,7 @@ def _recovered(observer: Observer, outcome: Outcome, home: str | None) -> None:
         outcome.wrong.append("no cycle was stamped by an order after it has ended")
 
 
-def _settle(cell: Ground, rests_s: float, outcome: Outcome) -> None:
+def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:
     """Wait until a cell is whole and at home, and has been left alone for a while.
 
     The guard may move it meanwhile: the bound is one for a single fault, of a cell at home.
@@ -353,7 +353,7 @@ def _settle(cell: Ground, rests_s: float, outcome: Outcome) -> None:
         outcome.note = f"left alone, it had to be waited for: {missing}"
 
 
-def _old(cell: Ground, observer: Observer, fault: Fault, outcome: Outcome) -> list[str]:
+def _old(cell: Harness, observer: Observer, fault: Fault, outcome: Outcome) -> list[str]:
     """Return commands that were applied too long after their stamp was heard."""
     if fault.how in ("jump", "drift"):
         return []
@@ -370,7 +370,7 @@ def _old(cell: Ground, observer: Observer, fault: Fault, outcome: Outcome) -> li
     ]
 
 
-def _unread(cell: Ground) -> Sequence[str]:
+def _unread(cell: Harness) -> Sequence[str]:
     """Return which runs cannot be read."""
     found = []
     for folder in cell.runs:

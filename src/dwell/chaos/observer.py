@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
-from dwell.chaos.ear import Ear, Records
 from dwell.chaos.invariants import Judge
 from dwell.chaos.stage import Stage
+from dwell.chaos.wiretap import Records, Wiretap
 from dwell.errors import LiveError
 
 __all__ = ["Observer"]
@@ -30,12 +30,12 @@ class Observer:
 
     def __init__(self, stage: Stage, cell: Path) -> None:
         self.judge = Judge(stage.problem)
-        self._ears: list[Ear] = []
+        self._ears: list[Wiretap] = []
         self._records: list[Records] = []
         self._stack = ExitStack()
         for name, prefix in stage.ears().items():
             out = stage.folder / f"heard-{name}"
-            self._ears.append(Ear(cell, stage.heard_at(name), out, prefix))
+            self._ears.append(Wiretap(cell, stage.heard_at(name), out, prefix))
             self._records.append(Records(out))
 
     def __enter__(self) -> Self:

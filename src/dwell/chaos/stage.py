@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from dwell.demo.stageplay import Stageplay
+from dwell.demo.loopback import Loopback
 from dwell.errors import LiveError
-from dwell.live.visiting import Visitor
+from dwell.live.operator_client import OperatorClient
 from dwell.model import Problem
-from dwell.testbed.bed import Bed
+from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.processes import without_keys
 
 __all__ = ["OnHosts", "OnLoopback", "Stage"]
@@ -101,8 +101,8 @@ class OnLoopback:
         self, problem: Problem, folder: Path, *, seed: int, environment: Mapping[str, str]
     ) -> None:
         self._problem, self._folder = problem, folder
-        self._play = Stageplay(problem, folder, {}, seed=seed, environment=environment)
-        self._visitor: Visitor | None = None
+        self._play = Loopback(problem, folder, {}, seed=seed, environment=environment)
+        self._visitor: OperatorClient | None = None
 
     @property
     def problem(self) -> Problem:
@@ -122,7 +122,7 @@ class OnLoopback:
     def begin(self) -> None:
         """Start everything."""
         self._play.__enter__()
-        self._visitor = Visitor(self.problem, without_keys())
+        self._visitor = OperatorClient(self.problem, without_keys())
 
     def start_agent(self, node: str) -> None:
         """Start a node's agent again."""
@@ -175,11 +175,11 @@ class OnHosts:
 
     Parameters
     ----------
-    bed : Bed
+    bed : NetnsTestbed
         Of one cell; not entered yet.
     """
 
-    def __init__(self, bed: Bed) -> None:
+    def __init__(self, bed: NetnsTestbed) -> None:
         self._bed = bed
 
     @property

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 from dwell.chaos.actuations import out_of_order, unsafe
 from dwell.chaos.faults import Fault, hit_by
-from dwell.chaos.ground import Ground
+from dwell.chaos.harness import Harness
 from dwell.chaos.stages import APPLY, HOLD, ZERO
 from dwell.chaos.stalls import StallDetector
 
@@ -77,7 +77,7 @@ class Outcome:
 
 
 def strike(
-    cell: Ground,
+    cell: Harness,
     fault: Fault,
     stalls: StallDetector,
     *,
@@ -91,7 +91,7 @@ def strike(
 
     Parameters
     ----------
-    cell : Ground
+    cell : Harness
         At home, and healthy where the fault makes it move.
     fault : Fault
     stalls : StallDetector
@@ -153,7 +153,7 @@ def beyond(outcome: Outcome) -> list[str]:
     ]
 
 
-def _last(cell: Ground, fault: Fault, begin_ns: int, lasts: int, bound: int | None) -> None:
+def _last(cell: Harness, fault: Fault, begin_ns: int, lasts: int, bound: int | None) -> None:
     """Wait for the event that the fault's end waits for."""
     over_ns = begin_ns + lasts * cell.period_ns
     if bound is not None:
@@ -169,13 +169,13 @@ def _last(cell: Ground, fault: Fault, begin_ns: int, lasts: int, bound: int | No
     )
 
 
-def _few(cell: Ground, since_ns: int, count: int) -> str:
+def _few(cell: Harness, since_ns: int, count: int) -> str:
     found = sum(seen.what == APPLY for seen in cell.actuations.since(since_ns))
     return "" if found >= count else f"{found} of {count} cycles actuated"
 
 
 def _weigh(
-    cell: Ground, fault: Fault, stalls: StallDetector, found: Outcome, cpus: Collection[int]
+    cell: Harness, fault: Fault, stalls: StallDetector, found: Outcome, cpus: Collection[int]
 ) -> None:
     begin_ns, period_ns, problem = found.begin_ns, cell.period_ns, cell.problem
     seen = cell.actuations.since(begin_ns - 10 * period_ns)

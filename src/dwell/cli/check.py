@@ -14,7 +14,7 @@ from dwell.errors import Fault, ProblemError
 from dwell.estimators import Profile
 from dwell.estimators.profile import mean_ms
 from dwell.io import load
-from dwell.live.cautions import find_cautions
+from dwell.live.lint import lint
 from dwell.model import Problem, Trace
 
 __all__ = ["check_cell", "find_warnings"]
@@ -72,7 +72,7 @@ def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
     yield from _over_caps(problem, profile)
     yield from _false_alarms(problem, profile)
     yield from _late_releases(problem)
-    yield from find_cautions(problem)
+    yield from lint(problem)
 
 
 def _overloads(problem: Problem, profile: Profile) -> Iterator[Fault]:

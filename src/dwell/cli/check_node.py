@@ -12,7 +12,7 @@ import typer
 from dwell.cli.live import environment
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, LiveError, ProblemError, TrustError, installing
-from dwell.live.cautions import find_cautions
+from dwell.live.lint import lint
 from dwell.live.security import Security, exposed
 from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
@@ -47,7 +47,7 @@ def check_node(
     wiring, faults = _wiring(problem)
     security, unsafe = _security(problem, node, environment(keys, insecure=insecure))
     faults += [*unsafe, *_packages(), *_stages(problem, node), *_actuators(problem, node)]
-    warnings = [str(caution) for caution in find_cautions(problem)]
+    warnings = [str(caution) for caution in lint(problem)]
     if security is not None:
         warnings += [line.removeprefix("warning: ") for line in security.warnings()]
     if as_json:

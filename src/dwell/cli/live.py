@@ -19,7 +19,7 @@ import typer
 from dwell.cli.output import json_text, print_json
 
 if TYPE_CHECKING:
-    from dwell.live.visiting import Visitor
+    from dwell.live.operator_client import OperatorClient
 
 __all__ = ["agent", "controller", "live"]
 
@@ -92,13 +92,13 @@ def agent(
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     import dwell
     from dwell.cli.process import server, words
-    from dwell.live.cautions import find_cautions
+    from dwell.live.lint import lint
     from dwell.live.node import run_agent
     from dwell.live.stage import load_function
     from dwell.live.wiring import roles
 
     problem = dwell.load(cell)
-    for caution in find_cautions(problem):
+    for caution in lint(problem):
         _say(f"warning: {caution}")
     folder = state or _state_folder() / problem.name / node
     sys.path.insert(0, str(cell.resolve().parent))
@@ -183,9 +183,9 @@ def status(
     if check and watch:
         raise typer.BadParameter("--check looks once; leave --watch out")
     import dwell
-    from dwell.live.visiting import Visitor
+    from dwell.live.operator_client import OperatorClient
 
-    with Visitor(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
+    with OperatorClient(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
         if watch:
             _watch(visitor, as_json=as_json)
         found = visitor.look()
@@ -200,7 +200,7 @@ def status(
         raise typer.Exit(1)
 
 
-def _watch(visitor: Visitor, *, as_json: bool) -> NoReturn:
+def _watch(visitor: OperatorClient, *, as_json: bool) -> NoReturn:
     """Show how a cell is every second, until interrupted."""
     screen = sys.stdout.isatty() and not as_json
     while True:
@@ -322,9 +322,9 @@ def _ask(
     cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
 ) -> None:
     import dwell
-    from dwell.live.visiting import Visitor
+    from dwell.live.operator_client import OperatorClient
 
-    with Visitor(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
+    with OperatorClient(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
         found = visitor.ask(what, about)
     if as_json:
         print_json(found)
@@ -433,7 +433,7 @@ def _state_folder() -> Path:
 
 def _until_told() -> threading.Event:
     """Return an event that is set when this process is told to end, or its owner has ended."""
-    from dwell.live.leash import end_with_owner
+    from dwell.live.parent_death import end_with_owner
 
     stopped = threading.Event()
     end_with_owner(stopped)

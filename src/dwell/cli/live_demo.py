@@ -17,17 +17,17 @@ import dwell
 from dwell.cli.live_view import Look, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.demo.error_sampler import ErrorSampler
-from dwell.demo.stageplay import Stageplay, on_this_machine
+from dwell.demo.loopback import Loopback, on_this_machine
 from dwell.demo.world import World
 from dwell.errors import LiveError
-from dwell.live.visiting import Visitor
+from dwell.live.operator_client import OperatorClient
 from dwell.model import Problem
 from dwell.record import Run, open_run, seal_run
 from dwell.report import run_html
-from dwell.report.facts import Facts
+from dwell.report.formatting import listed, percent, write_number
 from dwell.report.phase_rows import PhaseRow, phase_rows
 from dwell.report.phases import Disturbed, disturbed
-from dwell.report.wording import listed, percent, write_number
+from dwell.report.run_header import RunHeader
 from dwell.testbed.playing import (
     LOOK_S,
     Ask,
@@ -81,7 +81,7 @@ def play(
     problem = on_this_machine(problem)
     told = _Told(problem, scenario, seed)
     interrupted = False
-    with interruptible(), Stageplay(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
+    with interruptible(), Loopback(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
         try:
             _watch_from_start(cell, changes, seconds, told)
         except KeyboardInterrupt:
@@ -136,11 +136,11 @@ def _cpus(problem: Problem) -> dict[str, int]:
 
 
 def _watch_from_start(
-    cell: Stageplay, changes: Sequence[Change], seconds: float, told: _Told
+    cell: Loopback, changes: Sequence[Change], seconds: float, told: _Told
 ) -> None:
     """Wait until everybody is there, and play the scenario."""
     awaited = [who for node in cell.problem.fabric.nodes for who in cell.expected(node)]
-    with Visitor(cell.problem, without_keys()) as visitor:
+    with OperatorClient(cell.problem, without_keys()) as visitor:
 
         def ask(patience_s: float) -> Mapping[str, Any]:
             return visitor.ask("status", patience_s=patience_s)
@@ -162,7 +162,7 @@ def _watch_from_start(
 
 def _watch(
     ask: Ask,
-    cell: Stageplay,
+    cell: Loopback,
     changes: Sequence[Change],
     begin_ns: int,
     seconds: float,
@@ -201,7 +201,7 @@ def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bo
     cycles, decisions = run.cycles, run.decisions
     guard = decisions.filter((decisions["reason"].cast(str) == "guard") & decisions["migrated"])
     missed = cycles["missed"].to_numpy()
-    phases = phase_rows(run, Facts.of(run))
+    phases = phase_rows(run, RunHeader.of(run))
     page = out / "report.html"
     report: Path | None = page
     # A run that ended within its warm-up has nothing to report on.

@@ -16,7 +16,7 @@ from dwell.cli.demo import find_examples
 from dwell.cli.output import Progress, print_json, progress, working
 from dwell.model import Problem
 from dwell.report import paper_report
-from dwell.report.look import Look
+from dwell.report.style import PageStyle
 from dwell.study.demo import REAL
 from dwell.study.paper import CHAPTERS, Chapter, Paper, Scale, paper_problem, paper_study
 from dwell.study.paper.paper import REAL as REPLAY
@@ -90,7 +90,7 @@ def run_paper(request: Request, *, as_json: bool) -> bool:
         if not as_json:
             typer.echo(f"{look.prose(chapter_line(chapter))}\n")
 
-    look = Look.of(problem)
+    look = PageStyle.of(problem)
     resumed = (request.folder / "runs").exists()
     begun_s = time.monotonic()
     with _resumable(request.folder):

@@ -81,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _serve(cell: Path) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
     from dwell.io import load
-    from dwell.live import leash, process  # noqa: F401
+    from dwell.live import parent_death, process  # noqa: F401
     from dwell.live.launcher import serve
     from dwell.profiling import memory  # noqa: F401
 
@@ -104,8 +104,8 @@ def _run(asked: argparse.Namespace) -> None:
     sys.path.insert(0, str(asked.cell.resolve().parent))
 
     from dwell.io import load
-    from dwell.live.leash import end_with_owner
     from dwell.live.log import escape_output
+    from dwell.live.parent_death import end_with_owner
     from dwell.live.process import run_process
     from dwell.profiling.memory import keep_memory
 

@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 from dwell.cli.output import Progress, aligned, print_json, progress, working
-from dwell.report.wording import Measure, shown_policy, shown_scenario, write_interval
+from dwell.report.formatting import Measure, shown_policy, shown_scenario, write_interval
 from dwell.study import Interval, Study, StudyResult, load_study, run_study
 from dwell.study.over_seeds import over_seeds
 

@@ -17,7 +17,7 @@ from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
-from dwell.model.meaning import too_many_shadows
+from dwell.model.semantics import too_many_shadows
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
 

@@ -22,7 +22,7 @@ from dwell.testbed.conditions import Conditions
 from dwell.testbed.draws import Draws
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.orders import Orders, Set
-from dwell.testbed.punctuality import come_first
+from dwell.testbed.realtime import come_first
 
 __all__ = ["main"]
 

@@ -11,8 +11,8 @@ from dwell.estimators.profile import Profile
 from dwell.estimators.protocol import Estimator
 from dwell.estimators.scaling import Scaling
 from dwell.estimators.shadow import Shadow
-from dwell.model.meaning import nearest_of
 from dwell.model.problem import Problem
+from dwell.model.semantics import nearest_of
 
 __all__ = ["REGISTRY", "by_name", "name_in_run"]
 

@@ -47,11 +47,11 @@ from dwell.estimators.paths import longest_path, order_statistic, steps_of
 from dwell.estimators.profile import SEED, Profile, SampleCycles
 from dwell.estimators.spans import Spans, patience_ns, spans_of
 from dwell.model.bounds import VALUE, shown
-from dwell.model.meaning import nearest
 from dwell.model.pipeline import Flow
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
+from dwell.model.semantics import nearest
 
 __all__ = ["Scaling"]
 

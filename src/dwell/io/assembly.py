@@ -56,9 +56,9 @@ from dwell.model import (
 )
 from dwell.model.bounds import require
 from dwell.model.frozen import FrozenDict
-from dwell.model.meaning import Parts, find_faults
 from dwell.model.problem import POLICIES
 from dwell.model.process import DRAWN, UnreadTrace
+from dwell.model.semantics import Parts, find_faults
 
 __all__ = ["Assembly"]
 

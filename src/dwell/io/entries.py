@@ -22,7 +22,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from dwell.io.wording import as_read
+from dwell.io.rendering import as_read
 from dwell.model import bounds
 from dwell.model.bounds import Bound
 

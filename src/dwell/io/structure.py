@@ -19,10 +19,10 @@ from pydantic_core import ErrorDetails
 
 from dwell.io.entries import CellEntry, Entry
 from dwell.io.faults import Faults, Step, dotted
-from dwell.io.wording import as_read
+from dwell.io.rendering import as_read
 from dwell.model import bounds
 from dwell.model.document import VERSION
-from dwell.model.meaning import nearest
+from dwell.model.semantics import nearest
 
 __all__ = ["CELL", "Form", "read_structure"]
 

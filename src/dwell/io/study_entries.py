@@ -11,8 +11,8 @@ from pydantic_core import CoreSchema, core_schema
 
 from dwell.io.entries import Entry, Number, wrong
 from dwell.io.faults import Step
+from dwell.io.rendering import as_read
 from dwell.io.structure import Form
-from dwell.io.wording import as_read
 from dwell.model.bounds import MAX_COUNT, Bound
 
 __all__ = ["STUDY", "StudyEntry"]

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from dwell.errors import ProblemError
 from dwell.io.cell import read_problem
 from dwell.io.faults import Faults, Step, dotted
+from dwell.io.rendering import as_read
 from dwell.io.study_paths import SETTINGS, put, steps_of
-from dwell.io.wording import as_read
 from dwell.model import Problem
-from dwell.model.meaning import LONGEST_NAME, NAME, nearest
 from dwell.model.problem import ESTIMATORS
+from dwell.model.semantics import LONGEST_NAME, NAME, nearest
 from dwell.policies.registry import names as policy_names
 
 if TYPE_CHECKING:

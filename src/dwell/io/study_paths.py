@@ -9,10 +9,10 @@ from typing import Any
 
 from dwell.errors import Fault, ProblemError
 from dwell.io.faults import Faults, Step, dotted
-from dwell.io.wording import as_read
+from dwell.io.rendering import as_read
 from dwell.model import Problem
 from dwell.model.document import to_document
-from dwell.model.meaning import nearest
+from dwell.model.semantics import nearest
 
 __all__ = ["SETTINGS", "put", "steps_of", "with_settings"]
 

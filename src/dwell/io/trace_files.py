@@ -18,7 +18,7 @@ from dwell.io.traces import Source
 from dwell.model import Trace, TraceTable
 from dwell.model.bounds import VALUE
 from dwell.model.document import digest
-from dwell.model.meaning import nearest
+from dwell.model.semantics import nearest
 
 if TYPE_CHECKING:
     import polars as pl

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
-from dwell.live.bundle import MOST_MESSAGES, Bundle
+from dwell.live.control_group import ControlGroup
 from dwell.live.failures import start_thread
-from dwell.live.group import ControlGroup
 from dwell.live.messages import Carried, Load, encode
+from dwell.live.relay_batch import MOST_MESSAGES, RelayBatch
 from dwell.live.role import TWICE, Place, Pulse
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.protocol import Sample
@@ -139,10 +139,10 @@ class Agent:
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.relay
         self._look_ns = self._load_ns = self._tend_ns = 0
-        self._carried = Bundle()
+        self._carried = RelayBatch()
         self._carry_ns = NEVER_NS
-        self._gathered = Bundle(MOST_MESSAGES // 2)
-        self._beats = Bundle(MOST_MESSAGES // 2, newest=True)
+        self._gathered = RelayBatch(MOST_MESSAGES // 2)
+        self._beats = RelayBatch(MOST_MESSAGES // 2, newest=True)
         self._gather_ns = self._beats_ns = 0
         self._beat_prefix = place.keys.relay(place.keys.beat("", "").removesuffix("/"))
         self._relay_prefix = f"{place.keys.root}/relay/"

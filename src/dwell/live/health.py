@@ -7,7 +7,7 @@
 ``degraded``  windows close, but a process is silent, not ready, or has another cell file or version
 ``stalled``   no window has closed for too long, or no cycle of the last one was completed
 ``silent``    the controller hears no process of the cell
-``absent``    no controller answers; only who asks can tell (`dwell.live.visiting`)
+``absent``    no controller answers; only who asks can tell (`dwell.live.operator_client`)
 ============  ====================================================================================
 
 Processes on a node that is drained may be silent: somebody has said so.

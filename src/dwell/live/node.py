@@ -15,8 +15,8 @@ from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.agent import Agent, CpuCount, Gauge
 from dwell.live.cell import Cell
+from dwell.live.control_group import own_group
 from dwell.live.files import make_folder
-from dwell.live.group import own_group
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, take_turns
 from dwell.live.launcher import ForkServer
 from dwell.live.log import Log

@@ -10,8 +10,8 @@ from pathlib import Path
 import msgspec
 
 from dwell.errors import LiveError
+from dwell.live.control_group import ControlGroup, own_group
 from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
-from dwell.live.group import ControlGroup, own_group
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.messages import Header

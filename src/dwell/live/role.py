@@ -11,7 +11,7 @@ import msgspec
 
 from dwell import __version__
 from dwell.errors import LiveError, TrustError
-from dwell.live.hearing import Hearing
+from dwell.live.failure_detector import FailureDetector
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.log import printable
 from dwell.live.messages import (
@@ -334,7 +334,7 @@ class Pulse:
     ) -> None:
         self.place = place
         self._hears = (place.stamper,) if hears is None else tuple(hears)
-        self.hearing = Hearing(place.who, place.patience_ns)
+        self.hearing = FailureDetector(place.who, place.patience_ns)
         self._state, self._holds = state, holds
         self._every_ns = every * place.period_ns
         self._digest = fingerprint(place.problem)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from dwell.errors import LiveError
-from dwell.live.group import UNKNOWN
+from dwell.live.control_group import UNKNOWN
 from dwell.live.messages import Completion, Header
 from dwell.live.payloads import read_payload
 from dwell.live.role import Place, Pulse

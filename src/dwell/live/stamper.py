@@ -10,7 +10,7 @@ from dwell.control import shadow_stamps
 from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
 from dwell.live.continuity import RESERVED
-from dwell.live.group import UNKNOWN
+from dwell.live.control_group import UNKNOWN
 from dwell.live.intervals import Intervals
 from dwell.live.keys import CONTROLLER
 from dwell.live.messages import (

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from dwell.errors import LiveError
-from dwell.live.group import UNKNOWN, Counts
+from dwell.live.control_group import UNKNOWN, Counts
 from dwell.live.keys import CONTROLLER, MAIN, SHADOW
 from dwell.live.messages import (
     Completion,

@@ -22,11 +22,11 @@ from dwell.model.bounds import (
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.live import LiveSettings
-from dwell.model.meaning import Parts, find_faults, nearest_of
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.scenario import Scenario
+from dwell.model.semantics import Parts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
 __all__ = ["ESTIMATORS", "MIGRATIONS", "POLICIES", "ControllerSettings", "Problem"]

@@ -9,9 +9,9 @@ from typing import TypeVar
 from dwell.errors import PolicyError
 from dwell.model.bounds import Bound
 from dwell.model.frozen import FrozenDict
-from dwell.model.meaning import nearest_of
 from dwell.model.placement import Placement
 from dwell.model.qos import Decision, Reason
+from dwell.model.semantics import nearest_of
 
 __all__ = ["Incumbent", "check_candidates", "check_name", "check_parameter"]
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import PolicyError
-from dwell.model.meaning import nearest_of
+from dwell.model.semantics import nearest_of
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem

@@ -28,8 +28,8 @@ import numpy as np
 
 from dwell.errors import MeasurementError
 from dwell.model.bounds import MAX_COUNT, PERIOD_MS, Bound
-from dwell.profiling.blame import blamed, raised_here
 from dwell.profiling.conditions import Conditions, Watch, processor
+from dwell.profiling.error_origin import blamed, raised_here
 from dwell.profiling.profile_file import Measurement, stamp, task_name
 
 __all__ = ["Pace", "Settings", "Timing", "measure_task", "time_runs", "undisturbed_collector"]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import ProfileError
-from dwell.model.meaning import LONGEST_NAME, NAME
+from dwell.model.semantics import LONGEST_NAME, NAME
 
 __all__ = [
     "Measurement",

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dwell.errors import ProfileError
-from dwell.profiling.blame import blamed
+from dwell.profiling.error_origin import blamed
 
 __all__ = ["find_callable", "importable_from"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from html import escape
 
-from dwell.report.look import Look
 from dwell.report.page import Cell, marked, table
+from dwell.report.style import PageStyle
 from dwell.study.chapter import Answer, Chapter
 
 __all__ = ["answers", "beginning"]
@@ -20,7 +20,7 @@ TAGS: dict[Answer, tuple[str, str]] = {
 }
 
 
-def answers(chapters: Sequence[Chapter], look: Look) -> Iterator[str]:
+def answers(chapters: Sequence[Chapter], look: PageStyle) -> Iterator[str]:
     """Return every question with its answer, as a table; nothing without chapters."""
     rows: list[tuple[str, Sequence[Cell]]] = [
         (
@@ -37,7 +37,7 @@ def answers(chapters: Sequence[Chapter], look: Look) -> Iterator[str]:
         yield table([Cell("question"), Cell("answer"), Cell("")], rows, kind="summary")
 
 
-def beginning(chapter: Chapter, look: Look) -> str:
+def beginning(chapter: Chapter, look: PageStyle) -> str:
     """Return the beginning of a chapter's section: where the table leads to, and its heading."""
     tag = _tagged(chapter.answer, "tag")
     heading = f"<h2>{marked(look.prose(chapter.title))}{tag}</h2>"

@@ -9,7 +9,7 @@ from dwell.report import chapter_tables, figures
 from dwell.report.answers import answers, beginning
 from dwell.report.contenders import describe_contenders, palette_of
 from dwell.report.drawing import draw
-from dwell.report.look import Look
+from dwell.report.formatting import listed, percent, shown_contender, shown_scenario, write_number
 from dwell.report.method import describe_cell, describe_scenario
 from dwell.report.page import (
     definitions,
@@ -19,8 +19,8 @@ from dwell.report.page import (
     paragraph,
     section,
 )
+from dwell.report.style import PageStyle
 from dwell.report.svg import inline
-from dwell.report.wording import listed, percent, shown_contender, shown_scenario, write_number
 from dwell.study.campaign import Measured
 from dwell.study.campaign_questions import is_steady, main_table, needed_pairs, questions
 from dwell.study.chapter import Chapter, Figure
@@ -46,7 +46,7 @@ def campaign_html(measured: Measured) -> str:
     """
     comparison = measured.comparison
     chapters = questions(measured)
-    look = Look(
+    look = PageStyle(
         palette_of(comparison.problem, comparison.policies), frozenset(comparison.scenarios)
     )
     body = [f"<h1>{TITLE}</h1>", paragraph(_subtitle(measured), "subtitle")]
@@ -124,7 +124,7 @@ def counted_windows(measured: Measured) -> str:
 # ----------------------------------------------------------------------------------- parts
 
 
-def _results(measured: Measured, look: Look) -> Iterator[str]:
+def _results(measured: Measured, look: PageStyle) -> Iterator[str]:
     comparison = measured.comparison
     yield definitions(describe_contenders(comparison.problem, comparison.policies))
     yield paragraph(
@@ -161,7 +161,7 @@ def _caption(measure: str) -> str:
     return f"{text}: mean over repetitions, with its 95 % interval as a bar where there is one."
 
 
-def _distributions(measured: Measured, look: Look) -> Iterator[str]:
+def _distributions(measured: Measured, look: PageStyle) -> Iterator[str]:
     yield _drawn(
         figures.latency_figure(measured.comparison),
         look,
@@ -177,7 +177,7 @@ def _distributions(measured: Measured, look: Look) -> Iterator[str]:
         yield _drawn(one, look, f"{one.title}.")
 
 
-def _chapter(chapter: Chapter, look: Look) -> str:
+def _chapter(chapter: Chapter, look: PageStyle) -> str:
     parts = [
         beginning(chapter, look),
         paragraph(look.prose(chapter.verdict), "question"),
@@ -191,7 +191,7 @@ def _chapter(chapter: Chapter, look: Look) -> str:
     return "\n".join([*parts, "</section>"])
 
 
-def _parts(measured: Measured, look: Look) -> Iterator[str]:
+def _parts(measured: Measured, look: PageStyle) -> Iterator[str]:
     if measured.profiles.is_empty() and measured.links.is_empty():
         yield paragraph("The runs kept no jobs: there is nothing to take profiles from.")
         return
@@ -205,7 +205,7 @@ def _parts(measured: Measured, look: Look) -> Iterator[str]:
         yield chapter_tables.html(shown.links_table(measured), look)
 
 
-def _record(measured: Measured, look: Look) -> Iterator[str]:
+def _record(measured: Measured, look: PageStyle) -> Iterator[str]:
     busy = measured.log.height - int(measured.log["idle"].sum())
     yield paragraph(
         "Each repetition is a complete random order of all policies in all scenarios. Before a run "
@@ -274,5 +274,5 @@ def limits_of(measured: Measured) -> Iterator[str]:
         yield ("ATP is our reconstruction: its authors' may do better or worse.")
 
 
-def _drawn(item: Figure, look: Look, caption: str) -> str:
+def _drawn(item: Figure, look: PageStyle, caption: str) -> str:
     return figure(inline(draw(item, look), item.slug, item.title), caption)

@@ -6,14 +6,14 @@ import textwrap
 
 from dwell.report.campaign_page import counted_windows
 from dwell.report.contenders import palette_of
-from dwell.report.look import Look
-from dwell.report.wording import (
+from dwell.report.formatting import (
     OURS,
     Measure,
     shown_contender,
     shown_scenario,
     write_interval,
 )
+from dwell.report.style import PageStyle
 from dwell.study.campaign import Measured
 from dwell.study.campaign_questions import questions
 
@@ -32,7 +32,7 @@ MEASURES = (
 def campaign_text(measured: Measured) -> str:
     """Return the results of a campaign as plain text of at most 100 columns."""
     comparison = measured.comparison
-    look = Look(
+    look = PageStyle(
         palette_of(comparison.problem, comparison.policies), frozenset(comparison.scenarios)
     )
     head = ["", "runs", *(measure.heading for measure in MEASURES)]

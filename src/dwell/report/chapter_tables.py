@@ -8,13 +8,13 @@ from html import escape
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
+from dwell.report.formatting import OURS, SYMBOL, Measure, Written
 from dwell.report.latex import tabular
-from dwell.report.look import CONTENDERS, Look, key
 from dwell.report.page import Cell, marked, named, swatch, table
 from dwell.report.palette import contended
 from dwell.report.panels import floats
+from dwell.report.style import CONTENDERS, PageStyle, key
 from dwell.report.units import labelled, measure_of, write, write_over_seeds
-from dwell.report.wording import OURS, SYMBOL, Measure, Written
 from dwell.study import Interval
 from dwell.study.chapter import Figure, Table, Unit
 
@@ -107,13 +107,13 @@ class Shown:
             before = mine
 
 
-def html(item: Table, look: Look, *, main: bool = False) -> str:
+def html(item: Table, look: PageStyle, *, main: bool = False) -> str:
     """Return a table of a page: numbers with their intervals, long tables folded away.
 
     Parameters
     ----------
     item : Table
-    look : Look
+    look : PageStyle
     main : bool
         Whether it is what its chapter is about.
     """
@@ -147,7 +147,7 @@ def csv(item: Table) -> str:
     return item.frame.write_csv()
 
 
-def latex(item: Table, look: Look, label: str) -> str:
+def latex(item: Table, look: PageStyle, label: str) -> str:
     """Return a table for LaTeX, with the package booktabs; intervals stand in brackets."""
     shown = Shown.of(item)
     rows: list[tuple[str, Sequence[str]]] = []
@@ -164,7 +164,7 @@ def latex(item: Table, look: Look, label: str) -> str:
     )
 
 
-def noted(item: Table | Figure, look: Look) -> str:
+def noted(item: Table | Figure, look: PageStyle) -> str:
     """Return what has to be known of a table or figure, and what ATP is where it is in it."""
     own = look.prose(item.note).strip()
     own += "" if not own or own.endswith((".", "!", "?")) else "."
@@ -199,7 +199,7 @@ def _is_grouped(frame: pl.DataFrame, columns: Sequence[Column]) -> bool:
     return len(values) > 3 and once and changes + 1 <= len(values) / 2
 
 
-def _cells(row: dict[str, object], column: Column, look: Look) -> list[Cell]:
+def _cells(row: dict[str, object], column: Column, look: PageStyle) -> list[Cell]:
     written = _written(row, column, look, ends=False)
     if column.unit == "text":
         kind = "nowrap" if len(written.value) <= SHORT else "text"
@@ -208,7 +208,7 @@ def _cells(row: dict[str, object], column: Column, look: Look) -> list[Cell]:
     return [number, Cell(escape(written.error), "err")] if column.interval else [number]
 
 
-def _text(value: object, column: Column, look: Look) -> str:
+def _text(value: object, column: Column, look: PageStyle) -> str:
     """Return a text: a contender with its mark, a word that says how it came out in its colour."""
     if value is None:
         return "–"
@@ -224,7 +224,7 @@ def _text(value: object, column: Column, look: Look) -> str:
     return marked(look.prose(look.shown(value)))
 
 
-def _written(row: dict[str, object], column: Column, look: Look, *, ends: bool) -> Written:
+def _written(row: dict[str, object], column: Column, look: PageStyle, *, ends: bool) -> Written:
     value = row.get(column.name)
     if value is None:
         return Written("–", "")

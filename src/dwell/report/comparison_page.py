@@ -25,7 +25,17 @@ from dwell.report.findings import (
     standing,
     verdict,
 )
-from dwell.report.look import Look
+from dwell.report.formatting import (
+    OURS,
+    Measure,
+    listed,
+    percent,
+    shown_contender,
+    shown_policy,
+    shown_scenario,
+    write_interval,
+    write_number,
+)
 from dwell.report.method import method
 from dwell.report.page import (
     Cell,
@@ -41,17 +51,7 @@ from dwell.report.page import (
     table,
 )
 from dwell.report.palette import Palette
-from dwell.report.wording import (
-    OURS,
-    Measure,
-    listed,
-    percent,
-    shown_contender,
-    shown_policy,
-    shown_scenario,
-    write_interval,
-    write_number,
-)
+from dwell.report.style import PageStyle
 from dwell.study import AIM, Comparison, Interval, StudyResult
 from dwell.study.predictions import Answer, Prediction, judge_claim
 
@@ -122,7 +122,7 @@ def comparison_html(*comparisons: Comparison, tenants: StudyResult | None = None
 
 def _chapter(comparison: Comparison, tenants: StudyResult | None) -> Iterator[str]:
     palette = palette_of(comparison.problem, comparison.policies)
-    look = Look(palette, frozenset(comparison.scenarios))
+    look = PageStyle(palette, frozenset(comparison.scenarios))
     yield paragraph(_subtitle(comparison), "subtitle")
     yield paragraph(question(comparison), "question")
     yield items(verdict(comparison))
@@ -354,7 +354,7 @@ def _claims(comparison: Comparison, prediction: Prediction) -> str:
 # ----------------------------------------------------------------------------------- figures
 
 
-def _figures(comparison: Comparison, look: Look) -> Iterator[str]:
+def _figures(comparison: Comparison, look: PageStyle) -> Iterator[str]:
     deadline_ms = comparison.problem.pipeline.deadline_ms
     yield figure(
         figures.intervals(comparison, look, RATE, "percent", limit=AIM, name="the aim, 5 %"),
@@ -397,7 +397,7 @@ def _shown_in_time(comparison: Comparison) -> str | None:
     return DTP if DTP in moving else next(iter(moving), None)
 
 
-def _timelines(comparison: Comparison, look: Look, policy: str) -> Iterator[str]:
+def _timelines(comparison: Comparison, look: PageStyle, policy: str) -> Iterator[str]:
     yield paragraph(
         f"One run in each scenario, of seed {comparison.seeds[0]}. Each mark is a window and has "
         "the colour of the placement that was active. In the lowest panel the lines without marks "

@@ -7,8 +7,7 @@ import itertools
 import textwrap
 
 from dwell.report.findings import COST, RATE, question, standing, verdict
-from dwell.report.palette import contended
-from dwell.report.wording import (
+from dwell.report.formatting import (
     OURS,
     Measure,
     listed,
@@ -16,6 +15,7 @@ from dwell.report.wording import (
     shown_scenario,
     write_interval,
 )
+from dwell.report.palette import contended
 from dwell.study import Comparison
 
 __all__ = ["comparison_text"]

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 from dwell.model import Problem
 from dwell.policies.registry import REGISTRY
+from dwell.report.formatting import OURS, shown_contender
 from dwell.report.method import placements
 from dwell.report.palette import Palette, contended
-from dwell.report.wording import OURS, shown_contender
 
 __all__ = ["POLICIES", "describe_contenders", "palette_of"]
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.look import Look
 from dwell.report.palette import MUTED, PAPER, Style
 from dwell.report.panels import (
     Floats,
@@ -29,6 +28,7 @@ from dwell.report.panels import (
     spread,
 )
 from dwell.report.scales import set_log_ticks
+from dwell.report.style import PageStyle
 from dwell.report.svg import new_figure
 from dwell.report.units import labelled
 from dwell.study import AIM
@@ -57,7 +57,7 @@ LATER = (0.1, 120.0)
 DEADLINES = 3
 
 
-def draw_lines(figure: Figure, look: Look) -> Canvas:
+def draw_lines(figure: Figure, look: PageStyle) -> Canvas:
     """Draw a line for every series, with a band where it has an interval."""
     grid = parted(figure, look, MOST_PANELS)
     names = keys(figure.frame, figure.series)
@@ -154,7 +154,7 @@ def _line(
         )
 
 
-def draw_distributions(figure: Figure, look: Look) -> Canvas:
+def draw_distributions(figure: Figure, look: PageStyle) -> Canvas:
     """Draw the share of cycles that took longer than a latency, on a logarithmic scale.
 
     One less the distribution: what is left at the deadline is what counts, and a tail of one in a

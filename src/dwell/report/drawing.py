@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.report.curves import draw_distributions, draw_lines
-from dwell.report.look import Look
 from dwell.report.named_rows import draw_bars, draw_intervals
 from dwell.report.palette import MUTED
 from dwell.report.panels import floats
+from dwell.report.style import PageStyle
 from dwell.report.svg import new_figure
 from dwell.report.window_timeline import draw_timeline
 from dwell.report.winner_map import draw_map
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["draw"]
 
-KINDS: Mapping[FigureKind, Callable[[Figure, Look], Canvas]] = {
+KINDS: Mapping[FigureKind, Callable[[Figure, PageStyle], Canvas]] = {
     "intervals": draw_intervals,
     "lines": draw_lines,
     "bars": draw_bars,
@@ -35,13 +35,13 @@ KINDS: Mapping[FigureKind, Callable[[Figure, Look], Canvas]] = {
 }
 
 
-def draw(figure: Figure, look: Look) -> Canvas:
+def draw(figure: Figure, look: PageStyle) -> Canvas:
     """Draw a figure; where it holds no number, that is what it says.
 
     Parameters
     ----------
     figure : Figure
-    look : Look
+    look : PageStyle
         Of the whole page.
     """
     if _is_empty(figure):

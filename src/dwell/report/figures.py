@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 from dwell.report.drawing import draw
-from dwell.report.look import Look
+from dwell.report.formatting import Measure, shown_contender, shown_scenario
 from dwell.report.palette import INK, MUTED, PAPER, PARTS, Palette
 from dwell.report.panels import folded
 from dwell.report.scales import is_wide
+from dwell.report.style import PageStyle
 from dwell.report.svg import inline, new_figure
 from dwell.report.timeline import run_timeline
-from dwell.report.wording import Measure, shown_contender, shown_scenario
 from dwell.study import Comparison
 from dwell.study.chapter import Figure, Unit
 
@@ -38,14 +38,20 @@ NODE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def intervals(
-    comparison: Comparison, look: Look, measure: Measure, unit: Unit, *, limit: float, name: str
+    comparison: Comparison,
+    look: PageStyle,
+    measure: Measure,
+    unit: Unit,
+    *,
+    limit: float,
+    name: str,
 ) -> str:
     """One column of every policy and scenario: mean over seeds, and its interval as a bar.
 
     Parameters
     ----------
     comparison : Comparison
-    look : Look
+    look : PageStyle
     measure : Measure
     unit : Unit
         Of the column.
@@ -170,7 +176,7 @@ def node_use(comparison: Comparison) -> str:
     return _panels(comparison, policies, name, draw, label, handles=handles)
 
 
-def distributions(comparison: Comparison, look: Look) -> str:
+def distributions(comparison: Comparison, look: PageStyle) -> str:
     """Share of the cycles that took longer than a latency: one less the empirical distribution."""
     return _drawn(comparison, look, latency_figure(comparison))
 
@@ -192,7 +198,7 @@ def latency_figure(comparison: Comparison) -> Figure:
     )
 
 
-def through_time(comparison: Comparison, look: Look, scenario: str, policy: str) -> str:
+def through_time(comparison: Comparison, look: PageStyle, scenario: str, policy: str) -> str:
     """One run, window by window."""
     example, problem = comparison.examples[scenario, policy], comparison.problem
     figure = run_timeline(
@@ -206,7 +212,7 @@ def through_time(comparison: Comparison, look: Look, scenario: str, policy: str)
     return _drawn(comparison, look, figure)
 
 
-def _drawn(comparison: Comparison, look: Look, figure: Figure) -> str:
+def _drawn(comparison: Comparison, look: PageStyle, figure: Figure) -> str:
     return inline(draw(figure, look), f"{figure.slug}-{comparison.problem.name}", figure.title)
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from dwell.model.document import to_document
-from dwell.report.palette import contended
-from dwell.report.wording import (
+from dwell.report.formatting import (
     Measure,
     listed,
     percent,
@@ -18,6 +17,7 @@ from dwell.report.wording import (
     write_interval,
     write_number,
 )
+from dwell.report.palette import contended
 from dwell.study import AIM, Comparison, Interval
 from dwell.study.family import cannot_tell
 from dwell.study.intervals import Verdict, rule_of_three, under

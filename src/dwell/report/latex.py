@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Iterable, Sequence
 
-from dwell.report.wording import SYMBOL
+from dwell.report.formatting import SYMBOL
 
 __all__ = ["escaped", "tabular"]
 

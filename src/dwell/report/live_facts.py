@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from dwell.report.wording import listed, percent, write_number
+from dwell.report.formatting import listed, percent, write_number
 
 if TYPE_CHECKING:
     from dwell.record import Run
-    from dwell.report.facts import Facts
+    from dwell.report.run_header import RunHeader
 
 __all__ = ["known", "recovery"]
 
 
-def known(run: Run, facts: Facts) -> Iterator[str]:
+def known(run: Run, facts: RunHeader) -> Iterator[str]:
     """Yield sentences on how well a live run is known."""
     yield _clocks(run, facts)
     yield from _unheard(run)
@@ -22,7 +22,7 @@ def known(run: Run, facts: Facts) -> Iterator[str]:
     yield from recovery(facts.recovered)
 
 
-def _clocks(run: Run, facts: Facts) -> str:
+def _clocks(run: Run, facts: RunHeader) -> str:
     windows = run.windows
     bounds = windows["bound_ms"].drop_nulls()
     unproven = int(windows["unproven"].sum())

@@ -20,8 +20,8 @@ from dwell.model import (
     Trace,
     Uniform,
 )
+from dwell.report.formatting import listed, percent, shown_scenario, write_number
 from dwell.report.page import definitions, items, paragraph
-from dwell.report.wording import listed, percent, shown_scenario, write_number
 from dwell.study import Comparison
 
 __all__ = ["describe_cell", "describe_scenario", "method", "placements"]

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dwell.report.look import Look, key
 from dwell.report.palette import INK, MUTED, PAPER, RULE, Style
 from dwell.report.panels import (
     Place,
@@ -24,6 +23,7 @@ from dwell.report.panels import (
     parted,
     spread,
 )
+from dwell.report.style import PageStyle, key
 from dwell.report.svg import new_figure
 from dwell.study.chapter import Figure
 
@@ -74,7 +74,7 @@ class Rows:
     stacked: bool = False
 
     @classmethod
-    def of(cls, figure: Figure, look: Look) -> Rows:
+    def of(cls, figure: Figure, look: PageStyle) -> Rows:
         """Find the lines of a figure."""
         names, series = keys(figure.frame, figure.x), keys(figure.frame, figure.series)
         pairs = figure.frame.select({figure.x, figure.series}).unique()
@@ -98,7 +98,7 @@ class Rows:
         return row + share * TAKEN
 
 
-def draw_intervals(figure: Figure, look: Look) -> Canvas:
+def draw_intervals(figure: Figure, look: PageStyle) -> Canvas:
     """Draw a dot for every name and series, and its interval as a bar.
 
     Names with many series have a panel each, whose lines are the series.
@@ -117,7 +117,7 @@ def draw_intervals(figure: Figure, look: Look) -> Canvas:
     return _draw_rows(figure, look, rows, draw, handles, bars=False)
 
 
-def draw_bars(figure: Figure, look: Look) -> Canvas:
+def draw_bars(figure: Figure, look: PageStyle) -> Canvas:
     """Draw a bar for every name and series, its interval as a whisker.
 
     Series that are measures are told apart by their filling: the first is filled, the second an
@@ -161,7 +161,7 @@ def draw_bars(figure: Figure, look: Look) -> Canvas:
     return _draw_rows(figure, look, rows, draw, handles, bars=True)
 
 
-def _are_parts(figure: Figure, look: Look, rows: Rows) -> bool:
+def _are_parts(figure: Figure, look: PageStyle, rows: Rows) -> bool:
     """Whether the bars of a line are shares of the candidates."""
     bare = f"{figure.y}_low" not in figure.frame.columns
     return bare and all(name in look.placements for name in rows.series)
@@ -178,7 +178,7 @@ def _stacked(figure: Figure) -> pl.DataFrame:
 
 def _draw_rows(
     figure: Figure,
-    look: Look,
+    look: PageStyle,
     rows: Rows,
     draw: Callable[[Axes, Place, Scale], None],
     handles: Sequence[Artist],

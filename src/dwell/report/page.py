@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
+from dwell.report.formatting import SYMBOL
 from dwell.report.palette import INK, MUTED, PARTS, RAMP
-from dwell.report.wording import SYMBOL
 
 __all__ = [
     "Cell",

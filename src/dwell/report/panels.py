@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.report.look import Look, key
 from dwell.report.palette import INK
 from dwell.report.scales import set_log_ticks
+from dwell.report.style import PageStyle, key
 from dwell.report.svg import WIDTH
 from dwell.report.units import factor, labelled
 from dwell.study.chapter import Figure, Panel
@@ -199,20 +199,20 @@ class Grid:
         )
 
 
-def entries(figure: Figure, look: Look, names: Sequence[str]) -> list[str]:
+def entries(figure: Figure, look: PageStyle, names: Sequence[str]) -> list[str]:
     """Return what series are called in a legend; a bare number says what it is of."""
     numbers = figure.frame[figure.series].dtype.is_numeric()
     what = f"{figure.series.replace('_', ' ')} " if numbers else ""
     return [f"{what}{look.shown(name)}" for name in names]
 
 
-def parted(figure: Figure, look: Look, most: int) -> Grid:
+def parted(figure: Figure, look: PageStyle, most: int) -> Grid:
     """Part a figure into its panels.
 
     Parameters
     ----------
     figure : Figure
-    look : Look
+    look : PageStyle
     most : int
         Panels side by side.
     """

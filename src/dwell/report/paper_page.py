@@ -10,7 +10,7 @@ from dwell.model import Problem
 from dwell.report import chapter_tables
 from dwell.report.answers import answers, beginning
 from dwell.report.contenders import describe_contenders
-from dwell.report.look import Look
+from dwell.report.formatting import listed, shown_scenario, write_number
 from dwell.report.method import describe_cell, describe_scenario
 from dwell.report.page import (
     definitions,
@@ -20,7 +20,7 @@ from dwell.report.page import (
     paragraph,
     section,
 )
-from dwell.report.wording import listed, shown_scenario, write_number
+from dwell.report.style import PageStyle
 from dwell.study.chapter import Chapter
 from dwell.study.paper.running import HELD_OUT, Scale
 
@@ -86,7 +86,7 @@ class Made(NamedTuple):
 def paper_html(
     chapters: Sequence[Chapter],
     problem: Problem,
-    look: Look,
+    look: PageStyle,
     made: Made,
     drawings: Mapping[str, str],
     files: Mapping[int, str],
@@ -97,7 +97,7 @@ def paper_html(
     ----------
     chapters : sequence of Chapter
     problem : Problem
-    look : Look
+    look : PageStyle
         Of all chapters.
     made : Made
     drawings : mapping of str to str
@@ -153,7 +153,7 @@ def _lasted(seconds: float) -> str:
 
 
 def _chapter(
-    chapter: Chapter, look: Look, drawings: Mapping[str, str], files: Mapping[int, str]
+    chapter: Chapter, look: PageStyle, drawings: Mapping[str, str], files: Mapping[int, str]
 ) -> str:
     parts = [
         beginning(chapter, look),

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dwell.errors import SimulationError
-from dwell.io.claimed import write_whole
+from dwell.io.work_folder import write_whole
 from dwell.model import FrozenDict, Problem
 from dwell.report import chapter_tables
 from dwell.report.drawing import draw
-from dwell.report.look import Look
 from dwell.report.paper_page import Made, paper_html
+from dwell.report.style import PageStyle
 from dwell.report.svg import drawn, in_page, pdf_file, svg_file
 from dwell.study.chapter import Chapter, Figure
 from dwell.study.paper.running import Scale
@@ -72,7 +72,7 @@ def paper_report(
     SimulationError
         If the folder cannot be written; what is there stays.
     """
-    look = Look.of(problem, chapters)
+    look = PageStyle.of(problem, chapters)
     files = _named(chapters)
     why = {name: str(error) for name, error in failures.items()}
     made = Made(scale, elapsed_s, versions(), why, replayed)
@@ -113,7 +113,7 @@ def _name(chapter: str, slug: str) -> str:
     return slug if inside else f"{chapter}-{slug}"
 
 
-def _write_figure(figure: Figure, look: Look, folder: Path, name: str) -> str:
+def _write_figure(figure: Figure, look: PageStyle, folder: Path, name: str) -> str:
     """Write a figure's files; return what stands in the page."""
     canvas = draw(figure, look)
     # Places are found once, and not again for every file.

@@ -11,7 +11,7 @@ from dwell.study.summary import latency_ms, order_statistic
 
 if TYPE_CHECKING:
     from dwell.record import Run
-    from dwell.report.facts import Facts
+    from dwell.report.run_header import RunHeader
 
 __all__ = ["PhaseRow", "phase_rows"]
 
@@ -54,7 +54,7 @@ class PhaseRow(NamedTuple):
     rms_px: float
 
 
-def phase_rows(run: Run, facts: Facts) -> list[PhaseRow]:
+def phase_rows(run: Run, facts: RunHeader) -> list[PhaseRow]:
     """Return the phases of a run that have cycles; none where there are too many of them."""
     import polars as pl
 

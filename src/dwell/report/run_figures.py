@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.report.drawing import draw
-from dwell.report.look import Look
 from dwell.report.palette import INK, MUTED, PAPER, PARTS
+from dwell.report.style import PageStyle
 from dwell.report.svg import inline, new_figure
 from dwell.study.chapter import Figure
 from dwell.study.summary import latency_ms
@@ -25,7 +25,7 @@ LINES = ("solid", (0, (5, 2)), (0, (1.2, 1.6)), (0, (5, 1.5, 1.2, 1.5)))
 DASHED = (0, (4, 2))
 
 
-def latencies_by_placement(cycles: pl.DataFrame, look: Look, deadline_ms: float) -> str:
+def latencies_by_placement(cycles: pl.DataFrame, look: PageStyle, deadline_ms: float) -> str:
     """Share of the cycles that took longer than a latency, a line for each placement."""
     import polars as pl
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
 from dwell.report import live_facts, run_figures
 from dwell.report.drawing import draw
-from dwell.report.facts import Facts
-from dwell.report.look import Look
+from dwell.report.formatting import OURS, listed, percent, shown_scenario, write_number
 from dwell.report.page import (
     Cell,
     definitions,
@@ -31,9 +30,10 @@ from dwell.report.page import (
 from dwell.report.palette import Palette
 from dwell.report.phase_rows import PhaseRow, phase_rows
 from dwell.report.phases import Disturbed
+from dwell.report.run_header import RunHeader
+from dwell.report.style import PageStyle
 from dwell.report.svg import inline
 from dwell.report.timeline import run_timeline
-from dwell.report.wording import OURS, listed, percent, shown_scenario, write_number
 from dwell.study import AIM
 from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
 
@@ -70,14 +70,16 @@ def run_html(run: Run) -> str:
     SimulationError
         If the run has no window after its warm-up.
     """
-    facts = Facts.of(run)
+    facts = RunHeader.of(run)
     counted = count_in(run, facts.window_cycles)
     palette = Palette.of(facts.candidates)
     title = f"A run of {_policy(facts, counted)} on {facts.cell}"
     return document(title, _body(run, facts, counted, palette, title))
 
 
-def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str) -> Iterator[str]:
+def _body(
+    run: Run, facts: RunHeader, counted: Counted, palette: Palette, title: str
+) -> Iterator[str]:
     seconds = counted.cycles.height * facts.period_ms / 1e3
     yield f"<h1>{escape(title)}</h1>"
     yield paragraph(
@@ -102,7 +104,7 @@ def _body(run: Run, facts: Facts, counted: Counted, palette: Palette, title: str
     yield section("What this is", *_about(facts))
 
 
-def _what(facts: Facts) -> str:
+def _what(facts: RunHeader) -> str:
     if not facts.live:
         return f"Scenario “{shown_scenario(facts.scenario)}”, {facts.kind}, seed {facts.seed}"
     # A cell in earnest has no scenario but what happens to it.
@@ -110,7 +112,7 @@ def _what(facts: Facts) -> str:
     return f"Live{f', scenario “{shown_scenario(facts.scenario)}”' if played else ''}"
 
 
-def _begins(run: Run, facts: Facts) -> NDArray[np.float64]:
+def _begins(run: Run, facts: RunHeader) -> NDArray[np.float64]:
     """When every window began, seconds; a live run's cycles do not come by their numbers."""
     first = run.windows["first_cycle"].to_numpy()
     if not facts.live:
@@ -120,7 +122,7 @@ def _begins(run: Run, facts: Facts) -> NDArray[np.float64]:
     return np.array([released[cycle] / 1e9 for cycle in first.tolist()], np.float64)
 
 
-def _policy(facts: Facts, counted: Counted) -> str:
+def _policy(facts: RunHeader, counted: Counted) -> str:
     """Return the policy's name; a placement's where it never moves."""
     if facts.policy_name == "Static":
         return f"{counted.windows['placement'][0]}, which never moves,"
@@ -130,7 +132,7 @@ def _policy(facts: Facts, counted: Counted) -> str:
 # ----------------------------------------------------------------------------------- verdict
 
 
-def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
+def _verdict(facts: RunHeader, counted: Counted) -> Iterator[str]:
     cycles, windows, decisions = counted.cycles, counted.windows, counted.decisions
     missed = cycles["missed"].to_numpy()
     rate = float(missed.mean())
@@ -165,7 +167,7 @@ def _verdict(facts: Facts, counted: Counted) -> Iterator[str]:
     )
 
 
-def _shadows(facts: Facts, windows: pl.DataFrame) -> Iterator[str]:
+def _shadows(facts: RunHeader, windows: pl.DataFrame) -> Iterator[str]:
     """Say what shadow jobs cost, where there were any."""
     if "shadow_cycles" not in windows.columns or not windows["shadow_cycles"].sum():
         return
@@ -212,7 +214,7 @@ def _count(number: int, what: str) -> str:
 
 
 def _in_time(
-    run: Run, facts: Facts, palette: Palette, begin_s: NDArray[np.float64]
+    run: Run, facts: RunHeader, palette: Palette, begin_s: NDArray[np.float64]
 ) -> Iterator[str]:
     shown = run_timeline(
         run.windows,
@@ -227,7 +229,7 @@ def _in_time(
     )
     error = " The tracking error is its root mean square." if facts.tracking is not None else ""
     yield figure(
-        inline(draw(shown, Look(palette, frozenset())), shown.slug, shown.title),
+        inline(draw(shown, PageStyle(palette, frozenset())), shown.slug, shown.title),
         "Each mark is a window and has the colour of the placement that was active. In the panel "
         "of J the lines without marks are what the other placements were estimated to cost."
         + error,
@@ -241,7 +243,7 @@ def _in_time(
     )
 
 
-def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str:
+def _by_phase(facts: RunHeader, palette: Palette, phases: Sequence[PhaseRow]) -> str:
     """Say what every phase showed."""
     guarded = any(row.guard_moves for row in phases)
     tracked = facts.tracking is not None
@@ -291,15 +293,15 @@ def _by_phase(facts: Facts, palette: Palette, phases: Sequence[PhaseRow]) -> str
     return table(head, rows, caption)
 
 
-def _once(facts: Facts) -> list[Disturbed]:
+def _once(facts: RunHeader) -> list[Disturbed]:
     """Return what was done, each thing once."""
     return list({(one.kind, one.what): one for one in facts.disturbed}.values())
 
 
-def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
+def _latency(facts: RunHeader, counted: Counted, palette: Palette) -> Iterator[str]:
     yield figure(
         run_figures.latencies_by_placement(
-            counted.cycles, Look(palette, frozenset()), facts.deadline_ms
+            counted.cycles, PageStyle(palette, frozenset()), facts.deadline_ms
         ),
         "Latency of the cycles that were released under each placement: one less the empirical "
         "distribution function, on a logarithmic scale. Dotted: 5 %.",
@@ -314,7 +316,7 @@ def _latency(facts: Facts, counted: Counted, palette: Palette) -> Iterator[str]:
 
 
 def _decisions(
-    run: Run, counted: Counted, facts: Facts, palette: Palette, begins: NDArray[np.float64]
+    run: Run, counted: Counted, facts: RunHeader, palette: Palette, begins: NDArray[np.float64]
 ) -> Iterator[str]:
     decisions = counted.decisions
     counts = dict(decisions["reason"].cast(str).value_counts().rows())
@@ -329,7 +331,7 @@ def _decisions(
 
 
 def _migrations(
-    run: Run, facts: Facts, palette: Palette, moves: pl.DataFrame, begins: NDArray[np.float64]
+    run: Run, facts: RunHeader, palette: Palette, moves: pl.DataFrame, begins: NDArray[np.float64]
 ) -> str:
     cost = dict(run.windows.select("window", "cost").rows())
     begin_s = _by_window(run.windows, begins)
@@ -374,7 +376,7 @@ def _by_window(windows: pl.DataFrame, begins: NDArray[np.float64]) -> Mapping[in
 
 
 def _worst_windows(
-    facts: Facts, counted: Counted, palette: Palette, all_begins: Mapping[int, float]
+    facts: RunHeader, counted: Counted, palette: Palette, all_begins: Mapping[int, float]
 ) -> str:
     worst = counted.windows.sort(
         "violation_rate", "seen_l95_ms", descending=True, nulls_last=True, maintain_order=True
@@ -410,7 +412,7 @@ def _worst_windows(
     )
 
 
-def _about(facts: Facts) -> Iterator[str]:
+def _about(facts: RunHeader) -> Iterator[str]:
     yield definitions(
         {
             "cell": facts.cell,
@@ -428,7 +430,7 @@ def _about(facts: Facts) -> Iterator[str]:
         yield paragraph(OURS)
 
 
-def _placements(facts: Facts) -> str:
+def _placements(facts: RunHeader) -> str:
     """Say where each candidate puts the tasks that are not on the same node in all of them."""
     first = next(iter(facts.candidates.values()))
     parts = []

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from dwell.report.formatting import SYMBOL
 from dwell.report.palette import INK, MUTED, PAPER, PARTS, RAMP, RULE
-from dwell.report.wording import SYMBOL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

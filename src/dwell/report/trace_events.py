@@ -11,7 +11,7 @@ import heapq
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NotRequired, TypeAlias, TypedDict
 
-from dwell.report.facts import Facts
+from dwell.report.run_header import RunHeader
 
 if TYPE_CHECKING:
     import polars as pl
@@ -70,7 +70,7 @@ def trace_events(run: Run) -> TraceDocument:
     RunError
         If the run kept no jobs, or its record is incomplete.
     """
-    facts = Facts.of(run)
+    facts = RunHeader.of(run)
     jobs = run.jobs
     return {
         "traceEvents": [
@@ -89,7 +89,7 @@ def trace_events(run: Run) -> TraceDocument:
     }
 
 
-def _names(facts: Facts, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+def _names(facts: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
     """Name the processes, and the first thread of every task."""
     yield _name("process_name", CELL, 0, f"cell {facts.cell}")
     for node, pid in _processes(facts).items():
@@ -98,7 +98,7 @@ def _names(facts: Facts, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
         yield _name("thread_name", _processes(facts)[node], _threads(jobs)[task], task)
 
 
-def _job_events(facts: Facts, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+def _job_events(facts: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
     """Jobs as slices, their waiting as asynchronous ones."""
     threads = _threads(jobs)
     known = [jobs[column].max() for column in ("ready_ns", "start_ns", "end_ns")]
@@ -151,7 +151,7 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
         yield from _span(name, "cycle", CELL, key, (release_ns, end_ns), about)
 
 
-def _migration_events(run: Run, facts: Facts) -> Iterator[TraceEvent]:
+def _migration_events(run: Run, facts: RunHeader) -> Iterator[TraceEvent]:
     """Decisions that migrate, at the close of the window they were made after."""
     import polars as pl
 
@@ -170,7 +170,7 @@ def _migration_events(run: Run, facts: Facts) -> Iterator[TraceEvent]:
         }
 
 
-def _processes(facts: Facts) -> dict[str, int]:
+def _processes(facts: RunHeader) -> dict[str, int]:
     return {node: pid for pid, node in enumerate(facts.nodes, start=CELL + 1)}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from dwell.report.wording import Measure, Written, write_interval, write_number
+from dwell.report.formatting import Measure, Written, write_interval, write_number
 from dwell.study import Interval
 from dwell.study.chapter import Unit
 

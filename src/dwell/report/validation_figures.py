@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.report.formatting import shown_contender, shown_scenario
 from dwell.report.palette import INK, MUTED, PAPER, PARTS, RULE, Palette
 from dwell.report.panels import folded
 from dwell.report.scales import is_wide, set_log_ticks
 from dwell.report.svg import inline, new_figure
-from dwell.report.wording import shown_contender, shown_scenario
 from dwell.study.intervals import Interval
 from dwell.study.judged_prediction import Judged
 from dwell.study.validation import L95_ALLOWED, POINTS_ALLOWED, USE_ALLOWED, Group, Validation

@@ -5,7 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from dwell.report.wording import listed, percent, shown_contender, shown_in_sentence, write_number
+from dwell.report.formatting import (
+    listed,
+    percent,
+    shown_contender,
+    shown_in_sentence,
+    write_number,
+)
 from dwell.study.judged_prediction import ORDER, Judged, Outcome
 from dwell.study.validation import GOALS, LEAST_MINUTES, Group, Validation
 

@@ -8,6 +8,15 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from dwell.report import validation_figures as figures
+from dwell.report.formatting import (
+    OURS,
+    Measure,
+    percent,
+    shown_contender,
+    shown_scenario,
+    write_interval,
+    write_number,
+)
 from dwell.report.method import describe_cell
 from dwell.report.page import (
     Cell,
@@ -23,15 +32,6 @@ from dwell.report.page import (
 )
 from dwell.report.palette import Palette
 from dwell.report.validation_findings import GOAL_NAMES, remarks, totals, worst_use
-from dwell.report.wording import (
-    OURS,
-    Measure,
-    percent,
-    shown_contender,
-    shown_scenario,
-    write_interval,
-    write_number,
-)
 from dwell.study.intervals import Interval
 from dwell.study.judged_prediction import Outcome
 from dwell.study.resampling import DRAWS

@@ -5,8 +5,8 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 
+from dwell.report.formatting import shown_contender, shown_scenario, write_number
 from dwell.report.validation_findings import GOAL_NAMES, remarks, totals, worst_use
-from dwell.report.wording import shown_contender, shown_scenario, write_number
 from dwell.study.judged_prediction import Outcome
 from dwell.study.validation import Group, Validation
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from dwell.report.look import Look, key
 from dwell.report.palette import INK, MUTED, RULE
 from dwell.report.panels import (
     Floats,
@@ -27,6 +26,7 @@ from dwell.report.panels import (
     scale_of,
 )
 from dwell.report.scales import is_wide
+from dwell.report.style import PageStyle, key
 from dwell.report.svg import new_figure
 from dwell.report.units import labelled
 from dwell.study.chapter import Figure
@@ -60,7 +60,7 @@ class Span(NamedTuple):
         return self.end > self.begin
 
 
-def draw_timeline(figure: Figure, look: Look) -> Canvas:
+def draw_timeline(figure: Figure, look: PageStyle) -> Canvas:
     """Draw panels that share their time, below strips of what happened and of the placement."""
     places = parted(figure, look, 1).places
     x = floats(figure.frame, figure.x)
@@ -97,7 +97,7 @@ def draw_timeline(figure: Figure, look: Look) -> Canvas:
     return canvas
 
 
-def _placements(ax: Axes, figure: Figure, look: Look, step: float) -> None:
+def _placements(ax: Axes, figure: Figure, look: PageStyle, step: float) -> None:
     """Draw a band that has the colour of the placement."""
     shown = figure.frame.select(figure.x, "placement").unique(figure.x).sort(figure.x)
     at = floats(shown, figure.x)
@@ -144,7 +144,7 @@ def _as_strip(ax: Axes, label: str) -> None:
     ax.spines[["left", "bottom"]].set_visible(False)
 
 
-def _panel(ax: Axes, figure: Figure, look: Look, place: Place, spans: Sequence[Span]) -> None:
+def _panel(ax: Axes, figure: Figure, look: PageStyle, place: Place, spans: Sequence[Span]) -> None:
     for span in (span for span in spans if span.lasts):
         ax.axvspan(span.begin, span.end, color=RULE, alpha=0.4, lw=0, zorder=0)
     scale = _scale(place, figure.y)
@@ -171,7 +171,9 @@ def _panel(ax: Axes, figure: Figure, look: Look, place: Place, spans: Sequence[S
     ax.grid(axis="x", visible=False)
 
 
-def _marks(ax: Axes, at: Floats, values: Floats, placed: Sequence[str | None], look: Look) -> None:
+def _marks(
+    ax: Axes, at: Floats, values: Floats, placed: Sequence[str | None], look: PageStyle
+) -> None:
     """Draw one mark a window, joined by a faint line."""
     ax.plot(at, values, "-", color=RULE, lw=0.8, zorder=1)
     for name in dict.fromkeys(placed):
@@ -191,7 +193,7 @@ def _scale(place: Place, column: str) -> Scale:
     return scale_of([place], [column], linear=True)
 
 
-def _base(name: str, look: Look) -> str | None:
+def _base(name: str, look: PageStyle) -> str | None:
     """Return the candidate that a series is about: ``LOC`` of ``LOC alone``."""
     first = name.split(" ", 1)[0]
     return first if first != name and first in look.placements else None
@@ -209,7 +211,9 @@ def _spans(figure: Figure) -> Iterable[Span]:
         yield Span(float(row["begin"]), float(row["end"]), str(row["label"]))
 
 
-def _legend(figure: Figure, look: Look, places: Sequence[Place]) -> tuple[list[str], list[Artist]]:
+def _legend(
+    figure: Figure, look: PageStyle, places: Sequence[Place]
+) -> tuple[list[str], list[Artist]]:
     """Say what colours, marks and lines are."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch

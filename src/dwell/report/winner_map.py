@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.look import Look, key
 from dwell.report.palette import INK, MUTED, PAPER
 from dwell.report.panels import Place, floats, keys, legend, legend_lines, parted
+from dwell.report.style import PageStyle, key
 from dwell.report.svg import WIDTH, new_figure
 from dwell.report.units import labelled, write
 from dwell.study.chapter import Figure
@@ -36,7 +36,7 @@ HATCH = "///"
 LETTER_INCHES = 0.07
 
 
-def draw_map(figure: Figure, look: Look) -> Canvas:
+def draw_map(figure: Figure, look: PageStyle) -> Canvas:
     """Draw a cell for every point, in its winner's colour and with its name.
 
     The more it wins by, the stronger the colour. Points are equally spaced, whatever their values.
@@ -147,7 +147,7 @@ def _fitting(names: list[str], room: int) -> dict[str, str]:
 
 
 def _legend(
-    figure: Figure, look: Look, colours: dict[str, str], largest: float, strong: float
+    figure: Figure, look: PageStyle, colours: dict[str, str], largest: float, strong: float
 ) -> tuple[list[str], list[Artist]]:
     from matplotlib.patches import Patch
 

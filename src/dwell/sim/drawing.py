@@ -28,8 +28,8 @@ from dwell.model import (
     TraceTable,
 )
 from dwell.model.scenario import RAMP_STEPS
+from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
-from dwell.sim.spells import LONGEST_NS, Spells, drawn_spells, ramp, spell
 
 __all__ = ["draw", "draw_shadows", "stream"]
 
@@ -42,7 +42,7 @@ NS_PER_S = 1e9
 OF_A_JOB = ("exec/", "delay/", "extra/", "loss/")
 # Values drawn at a time: a block and its temporaries stay in the second-level cache.
 BLOCK = 16384
-NEVER = Spells(*np.empty((3, 0), np.int64))
+NEVER = OnOffIntervals(*np.empty((3, 0), np.int64))
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -290,27 +290,27 @@ class _Draw:
     def _on_link(self, link: str) -> list[LinkDisturbance]:
         return [i for i in self.scenario if isinstance(i, LinkDisturbance) and i.link == link]
 
-    def _bursts(self, part: Node | Link) -> Spells:
+    def _bursts(self, part: Node | Link) -> OnOffIntervals:
         """Bursts of a node or link, up to the end of the run."""
         if part.bursts is None:
             return NEVER
         every, length = part.bursts.every_ms, part.bursts.for_ms
         rngs = self._rng(f"bursts/{part.name}/every"), self._rng(f"bursts/{part.name}/for")
-        return drawn_spells(every, length, NS_PER_MS, rngs, 0, int(self.release_ns[-1]))
+        return drawn_intervals(every, length, NS_PER_MS, rngs, 0, int(self.release_ns[-1]))
 
-    def _spells(self, item: Disturbance) -> Spells:
+    def _spells(self, item: Disturbance) -> OnOffIntervals:
         """Say when a disturbance is on, up to the end of the run."""
         begin_ns = round(item.at_s * NS_PER_S)
         end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS)))
         if item.ramp_s:
             return ramp(begin_ns, end_ns, round(item.ramp_s * NS_PER_S))
         if item.episodes is None:
-            return spell(begin_ns, end_ns)
+            return interval(begin_ns, end_ns)
         episodes, horizon_ns = item.episodes, min(end_ns, int(self.release_ns[-1]))
         # The stream has the name of the episodes alone: what shares it comes and goes together.
         name, every, length = episodes.name, episodes.every_s, episodes.for_s
         rngs = self._rng(f"episodes/{name}/every"), self._rng(f"episodes/{name}/for")
-        drawn = drawn_spells(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
+        drawn = drawn_intervals(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
         return drawn.until(end_ns)
 
     def _node_changes(self) -> NodeChanges:
@@ -387,7 +387,7 @@ def _rates(own_mbps: float, mbps: float, level: Ints) -> Floats:
     return rates
 
 
-def _steps(spells: Spells, threads: int, down: bool = False) -> Ints:
+def _steps(spells: OnOffIntervals, threads: int, down: bool = False) -> Ints:
     """Steps at the begins and ends of spells: rows at, change of threads, change of outages."""
     steps = np.empty((3, 2 * len(spells.begin)), np.int64)
     steps[0, 0::2], steps[0, 1::2] = spells.begin, spells.end

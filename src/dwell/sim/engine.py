@@ -31,7 +31,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out, ordered_flows
-from dwell.sim.cold import Cold
+from dwell.sim.cold_migration import ColdMigration
 from dwell.sim.drawing import draw, draw_shadows
 from dwell.sim.guard import Watch
 from dwell.sim.realisation import NodeChanges, Realisation
@@ -281,7 +281,7 @@ class _Stamper:
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
-        self.cold = Cold(problem, realisation) if settings.migration == "cold" else None
+        self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.fraction = controller.shadow_fraction
         self.placement = controller.incumbent
         self.next_first = 0

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import Problem
-from dwell.model.meaning import nearest
+from dwell.model.semantics import nearest
 from dwell.study.engine import Progress, play_in_memory
 from dwell.study.intervals import Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import MetricError
-from dwell.model.meaning import nearest
+from dwell.model.semantics import nearest
 from dwell.study.intervals import (
     Interval,
     mean_interval,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dwell.errors import RunError
-from dwell.io.claimed import Claim, Description, claimed, unwritable, write_whole
+from dwell.io.work_folder import Claim, Description, claimed, unwritable, write_whole
 
 if TYPE_CHECKING:
     import polars as pl

@@ -22,8 +22,8 @@ from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.model import Problem, Trace
 from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
-from dwell.testbed.hops import OnTheWay, floors, hops, own_delays
 from dwell.testbed.measured import Measured, look_at, usable
+from dwell.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell.testbed.node_loads import (
     backgrounds,
     beside_jobs,

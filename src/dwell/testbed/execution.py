@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from dwell.errors import DwellError, LiveError, RunError
-from dwell.io.claimed import Claim, claimed, unwritable, write_whole
+from dwell.io.work_folder import Claim, claimed, unwritable, write_whole
 from dwell.model import Problem
 from dwell.record import Run, open_run
 from dwell.testbed.campaign import TRACES, Campaign, Entrant, Planned

@@ -26,7 +26,7 @@ from dwell.testbed.draws import Draws
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.orders import Orders, Set
 from dwell.testbed.packets import kind_of
-from dwell.testbed.punctuality import come_first
+from dwell.testbed.realtime import come_first
 
 __all__ = ["LATE_MS", "main"]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dwell.errors import RunError
 from dwell.model import LinkDisturbance, Problem
 from dwell.model.scenario import is_always_on
-from dwell.testbed.hops import LEAST_JOBS
+from dwell.testbed.message_costs import LEAST_JOBS
 from dwell.testbed.speeds import work_ms
 
 if TYPE_CHECKING:

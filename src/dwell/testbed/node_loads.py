@@ -12,8 +12,8 @@ import numpy as np
 
 from dwell.model import Problem
 from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
-from dwell.testbed.hops import LEAST_JOBS
 from dwell.testbed.measured import Measured, SiteName
+from dwell.testbed.message_costs import LEAST_JOBS
 from dwell.testbed.speeds import Usual
 from dwell.testbed.task_costs import Site
 

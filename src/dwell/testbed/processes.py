@@ -18,7 +18,7 @@ from typing import TypeAlias
 import yaml
 
 from dwell.errors import LiveError
-from dwell.live.leash import OWNER, start_sweeper
+from dwell.live.parent_death import OWNER, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import roles
 from dwell.model import Problem

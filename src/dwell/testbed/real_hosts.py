@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
-from dwell.live.leash import OWNER
-from dwell.live.visiting import Visitor
+from dwell.live.operator_client import OperatorClient
+from dwell.live.parent_death import OWNER
 from dwell.model import Host, LinkDisturbance, NodeDisturbance, Normal, Problem
 from dwell.model.document import disturbance_document
 from dwell.policies import by_name
@@ -175,7 +175,7 @@ class RealHosts:
 
     # ------------------------------------------------------------------------- running
 
-    def begin(self, visitor: Visitor) -> None:
+    def begin(self, visitor: OperatorClient) -> None:
         """Wait until everybody is there, and begin a run that knows nothing of the time before.
 
         Raises
@@ -337,7 +337,7 @@ def run_on_hosts(
 
         stack.callback(close)
         hosts.__enter__()
-        visitor = stack.enter_context(Visitor(hosts.problem))
+        visitor = stack.enter_context(OperatorClient(hosts.problem))
         hosts.begin(visitor)
         begun_s = time.monotonic()
 

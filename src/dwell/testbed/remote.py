@@ -21,7 +21,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from types import FrameType
 
-from dwell.live.leash import OWNER, end_with_owner
+from dwell.live.parent_death import OWNER, end_with_owner
 
 __all__ = ["local_words", "script_of"]
 

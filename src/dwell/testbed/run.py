@@ -12,8 +12,8 @@ from dwell.live.hosting import clock_of
 from dwell.model import NodeDisturbance, Problem
 from dwell.policies import by_name
 from dwell.record import Run, open_run
-from dwell.testbed.bed import STARTING, Bed
 from dwell.testbed.doctor import examine
+from dwell.testbed.netns_testbed import STARTING, NetnsTestbed
 from dwell.testbed.playing import (
     Played,
     begun,
@@ -115,7 +115,7 @@ def run_once(
         problem = problem.under(policy)
     changes = changes_of(problem, scenario, outages=True)
     arguments = ["--jobs"] if jobs else []
-    bed = Bed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
+    bed = NetnsTestbed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
     require_machine([problem])
     rule = rule or Rule()
     played = Played(problem, scenario, seed)
@@ -150,7 +150,7 @@ def run_once(
 
 
 def _play(
-    bed: Bed,
+    bed: NetnsTestbed,
     changes: Sequence[Change],
     seconds: float,
     played: Played,
@@ -173,7 +173,7 @@ def _play(
 
 def _seal(
     folder: Path,
-    bed: Bed,
+    bed: NetnsTestbed,
     played: Played,
     samplers: Sequence[Sampler],
     rule: Rule,

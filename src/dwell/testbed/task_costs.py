@@ -6,7 +6,7 @@ messages on one node, and of what they cost, is told so by way of the execution 
 
 - a worker's CPU time is idle · wall + Σ (stage + overhead) over its jobs. Runs in which it has jobs
   and runs in which it has none tell the two apart; a worker that always has jobs idles like others;
-- of the overhead, what lies on the way of messages delays the cycle (`dwell.testbed.hops`);
+- of the overhead, what delays messages (`dwell.testbed.message_costs`) delays the cycle;
 - a job takes, besides, what passes between its last input and its start, and a sink's what passes
   between its end and the command's hand-over, as where the quota does not interfere;
 - where something counts what a node takes between a release and its source's start, or between two
@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dwell.model import Flow, Problem
-from dwell.testbed.hops import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.measured import Floats, Measured, SiteName
+from dwell.testbed.message_costs import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
 from dwell.testbed.speeds import Usual
 

@@ -58,7 +58,7 @@ class Watcher(Started):
         return self.ask("status", patience_s=patience_s)
 
     def ask(self, what: str, about: str = "", *, patience_s: float = 3.0) -> Mapping[str, Any]:
-        """Ask as `Visitor.ask` does.
+        """Ask as `OperatorClient.ask` does.
 
         Raises
         ------
@@ -73,8 +73,8 @@ class Watcher(Started):
 def main() -> None:
     """Answer until the parent ends, or wants this to."""
     import dwell
+    from dwell.live.operator_client import OperatorClient
     from dwell.live.security import INSECURE
-    from dwell.live.visiting import Visitor
     from dwell.testbed.processes import without_keys
 
     parent = Parent()
@@ -83,7 +83,7 @@ def main() -> None:
         try:
             # The testbed's hosts lead nowhere but to each other.
             environment = {**without_keys(), INSECURE: "1"}
-            visitor = Visitor(dwell.load(cast("str", settings["cell"])), environment)
+            visitor = OperatorClient(dwell.load(cast("str", settings["cell"])), environment)
         except DwellError as error:
             parent.answer({"error": str(error)})
             return

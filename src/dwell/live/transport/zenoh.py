@@ -27,8 +27,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
 from dwell.live.transport.expressions import require_expression, require_key
-from dwell.live.transport.lingering import Connections
 from dwell.live.transport.losses import Losses
+from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.protocol import Lane, Receive, Sample
 from dwell.live.wiring import Entry, Session, session_of
 from dwell.model import FrozenDict

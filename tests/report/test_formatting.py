@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dwell.report.wording import (
+from dwell.report.formatting import (
     Measure,
     listed,
     percent,

@@ -1,4 +1,4 @@
-"""Look: what names are shown as, and how what they name is drawn, in all figures of a page."""
+"""Style of a page: the labels and colours of policies and scenarios in all of its figures."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dwell.model import Problem
+from dwell.report.formatting import shown_contender, shown_in_sentence, shown_scenario
 from dwell.report.palette import BELIEFS, FAMILIES, VARIANTS, Palette, Style, contended, ramp_styles
-from dwell.report.wording import shown_contender, shown_in_sentence, shown_scenario
 from dwell.study.chapter import Chapter, Figure
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["CONTENDERS", "Look", "key"]
+__all__ = ["CONTENDERS", "PageStyle", "key"]
 
 #: A contender's name as studies have it, in a sentence; two words are what they say there.
 WORDS = tuple(name for name in FAMILIES if " " not in name)
@@ -33,7 +33,7 @@ def key(value: object) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class PageStyle:
     """Colours, styles and names that are the same wherever something is shown.
 
     Parameters
@@ -47,7 +47,7 @@ class Look:
     scenarios: frozenset[str]
 
     @classmethod
-    def of(cls, problem: Problem, chapters: Iterable[Chapter] = ()) -> Look:
+    def of(cls, problem: Problem, chapters: Iterable[Chapter] = ()) -> PageStyle:
         """Collect every candidate and contender that chapters show.
 
         A candidate that a chapter adds to those of the cell has the next colour, in every chapter.

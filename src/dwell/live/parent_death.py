@@ -1,4 +1,4 @@
-"""Leash: a process that ends with another one, whatever becomes of those in between.
+"""Ends this process when its owner ends, however many processes stand between the two.
 
 The processes of a cell outlive their agent, so that it can be started again. Where a whole cell
 belongs to one process (the demo, a test), its variable `OWNER` says so to all of them, and none of
@@ -6,8 +6,8 @@ them is left when that process has ended, even if it was killed.
 
 Nor is their shared memory. Zenoh removes a segment with the last process that lets go of it, but
 where two do so at the same instant each finds it held by the other, and it stays until a Zenoh
-starts again. So a process of its own, ``python -m dwell.live.leash OWNER``, waits until all of them
-have ended, and removes what nobody holds.
+starts again. So a process of its own, ``python -m dwell.live.parent_death OWNER``, waits until all
+of them have ended, and removes the segments that nobody holds.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def end_with_owner(stopped: threading.Event) -> None:
         return
     except OSError:
         return  # a kernel without them
-    start_thread("leash", _wait, owner, stopped)
+    start_thread("parent-death", _wait, owner, stopped)
 
 
 def _wait(owner: int, stopped: threading.Event) -> None:
@@ -62,7 +62,7 @@ def _wait(owner: int, stopped: threading.Event) -> None:
 def start_sweeper() -> subprocess.Popen[bytes]:
     """Start what removes the shared memory of all that end with this process, once they have."""
     return subprocess.Popen(  # noqa: S603 - our own command
-        [sys.executable, "-P", "-m", "dwell.live.leash", str(os.getpid())],
+        [sys.executable, "-P", "-m", "dwell.live.parent_death", str(os.getpid())],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dwell.model import Process
 from dwell.model.scenario import RAMP_STEPS
 
-__all__ = ["LONGEST_NS", "Spells", "drawn_spells", "ramp", "spell"]
+__all__ = ["LONGEST_NS", "OnOffIntervals", "drawn_intervals", "interval", "ramp"]
 
 Ints = NDArray[np.int64]
 
@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 LONGEST_NS = 10**17
 
 
-class Spells(NamedTuple):
+class OnOffIntervals(NamedTuple):
     """Times during which something is on; they are ascending and never overlap.
 
     Parameters
@@ -40,20 +40,20 @@ class Spells(NamedTuple):
         last = np.searchsorted(self.begin, at, side="right") - 1
         return np.where((last >= 0) & (at < self.end[last]), self.level[last], 0)
 
-    def until(self, end_ns: int) -> Spells:
+    def until(self, end_ns: int) -> OnOffIntervals:
         """Return what is left if all is off from an instant on."""
         left = int(np.searchsorted(self.begin, end_ns))
         end = np.minimum(self.end[:left], end_ns)
-        return Spells(self.begin[:left], end, self.level[:left])
+        return OnOffIntervals(self.begin[:left], end, self.level[:left])
 
 
-def spell(begin_ns: int, end_ns: int) -> Spells:
-    """Return one spell at full strength."""
-    return Spells(np.array([begin_ns]), np.array([end_ns]), np.array([RAMP_STEPS]))
+def interval(begin_ns: int, end_ns: int) -> OnOffIntervals:
+    """Return one interval at full strength."""
+    return OnOffIntervals(np.array([begin_ns]), np.array([end_ns]), np.array([RAMP_STEPS]))
 
 
-def ramp(begin_ns: int, end_ns: int, ramp_ns: int) -> Spells:
-    """Return a spell that grows in equal steps, and falls in as many, each time for `ramp_ns`.
+def ramp(begin_ns: int, end_ns: int, ramp_ns: int) -> OnOffIntervals:
+    """Return an interval that grows in equal steps, and falls in as many, each time for `ramp_ns`.
 
     Step n is reached n / `RAMP_STEPS` of that time after the begin, and left as long before the
     end. One that ends no earlier than `LONGEST_NS` does not fall.
@@ -66,17 +66,17 @@ def ramp(begin_ns: int, end_ns: int, ramp_ns: int) -> Spells:
         level, last = np.concatenate((step, step[-2::-1])), end_ns - int(after[0])
     # Where growing and falling meet, rounding must not put the one behind the other.
     begin = np.maximum.accumulate(begin)
-    return Spells(begin, np.append(begin[1:], last), level)
+    return OnOffIntervals(begin, np.append(begin[1:], last), level)
 
 
-def drawn_spells(
+def drawn_intervals(
     every: Process,
     length: Process,
     unit_ns: float,
     rngs: tuple[np.random.Generator, np.random.Generator],
     begin_ns: int,
     horizon_ns: int,
-) -> Spells:
+) -> OnOffIntervals:
     """Draw an alternating renewal process: off for `every`, then on for `length`, and so on.
 
     Parameters
@@ -87,7 +87,7 @@ def drawn_spells(
     rngs : pair of Generator
         Of the times off, and of those on.
     begin_ns, horizon_ns : int
-        Where the first time off begins, and from where on no spell begins any more.
+        Where the first time off begins, and from where on no interval begins any more.
     """
     mean_ns = (every.expectation + length.expectation) * unit_ns
     count = 64 + round(1.1 * max(horizon_ns - begin_ns, 0) / mean_ns)
@@ -106,4 +106,4 @@ def drawn_spells(
     begun = int(np.searchsorted(begin, horizon_ns))
     begin, end = begin[:begun], np.minimum(np.concatenate(ends)[:begun], LONGEST_NS)
     level = np.full(begun, RAMP_STEPS)
-    return Spells(np.rint(begin).astype(np.int64), np.rint(end).astype(np.int64), level)
+    return OnOffIntervals(np.rint(begin).astype(np.int64), np.rint(end).astype(np.int64), level)

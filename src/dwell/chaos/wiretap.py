@@ -1,4 +1,4 @@
-"""Ear: a process that is no part of a cell and writes down what it hears on the wire.
+"""Records a cell's messages from the wire, in a process that is no part of the cell.
 
 It has sessions of its own, sends nothing, and decodes nothing: a record is the instant on the true
 clock, the key, and the message; of a stage's message, its header.
@@ -20,7 +20,7 @@ from dwell.live.transport.protocol import Sample
 from dwell.live.wiring import SESSIONS, Entry, Role, Session, Wiring
 from dwell.testbed.child import Child, Parent, Started
 
-__all__ = ["Ear", "Records", "entry_for", "heard"]
+__all__ = ["Records", "Wiretap", "entry_for", "heard"]
 
 _HEAD = struct.Struct("<QIII")
 
@@ -43,7 +43,7 @@ def entry_for(wiring: Wiring, nodes: Sequence[str]) -> Entry:
     return Entry(role, {}, ends)
 
 
-class Ear(Started):
+class Wiretap(Started):
     """The process, as its parent sees it; a context manager.
 
     Parameters
@@ -66,7 +66,7 @@ class Ear(Started):
             "nodes": list(nodes),
             "out": str(out),
         }
-        self._child = Child("dwell.chaos.ear", f"ear at {','.join(nodes)}", prefix=prefix)
+        self._child = Child("dwell.chaos.wiretap", f"ear at {','.join(nodes)}", prefix=prefix)
 
     def start(self) -> None:
         """Start it.
@@ -88,7 +88,7 @@ class Ear(Started):
 
 
 class Records:
-    """What an ear has written, as far as it has been read.
+    """The records that a wiretap has written, as far as they have been read.
 
     Parameters
     ----------

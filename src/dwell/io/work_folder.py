@@ -1,4 +1,4 @@
-"""Folders that belong to one piece of work: it alone fills them, in as many attempts as it takes.
+"""Work folders: each belongs to one piece of work, which fills it in as many attempts as needed.
 
 A file in the folder says whose it is. Whoever comes with another description is told what differs,
 and nothing is touched. What is written appears complete or not at all.
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dwell.errors import RunError, SimulationError
-from dwell.io.wording import as_read
+from dwell.io.rendering import as_read
 
 __all__ = ["Claim", "Description", "claimed", "unwritable", "write_whole"]
 

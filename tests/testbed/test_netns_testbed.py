@@ -13,8 +13,8 @@ import dwell
 from dwell.errors import LiveError
 from dwell.io import from_document
 from dwell.model import LinkDisturbance, NodeDisturbance
-from dwell.testbed.bed import Bed
 from dwell.testbed.hosts import namespace_path
+from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.timeline import Change
 from tests.testbed.light_cell import document, write_cell
 from tests.testbed.machine import no_groups, no_hosts, own_name
@@ -24,13 +24,13 @@ PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bed]:
+def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetnsTestbed]:
     """One that runs."""
     if why := no_hosts() or no_groups():
         pytest.skip(why)
     folder = tmp_path_factory.mktemp("bed")
     cell = write_cell(folder)
-    with Bed(dwell.load(cell), folder / "out", name=own_name(), beside=folder) as one:
+    with NetnsTestbed(dwell.load(cell), folder / "out", name=own_name(), beside=folder) as one:
         one.come_up(patience_s=PATIENCE_S)
         yield one
 
@@ -49,7 +49,7 @@ def test_what_a_testbed_does_not_have_is_refused(tmp_path: Path) -> None:
     links[0]["bursts"] = {"every_ms": 100, "for_ms": 10, "add_delay_ms": 5}
     problem = from_document(document(nodes=nodes, links=links))
     with pytest.raises(LiveError, match=r"nodes\.E\.bursts.*links R1->E: bursts"):
-        Bed(problem, tmp_path / "out", name="refused")
+        NetnsTestbed(problem, tmp_path / "out", name="refused")
     assert not (tmp_path / "out").exists()
 
 
@@ -58,11 +58,11 @@ def test_cells_that_share_a_link_have_to_agree_on_it(tmp_path: Path) -> None:
     links[0]["delay_ms"] = 7
     one, other = from_document(document()), from_document(document(links=links, name="other"))
     with pytest.raises(LiveError, match="links R1->E: two cells share it"):
-        Bed([one, other], tmp_path, name="refused")
-    assert len(Bed([one, replace(one, name="third")], tmp_path, name="fine").problems) == 2
+        NetnsTestbed([one, other], tmp_path, name="refused")
+    assert len(NetnsTestbed([one, replace(one, name="third")], tmp_path, name="fine").problems) == 2
 
 
-def test_a_run_begins_anew_with_everybody_there(bed: Bed) -> None:
+def test_a_run_begins_anew_with_everybody_there(bed: NetnsTestbed) -> None:
     (watcher,) = bed.watchers
     begun_ns = time.monotonic_ns()
     before = {bed.begin(patience_s=PATIENCE_S)[0]}
@@ -79,7 +79,7 @@ def test_a_run_begins_anew_with_everybody_there(bed: Bed) -> None:
     assert watcher.status(10.0)["run"] != status["run"]
 
 
-def test_stress_is_in_the_group_of_its_node(bed: Bed) -> None:
+def test_stress_is_in_the_group_of_its_node(bed: NetnsTestbed) -> None:
     stress = NodeDisturbance("R2", stress_threads=2)
     bed.apply(Change(0.0, stress, begins=True))
     begun_ns = bed.used_ns["R2"]()
@@ -88,7 +88,7 @@ def test_stress_is_in_the_group_of_its_node(bed: Bed) -> None:
     bed.apply(Change(1.0, stress, begins=False))
 
 
-def test_a_link_that_is_down_lets_nothing_through(bed: Bed) -> None:
+def test_a_link_that_is_down_lets_nothing_through(bed: NetnsTestbed) -> None:
     link = bed.links[frozenset(("R1", "R2"))]
     cut = LinkDisturbance("R1", "R2", down=True, loss=0.5)
     bed.apply(Change(0.0, cut, begins=True))
@@ -98,7 +98,7 @@ def test_a_link_that_is_down_lets_nothing_through(bed: Bed) -> None:
     wait_for(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
 
 
-def test_a_node_that_was_down_comes_back(bed: Bed) -> None:
+def test_a_node_that_was_down_comes_back(bed: NetnsTestbed) -> None:
     (watcher,) = bed.watchers
     if "controller@E" not in bed._processes.running:
         bed.begin(patience_s=PATIENCE_S)
@@ -117,7 +117,7 @@ def test_a_node_that_was_down_comes_back(bed: Bed) -> None:
     assert not there & set(bed._groups.pids("R2"))
 
 
-def test_nothing_is_left(bed: Bed) -> None:
+def test_nothing_is_left(bed: NetnsTestbed) -> None:
     """The last: it takes the bed down."""
     namespaces = [namespace_path(bed._hosts.namespace(node)) for node in bed.nodes]
     assert all(path.exists() for path in namespaces)

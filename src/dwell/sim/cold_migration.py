@@ -8,7 +8,7 @@ from dwell.kernels.links import send_state
 from dwell.model import Problem
 from dwell.sim.realisation import Realisation
 
-__all__ = ["Cold"]
+__all__ = ["ColdMigration"]
 
 # The cycle field of an event: number of the migration, attempt, whether it is ready.
 NUMBER_SHIFT = 20
@@ -16,7 +16,7 @@ ATTEMPTS = (1 << (NUMBER_SHIFT - 1)) - 1
 NUMBERS = (1 << (k.CYCLE_BITS - NUMBER_SHIFT)) - 1
 
 
-class Cold:
+class ColdMigration:
     """The one cold migration of a cell that may be under way.
 
     Its steps are events like any others, which `dwell.kernels.advance` hands back: a worker is

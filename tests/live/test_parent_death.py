@@ -11,17 +11,17 @@ import threading
 
 import pytest
 
-from dwell.live.leash import OWNER, end_with_owner
+from dwell.live.parent_death import OWNER, end_with_owner
 from dwell.live.transport.orphans import SHARED_MEMORY
 
 PATIENCE_S = 60.0
 
-#: Starts a process that waits on the leash of its parent, tells its id, and waits to be killed.
+#: Starts a process that ends with its parent, tells its id, and waits to be killed.
 OWNER_CODE = """
 import os, subprocess, sys, time
 code = '''
 import sys, threading
-from dwell.live.leash import end_with_owner
+from dwell.live.parent_death import end_with_owner
 stopped = threading.Event()
 end_with_owner(stopped)
 print("waits", flush=True)
@@ -58,10 +58,10 @@ def test_an_owner_that_has_gone_already_is_noticed(monkeypatch: pytest.MonkeyPat
 #: As above; the process holds a file as Zenoh holds a segment, and a sweeper waits as well.
 HOLDER_CODE = """
 import os, subprocess, sys, time
-from dwell.live.leash import start_sweeper
+from dwell.live.parent_death import start_sweeper
 code = '''
 import fcntl, os, sys, threading, time
-from dwell.live.leash import end_with_owner
+from dwell.live.parent_death import end_with_owner
 fcntl.flock(os.open(sys.argv[1], os.O_RDWR), fcntl.LOCK_SH)
 stopped = threading.Event()
 end_with_owner(stopped)

@@ -1,4 +1,4 @@
-"""Blame: what somebody else's code raised, in one line that says where."""
+"""Says in one line what a user's code raised, and where."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is allowed in a cell file, and seldom meant in one that is run live."""
+"""Warns of settings of a live cell that are allowed and seldom meant."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dwell.errors import Fault
 from dwell.model import Problem
 
-__all__ = ["find_cautions"]
+__all__ = ["lint"]
 
 
-def find_cautions(problem: Problem) -> Iterator[Fault]:
+def lint(problem: Problem) -> Iterator[Fault]:
     """Yield what a live cell does not do as its file says, or not as well as it could.
 
     Of one that is for the simulator alone, with neither hosts nor stages, nothing.

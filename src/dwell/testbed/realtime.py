@@ -1,4 +1,4 @@
-"""How a process gets the CPU as soon as something is due."""
+"""Gives a process real-time priority, so that it runs as soon as something is due."""
 
 from __future__ import annotations
 

@@ -11,19 +11,19 @@ from hypothesis import strategies as st
 
 from dwell.model import Constant, Exponential, LogNormal, Process, Uniform
 from dwell.model.scenario import RAMP_STEPS
-from dwell.sim.spells import LONGEST_NS, Spells, drawn_spells, ramp, spell
+from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
 
 S = 1_000_000_000
 
 
 def drawn(
     every: Process, length: Process, *, begin_ns: int = 0, horizon_ns: int = 1000 * S, seed: int = 1
-) -> Spells:
+) -> OnOffIntervals:
     rngs = np.random.default_rng((seed, 0)), np.random.default_rng((seed, 1))
-    return drawn_spells(every, length, float(S), rngs, begin_ns, horizon_ns)
+    return drawn_intervals(every, length, float(S), rngs, begin_ns, horizon_ns)
 
 
-def level(spells: Spells, at_ns: int) -> int:
+def level(spells: OnOffIntervals, at_ns: int) -> int:
     return int(spells.levels(np.array([at_ns]))[0])
 
 
@@ -86,9 +86,9 @@ def test_a_ramp_is_never_a_step_off_the_line(
 
 
 def test_a_spell_is_on_from_its_begin_until_before_its_end() -> None:
-    spells = spell(3, 5)
+    spells = interval(3, 5)
     assert spells.levels(np.arange(7)).tolist() == [0, 0, 0, RAMP_STEPS, RAMP_STEPS, 0, 0]
-    none = Spells(*np.empty((3, 0), np.int64))
+    none = OnOffIntervals(*np.empty((3, 0), np.int64))
     assert none.levels(np.arange(3)).tolist() == [0, 0, 0]
 
 

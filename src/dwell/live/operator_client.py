@@ -1,4 +1,4 @@
-"""Visiting: questions of a person to a cell's controller."""
+"""Asks a cell's controller for its status, and tells it what an operator wants."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from dwell.live.transport.protocol import Sample
 from dwell.live.wiring import Role
 from dwell.model import Problem
 
-__all__ = ["Visitor"]
+__all__ = ["OperatorClient"]
 
 RESEND_S = 0.2
 
 
-class Visitor:
-    """Somebody who is no part of a cell and talks to its controller; a context manager.
+class OperatorClient:
+    """Client of a cell's controller, outside of the cell; a context manager.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Visitor:
         self._transport = security.visit(self._name, self._controller)
         self._transport.subscribe(self._keys.answer(self._name), self._heard)
 
-    def __enter__(self) -> Visitor:
+    def __enter__(self) -> OperatorClient:
         """Return itself."""
         return self
 

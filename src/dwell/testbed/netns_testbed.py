@@ -1,4 +1,4 @@
-"""Bed: the hosts, links and CPUs of some cells on this machine, with the cells running on them.
+"""Testbed on this machine: network namespaces as hosts, links, CPUs, and the cells on them.
 
 Nothing here moves a stage: it plays what a scenario does to nodes and links, and what a controller
 makes of it is the controller's. Cells that share nodes (their edge, say) share hosts.
@@ -37,7 +37,7 @@ from dwell.testbed.stress import Stress
 from dwell.testbed.timeline import Change, is_down, link_changes, link_with, threads_on
 from dwell.testbed.watcher import Watcher
 
-__all__ = ["Bed", "require_playable"]
+__all__ = ["NetnsTestbed", "require_playable"]
 
 FIRST_PORT = 7_450
 #: With a share of a CPU, a node's processes take a while to start.
@@ -117,7 +117,7 @@ def _modules(beside: Path | None) -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
 
 
-class Bed:
+class NetnsTestbed:
     """Cells on hosts of their own on this machine; a context manager.
 
     Parameters
@@ -198,7 +198,7 @@ class Bed:
             self._stack.callback(remove_orphans)
             self._claimed = True
 
-    def __enter__(self) -> Bed:
+    def __enter__(self) -> NetnsTestbed:
         """Make hosts, links and groups, and start everything; `come_up` waits for it."""
         try:
             self.claim()

@@ -8,7 +8,7 @@ import stat
 import struct
 from pathlib import Path
 
-from dwell.live.transport.lingering import Connections
+from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.zenoh import ZenohTransport
 from tests.live.transport.meshes import ZenohMesh
 

@@ -1,4 +1,4 @@
-"""Hearing: who has been heard lately, directly or over the detour, and over which links.
+"""Failure detector: whose beats have come lately, directly or over the detour.
 
 Every process sends a beat each period. A beat says which beats of others its sender heard last, so
 that a node learns of links that it is no end of, and clocks can be compared (see `offsets`).
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from dwell.live.continuity import LATENESS_NS, Retreat
 from dwell.live.messages import Beat, Heard
 
-__all__ = ["Hearing"]
+__all__ = ["FailureDetector"]
 
 
 @dataclass(slots=True)
@@ -25,7 +25,7 @@ class _Voice:
     retreat: Retreat = field(default_factory=Retreat)
 
 
-class Hearing:
+class FailureDetector:
     """Beats as one process has heard them.
 
     Parameters

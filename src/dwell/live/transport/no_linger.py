@@ -1,4 +1,4 @@
-"""Lingering: closing a connection waits for nobody.
+"""Disables SO_LINGER on the TCP sockets of this process: closing a connection never blocks.
 
 Zenoh asks for ten seconds of SO_LINGER on every TCP and TLS connection
 (https://github.com/eclipse-zenoh/zenoh/issues/1101). Closing one whose peer is out of reach then
@@ -29,7 +29,7 @@ EVERY_S = 0.5
 
 
 class Connections:
-    """Has no connection of this process wait when it is closed, from soon after it is there."""
+    """Disables SO_LINGER on every TCP socket of this process, soon after it was opened."""
 
     def __init__(self) -> None:
         self._known: set[int] = set()

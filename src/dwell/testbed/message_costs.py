@@ -1,4 +1,4 @@
-"""Hops: what the messages between two jobs take, of their workers' CPU time and of their link.
+"""Costs of the messages between two jobs: CPU time of their workers, time on their link.
 
 A worker spends more CPU time on a job than its stage takes: on messages. Not all of that lies on
 the way of the cycle: it also reads what is late, answers, and puts away. How much does is seen
@@ -20,7 +20,16 @@ from dwell.model import Problem
 if TYPE_CHECKING:
     from dwell.testbed.measured import Measured
 
-__all__ = ["LEAST_JOBS", "QUICK", "Hop", "OnTheWay", "floors", "hops", "own_delays", "share"]
+__all__ = [
+    "LEAST_JOBS",
+    "QUICK",
+    "MessageCost",
+    "OnTheWay",
+    "floors",
+    "hops",
+    "own_delays",
+    "share",
+]
 
 Floats: TypeAlias = NDArray[np.float64]
 #: Source, target, and the nodes of both.
@@ -35,7 +44,7 @@ QUICK = 0.1
 MESSAGE_BYTES = 20_000
 
 
-class Hop(NamedTuple):
+class MessageCost(NamedTuple):
     """Of a message, the CPU time that lies on its way, ms: its sender's and its receiver's."""
 
     sender_ms: float
@@ -47,13 +56,13 @@ class OnTheWay(NamedTuple):
 
     Parameters
     ----------
-    hops : dict of (str, str, str, str) to Hop
+    hops : dict of (str, str, str, str) to MessageCost
         By source, target, and the nodes of both.
     asked_ms : mapping of (str, str) to float64 array
         Delays that the cell asks of links that are emulated.
     """
 
-    hops: dict[HopName, Hop]
+    hops: dict[HopName, MessageCost]
     asked_ms: Mapping[Link, Floats]
 
     def known_ms(self, hop: HopName, problem: Problem) -> float:
@@ -99,7 +108,7 @@ def hops(
             spends = np.where(is_open, sides_ms, 0.0)
             spends = spends if spends.sum() > over_ms else sides_ms
             sides_ms = sides_ms - over_ms * spends / spends.sum()
-        found[hop] = Hop(*sides_ms.tolist())
+        found[hop] = MessageCost(*sides_ms.tolist())
     return OnTheWay(found, asked_ms)
 
 

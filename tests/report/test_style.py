@@ -7,16 +7,16 @@ from dataclasses import replace
 import polars as pl
 import pytest
 
-from dwell.report.look import Look
+from dwell.report.formatting import shown_contender
 from dwell.report.palette import INK, MUTED, PAPER, RAMP, RULE, Palette, contended, ramp_styles
-from dwell.report.wording import shown_contender
+from dwell.report.style import PageStyle
 from tests.report.paper_chapters import POLICIES, every_kind, one_of
 from tests.study.cell import make_problem
 
 
 @pytest.fixture(scope="module")
-def look() -> Look:
-    return Look.of(make_problem(), every_kind())
+def look() -> PageStyle:
+    return PageStyle.of(make_problem(), every_kind())
 
 
 @pytest.mark.parametrize(
@@ -40,16 +40,16 @@ def test_contenders_have_names(name: str, shown: str) -> None:
     assert shown_contender(name) == shown
 
 
-def test_a_sentence_names_them_alike(look: Look) -> None:
+def test_a_sentence_names_them_alike(look: PageStyle) -> None:
     text = "dtp+corrected beats atp in robot-cpu-stress, not `dtp+corrected`; my-dtp stays."
     assert look.prose(text) == (
         "DTP (corrected) beats ATP in robot CPU stress, not `dtp+corrected`; my-dtp stays."
     )
 
 
-def test_a_placement_of_a_chapter_has_a_colour_of_its_own(look: Look) -> None:
+def test_a_placement_of_a_chapter_has_a_colour_of_its_own(look: PageStyle) -> None:
     # REV is in no cell of these chapters' problem; a map shows it.
-    alone = Look.of(make_problem())
+    alone = PageStyle.of(make_problem())
     assert tuple(look.placements) == (*alone.placements, "REV")
     assert alone.placements.items() <= look.placements.items()
     assert len(set(look.placements.values())) == 4
@@ -59,10 +59,10 @@ def test_what_a_map_shows_beside_winners_is_no_placement() -> None:
     figure = one_of("map")
     counted = replace(figure, frame=figure.frame.with_columns(winner=pl.lit("3 of 4")))
     chapter = replace(every_kind()[3], figures=(counted,))
-    assert tuple(Look.of(make_problem(), (chapter,)).placements) == ("LOC", "SO", "HYB")
+    assert tuple(PageStyle.of(make_problem(), (chapter,)).placements) == ("LOC", "SO", "HYB")
 
 
-def test_policies_differ_by_more_than_colour(look: Look) -> None:
+def test_policies_differ_by_more_than_colour(look: PageStyle) -> None:
     styles = look.styles(POLICIES)
     assert [styles[name].colour for name in POLICIES[:3]] == list(look.placements.values())[:3]
     moving = [styles[name] for name in POLICIES[3:]]
@@ -92,7 +92,7 @@ def test_long_sentences_are_no_contenders() -> None:
     assert contended("DTP loses in all of the scenarios that were looked at") is None
 
 
-def test_links_have_arrows_and_titles_begin_large(look: Look) -> None:
+def test_links_have_arrows_and_titles_begin_large(look: PageStyle) -> None:
     assert look.prose("R1->E carries what dtp+corrected sends") == (
         "R1→E carries what DTP (corrected) sends"
     )

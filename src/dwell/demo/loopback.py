@@ -1,4 +1,4 @@
-"""Stageplay: the demo's processes, and what happens to their links and CPUs.
+"""Runs the demo's processes on this machine, and plays a scenario on their links and CPUs.
 
 Nothing here moves a stage: it plays a scenario of the cell file on the links and CPUs, and what the
 controller makes of it is the controller's.
@@ -24,7 +24,7 @@ from dwell.testbed.conditions import Conditions
 from dwell.testbed.processes import Processes, expected
 from dwell.testbed.timeline import Change, link_changes, link_with, threads_on
 
-__all__ = ["Stageplay", "on_this_machine"]
+__all__ = ["Loopback", "on_this_machine"]
 
 #: Where ports are looked for; below what the kernel gives out by itself.
 PORTS = range(10_000, 32_000, 500)
@@ -73,7 +73,7 @@ def _free(port: int) -> bool:
     return True
 
 
-class Stageplay:
+class Loopback:
     """A cell on this machine: agents, controller, links, burners; a context manager.
 
     Parameters
@@ -122,7 +122,7 @@ class Stageplay:
         """Agents and controller, by name."""
         return self._processes.running
 
-    def __enter__(self) -> Stageplay:
+    def __enter__(self) -> Loopback:
         """Start everything."""
         try:
             self._processes.write()

@@ -1,4 +1,4 @@
-"""Bundle: small messages that the detour carries on together.
+"""Relay batch: small messages that the detour carries together.
 
 Whoever gets a bundle reads a bounded length of it (`MAX_CONTROL_BYTES`), or nothing. So one that
 sends too much, or too often, must leave room for what the others have sent.
@@ -10,7 +10,7 @@ from collections import Counter
 
 from dwell.live.messages import MAX_HEADER_BYTES
 
-__all__ = ["MOST_MESSAGES", "Bundle"]
+__all__ = ["MOST_MESSAGES", "RelayBatch"]
 
 #: In one bundle at most; more within the time that it is gathered in are dropped.
 MOST_MESSAGES = 1_000
@@ -23,7 +23,7 @@ LONGEST_MESSAGE = MAX_HEADER_BYTES
 LONGEST_KEY = 400
 
 
-class Bundle:
+class RelayBatch:
     """See the module.
 
     Parameters

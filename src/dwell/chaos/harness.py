@@ -1,4 +1,4 @@
-"""Ground: a cell that runs, with the means to harm it, and to tell when it has recovered."""
+"""Runs a cell, injects faults into it, and tells when it has recovered."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from dwell.model import Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.processes import expected
 
-__all__ = ["Ground", "environment_of", "pid_of"]
+__all__ = ["Harness", "environment_of", "pid_of"]
 
 OBSERVED, CLOCK_FILE = "observed", "clocks"
 #: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
@@ -52,7 +52,7 @@ def pid_of(mark: Path) -> int | None:
         return None
 
 
-class Ground:
+class Harness:
     """See the module; a context manager.
 
     Parameters
@@ -87,7 +87,7 @@ class Ground:
         """P."""
         return round(self.problem.pipeline.period_ms * 1e6)
 
-    def __enter__(self) -> Ground:
+    def __enter__(self) -> Harness:
         """Start everything, and wait until the cell is at home."""
         try:
             nodes = list(self.problem.fabric.nodes)

@@ -1,4 +1,4 @@
-"""What a page needs to know of a run besides its tables, read from the run's own record."""
+"""Header of a run's page: cell, scenario, policy, seed, versions, from the run's record."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from dwell.record import Run
 from dwell.report.phases import Disturbed, disturbed
 from dwell.report.tracking import Tracking
 
-__all__ = ["Facts"]
+__all__ = ["RunHeader"]
 
 
-class Facts(NamedTuple):
+class RunHeader(NamedTuple):
     """Of what a run is the record.
 
     Parameters
@@ -55,7 +55,7 @@ class Facts(NamedTuple):
     recovered: Mapping[str, Any] = {}
 
     @classmethod
-    def of(cls, run: Run) -> Facts:
+    def of(cls, run: Run) -> RunHeader:
         """Read the facts of a run.
 
         Raises

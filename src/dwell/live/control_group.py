@@ -1,4 +1,4 @@
-"""ControlGroup: what the kernel has counted for the group of processes that this one belongs to."""
+"""Reads the kernel's counters of this process's control group."""
 
 from __future__ import annotations
 
