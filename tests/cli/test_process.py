@@ -137,7 +137,7 @@ def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:
 def test_an_interrupted_run_leaves_the_one_before(tmp_path: Path) -> None:
     before = ("run", CANONICAL, "--policy", "LOC", "--windows", "6", "--out", "here")
     assert call(*before, folder=tmp_path).returncode == 0
-    arguments = ["run", str(CANONICAL), "--windows", "200000", "--out", "here"]
+    arguments = ["run", str(CANONICAL), "--windows", "200000", "--out", "here", "--force"]
     code, _, _ = interrupt_at_first_sign(arguments, tmp_path)
     assert code == 130
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
