@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import dwell
-from dwell.control import NEVER_NS, ClosedWindow, Controller, Evidence
+from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.errors import LiveError
 from dwell.estimators import Profile
 from dwell.live.messages import Completion, Hop, Load, Stamp
@@ -28,6 +28,7 @@ from dwell.live.offsets import Offsets
 from dwell.live.tables import columns_of
 from dwell.live.windows import LiveWindows, Resume, Rows
 from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
+from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant
 from dwell.record import Journal, Run, seal_run
 from tests.generate import make_problem

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from dwell.model import MovingTarget, Servo
+from dwell.model.instants import NEVER_NS
 from dwell.study.quality import (
-    NEVER_NS,
     Actuations,
     actuations,
     age_of_information,

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from dwell.errors import SimulationError
 from dwell.model import MovingTarget, Servo
+from dwell.model.instants import NEVER_NS
 from dwell.record import OUTCOMES, Run
-from dwell.study.quality import NEVER_NS, actuations, track
+from dwell.study.quality import actuations, track
 from dwell.study.summary import (
     count_in,
     count_within,

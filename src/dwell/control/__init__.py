@@ -3,12 +3,11 @@
 from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
 from dwell.control.guard import Guard, Presence, Probation, parts_of, rest_cycles
 from dwell.control.shadows import shadow_stamps
-from dwell.control.windows import NEVER_NS, final_l95_ms
+from dwell.control.windows import final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.policies import MinimalPolicy
 
 __all__ = [
-    "NEVER_NS",
     "ClosedWindow",
     "Controller",
     "Estimator",

@@ -12,13 +12,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NEVER_NS", "final_l95_ms", "l95_rank", "missed_cycles", "seen_l95_ns", "utilisation"]
+from dwell.model.instants import NEVER_NS
+
+__all__ = ["final_l95_ms", "l95_rank", "missed_cycles", "seen_l95_ns", "utilisation"]
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
-
-#: Latency of a cycle that has not completed.
-NEVER_NS = 1 << 62
 
 
 def l95_rank(cycles: int) -> int:

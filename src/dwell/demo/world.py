@@ -27,10 +27,10 @@ import numpy as np
 
 from dwell.demo.scene import Array, Axes, Limits, Scene
 from dwell.errors import LiveError
+from dwell.model.instants import NEVER_NS
 
-__all__ = ["FOREVER_NS", "Motion", "World", "Worth"]
+__all__ = ["Motion", "World", "Worth"]
 
-FOREVER_NS = 1 << 62
 _MAGIC = b"dwell-world-1\n"
 _FRONT_BYTES = 2048
 _RECORDS = 64
@@ -58,7 +58,7 @@ class Motion:
     position: Axes
     velocity: Axes
     command: Axes = (0.0, 0.0, 0.0, 0.0)
-    expires_ns: int = FOREVER_NS
+    expires_ns: int = NEVER_NS
 
     def state(self, at_ns: int, limits: Limits) -> tuple[Array, Array]:
         """Return position and velocity at an instant, in closed form, shapes (4,).

@@ -24,6 +24,7 @@ from dwell.estimators.paths import Step, steps_of
 from dwell.estimators.profile import SEED, Profile, SampleCycles
 from dwell.estimators.protocol import Support
 from dwell.model.bounds import HALF_LIFE_WINDOWS
+from dwell.model.instants import NEVER_NS
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
@@ -42,8 +43,6 @@ LARGEST = 5000
 SINK_SAMPLES = 1000
 
 NS_PER_MS = 1e6
-#: Latency of what has not come to its end.
-NEVER_NS = 1 << 62
 
 
 class _Samples:

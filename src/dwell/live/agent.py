@@ -18,6 +18,7 @@ from dwell.live.relay_batch import MOST_MESSAGES, RelayBatch
 from dwell.live.role import TWICE, Place, Pulse
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.protocol import Sample
+from dwell.model.instants import NEVER_NS
 
 __all__ = ["Agent", "CpuCount", "Gauge"]
 
@@ -30,7 +31,6 @@ TEND_NS = 1_000_000_000
 GAUGE_S = 2.0
 #: Periods between two beats of an agent, and between two of anybody that the controller is told of.
 AGENT_BEAT = 5
-NEVER_NS = 1 << 62
 
 
 class CpuCount:

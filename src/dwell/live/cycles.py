@@ -15,10 +15,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import NEVER_NS, Evidence, Instants
+from dwell.control import Evidence, Instants
 from dwell.live.messages import Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.model import Problem
+from dwell.model.instants import NEVER_NS
 from dwell.record import Values
 
 __all__ = ["Ledger", "LiveCycle"]

@@ -12,9 +12,10 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from dwell.control import NEVER_NS, Controller
+from dwell.control import Controller
 from dwell.live.cycles import LiveCycle
 from dwell.live.offsets import UNBOUNDED_NS
+from dwell.model.instants import NEVER_NS
 from dwell.record import Columns, Feature, Row, Types, Values, column_types, row_of
 
 if TYPE_CHECKING:

@@ -28,6 +28,7 @@ from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import Message, Stage, Stateful
 from dwell.live.transport.protocol import Lane, Sample
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
+from dwell.model.instants import NEVER_NS
 
 __all__ = ["Job", "Worker"]
 
@@ -35,7 +36,6 @@ __all__ = ["Job", "Worker"]
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
-NEVER_NS = 1 << 62
 NOT_COUNTED = Counts(), UNKNOWN, Counts()
 
 

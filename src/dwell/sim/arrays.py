@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from dwell.control import NEVER_NS
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
+from dwell.model.instants import NEVER_NS
 from dwell.sim.guard import back_ns
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 

@@ -13,11 +13,10 @@ from dwell.control import Presence, Probation, parts_of, rest_cycles
 from dwell.kernels import layout as k
 from dwell.kernels.heaps import post_event
 from dwell.model import Placement, Problem
+from dwell.model.instants import NEVER_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 __all__ = ["Watch", "back_ns"]
-
-FOREVER = 1 << 62
 
 
 def back_ns(problem: Problem, placement: Placement) -> int:
@@ -82,7 +81,7 @@ class Watch:
 
     def _due_ns(self, first: int) -> int:
         """When the guard fires if no cycle from `first` on completes."""
-        return int(self.release_ns[first]) + self.patience_ns if first < self.cycles else FOREVER
+        return int(self.release_ns[first]) + self.patience_ns if first < self.cycles else NEVER_NS
 
     def _look_at(self, tables: k.Tables, at_ns: int) -> None:
         """Look at an instant, and not before."""
@@ -118,11 +117,11 @@ class Watch:
                 for _, up in self._outages.of(part)
                 if up > now
             )
-            again = min(ends, default=FOREVER)
+            again = min(ends, default=NEVER_NS)
             moved = int(tables.cells[0, k.MOVED])
             if self.release_ns[moved] >= now:
                 again = min(again, self._due_ns(moved))
-        if again < FOREVER:
+        if again < NEVER_NS:
             self._look_at(tables, again)
         return None
 
@@ -151,7 +150,7 @@ class Watch:
         cell[k.MOVED] = first
         # Other fallbacks may be open to the new placement than those that were not whole.
         due_ns, next_ns = self._due_ns(first), int(cell[k.GUARD_T])
-        if due_ns < FOREVER and not 0 <= next_ns <= due_ns:
+        if due_ns < NEVER_NS and not 0 <= next_ns <= due_ns:
             self._look_at(tables, due_ns)
 
     def _note_health(self, tables: k.Tables, now: int) -> None:
@@ -227,7 +226,7 @@ def _spells(at_ns: NDArray[np.int64], down: NDArray[np.int64]) -> Iterator[tuple
             yield begun, at
             begun = None
     if begun is not None:
-        yield begun, FOREVER
+        yield begun, NEVER_NS
 
 
 def _joined(spells: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control import (
-    NEVER_NS,
     ClosedWindow,
     Controller,
     final_l95_ms,
@@ -18,6 +17,7 @@ from dwell.control import (
 )
 from dwell.kernels import layout as k
 from dwell.model import Problem
+from dwell.model.instants import NEVER_NS
 from dwell.record import OUTCOMES, Feature, frame_of
 from dwell.sim.arrays import Arrays
 from dwell.sim.realisation import Realisation

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import NEVER_NS
 from dwell.control.windows import missed_cycles, seen_l95_ns
 from dwell.errors import SimulationError
 from dwell.estimators import Evidence
 from dwell.model import FrozenDict, Problem, QoS
+from dwell.model.instants import NEVER_NS
 
 if TYPE_CHECKING:
     from dwell.record import Run

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import Servo
+from dwell.model.instants import NEVER_NS
 
 __all__ = [
-    "NEVER_NS",
     "Actuations",
     "Age",
     "Tracking",
@@ -35,8 +35,6 @@ __all__ = [
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 
-#: Latency that stands for a cycle that never finished.
-NEVER_NS = 2**62
 #: Percentile of the age that is given.
 PERCENT = 95
 

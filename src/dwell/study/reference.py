@@ -25,12 +25,12 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import NEVER_NS
 from dwell.control.windows import seen_l95_ns
 from dwell.cost import hamming, price, tier_nodes
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.model import FrozenDict, Problem
+from dwell.model.instants import NEVER_NS
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.script import Script
 

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
 from dwell.model import Problem
+from dwell.model.instants import NEVER_NS
 from dwell.study.quality import (
-    NEVER_NS,
     actuations,
     age_of_information,
     misses_in,
