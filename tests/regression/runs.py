@@ -58,15 +58,15 @@ def load(example: str) -> Problem:
     return dwell.load(ROOT / "examples" / f"{example}.yaml")
 
 
-def play(example: str, case: Case, columns: Mapping[str, list[str]] | None) -> dict[str, str]:
+def play(example: str, case: Case, columns: Mapping[str, list[str]]) -> dict[str, str]:
     """Play a case; returns its digests and some numbers that tell what has changed.
 
     Parameters
     ----------
     example : str
     case : Case
-    columns : mapping of str to list of str, or None
-        Which columns of each table count: new ones do not. All of them where None.
+    columns : mapping of str to list of str
+        Which columns of each table count: new ones do not.
     """
     problem = load(example)
     run = dwell.simulate(
@@ -80,10 +80,7 @@ def play(example: str, case: Case, columns: Mapping[str, list[str]] | None) -> d
     )
     windows, decisions = run.windows, run.decisions
     return {
-        **{
-            table: digest(getattr(run, table), None if columns is None else columns[table])
-            for table in TABLES
-        },
+        **{table: digest(getattr(run, table), columns[table]) for table in TABLES},
         "lost": str(run.cycles.filter(pl.col("outcome") != "done").height),
         "violation_rate": f"{_number(windows['violation_rate'].mean()):.4f}",
         "l95_ms": f"{_number(windows['seen_l95_ms'].median()):.3f}",
@@ -97,10 +94,10 @@ def _number(value: object) -> float:
     return value
 
 
-def digest(table: pl.DataFrame, columns: list[str] | None) -> str:
+def digest(table: pl.DataFrame, columns: list[str]) -> str:
     """Return a digest of a table: floats to six places, everything else exactly."""
     found = hashlib.sha256()
-    for name in table.columns if columns is None else columns:
+    for name in columns:
         if name not in table.columns:
             continue
         column = table[name]

@@ -96,14 +96,26 @@ class Assembly:
     faults: Faults
     anchored: bool = False
 
-    def problem(self, name: str) -> Problem | None:
-        """Return the problem, or None beside at least one fault.
+    def problem(self, name: str) -> Problem:
+        """Return the problem.
 
         Parameters
         ----------
         name : str
             For a cell that does not name itself.
+
+        Raises
+        ------
+        ProblemError
+            With every fault found, those before the assembly included.
         """
+        problem = self._problem(name)
+        if problem is None or self.faults:
+            raise self.faults.error()
+        return problem
+
+    def _problem(self, name: str) -> Problem | None:
+        """Return the problem, or None beside at least one fault."""
         entry = self.entry
         nodes = {name: self._node(name, node) for name, node in entry.nodes.items()}
         tasks = {name: self._task(name, task) for name, task in entry.tasks.items()}
@@ -172,10 +184,9 @@ class Assembly:
     def _process(self, entry: ProcessEntry, path: str) -> Process:
         if entry.constant is not None:
             return Constant(entry.constant)
-        if entry.trace is not None and self.tables is None:
-            declaration = entry.trace.model_dump(exclude_none=True)
-            return UnreadTrace(FrozenDict(declaration))
-        if entry.trace is not None and self.tables is not None:
+        if entry.trace is not None:
+            if self.tables is None:
+                return UnreadTrace(FrozenDict(entry.trace.model_dump(exclude_none=True)))
             table = self.tables.get(Source.of(entry.trace))
             return Trace(table, entry.trace.column) if table is not None else STAND_IN
         for name, kind in DRAWN.items():

@@ -114,10 +114,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
 
     faults = Faults()
     entry = read_structure(document, faults, CELL)
-    problem = Assembly(entry, None, faults, anchored=True).problem("cell")
-    if problem is None or faults:
-        raise faults.error()
-    return problem
+    return Assembly(entry, None, faults, anchored=True).problem("cell")
 
 
 def read_problem(
@@ -161,7 +158,4 @@ def read_problem(
     declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
     if declared not in known:
         known[declared] = read_traces(entry, folder, faults)
-    problem = Assembly(entry, known[declared], faults, anchored=anchored).problem(name)
-    if problem is None or faults:
-        raise faults.error()
-    return problem
+    return Assembly(entry, known[declared], faults, anchored=anchored).problem(name)

@@ -22,7 +22,7 @@ from dwell.io.rendering import as_read
 from dwell.io.study_paths import SETTINGS, put, steps_of
 from dwell.model import Problem
 from dwell.model.problem import ESTIMATORS
-from dwell.model.semantics import LONGEST_NAME, NAME, nearest
+from dwell.model.semantics import LONGEST_NAME, NAME, nearest, nearest_of
 from dwell.policies.registry import names as policy_names
 
 if TYPE_CHECKING:
@@ -379,10 +379,8 @@ class _Reading:
         path = f"policies.{policy.name}"
         known = [*policy_names(), *problem.candidates]
         if policy.policy not in known:
-            hint = nearest(policy.policy, known)
-            shown = f"unknown policy {policy.policy!r}; {hint}"
-            listed = f" (policies here: {', '.join(known)})"
-            self.faults.add(path, shown if hint.startswith("known") else shown + listed)
+            hint = nearest_of(policy.policy, known, "policies")
+            self.faults.add(path, f"unknown policy {policy.policy!r}; {hint}")
         elif policy.name in problem.candidates and policy.policy != policy.name:
             self.faults.add(
                 path,

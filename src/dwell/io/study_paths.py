@@ -157,6 +157,4 @@ def with_settings(problem: Problem, settings: Mapping[str, object]) -> Problem:
         raise faults.error()
     # Without its traces, which take time to read and which no setting depends on.
     other = Assembly(read_structure(document, faults, CELL), {}, faults).problem(problem.name)
-    if other is None or faults:
-        raise faults.error()
     return replace(problem, objective=other.objective, controller=other.controller)

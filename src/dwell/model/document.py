@@ -26,6 +26,7 @@ __all__ = [
     "disturbance_document",
     "fingerprint",
     "objective_document",
+    "relocated",
     "to_document",
 ]
 
@@ -78,7 +79,7 @@ def to_document(problem: Problem) -> Document:
                 name: _process(f"scales.{name}", scale) for name, scale in pipeline.scales.items()
             },
             "candidates": {
-                name: _relocated(placement, pipeline.tasks)
+                name: relocated(placement, pipeline.tasks)
                 for name, placement in problem.candidates.items()
             },
             "scenarios": {
@@ -164,7 +165,8 @@ def _quota(quota: Quota) -> Document:
     return _filled({"cpu": quota.cpu, "period_ms": quota.period_ms, **more})
 
 
-def _relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
+def relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
+    """Return the part of a placement that a document has: anchored tasks are left out."""
     return {name: node for name, node in placement.items() if not tasks[name].anchored}
 
 

@@ -21,7 +21,16 @@ if TYPE_CHECKING:
     from dwell.model.problem import Problem
     from dwell.policies.protocol import Policy
 
-__all__ = ["GROUP", "REGISTRY", "PolicyEntry", "by_name", "estimates", "name_of_class", "names"]
+__all__ = [
+    "FAMILIES",
+    "GROUP",
+    "REGISTRY",
+    "PolicyEntry",
+    "by_name",
+    "estimates",
+    "name_of_class",
+    "names",
+]
 
 #: Group of the entry points by which other packages add policies.
 GROUP = "dwell.policies"
@@ -101,6 +110,12 @@ REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
             "moves once that is enough; it has no dwell time.",
         ),
     }
+)
+
+
+#: Those that have a label, a colour and a sentence of their own.
+FAMILIES: Mapping[str, PolicyEntry] = MappingProxyType(
+    {name: entry for name, entry in REGISTRY.items() if not entry.variant_of}
 )
 
 

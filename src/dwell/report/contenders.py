@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dwell.model import Problem
-from dwell.policies.registry import REGISTRY
+from dwell.policies.registry import FAMILIES
 from dwell.report.formatting import OURS, shown_contender
 from dwell.report.method import placements
 from dwell.report.palette import Palette, contended
@@ -14,7 +14,7 @@ __all__ = ["POLICIES", "describe_contenders", "palette_of"]
 
 #: By the family of the policy.
 POLICIES = {
-    **{name: one.sentence for name, one in REGISTRY.items() if not one.variant_of},
+    **{name: policy.sentence for name, policy in FAMILIES.items()},
     "clairvoyant": "Clairvoyant is no policy but a reference: it knows what every placement, run "
     "alone, costs in every window to come, and plays the cheapest sequence.",
     "best static": "Best static is no policy either: of the placements that never move, the one "

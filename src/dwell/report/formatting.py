@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from dwell.policies.registry import REGISTRY
+from dwell.policies.registry import FAMILIES
 from dwell.report.palette import contended
 from dwell.study import Interval
 
@@ -28,7 +28,7 @@ __all__ = [
 
 #: By the family of the policy.
 NAMES = {
-    **{name: one.label for name, one in REGISTRY.items() if not one.variant_of},
+    **{name: policy.label for name, policy in FAMILIES.items()},
     "clairvoyant": "Clairvoyant",
     "best static": "Best static",
 }

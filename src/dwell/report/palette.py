@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from dwell.policies.registry import REGISTRY
+from dwell.policies import registry
 
 __all__ = [
     "BELIEFS",
@@ -56,9 +56,8 @@ DASHES: tuple[Dashes, ...] = (SOLID, DASHED, DOTTED, (0, (5, 1.5, 1.2, 1.5)), (0
 #: Hues of the policies that move, from the back of the placements'.
 FAMILIES = {
     **{
-        name: {"ink": INK, "muted": MUTED}.get(one.colour, one.colour)
-        for name, one in REGISTRY.items()
-        if not one.variant_of
+        name: {"ink": INK, "muted": MUTED}.get(policy.colour, policy.colour)
+        for name, policy in registry.FAMILIES.items()
     },
     "clairvoyant": MUTED,
     "best static": MUTED,

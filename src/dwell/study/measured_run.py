@@ -17,8 +17,8 @@ import numpy as np
 
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
-from dwell.model import Placement, Problem
-from dwell.model.document import disturbance_document, to_document
+from dwell.model import Problem
+from dwell.model.document import disturbance_document, relocated, to_document
 from dwell.model.scenario import Disturbance, Scenario
 from dwell.policies.registry import by_name, name_of_class
 from dwell.study.predicting import Asked
@@ -290,7 +290,8 @@ def _with_candidates(problem: Problem, recorded: Problem) -> Problem:
     """
     for name, placement in recorded.candidates.items():
         if name in problem.candidates and placement != problem.candidates[name]:
-            was, now = _moving(placement, problem), _moving(problem.candidates[name], problem)
+            tasks = problem.pipeline.tasks
+            was, now = (relocated(one, tasks) for one in (placement, problem.candidates[name]))
             raise RunError(f"candidate {name} was {was} in the run; in the cell {now}")
     if list(recorded.candidates) == list(problem.candidates):
         return problem
@@ -300,11 +301,6 @@ def _with_candidates(problem: Problem, recorded: Problem) -> Problem:
         fallbacks=recorded.controller.fallbacks,
     )
     return replace(problem, candidates=recorded.candidates, controller=controller)
-
-
-def _moving(placement: Placement, problem: Problem) -> dict[str, str]:
-    tasks = problem.pipeline.tasks
-    return {task: node for task, node in placement.items() if not tasks[task].anchored}
 
 
 # --------------------------------------------------------------------------------- the scenario
