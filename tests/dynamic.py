@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from dwell.io import from_document
-from dwell.io.faults import Faults
-from dwell.io.yaml_text import read_yaml
+from dwell.cellfile import from_document
+from dwell.cellfile.faults import Faults
+from dwell.cellfile.yaml_text import read_yaml
 from dwell.model import Problem
 
 __all__ = ["dynamic_problem"]

@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dwell.io import load
+    from dwell.cellfile import load
     from dwell.record import Run, open_run
     from dwell.sim import Realisation, draw, simulate, simulate_realisation
 
@@ -23,7 +23,7 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOME = {
-    "load": "dwell.io",
+    "load": "dwell.cellfile",
     "Run": "dwell.record",
     "open_run": "dwell.record",
     "Realisation": "dwell.sim",

@@ -24,11 +24,11 @@ import dwell
 from dwell.cli import live_demo
 from dwell.cli.live_view import Lines, Look, Screen
 from dwell.errors import LiveError
+from dwell.live.trust import KEYS
 from dwell.model import Problem
 from dwell.report.phases import Disturbed, disturbed
 from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import Change, changes_of
-from dwell.trust import KEYS
 from tests.report.live_runs import PERIOD_NS, live_run
 
 SECONDS = 116.0

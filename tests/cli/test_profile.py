@@ -19,10 +19,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import dwell
+from dwell.calibration.link import listen
+from dwell.calibration.profile_file import read_profile
 from dwell.cli.commands import app
 from dwell.estimators import Profile
-from dwell.profiling.link import listen
-from dwell.profiling.profile_file import read_profile
 
 ROOT = Path(__file__).parents[2]
 

@@ -21,7 +21,7 @@ MOST_MB = 1_024
 def _fuzz(name: str, corpus: Path, seconds: float) -> None:
     import atheris
 
-    with atheris.instrument_imports(include=["dwell.live", "dwell.trust", "dwell.errors"]):
+    with atheris.instrument_imports(include=["dwell.live", "dwell.live.trust", "dwell.errors"]):
         from tests.fuzz.targets import TARGETS, seeds
     corpus.mkdir(parents=True, exist_ok=True)
     for number, seed in enumerate(seeds(name)):

@@ -28,10 +28,10 @@ from dwell.live.payloads import read_payload
 from dwell.live.role import TWICE
 from dwell.live.stage import Message
 from dwell.live.transport.protocol import Sample
-from dwell.trust.authority import Authority
-from dwell.trust.keyring import Keyring
-from dwell.trust.roster import Roster
-from dwell.trust.signing import Seals
+from dwell.live.trust.authority import Authority
+from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.roster import Roster
+from dwell.live.trust.signing import Seals
 from tests.live.small_world import Bench, Passing, World
 
 __all__ = ["KINDS", "NODES", "TARGETS", "FrozenError", "ReachedError", "seeds"]

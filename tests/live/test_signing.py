@@ -32,11 +32,11 @@ from dwell.live.messages import (
 from dwell.live.role import SIGNATURE_BYTES, Place
 from dwell.live.transport.memory import MemoryTransport
 from dwell.live.transport.protocol import Sample
+from dwell.live.trust import signing
+from dwell.live.trust.authority import Authority
+from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.signing import Seals
 from dwell.model import Problem
-from dwell.trust import signing
-from dwell.trust.authority import Authority
-from dwell.trust.keyring import Keyring
-from dwell.trust.signing import Seals
 from tests.live.small_world import Counting, World
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}

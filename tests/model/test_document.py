@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from dwell.cellfile import from_document, load
 from dwell.errors import ProblemError
-from dwell.io import from_document, load
 from dwell.model import (
     Constant,
     Execution,

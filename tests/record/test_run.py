@@ -12,8 +12,8 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.errors import RunError, TraceError
-from dwell.io import from_document
 from dwell.model import NodeDisturbance
 from dwell.model.document import to_document
 from dwell.record import SCHEMA_VERSION, Run, open_run

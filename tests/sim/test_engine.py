@@ -19,8 +19,8 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.errors import PolicyError, ProblemError, RunError, SimulationError
-from dwell.io import from_document
 from dwell.model import (
     Constant,
     ControllerSettings,

@@ -14,8 +14,8 @@ import pytest
 
 import dwell
 from dwell import Run
+from dwell.cellfile import from_document
 from dwell.errors import RunError
-from dwell.io import from_document
 from dwell.model.document import to_document
 from dwell.record import seal_run
 from dwell.study.campaign import Measured, read_measured, without_excluded

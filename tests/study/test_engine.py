@@ -14,8 +14,8 @@ from polars.testing import assert_frame_equal
 
 import dwell.sim
 from dwell import draw, simulate, simulate_realisation
+from dwell.cellfile.study_paths import with_settings
 from dwell.errors import MetricError, SimulationError
-from dwell.io.study_paths import with_settings
 from dwell.model import FrozenDict, Problem
 from dwell.study import Contender, Point, Study, StudyResult, compare, run_study
 from dwell.study.judging import judged_cost, judged_costs

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dwell.cellfile.study_paths import with_settings
 from dwell.errors import DwellError, ProblemError, SimulationError
-from dwell.io.study_paths import with_settings
 from dwell.model import Constant, Problem
 from dwell.policies import Static
 from dwell.study import Contender, Point, Study

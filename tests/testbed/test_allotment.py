@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from dwell.cellfile import from_document
 from dwell.errors import LiveError
-from dwell.io import from_document
 from dwell.model import FrozenDict, Problem, Quota
 from dwell.testbed.allotment import allot
 from tests.testbed.light_cell import document

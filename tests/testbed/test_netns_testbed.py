@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.errors import LiveError
-from dwell.io import from_document
 from dwell.model import LinkDisturbance, NodeDisturbance
 from dwell.testbed.hosts import namespace_path
 from dwell.testbed.netns_testbed import NetnsTestbed

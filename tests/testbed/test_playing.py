@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from dwell.cellfile import from_document
 from dwell.errors import LiveError
-from dwell.io import from_document
 from dwell.model import Problem
 from dwell.testbed.playing import (
     Played,

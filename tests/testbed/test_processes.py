@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.errors import LiveError, TrustError
-from dwell.io import from_document
 from dwell.live.parent_death import OWNER
 from dwell.live.security import INSECURE, Security
+from dwell.live.trust import KEYS
 from dwell.live.wiring import Role
 from dwell.model import Problem
 from dwell.testbed.processes import Processes, expected, without_keys
-from dwell.trust import KEYS
 from tests.testbed.light_cell import document
 
 # Notes its words and its owner, and stays; it takes SIGTERM as it comes.

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from dwell.cellfile import from_document
 from dwell.errors import LiveError
-from dwell.io import from_document
 from dwell.model import Problem
 from dwell.testbed.playing import Played
 from dwell.testbed.run import MARK, length_s, run_once, spans_of

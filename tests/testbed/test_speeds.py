@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import dwell
-from dwell.io import from_document
+from dwell.cellfile import from_document
 from dwell.model import Problem, Trace
 from dwell.model.document import to_document
 from dwell.record import Run

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from dwell.cellfile import from_document
 from dwell.errors import LiveError, ProblemError
-from dwell.io import from_document
 from dwell.model import Constant, Problem
 from dwell.testbed.timeline import changes_of, is_down, link_changes, link_with, threads_on
 from tests.testbed.light_cell import document

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import typer
 
+from dwell.cellfile import load
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, ProblemError
 from dwell.estimators import Profile
 from dwell.estimators.profile import mean_ms
-from dwell.io import load
 from dwell.live.lint import lint
 from dwell.model import Problem, Trace
 

@@ -316,7 +316,7 @@ def schema() -> None:
     """Print the JSON Schema of the cell file."""
     import json
 
-    from dwell.io import schema as cell_schema
+    from dwell.cellfile import schema as cell_schema
 
     typer.echo(json.dumps(cell_schema(), indent=2))
 

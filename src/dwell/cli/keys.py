@@ -12,8 +12,8 @@ import typer
 from dwell.cli.output import aligned, print_json
 
 if TYPE_CHECKING:
+    from dwell.live.trust.roster import Roster
     from dwell.model import Problem
-    from dwell.trust.roster import Roster
 
 __all__ = ["keys"]
 
@@ -39,7 +39,7 @@ def init(
 ) -> None:
     """Make a cell's own authority, and keyrings for its nodes, its controller and an operator."""
     import dwell
-    from dwell.trust.authority import Authority
+    from dwell.live.trust.authority import Authority
 
     problem = dwell.load(cell)
     authority = Authority.create(out, problem.name, days=days)
@@ -80,7 +80,7 @@ def issue(
     as_json: AsJson = False,
 ) -> None:
     """Issue a certificate with a new key; the one that the subject had is revoked."""
-    from dwell.trust.authority import Authority
+    from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
     authority.issue(name, role, address, days=days)
@@ -91,7 +91,7 @@ def issue(
 @keys.command()
 def revoke(folder: Folder, name: Name, as_json: AsJson = False) -> None:
     """Take a subject's certificate back."""
-    from dwell.trust.authority import Authority
+    from dwell.live.trust.authority import Authority
 
     authority = Authority.open(folder)
     authority.revoke(name)
@@ -107,8 +107,8 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """List the subjects, with what they may do and until when."""
-    from dwell.trust.authority import AUTHORITY, Authority
-    from dwell.trust.keyring import Keyring
+    from dwell.live.trust.authority import AUTHORITY, Authority
+    from dwell.live.trust.keyring import Keyring
 
     if (folder / AUTHORITY).is_dir():
         _show(Authority.open(folder).roster, as_json=as_json)
@@ -165,7 +165,7 @@ def _days(expires: str, today: date) -> int:
 
 
 def _remark(days: int) -> str:
-    from dwell.trust.keyring import SOON_DAYS
+    from dwell.live.trust.keyring import SOON_DAYS
 
     if days < 0:
         return "has ended"

@@ -80,10 +80,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _serve(cell: Path) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
-    from dwell.io import load
+    from dwell.calibration import memory  # noqa: F401
+    from dwell.cellfile import load
     from dwell.live import parent_death, process  # noqa: F401
     from dwell.live.launcher import serve
-    from dwell.profiling import memory  # noqa: F401
 
     load(cell)
     asked = serve()
@@ -103,11 +103,11 @@ def _run(asked: argparse.Namespace) -> None:
     # The user's stages lie beside their cell file.
     sys.path.insert(0, str(asked.cell.resolve().parent))
 
-    from dwell.io import load
+    from dwell.calibration.memory import keep_memory
+    from dwell.cellfile import load
     from dwell.live.log import escape_output
     from dwell.live.parent_death import end_with_owner
     from dwell.live.process import run_process
-    from dwell.profiling.memory import keep_memory
 
     # What a user's code prints, and its exceptions, are shown on terminals.
     escape_output()

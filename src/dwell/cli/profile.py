@@ -16,8 +16,8 @@ from dwell.cli.output import aligned, print_json
 from dwell.errors import ProfileError
 
 if TYPE_CHECKING:
-    from dwell.profiling.measure import Settings
-    from dwell.profiling.profile_file import Measurement
+    from dwell.calibration.measure import Settings
+    from dwell.calibration.profile_file import Measurement
 
 __all__ = ["profile"]
 
@@ -98,7 +98,7 @@ def merge(
     as_json: Json = False,
 ) -> None:
     """Put the profiles of several nodes and links into one file."""
-    from dwell.profiling.profile_file import merge_profiles, write_profile
+    from dwell.calibration.profile_file import merge_profiles, write_profile
 
     merged = merge_profiles(files)
     write_profile(out, merged)
@@ -114,7 +114,7 @@ def listen(
     once: Annotated[bool, typer.Option("--once", help="End after the first connection.")] = False,
 ) -> None:
     """Answer the messages of `dwell profile link`, until Ctrl-C."""
-    from dwell.profiling.link import listen as answer
+    from dwell.calibration.link import listen as answer
 
     def announce(address: str, taken: int) -> None:
         typer.echo(f"listening on {address}:{taken}")
@@ -145,9 +145,9 @@ def link(
 
     The file is profiles/FROM-TO.parquet if not given.
     """
-    from dwell.profiling.link import measure_link, parse_address
-    from dwell.profiling.measure import Settings
-    from dwell.profiling.profile_file import link_name, require_free, write_profile
+    from dwell.calibration.link import measure_link, parse_address
+    from dwell.calibration.measure import Settings
+    from dwell.calibration.profile_file import link_name, require_free, write_profile
 
     host, port = parse_address(peer)
     path = out or FOLDER / f"{_file_name(source)}-{_file_name(target)}.parquet"
@@ -188,16 +188,16 @@ def _measure_tasks(
     as_json: bool,
 ) -> None:
     """Measure one task after another, then write them all."""
-    from dwell.profiling.pinning import choose_cores, pinned
+    from dwell.calibration.pinning import choose_cores, pinned
 
     sources = _sources(declared)
     factories = _factories(inputs, sources)
     # First the cores, then everything else: numerical packages start as many threads as they see
     # cores when they are imported. What the tasks print must not get into the results.
     with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
-        from dwell.profiling.measure import Settings
-        from dwell.profiling.memory import keep_memory
-        from dwell.profiling.profile_file import require_free, task_name, write_profile
+        from dwell.calibration.measure import Settings
+        from dwell.calibration.memory import keep_memory
+        from dwell.calibration.profile_file import require_free, task_name, write_profile
 
         settings = Settings(runs, warmup, period_ms)
         require_free(out, [task_name(task, node) for task in sources])
@@ -210,8 +210,8 @@ def _measure_tasks(
 def _measured(
     node: str, sources: Mapping[str, str], factories: Mapping[str, str], settings: Settings
 ) -> list[Measurement]:
-    from dwell.profiling.measure import measure_task, undisturbed_collector
-    from dwell.profiling.target import find_callable, importable_from
+    from dwell.calibration.measure import measure_task, undisturbed_collector
+    from dwell.calibration.target import find_callable, importable_from
 
     measured = []
     with importable_from(Path.cwd()), undisturbed_collector():
@@ -276,8 +276,8 @@ def _say(what: str) -> None:
 
 
 def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: bool) -> None:
-    from dwell.profiling.cell_yaml import cell_yaml
-    from dwell.profiling.summary import describe, find_doubts
+    from dwell.calibration.cell_yaml import cell_yaml
+    from dwell.calibration.summary import describe, find_doubts
 
     yaml = cell_yaml(path, measured)
     doubts = {one.name: list(find_doubts(one)) for one in measured}
@@ -304,7 +304,7 @@ def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: boo
 
 
 def _table(measured: Sequence[Measurement]) -> str:
-    from dwell.profiling.summary import describe
+    from dwell.calibration.summary import describe
 
     head = ("ms", "n", "mean", "median", "p95", "p99", "max", "cv", "lag 1", "cores used")
     rows = []
@@ -348,7 +348,7 @@ def _of_task(about: Mapping[str, Any]) -> list[str]:
 
 
 def _of_link(one: Measurement) -> list[str]:
-    from dwell.profiling.summary import percentile
+    from dwell.calibration.summary import percentile
 
     minimal = one.columns[f"{one.name}/round_trip_ms"]
     payload = one.columns[f"{one.name}/payload_round_trip_ms"]

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 
 from dwell.live.keys import CONTROLLER, MAIN, SHADOW, Keys
+from dwell.live.trust.roster import Roster
 from dwell.live.wiring import roles
 from dwell.model import Problem
-from dwell.trust.roster import Roster
 
 __all__ = ["senders", "subjects"]
 

@@ -53,7 +53,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Sealing(Protocol):
-    """Signs messages and checks them; see `dwell.trust.signing.Seals`."""
+    """Signs messages and checks them; see `dwell.live.trust.signing.Seals`."""
 
     def seal(self, word: str, data: bytes) -> bytes:
         """Return a message with a signature before it."""

@@ -18,13 +18,13 @@ from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.failures import start_thread
 from dwell.live.transport.protocol import Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
+from dwell.live.trust import KEYS
 from dwell.live.wiring import Role, longest_message_bytes, wire
 from dwell.model import FrozenDict, Problem
-from dwell.trust import KEYS
 
 if TYPE_CHECKING:
     from dwell.live.role import Place
-    from dwell.trust.keyring import Keyring
+    from dwell.live.trust.keyring import Keyring
 
 __all__ = ["INSECURE", "KEYS", "Security", "exposed"]
 
@@ -133,7 +133,7 @@ class Security:
 
         seals = None
         if self.keyring is not None:
-            from dwell.trust.signing import Seals
+            from dwell.live.trust.signing import Seals
 
             seals = Seals(self.keyring)
         return Place(self.problem, who, node, transport, time.time_ns(), say=say, seals=seals)
@@ -190,7 +190,7 @@ def _keyring(folder: Path, problem: Problem, role: Role) -> Keyring:
         If it is none.
     """
     try:
-        from dwell.trust.keyring import Keyring
+        from dwell.live.trust.keyring import Keyring
     except ImportError:
         raise TrustError(f"keys need cryptography; {installing('live')}") from None
     names = {"visitor": ("operator", "observer"), "controller": ("controller",)}
@@ -219,7 +219,7 @@ def _require_own(keyring: Keyring, role: Role) -> None:
 def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
     """Zenoh's settings for mutual TLS and nothing else."""
     from dwell.live.permissions import subjects
-    from dwell.trust.acl import access_control
+    from dwell.live.trust.acl import access_control
 
     certificate, key = str(keyring.folder / "cert.pem"), str(keyring.folder / "key.pem")
     tls = "transport/link/tls"

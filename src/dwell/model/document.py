@@ -41,7 +41,7 @@ NAMES: dict[type, str] = {kind: name for name, kind in DRAWN.items()}
 def to_document(problem: Problem) -> Document:
     """Return the document of a problem.
 
-    `dwell.io.from_document` makes an equal problem of it. A trace is named, not copied: its
+    `dwell.cellfile.from_document` makes an equal problem of it. A trace is named, not copied: its
     declaration carries a digest of the data, so that other data are not taken for it.
 
     Parameters

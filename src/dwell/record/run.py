@@ -98,7 +98,7 @@ class Run:
         return self.problem.scenarios.get(str(self.meta.get("scenario")), ())
 
     def _cell_with(self, changes: Mapping[str, object]) -> Problem:
-        from dwell.io import from_record
+        from dwell.cellfile import from_record
 
         told = self.meta.get("problem")
         if not isinstance(told, Mapping):

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dwell.cellfile.work_folder import write_whole
 from dwell.errors import SimulationError
-from dwell.io.work_folder import write_whole
 from dwell.model import FrozenDict, Problem
 from dwell.report import chapter_tables
 from dwell.report.drawing import draw

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dwell.cellfile import from_document
 from dwell.errors import RunError
-from dwell.io import from_document
 from dwell.model import Problem
 from dwell.record import Run, open_run
 from dwell.study.comparison import Comparison

@@ -76,7 +76,7 @@ def canonical_demo(
     ProblemError
         If the cell is missing or wrong.
     """
-    from dwell.io import load
+    from dwell.cellfile import load
 
     problem = load(Path(examples) / CANONICAL)
     (comparison,) = _compare_all([problem], seeds, windows, processes, progress)
@@ -144,7 +144,7 @@ def real_demo(
     ProblemError
         If a cell is missing or wrong; a TraceError where a trace is.
     """
-    from dwell.io import load
+    from dwell.cellfile import load
 
     problems = [load(Path(examples) / name, traces=traces) for name in REAL]
     return _compare_all(problems, seeds, windows, processes, progress)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dwell.cellfile.work_folder import Claim, Description, claimed, unwritable, write_whole
 from dwell.errors import RunError
-from dwell.io.work_folder import Claim, Description, claimed, unwritable, write_whole
 
 if TYPE_CHECKING:
     import polars as pl

@@ -12,8 +12,8 @@ from importlib.metadata import version
 from typing import Any
 
 from dwell import __version__
+from dwell.cellfile.sources import digest_of
 from dwell.errors import SimulationError
-from dwell.io.sources import digest_of
 from dwell.model.document import to_document
 from dwell.study.study import Contender, Study
 

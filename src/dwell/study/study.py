@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dwell.cellfile.study_file import Value, read_study
+from dwell.cellfile.study_paths import with_settings
 from dwell.errors import SimulationError
-from dwell.io.study_file import Value, read_study
-from dwell.io.study_paths import with_settings
 from dwell.model import FrozenDict, Problem
 from dwell.model.document import to_document
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL

@@ -18,10 +18,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.model import Problem, Trace
-from dwell.profiling.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.testbed.measured import Measured, look_at, usable
 from dwell.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell.testbed.node_loads import (
@@ -336,8 +336,8 @@ def _write_samples(
 
 def _document(cell: Path, out: Path) -> dict[str, Any]:
     """Return the cell file as plain values, its traces named from where the new file will be."""
-    from dwell.io.faults import Faults
-    from dwell.io.yaml_text import read_yaml
+    from dwell.cellfile.faults import Faults
+    from dwell.cellfile.yaml_text import read_yaml
 
     text = read_yaml(str(cell), Faults(str(cell)))
     if not isinstance(text, dict):

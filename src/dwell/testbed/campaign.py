@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dwell import __version__
+from dwell.cellfile.sources import digest_of
+from dwell.cellfile.study_paths import with_settings
 from dwell.errors import LiveError, PolicyError, ProblemError
-from dwell.io.sources import digest_of
-from dwell.io.study_paths import with_settings
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.policies.registry import by_name, estimates, names

@@ -17,8 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
+from dwell.cellfile.work_folder import Claim, claimed, unwritable, write_whole
 from dwell.errors import DwellError, LiveError, RunError
-from dwell.io.work_folder import Claim, claimed, unwritable, write_whole
 from dwell.model import Problem
 from dwell.record import Run, open_run
 from dwell.testbed.campaign import TRACES, Campaign, Entrant, Planned

@@ -20,11 +20,11 @@ import yaml
 from dwell.errors import LiveError
 from dwell.live.parent_death import OWNER, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
+from dwell.live.trust import KEYS
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.testbed.trace_names import move_traces
-from dwell.trust import KEYS
 
 __all__ = ["Inside", "Processes", "expected", "outright", "without_keys"]
 

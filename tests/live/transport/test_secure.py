@@ -18,10 +18,10 @@ from dwell.live.keys import Keys
 from dwell.live.security import INSECURE, KEYS, Security
 from dwell.live.transport.protocol import Sample
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
+from dwell.live.trust.authority import Authority, _general_name, _pem
+from dwell.live.trust.roster import Subject, write_private
 from dwell.live.wiring import Entry, Locator, Role, wire
 from dwell.model import Endpoint, Host, Problem
-from dwell.trust.authority import Authority, _general_name, _pem
-from dwell.trust.roster import Subject, write_private
 from tests.live.test_wiring import cell, housed
 from tests.live.transport.meshes import free_ports
 

@@ -28,8 +28,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from dwell.cellfile.study_paths import with_settings
 from dwell.cost import hamming
-from dwell.io.study_paths import with_settings
 from dwell.model import FrozenDict, Placement, Problem
 from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
 from dwell.study.engine import StudyResult

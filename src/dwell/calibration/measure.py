@@ -1,0 +1,299 @@
+"""Measure: runs of one callable, each timed on its own.
+
+Every run is timed by two clocks: wall time (``perf_counter_ns``) and, around it, the CPU time of
+the whole process (all its threads; processes that it starts are not in it). Their quotient is the
+number of cores used. Nothing is subtracted; what timing itself takes is measured with an empty
+callable and kept beside the samples.
+
+The garbage collector stays as it is, on unless the module measured turns it off: it is on in a
+live process too, and its pauses belong to the tail. It is run once before the warm-up, and what
+had been imported for measuring is kept out of its sight, so that it is not slower here than there.
+
+What a run returns is freed after the clocks were read. Inputs are made before the clocks are
+read, and where there is a pace before the wait, so that the core is as idle before a run as it
+would be.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from dwell.calibration.conditions import Conditions, Watch, processor
+from dwell.calibration.error_origin import blamed, raised_here
+from dwell.calibration.profile_file import Measurement, stamp, task_name
+from dwell.errors import MeasurementError
+from dwell.model.bounds import MAX_COUNT, PERIOD_MS, Bound
+
+__all__ = ["Pace", "Settings", "Timing", "measure_task", "time_runs", "undisturbed_collector"]
+
+RUNS = Bound(1, MAX_COUNT, whole=True)
+WARMUP = Bound(0, MAX_COUNT, whole=True)
+EMPTY_RUNS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How something is measured.
+
+    Parameters
+    ----------
+    runs : int
+        Samples.
+    warmup : int
+        Runs before them that are not kept.
+    period_ms : float or None
+        Time between the begins of two runs; None begins each when the one before has ended.
+    """
+
+    runs: int = 500
+    warmup: int = 50
+    period_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        RUNS.check("runs", self.runs)
+        WARMUP.check("warmup", self.warmup)
+        if self.period_ms is not None:
+            PERIOD_MS.check("period_ms", self.period_ms)
+
+
+class Pace:
+    """Releases at multiples of a period after the first: errors do not add up.
+
+    A release that has passed already is not waited for, and counted as late; the ones after it
+    stay where they are.
+
+    Parameters
+    ----------
+    period_ms : float or None
+        None never waits.
+    clock : callable
+        Nanoseconds, monotonic.
+    sleep : callable
+        Takes seconds.
+    """
+
+    def __init__(
+        self,
+        period_ms: float | None,
+        clock: Callable[[], int] = time.perf_counter_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period_ns = None if period_ms is None else round(period_ms * 1e6)
+        self._clock = clock
+        self._sleep = sleep
+        self._next_ns: int | None = None
+        self.late = 0
+
+    def wait(self) -> None:
+        """Return at the next release, or at once where there is none to wait for."""
+        if self._period_ns is None:
+            return
+        now_ns = self._clock()
+        if self._next_ns is None:
+            self._next_ns = now_ns
+        elif now_ns > self._next_ns:
+            self.late += 1
+        while (left_ns := self._next_ns - self._clock()) > 0:
+            self._sleep(left_ns / 1e9)
+        self._next_ns += self._period_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What the runs of one callable took.
+
+    Parameters
+    ----------
+    wall_ns, cpu_ns : array of int
+        One value a run, in the order of the runs.
+    first_ns : int
+        Wall time of the very first run, of the warm-up where there is one.
+    late : int
+        Runs that began after their release, because those before took too long.
+    collections : tuple of int
+        Garbage collections during the runs, by generation.
+    conditions : Conditions
+        During the runs.
+    """
+
+    wall_ns: array[int]
+    cpu_ns: array[int]
+    first_ns: int
+    late: int
+    collections: tuple[int, ...]
+    conditions: Conditions
+
+
+def time_runs(
+    call: Callable[..., object],
+    settings: Settings,
+    inputs: Callable[[int], object] | None = None,
+) -> Timing:
+    """Run `call` and time every run.
+
+    Parameters
+    ----------
+    call : callable
+        Takes nothing, or what `inputs` returns.
+    settings : Settings
+    inputs : callable, optional
+        Called before every run with its number, from 0 (the warm-up counts from 0 as well), so
+        that run k has the same inputs on every node.
+
+    Raises
+    ------
+    MeasurementError
+        If `call` or `inputs` raises; it names the run.
+    """
+    pace = Pace(settings.period_ms)
+    gc.collect()
+    warm_wall, _ = _series(call, inputs, settings.warmup, pace, "run {} of the warm-up")
+    pace.late = 0
+    watch = Watch(os.sched_getaffinity(0))
+    before = [generation["collections"] for generation in gc.get_stats()]
+    wall_ns, cpu_ns = _series(call, inputs, settings.runs, pace, "run {}")
+    after = [generation["collections"] for generation in gc.get_stats()]
+    return Timing(
+        wall_ns=wall_ns,
+        cpu_ns=cpu_ns,
+        first_ns=(warm_wall or wall_ns)[0],
+        late=pace.late,
+        collections=tuple(late - early for late, early in zip(after, before, strict=True)),
+        conditions=watch.conditions(),
+    )
+
+
+def _series(
+    call: Callable[..., object],
+    inputs: Callable[[int], object] | None,
+    count: int,
+    pace: Pace,
+    what: str,
+) -> tuple[array[int], array[int]]:
+    """Return wall and CPU time of `count` runs."""
+    wall_ns, cpu_ns = array("q", bytes(8 * count)), array("q", bytes(8 * count))
+    wall, cpu = time.perf_counter_ns, time.process_time_ns
+    arguments: tuple[object, ...] = ()
+    run = 0
+    try:
+        for run in range(count):
+            if inputs is not None:
+                arguments = _prepared(inputs, run, what)
+            pace.wait()
+            cpu_start = cpu()
+            start = wall()
+            result = call(*arguments)
+            end = wall()
+            cpu_end = cpu()
+            wall_ns[run] = end - start
+            cpu_ns[run] = cpu_end - cpu_start
+            del result
+    except MeasurementError:
+        raise
+    except (Exception, SystemExit) as error:
+        hint = ""
+        if isinstance(error, TypeError) and raised_here(error.__traceback__):
+            given = "one argument, from --inputs" if inputs else "no arguments (see --inputs)"
+            hint = f"; it is called with {given}"
+        raise MeasurementError(f"{what.format(run)}: {blamed(error)}{hint}") from error
+    return wall_ns, cpu_ns
+
+
+def _prepared(inputs: Callable[[int], object], run: int, what: str) -> tuple[object]:
+    try:
+        return (inputs(run),)
+    except (Exception, SystemExit) as error:
+        hint = ""
+        if isinstance(error, TypeError) and raised_here(error.__traceback__):
+            hint = "; it is called with the number of the run"
+        raise MeasurementError(f"inputs of {what.format(run)}: {blamed(error)}{hint}") from error
+
+
+@contextmanager
+def undisturbed_collector() -> Iterator[None]:
+    """Keep all objects that exist now out of the garbage collector's sight."""
+    ours = gc.get_freeze_count() == 0
+    if ours:
+        gc.freeze()
+    try:
+        yield
+    finally:
+        if ours:
+            gc.unfreeze()
+
+
+def measure_task(
+    task: str,
+    node: str,
+    call: Callable[..., object],
+    *,
+    settings: Settings,
+    inputs: Callable[[int], object] | None = None,
+    source: str | None = None,
+    inputs_source: str | None = None,
+) -> Measurement:
+    """Measure a task on this node, on the cores that the calling thread may use.
+
+    Parameters
+    ----------
+    task, node : str
+        Their names in the cell.
+    call, settings, inputs
+        See `time_runs`.
+    source, inputs_source : str, optional
+        What the file is to say about where `call` and `inputs` are from; their own names if not
+        given.
+
+    Returns
+    -------
+    Measurement
+        Column ``task@node``: wall time, ms; ``task@node/cpu_ms``: CPU time of all threads.
+
+    Raises
+    ------
+    ProfileError
+        If a name cannot be one in a cell.
+    MeasurementError
+        If a run raises; it names the task and the run.
+    """
+    name = task_name(task, node)
+    empty = time_runs(lambda: None, Settings(EMPTY_RUNS))
+    try:
+        timing = time_runs(call, settings, inputs)
+    except MeasurementError as error:
+        raise MeasurementError(f"{task}, {error}") from error.__cause__
+    wall_ns = np.array(timing.wall_ns, np.float64)
+    cpu_ns = np.array(timing.cpu_ns, np.float64)
+    about = {
+        **stamp(),
+        "kind": "task",
+        "task": task,
+        "node": node,
+        "callable": source or _name(call),
+        "inputs": inputs_source or (None if inputs is None else _name(inputs)),
+        "warmup": settings.warmup,
+        "first_ms": timing.first_ns / 1e6,
+        "period_ms": settings.period_ms,
+        "late": timing.late,
+        "cores": sorted(os.sched_getaffinity(0)),
+        "processor": processor(),
+        "cores_used": float(cpu_ns.sum() / max(wall_ns.sum(), 1)),
+        "gc_collections": list(timing.collections),
+        "gc_enabled": gc.isenabled(),
+        "empty_wall_ms": float(np.median(empty.wall_ns)) / 1e6,
+        "empty_cpu_ms": float(np.median(empty.cpu_ns)) / 1e6,
+        "conditions": asdict(timing.conditions),
+    }
+    return Measurement(name, {name: wall_ns / 1e6, f"{name}/cpu_ms": cpu_ns / 1e6}, about)
+
+
+def _name(call: Callable[..., object]) -> str:
+    return getattr(call, "__qualname__", None) or repr(call)

@@ -1,0 +1,133 @@
+"""Summary: what samples amount to, and what speaks against them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.calibration.profile_file import Measurement
+
+__all__ = ["Statistics", "describe", "find_doubts", "percentile"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+# Above these a measurement is called into question. A busy loop on a core of its own was taken
+# off it some 4 times a second by the kernel's own threads, and 250 times where it shared the core.
+STEAL = 0.01
+PREEMPTIONS = 5
+PREEMPTIONS_PER_S = 25
+LOAD_PER_CPU = 0.5
+CORES_USED = 0.9
+OVERHEAD = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Of n samples, in milliseconds; `lag1` is None where all are the same, or there is one."""
+
+    n: int
+    mean: float
+    median: float
+    p95: float
+    p99: float
+    max: float
+    cv: float
+    lag1: float | None
+
+
+def describe(samples: Floats) -> Statistics:
+    """Sum up samples, in the order in which they were taken.
+
+    Parameters
+    ----------
+    samples : array of float64, shape (n,)
+        At least one.
+
+    Returns
+    -------
+    Statistics
+        Percentiles are samples, never interpolated (see `percentile`); cv is the standard
+        deviation over the mean, of the samples as they are (divisor n); `lag1` the correlation
+        of neighbours, sum of (x[i] - m)(x[i+1] - m) over sum of (x[i] - m)^2.
+    """
+    mean = float(samples.mean())
+    centred = samples - mean
+    square = float(centred @ centred)
+    lag1 = None
+    if len(samples) > 1 and np.ptp(samples) > 0:
+        lag1 = float(centred[:-1] @ centred[1:]) / square
+    return Statistics(
+        n=len(samples),
+        mean=mean,
+        median=percentile(samples, 50),
+        p95=percentile(samples, 95),
+        p99=percentile(samples, 99),
+        max=float(samples.max()),
+        cv=(square / len(samples)) ** 0.5 / mean if mean > 0 else 0.0,
+        lag1=lag1,
+    )
+
+
+def percentile(samples: Floats, percent: int) -> float:
+    """Return the ceil(percent / 100 * n)-th smallest of n samples, never interpolated."""
+    rank = -(-percent * len(samples) // 100)  # in integers: 0.95 * n is not exact
+    return float(np.partition(samples, rank - 1)[rank - 1])
+
+
+def find_doubts(measurement: Measurement) -> Iterator[str]:
+    """Yield what speaks against a measurement; nothing where all is well."""
+    about = measurement.about
+    yield from _disturbed(about.get("conditions") or {})
+    if about.get("kind") == "task":
+        yield from _unlike_a_job(measurement)
+    if about.get("late"):
+        yield (
+            f"{about['late']} of {len(measurement.samples)} began late, because the ones before "
+            "took longer than the period"
+        )
+
+
+def _disturbed(conditions: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what else the machine did."""
+    if not conditions:
+        return
+    if (conditions["steal"] or 0.0) > STEAL:
+        yield f"the hypervisor took {conditions['steal']:.1%} of the time for others (steal)"
+    if _preempted(conditions):
+        yield (
+            f"its threads were taken off their cores {conditions['preemptions']} times in "
+            f"{conditions['cpu_s']:.3g} s of CPU time (involuntary context switches): something "
+            "else ran there, or it has more threads than it was given cores"
+        )
+    if conditions["load"] > LOAD_PER_CPU * conditions["cpus"]:
+        yield (
+            f"the machine was not idle when it began: load {conditions['load']:.2f} "
+            f"on {conditions['cpus']} CPUs"
+        )
+
+
+def _preempted(conditions: Mapping[str, Any]) -> bool:
+    usual = PREEMPTIONS_PER_S * float(conditions.get("cpu_s", 0))
+    return int(conditions.get("preemptions", 0)) >= max(PREEMPTIONS, usual)
+
+
+def _unlike_a_job(measurement: Measurement) -> Iterator[str]:
+    """Yield why the samples may not be what `exec_ms` means."""
+    about = measurement.about
+    # Where others had its core, that is what it waited for.
+    if about["cores_used"] < CORES_USED and not _preempted(about.get("conditions") or {}):
+        yield (
+            f"it used {about['cores_used']:.2f} cores: the rest of its time it waited (sleep, "
+            "input and output, an accelerator, another process), which a cell would take for CPU "
+            "work unless it names an `accelerator`"
+        )
+    median = percentile(measurement.samples, 50)
+    if about["empty_wall_ms"] > OVERHEAD * median:
+        yield (
+            f"timing alone takes {about['empty_wall_ms'] * 1e3:.2f} µs, more than "
+            f"{OVERHEAD:.0%} of the median: time several of its runs as one"
+        )

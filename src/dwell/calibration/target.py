@@ -1,0 +1,98 @@
+"""Target: the callable that ``package.module:function`` names."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dwell.calibration.error_origin import blamed
+from dwell.errors import ProfileError
+
+__all__ = ["find_callable", "importable_from"]
+
+
+@contextmanager
+def importable_from(folder: Path) -> Iterator[None]:
+    """Look for modules in `folder` first, as ``python -m`` does in the current one."""
+    place = str(folder.resolve())
+    sys.path.insert(0, place)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if place in sys.path:
+            sys.path.remove(place)
+
+
+def find_callable(name: str, option: str) -> Callable[..., object]:
+    """Import what `name` says.
+
+    Parameters
+    ----------
+    name : str
+        ``package.module:function``; after the colon also ``object.method``, to any depth.
+    option : str
+        What it was given as, for messages: ``--task perception``.
+
+    Raises
+    ------
+    ProfileError
+        If there is no such module or attribute, importing fails, or it cannot be timed: it is not
+        callable, or calling it runs nothing yet (coroutines, generators).
+    """
+    module_name, colon, path = name.partition(":")
+    if not colon or not all(part.isidentifier() for part in f"{module_name}.{path}".split(".")):
+        raise ProfileError(f"{option}: {name!r} is not of the form package.module:function")
+    found = _import(module_name, name, option)
+    for depth, part in enumerate(path.split(".")):
+        if not hasattr(found, part):
+            owner = ".".join([module_name, *path.split(".")[:depth]])
+            near = difflib.get_close_matches(part, dir(found), n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ProfileError(f"{option}: {owner} has no {part!r}{hint}")
+        found = getattr(found, part)
+    return _callable(found, name, option)
+
+
+def _import(module_name: str, name: str, option: str) -> object:
+    try:
+        return importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and _is_part(error.name, module_name):
+            raise ProfileError(
+                f"{option}: there is no module {error.name!r} (from {name!r}), neither in "
+                f"{Path.cwd()} nor among the installed ones"
+            ) from None
+        raise ProfileError(f"{option}: importing {module_name!r} failed: {blamed(error)}") from None
+
+
+def _is_part(missing: str | None, module_name: str) -> bool:
+    """Whether the module that is missing is the one asked for, or a package around it."""
+    return missing is not None and f"{module_name}.".startswith(f"{missing}.")
+
+
+def _callable(found: object, name: str, option: str) -> Callable[..., object]:
+    if isinstance(found, type) or not callable(found):
+        what = "a class" if isinstance(found, type) else f"of type {type(found).__name__}"
+        methods = "method" if not callable(getattr(found, "process", None)) else "process"
+        raise ProfileError(
+            f"{option}: {name!r} is {what}, not a function; make an object in the module and name "
+            f"its method, as module:object.{methods}"
+        )
+    for one in (found, getattr(found, "__call__", None)):  # noqa: B004
+        if inspect.iscoroutinefunction(one) or inspect.isasyncgenfunction(one):
+            raise ProfileError(
+                f"{option}: {name!r} is async, so that calling it runs nothing; name a function "
+                "that runs it to its end (asyncio.run)"
+            )
+        if inspect.isgeneratorfunction(one):
+            raise ProfileError(
+                f"{option}: {name!r} is a generator, so that calling it runs nothing; name a "
+                "function that goes through it"
+            )
+    return found

@@ -1,0 +1,161 @@
+"""Read a cell: a YAML file, or the same as plain values, into a Problem.
+
+One pass finds every fault. A part that is wrong is blanked, so that what remains of its element
+can still be built; an element that cannot is kept as a bare name, so that references to it
+resolve. Structure (keys and single values), construction (values against each other), traces and
+meaning (names, links, the DAG) then each add their faults to one list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike, fspath
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dwell.cellfile.faults import Faults
+from dwell.model import Problem
+
+if TYPE_CHECKING:
+    from dwell.cellfile.traces import Tables
+
+__all__ = ["from_document", "from_record", "load", "read_problem"]
+
+
+def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
+    """Read a cell file.
+
+    Parameters
+    ----------
+    path : str or path
+        A YAML 1.2 (or JSON) file.
+    traces : str or path, optional
+        Folder where the relative names of trace files start; the cell's own where None.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    ProblemError
+        With every fault found in the file and in its traces, each with its line and field path; a
+        TraceError where the traces alone are at fault.
+    """
+    from dwell.cellfile.yaml_text import read_yaml
+
+    source = fspath(path)
+    faults = Faults(source)
+    text = read_yaml(source, faults)
+    if faults.at(""):
+        raise faults.error()  # the file as such; there is nothing to read on
+    if isinstance(text, dict) and "dwell-study" in text and "dwell" not in text:
+        faults.add("dwell-study", "this is a study, not a cell; run it by `dwell study FILE`")
+        raise faults.error()
+    folder = Path(source).parent if traces is None else Path(traces)
+    return read_problem(text, faults, folder, Path(source).stem or "cell")
+
+
+def from_document(
+    document: Mapping[str, object],
+    *,
+    folder: str | PathLike[str] = ".",
+    source: str | None = None,
+) -> Problem:
+    """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
+
+    A candidate may name anchored tasks, too, as the documents of earlier versions do; a cell file
+    may not.
+
+    Parameters
+    ----------
+    document : mapping
+        What a YAML parser would make of a cell file.
+    folder : str or path
+        Where the traces that it names are.
+    source : str, optional
+        Name of the document in messages.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
+    return read_problem(document, Faults(source), Path(folder), "cell", anchored=True)
+
+
+def from_record(document: Mapping[str, object]) -> Problem:
+    """Read the cell that a run's record has, as `dwell.model.document.to_document` made it.
+
+    Its traces are named, and not read: the record has none of their data, and where their files
+    are it does not say.
+
+    Parameters
+    ----------
+    document : mapping
+        Of this version of Dwell, or of an older one, whose candidates name anchored tasks, too.
+
+    Returns
+    -------
+    Problem
+        With an `UnreadTrace` for every trace.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
+    from dwell.cellfile.assembly import Assembly
+    from dwell.cellfile.structure import CELL, read_structure
+
+    faults = Faults()
+    entry = read_structure(document, faults, CELL)
+    return Assembly(entry, None, faults, anchored=True).problem("cell")
+
+
+def read_problem(
+    document: object,
+    faults: Faults,
+    folder: Path,
+    name: str,
+    known: dict[object, Tables] | None = None,
+    *,
+    anchored: bool = False,
+) -> Problem:
+    """Read a document into a Problem.
+
+    Parameters
+    ----------
+    document : object
+        Plain values.
+    faults : Faults
+        Those of the document so far, and the lines of its values.
+    folder : Path
+        Where the traces that it names are.
+    name : str
+        For a cell that does not name itself.
+    known : dict, optional
+        Traces that were read for documents like this one; takes those that are read now.
+    anchored : bool
+        Whether a candidate may name anchored tasks where they are.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found.
+    """
+    from dwell.cellfile.assembly import Assembly
+    from dwell.cellfile.faults import dotted
+    from dwell.cellfile.structure import CELL, read_structure
+    from dwell.cellfile.traces import declared_traces, read_traces
+
+    known = {} if known is None else known
+    entry = read_structure(document, faults, CELL)
+    declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
+    if declared not in known:
+        known[declared] = read_traces(entry, folder, faults)
+    return Assembly(entry, known[declared], faults, anchored=anchored).problem(name)

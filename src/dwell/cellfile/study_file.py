@@ -1,0 +1,421 @@
+"""Read a study file: a cell, and the scenarios, policies, parameters and seeds to try on it.
+
+Whatever a study file puts into the cell goes through the reader of cells, so that a wrong value
+gets the message that it would get there, with its place in the study file.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike, fspath
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from dwell.cellfile.cell import read_problem
+from dwell.cellfile.faults import Faults, Step, dotted
+from dwell.cellfile.rendering import as_read
+from dwell.cellfile.study_paths import SETTINGS, put, steps_of
+from dwell.errors import ProblemError
+from dwell.model import Problem
+from dwell.model.problem import ESTIMATORS
+from dwell.model.semantics import LONGEST_NAME, NAME, nearest, nearest_of
+from dwell.policies.registry import names as policy_names
+
+if TYPE_CHECKING:
+    from dwell.cellfile.study_entries import StudyEntry
+    from dwell.cellfile.traces import Tables
+
+__all__ = ["DeclaredPoint", "DeclaredPolicy", "DeclaredStudy", "Value", "read_study"]
+
+WINDOWS = 300
+SEEDS = tuple(range(1, 21))
+# Every point is read and checked before the first run.
+MAX_POINTS = 10_000
+
+Value: TypeAlias = float | int | str
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredPolicy:
+    """A policy of a study: its name in tables, what it is, and its settings of the cell."""
+
+    name: str
+    policy: str
+    estimator: str | None
+    settings: Mapping[str, object]
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredPoint:
+    """A point of a study's grid: the values by their paths, and the cell with them."""
+
+    values: Mapping[str, Value]
+    problem: Problem
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredStudy:
+    """What a study file declares, with every default filled in."""
+
+    name: str
+    points: tuple[DeclaredPoint, ...]
+    scenarios: tuple[str, ...]
+    policies: tuple[DeclaredPolicy, ...]
+    seeds: tuple[int, ...]
+    windows: int
+    references: bool
+
+
+def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -> DeclaredStudy:
+    """Read a study file, and the cell that it names.
+
+    Parameters
+    ----------
+    path : str or path
+        A YAML 1.2 (or JSON) file.
+    references : collection of str
+        Names that no policy may have where the study asks for references.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found in it, each with its line and field path. A fault of the cell is one
+        at ``cell``.
+    """
+    from dwell.cellfile.structure import read_structure
+    from dwell.cellfile.study_entries import STUDY
+    from dwell.cellfile.yaml_text import read_yaml
+
+    source = fspath(path)
+    faults = Faults(source)
+    document = read_yaml(source, faults, STUDY.what, STUDY.begin)
+    if faults.at(""):
+        raise faults.error()
+    if isinstance(document, dict) and "dwell" in document and STUDY.key not in document:
+        faults.refuse("dwell", f"this is a cell; a study file begins with `{STUDY.begin}`")
+    entry = read_structure(document, faults, STUDY)
+    study = _Reading(entry, Path(source), faults, references).study()
+    if study is None or faults:
+        raise faults.error()
+    return study
+
+
+@dataclass(frozen=True, slots=True)
+class _Override:
+    """A value that the study puts into the cell."""
+
+    place: str
+    steps: tuple[Step, ...]
+    value: object
+
+    @property
+    def path(self) -> str:
+        """Where it goes."""
+        return dotted(self.steps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    """A cell with other values in it: its document, and what it has been read into."""
+
+    document: Any
+    problem: Problem
+    folder: Path
+    traces: dict[object, Tables] = field(repr=False)
+
+    def changed(self, overrides: Iterable[_Override]) -> _Cell:
+        """Return the cell with values put into it.
+
+        Raises
+        ------
+        ProblemError
+            With every fault found.
+        """
+        document = self.document
+        for one in overrides:
+            document = put(document, one.steps, one.value)
+        name = self.problem.name
+        problem = read_problem(document, Faults(), self.folder, name, self.traces)
+        return _Cell(document, problem, self.folder, self.traces)
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """One study file on its way from its entry to what it declares."""
+
+    entry: StudyEntry
+    path: Path
+    faults: Faults
+    reserved: Collection[str]
+
+    def study(self) -> DeclaredStudy | None:
+        """Return the study, or None beside at least one fault."""
+        entry = self.entry
+        name = entry.name or self.path.stem
+        self._check_name("name", name)
+        grid = self._grid()
+        policies = self._policies()
+        cell = self._cell()
+        if cell is None:
+            return None
+        cell = self._with_scenarios(cell)
+        scenarios = self._scenarios(cell.problem)
+        points = self._points(cell, grid)
+        for policy in policies:
+            self._check_names(policy, cell.problem)
+            self._check_settings(policy, [cell for _, cell in points] or [cell])
+        windows = WINDOWS if entry.windows is None else entry.windows
+        self._check_windows(windows, points)
+        return DeclaredStudy(
+            name=name,
+            points=tuple(DeclaredPoint(values, cell.problem) for values, cell in points),
+            scenarios=scenarios,
+            policies=tuple(policies),
+            seeds=SEEDS if entry.seeds is None else entry.seeds,
+            windows=windows,
+            references=bool(entry.references),
+        )
+
+    def _check_name(self, path: str, name: str) -> None:
+        if NAME.fullmatch(name) is None or len(name) > LONGEST_NAME:
+            self.faults.add(
+                path,
+                f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, a "
+                f"letter, a digit or _ first, at most {LONGEST_NAME} characters",
+            )
+
+    def _check_windows(self, windows: int, points: Sequence[tuple[object, _Cell]]) -> None:
+        warmup = max((cell.problem.warmup_windows for _, cell in points), default=0)
+        if windows <= warmup:
+            bound = f"more than the {warmup} windows of warm-up"
+            self.faults.add("windows", f"{windows} is not allowed; it must be {bound}")
+
+    # ------------------------------------------------------------------------------ cell
+
+    def _cell(self) -> _Cell | None:
+        """Read the cell as it is in its file."""
+        from dwell.cellfile.yaml_text import read_yaml
+
+        if not self.entry.cell:
+            if not self.faults.at("cell"):
+                self.faults.add("cell", "the text is empty; name the cell's file")
+            return None
+        file = self.path.parent / self.entry.cell
+        given = self.entry.traces
+        folder = file.parent if given is None else self.path.parent / given
+        faults = Faults(str(file))
+        document = read_yaml(str(file), faults)
+        traces: dict[object, Tables] = {}
+        try:
+            if faults.at(""):
+                raise faults.error()
+            problem = read_problem(document, faults, folder, file.stem or "cell", traces)
+        except ProblemError as error:
+            for line in str(error).splitlines():
+                self.faults.add("cell", line)
+            return None
+        return _Cell(document, problem, folder, traces)
+
+    def _changed(
+        self, cell: _Cell, overrides: Sequence[_Override], otherwise: str, where: str = ""
+    ) -> _Cell | None:
+        """Put values into the cell, or record what is wrong with them where they are given.
+
+        Parameters
+        ----------
+        otherwise : str
+            Place of faults that several values cause together.
+        where : str
+            What is added to their messages.
+        """
+        try:
+            return cell.changed(overrides)
+        except ProblemError as error:
+            for fault in error.faults:
+                beneath = Faults()
+                beneath.add(fault.path, "")
+                mine = [one for one in overrides if beneath.touches(one.path)]
+                exact = bool(mine) and mine[0].path == fault.path
+                message = fault.message if exact else str(fault)
+                if mine:
+                    self.faults.add(mine[0].place, message)
+                else:
+                    self.faults.add(otherwise, message + where)
+            return None
+
+    # ------------------------------------------------------------------------- scenarios
+
+    def _with_scenarios(self, cell: _Cell) -> _Cell:
+        """Put the study's own scenarios into the cell; a fault leaves them all out."""
+        own = [
+            _Override(f"scenarios.{name}", ("scenarios", name), items)
+            for name, items in (self.entry.scenarios or {}).items()
+            if items is not None
+        ]
+        try:
+            return cell.changed(own) if own else cell
+        except ProblemError as error:
+            for fault in error.faults:
+                self.faults.add(fault.path, fault.message)
+            return cell
+
+    def _scenarios(self, problem: Problem) -> tuple[str, ...]:
+        given = self.entry.scenarios
+        if given is None:
+            return tuple(problem.scenarios)
+        for name, items in given.items():
+            if items is None and name not in problem.scenarios:
+                hint = nearest(name, problem.scenarios)
+                path = f"scenarios.{name}"
+                self.faults.add(path, f"the cell has no scenario {name!r}; {hint}")
+        return tuple(given)
+
+    # ------------------------------------------------------------------------ parameters
+
+    def _grid(self) -> dict[str, list[Any]]:
+        """Return the values of every parameter whose structure is right."""
+        grid: dict[str, list[Any]] = {}
+        for path, values in (self.entry.parameters or {}).items():
+            place = f"parameters.{path}"
+            if not isinstance(values, list) or not values:
+                has = "the list is empty" if values == [] else f"{as_read(values)} is not allowed"
+                self.faults.add(place, f"{has}; it must be a list of at least one value")
+            elif self.faults.touches(place):
+                pass
+            elif len(set(_shown(values))) < len(values):
+                self.faults.add(place, "a value is given twice; give each once")
+            else:
+                grid[path] = values
+        count = math.prod(len(values) for values in grid.values())
+        if count > MAX_POINTS:
+            self.faults.add("parameters", f"{count} points are more than {MAX_POINTS}; give fewer")
+            return {}
+        return grid
+
+    def _points(
+        self, cell: _Cell, grid: Mapping[str, list[Any]]
+    ) -> list[tuple[dict[str, Value], _Cell]]:
+        """Return every combination of values, and the cell with them."""
+        steps = {path: self._steps("parameters", path, cell) for path in grid}
+        self._check_apart("parameters", steps)
+        places = {path: known for path, known in steps.items() if known is not None}
+        shown = {path: _shown(values) for path, values in grid.items()}
+        points = []
+        for picked in itertools.product(*(range(len(grid[path])) for path in places)):
+            at = list(zip(places.items(), picked, strict=True))
+            overrides = [
+                _Override(f"parameters.{path}[{i}]", known, grid[path][i])
+                for (path, known), i in at
+            ]
+            values = {path: shown[path][i] for (path, _), i in at}
+            listed = ", ".join(f"{path} = {value}" for path, value in values.items())
+            changed = self._changed(cell, overrides, "parameters", f" (at {listed})")
+            if changed is not None:
+                points.append((values, changed))
+        return points
+
+    def _steps(self, place: str, path: str, cell: _Cell) -> tuple[Step, ...] | None:
+        """Split a path into steps; None beside a fault."""
+        unread = path.startswith("scenarios.") and self.faults.touches("scenarios")
+        return None if unread else self.faults.attempt(place, steps_of, path, cell.document)
+
+    def _check_apart(self, place: str, steps: Mapping[str, tuple[Step, ...] | None]) -> None:
+        """Refuse a path that leads into what another one gives."""
+        known = {path: found for path, found in steps.items() if found is not None}
+        for (path, inner), (other, outer) in itertools.permutations(known.items(), 2):
+            if inner[: len(outer)] == outer:
+                self.faults.add(f"{place}.{path}", f"is a part of {other}; give one of them")
+
+    # -------------------------------------------------------------------------- policies
+
+    def _policies(self) -> list[DeclaredPolicy]:
+        """Return the policies whose structure is right."""
+        declared: list[DeclaredPolicy] = []
+        if not self.entry.policies and not self.faults.at("policies"):
+            self.faults.add("policies", "the mapping is empty; name at least one policy")
+        for name, given in self.entry.policies.items():
+            path = f"policies.{name}"
+            self._check_name(path, name)
+            if self.entry.references and name in self.reserved:
+                self.faults.add(path, f"{name!r} is a reference's name; choose another")
+            keys = {"policy": given} if isinstance(given, str) else given
+            if isinstance(keys, dict):
+                declared += self._policy(path, name, keys)
+            elif given is not None:  # that is a fault already
+                remedy = "a policy's name, or a mapping of policy, estimator and settings"
+                self.faults.add(path, f"{as_read(given)} is not allowed; it must be {remedy}")
+        return declared
+
+    def _policy(self, path: str, name: str, keys: Mapping[str, Any]) -> list[DeclaredPolicy]:
+        """Return a policy, or nothing beside at least one fault."""
+        before = len(self.faults)
+        texts: dict[str, str] = {}
+        settings: dict[str, object] = {}
+        for key, value in keys.items():
+            place = f"{path}.{key}"
+            if key in ("controller.policy", "controller.estimator"):
+                self.faults.add(place, f"write it as `{key.removeprefix('controller.')}`")
+            elif key.startswith(SETTINGS):
+                settings[key] = value
+            elif key not in ("policy", "estimator"):
+                hint = nearest(key, ["policy", "estimator", *(f"{name}..." for name in SETTINGS)])
+                self.faults.add(place, f"unknown key {key!r}; {hint}")
+            elif isinstance(value, str) and value:
+                texts[key] = value
+            elif value is not None:
+                has = as_read(value)
+                self.faults.add(place, f"{has} is not allowed; it must be a text that is not empty")
+        if len(self.faults) > before or self.faults.touches(path):
+            return []
+        policy = texts.get("policy", name)
+        return [DeclaredPolicy(name, policy, texts.get("estimator"), settings)]
+
+    def _check_names(self, policy: DeclaredPolicy, problem: Problem) -> None:
+        """Check that the names that a policy gives are known."""
+        path = f"policies.{policy.name}"
+        known = [*policy_names(), *problem.candidates]
+        if policy.policy not in known:
+            hint = nearest_of(policy.policy, known, "policies")
+            self.faults.add(path, f"unknown policy {policy.policy!r}; {hint}")
+        elif policy.name in problem.candidates and policy.policy != policy.name:
+            self.faults.add(
+                path,
+                f"{policy.name!r} is a candidate's name, for the placement that never moves; give "
+                f"{policy.policy!r} another one",
+            )
+        if policy.estimator is not None and policy.estimator not in ESTIMATORS:
+            hint = nearest(policy.estimator, ESTIMATORS)
+            shown = f"unknown estimator {policy.estimator!r}; {hint}"
+            self.faults.add(f"{path}.estimator", shown)
+
+    def _check_settings(self, policy: DeclaredPolicy, points: Sequence[_Cell]) -> None:
+        """Check that the settings of a policy are right at every point."""
+        path = f"policies.{policy.name}"
+        for cell in points:
+            steps = {key: self._steps(path, key, cell) for key in policy.settings}
+            self._check_apart(path, steps)
+            overrides = [
+                _Override(f"{path}.{key}", found, policy.settings[key])
+                for key, found in steps.items()
+                if found is not None
+            ]
+            if policy.estimator in ESTIMATORS:
+                place = f"{path}.estimator"
+                overrides.append(_Override(place, ("controller", "estimator"), policy.estimator))
+            if overrides:
+                self._changed(cell, overrides, path)
+
+
+def _shown(values: Sequence[Any]) -> list[Value]:
+    """Return the values of a parameter as a column can hold them: all numbers, or all texts."""
+    for kind in (bool, str):
+        if all(isinstance(value, kind) for value in values):
+            return list(values)
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        whole = all(isinstance(value, int) for value in values)
+        return list(values) if whole else [float(value) for value in values]
+    return [value if isinstance(value, str) else json.dumps(value) for value in values]

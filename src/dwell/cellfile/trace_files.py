@@ -1,0 +1,279 @@
+"""Trace files: the columns that a cell uses of one file, read, judged and put in groups."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.cellfile.entries import TraceEntry
+from dwell.cellfile.faults import Faults
+from dwell.cellfile.traces import Source
+from dwell.errors import TraceError
+from dwell.model import Trace, TraceTable
+from dwell.model.bounds import VALUE
+from dwell.model.document import digest
+from dwell.model.semantics import nearest
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["Reading"]
+
+Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+SUFFIXES = (".parquet", ".csv")
+
+RELATIVE = (
+    "file names are relative to the cell file's folder, or to the one given as `traces` "
+    "(`--traces FOLDER`)"
+)
+
+
+@dataclass(slots=True)
+class Reading:
+    """One source being read.
+
+    Parameters
+    ----------
+    source : Source
+    uses : sequence of (str, TraceEntry)
+        The declarations that share it, with their places in the cell file.
+    folder : Path
+        Where relative file names start.
+    faults : Faults
+        Takes what is wrong with the file.
+    """
+
+    source: Source
+    uses: Sequence[tuple[str, TraceEntry]]
+    folder: Path
+    faults: Faults
+    failed: bool = field(default=False, init=False)
+
+    def table(self, frame: pl.DataFrame) -> TraceTable | None:
+        """Return the table of the columns read, or None beside at least one fault."""
+        values = {name: _floats(frame[name]) for name in dict.fromkeys(self._columns())}
+        starts = self._starts(frame)
+        time = None
+        if self.source.time is not None:
+            time = _floats(frame[self.source.time])
+        keep, clipped = self._judge(values, time)
+        if not self.failed and not keep.any():
+            self._fail("file", f"none of its {frame.height} rows is left after `on_negative: drop`")
+        if self.failed:
+            return None
+        if self.source.on_negative == "clip":
+            values = {name: np.maximum(column, 0.0) for name, column in values.items()}
+        starts = _kept_starts(starts, keep)
+        values = {name: _frozen(column[keep]) for name, column in values.items()}
+        if time is not None:
+            time = self._instants(time[keep], starts, np.flatnonzero(keep))
+        if self.failed:
+            return None
+        table = TraceTable(
+            file=self.source.file,
+            columns=values,
+            by=self.source.by,
+            starts=starts,
+            time_ms=time,
+            wrap=self.source.wrap,
+            group=self.source.group,
+            on_negative=self.source.on_negative,
+            time=self.source.time,
+            dropped=int(np.count_nonzero(~keep)) + clipped,
+        )
+        self._verify(table)
+        return None if self.failed else table
+
+    def _fail(self, key: str, message: str, path: str | None = None) -> None:
+        self.failed = True
+        self.faults.add(f"{path or self.uses[0][0]}.{key}", message, kind=TraceError)
+
+    def _columns(self) -> Iterator[str]:
+        return (entry.column for _, entry in self.uses)
+
+    def frame(self) -> pl.DataFrame | None:
+        """Return the columns that the cell uses, of the right types, at least one row."""
+        import polars as pl
+        from polars.selectors import by_name
+
+        path = self.folder / self.source.file
+        suffix = path.suffix.lower()
+        if suffix not in SUFFIXES:
+            endings = " or ".join(SUFFIXES)
+            message = f"{self.source.file!r} must end in {endings}, which says how to read it"
+            self._fail("file", message)
+            return None
+        if not path.is_file():
+            what = "is a folder" if path.is_dir() else "does not exist"
+            self._fail("file", f"{path} {what}; {_beside(path)}")
+            return None
+        try:
+            lazy = (
+                pl.scan_parquet(path)
+                if suffix == ".parquet"
+                else pl.scan_csv(path, infer_schema_length=None)
+            )
+            if not self._has_columns(lazy.collect_schema().names()):
+                return None
+            wanted = [*self._columns(), *self.source.groups, self.source.time]
+            # By exact name: elsewhere polars takes ^x$ and * for patterns.
+            frame = lazy.select(by_name(*dict.fromkeys(filter(None, wanted)))).collect()
+        except pl.exceptions.NoDataError:
+            self._fail("file", f"{path} is empty; record it again, or name another")
+        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+            reason = str(error).partition("\n")[0]
+            self._fail("file", f"{path} cannot be read: {reason}")
+        else:
+            if frame.height > 0:
+                return frame if self._has_numbers(frame.schema) else None
+            self._fail("file", f"{path} has no rows; record it again, or name another")
+        return None
+
+    def _named(self) -> Iterator[tuple[str, str, str]]:
+        """Yield place, key and value of every column with numbers that is named."""
+        for path, entry in self.uses:
+            yield path, "column", entry.column
+        if self.source.time is not None:
+            yield self.uses[0][0], "time", self.source.time
+
+    def _has_columns(self, names: Sequence[str]) -> bool:
+        groups = ((self.uses[0][0], "group", name) for name in self.source.groups)
+        for path, key, name in (*self._named(), *groups):
+            if name not in names:
+                hint = nearest(name, names)
+                known = "" if hint.startswith("known") else f" (known: {', '.join(names)})"
+                message = f"{self.source.file} has no column {name!r}; {hint}{known}"
+                self._fail(key, message, path)
+        return not self.failed
+
+    def _has_numbers(self, types: Mapping[str, pl.DataType]) -> bool:
+        for path, key, name in self._named():
+            if not types[name].is_numeric():
+                message = f"column {name!r} holds {types[name]}; it must hold numbers"
+                self._fail(key, f"{message}: name another, or record it again", path)
+        return not self.failed
+
+    def _starts(self, frame: pl.DataFrame) -> NDArray[np.int64]:
+        """Return the first row of every group; each must stand in one piece."""
+        import polars as pl
+
+        if not self.source.groups:
+            return np.zeros(1, np.int64)
+        groups = frame[list(dict.fromkeys(self.source.groups))]
+        runs = groups.select(pl.struct(pl.all()).rle_id()).to_series().to_numpy()
+        starts = np.flatnonzero(np.diff(runs, prepend=-1)).astype(np.int64)
+        first = groups[starts].select(pl.struct(pl.all()).is_first_distinct()).to_series()
+        if not first.all():
+            row = int(starts[int((~first).arg_max() or 0)])
+            values = ", ".join(str(value) for value in groups.row(row))
+            self._fail(
+                "group",
+                f"group {values} begins again at row {row + 1} after another group; sort the file "
+                "so that the rows of each group stand together",
+            )
+        return starts
+
+    def _judge(self, values: dict[str, Floats], time: Floats | None) -> tuple[Mask, int]:
+        """Return which rows stay, and how many were clipped; what may not be is a fault."""
+        rows = len(next(iter(values.values())))
+        keep, clip = np.ones(rows, np.bool_), np.zeros(rows, np.bool_)
+        mode = self.source.on_negative
+        for path, entry in self.uses:
+            column = values[entry.column]
+            negative = column < 0
+            bad = ~(column <= VALUE.high)  # and so is NaN
+            if mode == "clip":
+                clip |= negative
+            else:
+                bad |= negative
+            if mode == "drop":
+                keep &= ~bad
+            elif bad.any():
+                self._fail("column", self._complaint(column, bad, mode), path)
+        if time is not None:
+            lost = ~np.isfinite(time)
+            if mode == "drop":
+                keep &= ~lost
+            elif lost.any():
+                self._fail("time", self._complaint(time, lost, "clip"))
+        return keep, int(np.count_nonzero(clip))
+
+    def _complaint(self, column: Floats, bad: Mask, mode: str) -> str:
+        kinds = {
+            "negative": bad & (column < 0),
+            "missing or NaN": bad & np.isnan(column),
+            "above 1e9": bad & (column > VALUE.high),
+        }
+        counts = {kind: int(np.count_nonzero(rows)) for kind, rows in kinds.items()}
+        has = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+        row = int(np.flatnonzero(bad)[0])
+        value = "" if np.isnan(column[row]) else f", {column[row]:g}"
+        drop = "set `on_negative: drop` to leave such rows out of all columns"
+        clip = "0 cannot stand for that" if mode == "clip" else "or `clip` to make negative ones 0"
+        return f"{has} of {len(column)} rows (first: row {row + 1}{value}); {drop}, {clip}"
+
+    def _instants(self, time: Floats, starts: NDArray[np.int64], rows: NDArray[np.int64]) -> Floats:
+        """Return each row's instant since its group's first; they must not go back."""
+        steps = np.diff(time)
+        steps[starts[1:] - 1] = 0
+        if (steps < 0).any():
+            at = int(np.flatnonzero(steps < 0)[0])
+            self._fail(
+                "time",
+                f"{self.source.time!r} goes back from {time[at]:g} to {time[at + 1]:g} at row "
+                f"{int(rows[at + 1]) + 1}; sort the file by it, or name the columns that tell "
+                "recordings apart with `group`",
+            )
+        lengths = np.diff(np.append(starts, len(time)))
+        return _frozen(time - np.repeat(time[starts], lengths))
+
+    def _verify(self, table: TraceTable) -> None:
+        for path, entry in self.uses:
+            if entry.sha256 is not None and digest(Trace(table, entry.column)) != entry.sha256:
+                self._fail(
+                    "sha256",
+                    f"{self.source.file} does not hold the data that were recorded; find the file "
+                    "that does, or remove the key to go on with this one",
+                    path,
+                )
+
+
+def _floats(series: pl.Series) -> Floats:
+    """Return a column as float64, NaN where a value is missing."""
+    import polars as pl
+
+    return series.cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+
+def _kept_starts(starts: NDArray[np.int64], keep: Mask) -> NDArray[np.int64]:
+    """Return the first row of every group that has one left, counted among the rows that stay."""
+    before = np.concatenate(([0], np.cumsum(keep)))
+    first = before[starts]
+    last = before[np.append(starts[1:], len(keep))]
+    return np.asarray(first[last > first], np.int64)
+
+
+def _frozen(column: Floats) -> Floats:
+    column = np.ascontiguousarray(column, np.float64)
+    column.setflags(write=False)
+    return column
+
+
+def _beside(path: Path) -> str:
+    """Return a remedy for a file that is not there."""
+    try:
+        names = [item.name for item in path.parent.iterdir() if item.suffix.lower() in SUFFIXES]
+    except OSError:
+        return f"there is no folder {path.parent}; {RELATIVE}"
+    match = difflib.get_close_matches(path.name, names, n=1)
+    if match:
+        return f"did you mean {match[0]!r}?"
+    return RELATIVE

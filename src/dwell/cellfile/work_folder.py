@@ -1,0 +1,185 @@
+"""Work folders: each belongs to one piece of work, which fills it in as many attempts as needed.
+
+A file in the folder says whose it is. Whoever comes with another description is told what differs,
+and nothing is touched. What is written appears complete or not at all.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dwell.cellfile.rendering import as_read
+from dwell.errors import RunError, SimulationError
+
+__all__ = ["Claim", "Description", "claimed", "unwritable", "write_whole"]
+
+# How many differences from other work are listed.
+LISTED = 4
+
+Description = Mapping[str, Any]
+
+
+class Claim(NamedTuple):
+    """What marks a folder.
+
+    Parameters
+    ----------
+    what : str
+        The kind of work, for messages: ``study``.
+    file : str
+        Name of the file with the description.
+    version : int
+        Of the folder's form.
+    folders : tuple of str
+        Those inside that the work fills.
+    """
+
+    what: str
+    file: str
+    version: int
+    folders: tuple[str, ...]
+
+
+@contextmanager
+def claimed(folder: Path, claim: Claim, description: Description) -> Iterator[None]:
+    """Open a folder for this process alone, and make it where there is none.
+
+    Parameters
+    ----------
+    folder : Path
+    claim : Claim
+    description : mapping
+        JSON-able: all that the results depend on.
+
+    Raises
+    ------
+    RunError
+        If the folder holds something else, or other work of the kind, or is in use.
+    SimulationError
+        If it cannot be made or written.
+    """
+    try:
+        if folder.exists():
+            _require_kind(folder, claim)
+        for inner in claim.folders:
+            (folder / inner).mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    try:
+        _lock(folder, handle, claim.what)
+        _take(folder, claim, description)
+        for place in (folder, *(folder / inner for inner in claim.folders)):
+            for draft in place.glob(".*.draft"):
+                draft.unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(folder: Path, handle: int, what: str) -> None:
+    """Keep other processes out; the kernel lets them in when this one ends, however it does."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise RunError(f"{folder} is in use: another process works on this {what}") from None
+
+
+def _require_kind(folder: Path, claim: Claim) -> None:
+    """Refuse a folder that holds something else."""
+    if not folder.is_dir():
+        raise RunError(f"{folder} is no folder; choose another one")
+    if (folder / claim.file).is_file():
+        return
+    # Killed at its very beginning, the work leaves these.
+    known: Collection[str] = {*claim.folders, f".{claim.file}.draft"}
+    if any(path.name not in known for path in folder.iterdir()):
+        raise RunError(f"{folder} exists and is no {claim.what}; choose another folder")
+
+
+def _take(folder: Path, claim: Claim, description: Description) -> None:
+    """Write whose folder it is, or refuse it where it is another's."""
+    path = folder / claim.file
+    text = json.dumps({f"dwell-{claim.what}-folder": claim.version, **description}, allow_nan=False)
+    whole = json.loads(text)
+    whole["digest"] = hashlib.sha256(text.encode()).hexdigest()
+    if path.is_file():
+        try:
+            known = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise RunError(f"{path}: cannot be read ({error})") from None
+        if not isinstance(known, dict):
+            raise RunError(f"{path} describes no {claim.what}; choose another folder")
+        if known.get("digest") != whole["digest"]:
+            raise RunError(_difference(folder, claim.what, known, whole))
+        return
+    try:
+        text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)
+        write_whole(path, f"{text}\n".encode())
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def unwritable(path: Path, error: OSError) -> SimulationError:
+    """Return the error that says so."""
+    return SimulationError(f"{path}: cannot be written ({error.strerror or error})")
+
+
+def _difference(folder: Path, what: str, known: Any, asked: Any) -> str:
+    """Return what is different about the work in a folder."""
+    found = [one for one in _differences(known, asked, "") if one.partition(":")[0] != "digest"]
+    more = [] if len(found) <= LISTED else [f"and {len(found) - LISTED} more"]
+    listed = "\n".join(f"  {line}" for line in (*found[:LISTED], *more))
+    return (
+        f"{folder} holds another {what}, or one made with other versions; choose another folder, "
+        f"or remove this one:\n{listed}"
+    )
+
+
+def _differences(known: Any, asked: Any, path: str) -> Iterator[str]:
+    """Yield ``path: it is ... there and ... now`` for everything that differs."""
+    if isinstance(known, dict) and isinstance(asked, dict):
+        for key in dict.fromkeys((*known, *asked)):
+            inner = f"{path}.{key}" if path else key
+            yield from _differences(known.get(key), asked.get(key), inner)
+    elif known != asked:
+        yield f"{path}: {_shown(known)} there, {_shown(asked)} now"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, list) and all(isinstance(item, int | float | str) for item in value):
+        text = ", ".join(str(item) for item in value)
+        return text if len(text) <= 60 else f"{text[:57]}..."
+    return as_read(value)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file that appears complete or not at all, and stays when the power goes.
+
+    Raises
+    ------
+    OSError
+        If that fails; an older file of the name stays then.
+    """
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        with draft.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
+    handle = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

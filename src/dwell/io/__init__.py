@@ -1,6 +1,0 @@
-"""Cell files, and the traces they name, read into a Problem; nothing heavy is imported here."""
-
-from dwell.io.cell import from_document, from_record, load
-from dwell.io.json_schema import schema
-
-__all__ = ["from_document", "from_record", "load", "schema"]

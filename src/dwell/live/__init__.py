@@ -1,0 +1,1 @@
+"""The live runtime: the roles of a cell, their protocol, and what carries it."""

@@ -1,0 +1,293 @@
+"""Authority: the certificates of a cell, issued and revoked where its own key is kept."""
+
+from __future__ import annotations
+
+import base64
+import ipaddress
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import cast
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from dwell.errors import TrustError
+from dwell.live.trust.roster import ROLES, Role, Roster, Subject, write_private
+
+__all__ = ["AUTHORITY", "DAYS", "Authority"]
+
+#: Folder of the authority's own key, which stays where the others are issued.
+AUTHORITY = "ca"
+#: How long certificates hold, unless asked otherwise; the authority's own holds ten times that.
+DAYS = 365
+MOST_DAYS = 3_650
+#: Clocks of hosts may be behind by that.
+BACKDATED = timedelta(hours=1)
+
+
+class Authority:
+    """Issues and revokes; every change is written to the folders of all subjects.
+
+    Parameters
+    ----------
+    folder : Path
+        With a folder for the authority, and one for each subject, to be taken to its host.
+    key : Ed25519PrivateKey
+    certificate : Certificate
+    roster : Roster
+    """
+
+    def __init__(
+        self, folder: Path, key: Ed25519PrivateKey, certificate: x509.Certificate, roster: Roster
+    ) -> None:
+        self.folder, self._key, self.certificate, self.roster = folder, key, certificate, roster
+
+    def __repr__(self) -> str:
+        return f"Authority({str(self.folder)!r}, cell {self.roster.cell!r})"
+
+    @classmethod
+    def create(cls, folder: Path, cell: str, *, days: int = DAYS) -> Authority:
+        """Make an authority with a key of its own, and nobody yet.
+
+        Raises
+        ------
+        TrustError
+            If the folder has one already, or cannot be made.
+        """
+        _require_days(days)
+        if (folder / AUTHORITY).exists():
+            raise TrustError(f"{folder}: has an authority already; keys are never replaced by it")
+        _make(folder / AUTHORITY)
+        key = Ed25519PrivateKey.generate()
+        name = _name(f"dwell authority of {cell}"[:64])
+        usage = x509.KeyUsage(
+            digital_signature=True,
+            content_commitment=False,
+            key_encipherment=False,
+            data_encipherment=False,
+            key_agreement=False,
+            key_cert_sign=True,
+            crl_sign=True,
+            encipher_only=False,
+            decipher_only=False,
+        )
+        certificate = (
+            _builder(name, name, key, _now() + timedelta(days=10 * days))
+            .serial_number(x509.random_serial_number())
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(usage, critical=True)
+            .sign(key, None)
+        )
+        made = cls(folder, key, certificate, Roster(cell, 1, {}))
+        write_private(folder / AUTHORITY / "key.pem", _pem(key))
+        write_private(folder / AUTHORITY / "ca.pem", certificate.public_bytes(Encoding.PEM))
+        made._publish(made.roster)
+        return made
+
+    @classmethod
+    def open(cls, folder: Path) -> Authority:
+        """Read an authority.
+
+        Raises
+        ------
+        TrustError
+            If it is missing or damaged.
+        """
+        own = folder / AUTHORITY
+        try:
+            key = load_pem_private_key((own / "key.pem").read_bytes(), password=None)
+            certificate = x509.load_pem_x509_certificate((own / "ca.pem").read_bytes())
+        except OSError as error:
+            raise TrustError(
+                f"{error.filename}: cannot be read ({error.strerror}); "
+                "make an authority with dwell keys init"
+            ) from None
+        except ValueError as error:
+            raise TrustError(f"{own}: key.pem or ca.pem is damaged ({error})") from None
+        if not isinstance(key, Ed25519PrivateKey):
+            raise TrustError(f"{own / 'key.pem'}: is no Ed25519 key")
+        if key.public_key() != certificate.public_key():
+            raise TrustError(f"{own}: key.pem does not belong to ca.pem")
+        return cls(folder, key, certificate, Roster.read(own / "roster.json", key.public_key()))
+
+    def issue(
+        self,
+        name: str,
+        role: str | None = None,
+        addresses: Collection[str] | None = None,
+        *,
+        days: int = DAYS,
+    ) -> Path:
+        """Issue a certificate with a new key; one that the subject had is revoked.
+
+        Parameters
+        ----------
+        name : str
+        role : {"node", "controller", "operator", "observer"}, optional
+            The one that it had if left out.
+        addresses : collection of str, optional
+            Where it is reached: host names and IP addresses; those it had if left out.
+        days : int
+            How long it holds, 1 to 3650.
+
+        Returns
+        -------
+        Path
+            Folder of its keyring.
+
+        Raises
+        ------
+        TrustError
+            If the name or role or time is not valid, or it cannot be written.
+        """
+        _require_days(days)
+        roster, before = self.roster, self.roster.subjects.get(name)
+        if name == AUTHORITY:
+            raise TrustError(f"{name!r} is the authority's own name; choose another")
+        if role is None and before is None:
+            raise TrustError(f"{name} is new; say its role, {', '.join(ROLES)}")
+        if before is not None and role not in (None, before.role):
+            raise TrustError(f"{name} has the role {before.role}; revoke it to make it {role}")
+        key = Ed25519PrivateKey.generate()
+        serial = x509.random_serial_number()
+        generation = 1 + max(before.generation if before else 0, self._last_generation(name))
+        public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
+        expires = min(_now() + timedelta(days=days), self.certificate.not_valid_after_utc)
+        encoded = base64.b64encode(public).decode()
+        played = cast("Role", role or (before.role if before else None))
+        subject = Subject(name, played, generation, serial, encoded, expires.date().isoformat())
+        names = self._names(name) if addresses is None else map(_general_name, addresses)
+        certificate = self._certificate(subject, key, list(dict.fromkeys(names)), expires)
+        folder = self.folder / name
+        _make(folder)
+        write_private(folder / "key.pem", _pem(key))
+        write_private(folder / "cert.pem", certificate.public_bytes(Encoding.PEM))
+        write_private(folder / "ca.pem", self.certificate.public_bytes(Encoding.PEM))
+        revoked = (*roster.revoked, before.serial) if before is not None else roster.revoked
+        subjects = {**roster.subjects, name: subject}
+        self._publish(replace(roster, subjects=subjects, revoked=revoked))
+        return folder
+
+    def revoke(self, name: str) -> None:
+        """Take a subject's certificate back; hosts know once they have the new roster.
+
+        Raises
+        ------
+        TrustError
+            If there is no such subject.
+        """
+        roster = self.roster
+        subject = roster.subjects.get(name)
+        if subject is None:
+            known = ", ".join(roster.subjects) or "nobody"
+            raise TrustError(f"no subject {name!r} in {self.folder}; there is {known}")
+        rest = {one: its for one, its in roster.subjects.items() if one != name}
+        self._publish(replace(roster, subjects=rest, revoked=(*roster.revoked, subject.serial)))
+
+    def _last(self, name: str) -> x509.Certificate | None:
+        """Return the newest certificate that a subject's folder has."""
+        try:
+            return x509.load_pem_x509_certificate((self.folder / name / "cert.pem").read_bytes())
+        except (OSError, ValueError):
+            return None
+
+    def _last_generation(self, name: str) -> int:
+        last = self._last(name)
+        if last is None:
+            return 0
+        found = str(last.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+        return int(found.rpartition(".")[2])
+
+    def _names(self, name: str) -> Iterable[x509.GeneralName]:
+        """Return the addresses that a subject had."""
+        last = self._last(name)
+        if last is None:
+            return ()
+        try:
+            return last.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            return ()
+
+    def _publish(self, roster: Roster) -> None:
+        """Write the roster to everybody's folder, those of the revoked aside."""
+        self.roster = replace(roster, number=roster.number + 1)
+        signed = self.roster.signed(self._key)
+        for name in (AUTHORITY, *self.roster.subjects):
+            write_private(self.folder / name / "roster.json", signed)
+
+    def _certificate(
+        self,
+        subject: Subject,
+        key: Ed25519PrivateKey,
+        names: Sequence[x509.GeneralName],
+        expires: datetime,
+    ) -> x509.Certificate:
+        uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        builder = (
+            _builder(_name(subject.common_name), self.certificate.subject, key, expires)
+            .serial_number(subject.serial)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+        )
+        if names:
+            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
+        return builder.sign(self._key, None)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: Ed25519PrivateKey, expires: datetime
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .not_valid_before(_now() - BACKDATED)
+        .not_valid_after(expires)
+    )
+
+
+def _now() -> datetime:
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+def _name(common: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+
+
+def _general_name(address: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(address))
+    except ValueError:
+        pass
+    try:
+        return x509.DNSName(address)
+    except ValueError:
+        raise TrustError(f"{address!r} is neither a host's name nor an address") from None
+
+
+def _pem(key: Ed25519PrivateKey) -> bytes:
+    return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.chmod(0o700)
+    except OSError as error:
+        raise TrustError(f"{folder}: cannot be made ({error.strerror})") from None
+
+
+def _require_days(days: int) -> None:
+    if not 1 <= days <= MOST_DAYS:
+        raise TrustError(f"days is {days}; a certificate holds 1 to {MOST_DAYS} days")

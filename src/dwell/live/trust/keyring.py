@@ -1,0 +1,142 @@
+"""Keyring: what a host has of its cell's authority: its own key, and the roster of all."""
+
+from __future__ import annotations
+
+import stat
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509.oid import NameOID
+
+from dwell.errors import TrustError
+from dwell.live.trust.roster import Roster, Subject
+
+__all__ = ["SOON_DAYS", "Keyring"]
+
+#: From how many days before its end on a certificate is warned of.
+SOON_DAYS = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Keyring:
+    """A subject's own key and certificate, and whom it knows.
+
+    Parameters
+    ----------
+    folder : Path
+        With ``ca.pem``, ``cert.pem``, ``key.pem`` and ``roster.json``.
+    own : Subject
+    roster : Roster
+    expires : datetime
+        When its certificate ends.
+    """
+
+    folder: Path
+    own: Subject
+    roster: Roster
+    expires: datetime
+    _key: Ed25519PrivateKey
+
+    def __repr__(self) -> str:
+        return f"Keyring({str(self.folder)!r}, {self.own.common_name})"
+
+    @classmethod
+    def open(cls, folder: Path, *, cell: str | None = None) -> Keyring:
+        """Read a keyring and check that its parts belong together.
+
+        Parameters
+        ----------
+        folder : Path
+        cell : str, optional
+            Cell that it has to be of.
+
+        Raises
+        ------
+        TrustError
+            If something is missing, readable by others, damaged, revoked, expired, or another's.
+        """
+        authority, certificate, key = _read(folder)
+        roster = Roster.read(folder / "roster.json", _public(authority, folder / "ca.pem"))
+        if cell is not None and roster.cell != cell:
+            raise TrustError(f"{folder}: keys of cell {roster.cell!r}, not of {cell!r}")
+        try:
+            certificate.verify_directly_issued_by(authority)
+        except (InvalidSignature, ValueError, TypeError):
+            raise TrustError(f"{folder / 'cert.pem'}: was not issued by ca.pem") from None
+        if key.public_key() != certificate.public_key():
+            raise TrustError(f"{folder}: key.pem does not belong to cert.pem")
+        common = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
+        own = roster.subjects.get(common.rpartition(".")[0])
+        if certificate.serial_number in roster.revoked or own is None:
+            raise TrustError(f"{folder}: the certificate of {common} has been revoked")
+        if own.serial != certificate.serial_number:
+            raise TrustError(
+                f"{folder}: cert.pem is that of {common}, roster.json has {own.common_name}; "
+                "take both from the authority's folder anew"
+            )
+        expires = certificate.not_valid_after_utc
+        if expires <= datetime.now(UTC):
+            raise TrustError(
+                f"{folder}: the certificate of {common} has expired on {expires:%Y-%m-%d}; "
+                "issue another with dwell keys issue"
+            )
+        return cls(folder, own, roster, expires, key)
+
+    def warning(self, now: datetime | None = None) -> str:
+        """Return that the certificate ends soon; nothing where it does not."""
+        days = (self.expires - (now or datetime.now(UTC))).days
+        if days >= SOON_DAYS:
+            return ""
+        return (
+            f"the certificate of {self.own.common_name} ends on {self.expires:%Y-%m-%d}, "
+            f"in {days} days; issue another with dwell keys issue"
+        )
+
+    def sign(self, domain: bytes, data: bytes) -> bytes:
+        """Sign data for one purpose; 64 bytes."""
+        return self._key.sign(domain + b"\0" + data)
+
+    def verifies(self, name: str, domain: bytes, data: bytes, signature: bytes) -> bool:
+        """Whether a subject of the roster has signed data for a purpose."""
+        subject = self.roster.subjects.get(name)
+        if subject is None:
+            return False
+        try:
+            subject.key.verify(signature, domain + b"\0" + data)
+        except InvalidSignature:
+            return False
+        return True
+
+
+def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519PrivateKey]:
+    try:
+        mode = (folder / "key.pem").stat().st_mode
+        if mode & (stat.S_IRWXG | stat.S_IRWXO):
+            raise TrustError(
+                f"{folder / 'key.pem'}: others may use it (mode {stat.S_IMODE(mode):o}); "
+                "chmod 600 it"
+            )
+        authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
+        certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
+        key = load_pem_private_key((folder / "key.pem").read_bytes(), password=None)
+    except OSError as error:
+        raise TrustError(f"{error.filename}: cannot be read ({error.strerror})") from None
+    except (ValueError, TypeError) as error:
+        if isinstance(error, TrustError):
+            raise
+        raise TrustError(f"{folder}: a key or certificate is damaged ({error})") from None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise TrustError(f"{folder / 'key.pem'}: is no Ed25519 key")
+    return authority, certificate, key
+
+
+def _public(certificate: x509.Certificate, path: Path) -> Ed25519PublicKey:
+    key = certificate.public_key()
+    if not isinstance(key, Ed25519PublicKey):
+        raise TrustError(f"{path}: has no Ed25519 key")
+    return key

@@ -1,0 +1,86 @@
+"""Seals: who has written a message, whichever way it came.
+
+A sealed message is a signature of 64 bytes (Ed25519, RFC 8032) and the message as it was encoded.
+What is signed begins with the cell and what kind of message it is: none passes for one of another
+kind, or of another cell. That it is not an old one has to follow from what it says.
+"""
+
+from __future__ import annotations
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
+from dwell.errors import TrustError
+from dwell.live.trust.keyring import Keyring
+
+__all__ = ["SIGNATURE_BYTES", "Seals"]
+
+SIGNATURE_BYTES = 64
+#: Sealed messages that are known to be good, so that the second copy of each costs nothing.
+REMEMBERED = 512
+
+
+class Seals:
+    """Seals what a process says, and checks what others have said.
+
+    Parameters
+    ----------
+    keyring : Keyring
+        The process's own.
+    """
+
+    def __init__(self, keyring: Keyring) -> None:
+        self._keyring = keyring
+        self._domain = f"dwell message 1 {keyring.roster.cell} "
+        self._keys: dict[str, Ed25519PublicKey] = {}
+        self._good: dict[tuple[str, str, bytes], None] = {}
+
+    def __repr__(self) -> str:
+        return f"Seals({self._keyring!r})"
+
+    def seal(self, word: str, data: bytes) -> bytes:
+        """Return a message with this process's signature before it.
+
+        Parameters
+        ----------
+        word : str
+            What kind of message it is.
+        data : bytes
+        """
+        return self._keyring.sign(self._of(word), data) + data
+
+    def require(self, word: str, name: str, sealed: bytes) -> None:
+        """Raise a TrustError unless a subject has sealed a message.
+
+        Parameters
+        ----------
+        word : str
+        name : str
+            Of the subject.
+        sealed : bytes
+        """
+        known = word, name, sealed
+        if known in self._good:
+            return
+        if not self._verifies(word, name, sealed):
+            raise TrustError(f"{word}: not signed by {name}")
+        if len(self._good) >= REMEMBERED:
+            del self._good[next(iter(self._good))]
+        self._good[known] = None
+
+    def _verifies(self, word: str, name: str, sealed: bytes) -> bool:
+        key = self._keys.get(name)
+        if key is None:
+            subject = self._keyring.roster.subjects.get(name)
+            if subject is None:
+                return False
+            key = self._keys[name] = subject.key
+        signature, data = sealed[:SIGNATURE_BYTES], sealed[SIGNATURE_BYTES:]
+        try:
+            key.verify(signature, self._of(word) + b"\0" + data)
+        except InvalidSignature:
+            return False
+        return True
+
+    def _of(self, word: str) -> bytes:
+        return (self._domain + word).encode()

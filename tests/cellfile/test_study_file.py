@@ -1,0 +1,498 @@
+"""Study files: what they declare, and every fault at once where they are wrong."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dwell.cellfile import load
+from dwell.cellfile.study_file import DeclaredStudy, read_study
+from dwell.cellfile.study_paths import put, steps_of, with_settings
+from dwell.errors import ProblemError, TraceError
+from dwell.model import Constant, LogNormal, NodeDisturbance, Problem, Trace
+from tests.cellfile.test_cell import EXAMPLE
+
+LEAST = """\
+dwell-study: 1
+cell: cell.yaml
+policies: [LOC]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a cell."""
+    (tmp_path / "cell.yaml").write_text(EXAMPLE.read_text(encoding="utf-8"), encoding="utf-8")
+    return tmp_path
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "study.yaml"
+    path.write_text(textwrap.dedent(text), encoding="utf-8")
+    return path
+
+
+def read(folder: Path, text: str, **options: Any) -> DeclaredStudy:
+    return read_study(write(folder, text), **options)
+
+
+def faults(folder: Path, text: str, **options: Any) -> dict[str, str]:
+    """Return the messages of a study file that is wrong, by their paths."""
+    with pytest.raises(ProblemError) as caught:
+        read(folder, text, **options)
+    assert caught.value.source == str(folder / "study.yaml")
+    return {fault.path: fault.message for fault in caught.value.faults}
+
+
+# ------------------------------------------------------------------------------- what is right
+
+
+def test_the_least_study_has_defaults(folder: Path) -> None:
+    study = read(folder, LEAST)
+    problem = load(folder / "cell.yaml")
+    assert study.name == "study"
+    assert [(point.values, point.problem) for point in study.points] == [({}, problem)]
+    assert study.scenarios == tuple(problem.scenarios)
+    assert [(one.name, one.policy, one.estimator) for one in study.policies] == [
+        ("LOC", "LOC", None)
+    ]
+    assert (study.seeds, study.windows, study.references) == (tuple(range(1, 21)), 300, False)
+
+
+def test_everything_that_a_study_may_say(folder: Path) -> None:
+    study = read(
+        folder,
+        """\
+        dwell-study: 1
+        name: all of it
+        cell: cell.yaml
+        scenarios:
+          baseline:
+          edge-crash: [{node: E, at_s: 5, down: true}]
+          step:
+            - {node: R1, at_s: 10, for_s: 20, stress_threads: 4}
+        windows: 50
+        seeds: {from: 101, count: 3}
+        references: true
+        policies:
+          LOC: LOC
+          dtp:
+          eager: {policy: dtp, estimator: shadow, controller.min_dwell: 0,
+                  objective.weights.switching: 0.1}
+        parameters:
+          objective.weights.switching: [0, 0.5]
+          links[0].delay_ms: [1, {lognormal: {mean: 2, cv: 0.5}}]
+          controller.escape: [false, true]
+        """.replace("  dtp:\n", "  dtp: dtp\n"),
+    )
+    assert (study.name, study.windows, study.seeds) == ("all of it", 50, (101, 102, 103))
+    assert study.references
+    assert study.scenarios == ("baseline", "edge-crash", "step")
+    assert [
+        (one.name, one.policy, one.estimator, dict(one.settings)) for one in study.policies
+    ] == [
+        ("LOC", "LOC", None, {}),
+        ("dtp", "dtp", None, {}),
+        (
+            "eager",
+            "dtp",
+            "shadow",
+            {"controller.min_dwell": 0, "objective.weights.switching": 0.1},
+        ),
+    ]
+    assert [tuple(point.values.values()) for point in study.points] == [
+        (switching, delay, escape)
+        for switching in (0.0, 0.5)
+        for delay in ("1", '{"lognormal": {"mean": 2, "cv": 0.5}}')
+        for escape in (False, True)
+    ]
+    first, last = study.points[0].problem, study.points[-1].problem
+    assert first.objective.weights.switching == 0
+    assert last.objective.weights.switching == 0.5
+    assert (first.controller.escape, last.controller.escape) == (False, True)
+    assert first.fabric.links["R1->E"].delay_ms == Constant(1)
+    # The cell says both ways.
+    assert last.fabric.links["E->R1"].delay_ms == LogNormal(2, 0.5)
+    for problem in (first, last):
+        assert problem.scenarios["step"] == (NodeDisturbance("R1", 10, 20, stress_threads=4),)
+        assert problem.scenarios["edge-crash"] == (NodeDisturbance("E", 5, down=True),)
+
+
+@pytest.mark.parametrize(
+    ("given", "seeds"),
+    [
+        ("3", (1, 2, 3)),
+        ("[7, 5]", (7, 5)),
+        ("{from: 0, count: 2}", (0, 1)),
+        ("2e0", (1, 2)),
+    ],
+)
+def test_seeds_are_a_number_a_list_or_a_stretch(
+    folder: Path, given: str, seeds: tuple[int, ...]
+) -> None:
+    assert read(folder, f"{LEAST}seeds: {given}\n").seeds == seeds
+
+
+@pytest.mark.parametrize(
+    ("values", "kinds"),
+    [("[1, 2]", [int, int]), ("[1, 2.5]", [float, float]), ("[1, {constant: 2}]", [str, str])],
+)
+def test_the_values_of_a_parameter_are_of_one_kind(
+    folder: Path, values: str, kinds: list[type]
+) -> None:
+    text = f"{LEAST}parameters: {{'links[0].delay_ms': {values}}}\n"
+    points = read(folder, text).points
+    assert [type(point.values["links[0].delay_ms"]) for point in points] == kinds
+
+
+def test_parameters_may_be_in_the_studys_own_scenarios(folder: Path) -> None:
+    study = read(
+        folder,
+        f"""\
+{LEAST}
+scenarios:
+  step: [{{node: R1, stress_threads: 4}}]
+parameters:
+  scenarios.step[0].at_s: [1, 2]
+""",
+    )
+    starts = [point.problem.scenarios["step"][0].at_s for point in study.points]
+    assert starts == [1, 2]
+
+
+def test_traces_are_read_once_for_all_points(folder: Path) -> None:
+    data = folder / "data"
+    data.mkdir()
+    pl.DataFrame({"a": np.linspace(1, 2, 50)}).write_parquet(data / "times.parquet")
+    text = (folder / "cell.yaml").read_text(encoding="utf-8")
+    assert "exec_ms: 18" in text
+    trace = "exec_ms: {trace: {file: times.parquet, column: a}}"
+    (folder / "cell.yaml").write_text(text.replace("exec_ms: 18", trace), encoding="utf-8")
+    study = read(folder, f"{LEAST}traces: data\nparameters: {{controller.min_dwell: [1, 2]}}\n")
+    tables = []
+    for point in study.points:
+        process = point.problem.pipeline.tasks["perception"].on["R1"].exec_ms
+        assert isinstance(process, Trace)
+        tables.append(process.table)
+    assert tables[0] is tables[1]
+    found = faults(folder, f"{LEAST}parameters: {{controller.min_dwell: [1, 2]}}\n")
+    assert "times.parquet" in found["cell"]
+
+
+# ------------------------------------------------------------------------------- what is wrong
+
+
+def test_every_fault_is_told_at_once_with_its_line(folder: Path) -> None:
+    path = write(
+        folder,
+        """\
+        dwell-study: 1
+        nmae: typo
+        cell: cell.yaml
+        scenarios:
+          rain:
+          step: [{node: R9, at_s: -1, stress_threads: 4}]
+        windows: 0
+        seeds: [1, 1]
+        policies:
+          LOC: dtp
+          dpt: dpt
+          a: {polisy: dtp}
+          b: {policy: dtp, controller.min_dwell: -1}
+          c: {policy: dtp, objective.wieghts.edge: 1}
+          d: {policy: dtp, estimator: shadows}
+          e: {policy: dtp, controller.policy: LOC}
+          clairvoyant: SO
+        references: true
+        parameters:
+          objective.weights.switching: [0, -1]
+          links[9].delay_ms: [1]
+          nodes.R7.cores: [1]
+          nodes.E.coers: [1]
+          controller.order_delay_ms: 3
+          controller.close_grace_ms: []
+          a..b: [1]
+        """,
+    )
+    with pytest.raises(ProblemError) as caught:
+        read_study(path, references=("clairvoyant",))
+    found = [(fault.line, fault.path) for fault in caught.value.faults]
+    assert found == [
+        (2, "nmae"),
+        (5, "scenarios.rain"),
+        (6, "scenarios.step[0].at_s"),
+        (6, "scenarios.step[0].node"),
+        (7, "windows"),
+        (8, "seeds"),
+        (10, "policies.LOC"),
+        (11, "policies.dpt"),
+        (12, "policies.a.polisy"),
+        (13, "policies.b.controller.min_dwell"),
+        (14, "policies.c.objective.wieghts.edge"),
+        (15, "policies.d.estimator"),
+        (16, "policies.e.controller.policy"),
+        (17, "policies.clairvoyant"),
+        (20, "parameters.objective.weights.switching[1]"),
+        (21, "parameters.links[9].delay_ms"),
+        (22, "parameters.nodes.R7.cores"),
+        (23, "parameters.nodes.E.coers[0]"),
+        (24, "parameters.controller.order_delay_ms"),
+        (25, "parameters.controller.close_grace_ms"),
+        (26, "parameters.a..b"),
+    ]
+    assert str(caught.value).startswith(f"{path}:2: nmae: unknown key 'nmae'; did you mean 'name'?")
+
+
+@pytest.mark.parametrize(
+    ("more", "path", "message"),
+    [
+        ("seeds: 0", "seeds", "0 is not allowed; it must be a whole number from 1 to 100000"),
+        ("seeds: yes", "seeds", "'yes' is not allowed; it must be a number of seeds, a list of"),
+        ("seeds: []", "seeds", "the list is empty; name at least one seed"),
+        ("seeds: [-1]", "seeds", "-1 is not allowed; it must be a whole number from 0 to"),
+        ("seeds: {from: 1}", "seeds", "`count` is missing; write it as {from: 101, count: 20}"),
+        ("seeds: {from: 1, to: 3}", "seeds", "unknown key 'to'; known: from, count"),
+        ("scenarios: rain", "scenarios", "'rain' is not allowed; it must be a list of scenarios"),
+        ("scenarios: []", "scenarios", "the list is empty; name at least one of scenarios"),
+        ("scenarios: {}", "scenarios", "the mapping is empty; name at least one scenario"),
+        ("scenarios: [baseline, baseline]", "scenarios", "'baseline' is given twice"),
+        ("scenarios: [crash]", "scenarios.crash", "the cell has no scenario 'crash'; did you mean"),
+        ("scenarios: {step: 5}", "scenarios.step", "5 is not allowed; it must be a list"),
+        ("scenarios: {baseline: [{node: E}]}", "scenarios.baseline", "must stay empty"),
+        ("windows: many", "windows", "'many' is not allowed; it must be a whole number from 1"),
+        ("parameters: [1]", "parameters", "a list is not allowed; it must be a mapping of paths"),
+        ("name: a/b", "name", "'a/b' is not a name"),
+        ("references: 1", "references", "1 is not allowed; it must be true or false"),
+        (
+            "parameters: {controller.min_dwell: [1, 1.0]}",
+            "parameters.controller.min_dwell",
+            "a value is given twice",
+        ),
+        (
+            "parameters: {warmup_windows: [300]}",
+            "windows",
+            "300 is not allowed; it must be more than the 300 windows of warm-up",
+        ),
+        (
+            "parameters: {objective.weights: [{edge: 1}], objective.weights.edge: [2]}",
+            "parameters.objective.weights.edge",
+            "is a part of objective.weights; give one of them",
+        ),
+        (
+            "parameters: {window_cycles: [" + ", ".join(map(str, range(1, 10_003))) + "]}",
+            "parameters",
+            "10002 points are more than 10000; give fewer",
+        ),
+    ],
+)
+def test_what_is_wrong_is_told_where_it_is(
+    folder: Path, more: str, path: str, message: str
+) -> None:
+    found = faults(folder, f"{LEAST}{more}\n")
+    assert list(found) == [path]
+    assert found[path].startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("policies", "path", "message"),
+    [
+        ("dtp", "policies", "'dtp' is not allowed; it must be a list of policies, or a mapping"),
+        ("[dtp, dtp]", "policies", "'dtp' is given twice; name each once"),
+        ("{dtp: 5}", "policies.dtp", "5 is not allowed; it must be a policy's name, or a mapping"),
+        ("{dtp: {policy: []}}", "policies.dtp.policy", "a list is not allowed; it must be a text"),
+        ("{d: {policy: dtp, controller: {}}}", "policies.d.controller", "unknown key 'controller'"),
+        ("{d: {policy: dtp, controller.: 1}}", "policies.d.controller.", "not a path; write it"),
+        ("{a/b: dtp}", "policies.a/b", "'a/b' is not a name"),
+        (
+            "{d: {policy: dtp, estimator: shadow, controller.shadow_fraction: 0.9}}",
+            "policies.d.controller.shadow_fraction",
+            "0.9 of the cycles through each of 2 alternatives is more than all cycles",
+        ),
+    ],
+)
+def test_policies_that_are_wrong(folder: Path, policies: str, path: str, message: str) -> None:
+    found = faults(folder, f"{LEAST.replace('[LOC]', policies)}")
+    assert list(found) == [path]
+    assert found[path].startswith(message)
+
+
+def test_settings_are_checked_at_every_point(folder: Path) -> None:
+    text = LEAST.replace("[LOC]", "{d: {policy: dtp, estimator: shadow}}")
+    more = "parameters: {controller.shadow_fraction: [0.1, 0.9]}\n"
+    found = faults(folder, text + more)
+    assert found == {
+        "policies.d": "controller.shadow_fraction: 0.9 of the cycles through each of 2 "
+        "alternatives is more than all cycles; at most 0.5"
+    }
+
+
+def test_values_that_only_together_make_no_cell_are_named_together(folder: Path) -> None:
+    more = "parameters: {period_ms: [40, 20], objective.weights.edge: [1, 2]}\n"
+    found = faults(folder, LEAST + more)
+    assert found["parameters"].endswith("(at period_ms = 20, objective.weights.edge = 2)")
+    assert "deadline_ms" in found["parameters"]
+
+
+def test_a_fault_of_the_cell_is_told_with_its_own_line(folder: Path) -> None:
+    text = (folder / "cell.yaml").read_text(encoding="utf-8")
+    (folder / "cell.yaml").write_text(text.replace("tier: edge", "tier: egde"), encoding="utf-8")
+    with pytest.raises(ProblemError) as caught:
+        read(folder, f"{LEAST}windows: 0\n")
+    first, second = caught.value.faults
+    assert (first.path, first.line) == ("cell", 2)
+    assert first.message.startswith(f"{folder / 'cell.yaml'}:")
+    assert first.message.endswith(
+        "'egde' is not allowed; it must be one of robot, edge, cloud; did you mean 'edge'?"
+    )
+    assert second.path == "windows"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty; a study file begins with `dwell-study: 1`"),
+        ("- 1", "a study file is a mapping that begins with `dwell-study: 1`; this is a list"),
+        ("dwell: 1", "this is a cell; a study file begins with `dwell-study: 1`"),
+        ("dwell-study: 2", "schema version 2 is newer than this Dwell, which reads 1"),
+        ("dwell-study: true", "true is not allowed; write `dwell-study: 1`"),
+        ("{", "not a YAML document"),
+        ("cell: cell.yaml", "missing; add it: version of this format"),
+        ("dwell-study: 1", "missing; add it: the cell file, relative to this file's folder"),
+        ("dwell-study: 1\ncell: ''\npolicies: {}", "cell: the text is empty"),
+        ("dwell-study: 1\ncell: 5\npolicies: {}", "cell: 5 is not allowed; it must be a text"),
+        ("dwell-study: 1\ncell: cell.yaml\npolicies: {}", "policies: the mapping is empty"),
+        ("dwell-study: 1\ncell: none.yaml", "none.yaml: no such file; check the path"),
+        ("dwell-study: 1\ncell: study.yaml", "study.yaml:1: dwell: missing"),
+    ],
+)
+def test_what_is_no_study_is_refused(folder: Path, text: str, message: str) -> None:
+    with pytest.raises(ProblemError, match=r"study\.yaml") as caught:
+        read(folder, text)
+    assert message in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ProblemError, match=r"none\.yaml: no such file"):
+        read_study(tmp_path / "none.yaml")
+    with pytest.raises(ProblemError, match="this is a folder; name the study file in it"):
+        read_study(tmp_path)
+
+
+def test_a_trace_at_fault_is_one_of_the_cell(folder: Path) -> None:
+    text = f"{LEAST}parameters: {{'links[0].delay_ms': [{{trace: {{file: no.csv, column: a}}}}]}}\n"
+    found = faults(folder, text)
+    assert list(found) == ["parameters.links[0].delay_ms[0]"]
+    assert "no.csv" in found["parameters.links[0].delay_ms[0]"]
+    assert not issubclass(ProblemError, TraceError)
+
+
+ODD = st.sampled_from((None, True, 0, -1, 1.5, 10**400, float("nan"), "", "x", "LOC", "a..b"))
+ODDER = ODD | st.lists(ODD, max_size=2) | st.dictionaries(st.text(max_size=3), ODD, max_size=2)
+KEYS = ("dwell-study", "name", "traces", "scenarios", "windows", "seeds", "references", "policies")
+
+
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.dictionaries(st.sampled_from((*KEYS, "parameters", "odd")), ODDER, max_size=4))
+def test_whatever_stands_there_ends_in_a_study_or_in_faults(
+    folder: Path, odd: dict[str, object]
+) -> None:
+    document = {"dwell-study": 1, "cell": "cell.yaml", "policies": ["LOC"], **odd}
+    try:
+        study = read(folder, yaml.safe_dump(document))
+    except ProblemError as error:
+        found: tuple[object, ...] = error.faults
+    else:
+        found = study.points
+    assert found
+
+
+# ----------------------------------------------------------------------------- dotted paths
+
+DOCUMENT = {
+    "nodes": {"R1": {"cores": 4}, "R1.5": {"cores": 2}, "big one": {"cores": 9}},
+    "links": [{"delay_ms": 1}, {"delay_ms": {"lognormal": {"mean": 1, "cv": 1}}}],
+}
+
+
+@pytest.mark.parametrize(
+    ("path", "steps"),
+    [
+        ("nodes.R1.cores", ("nodes", "R1", "cores")),
+        ("nodes.R1.5.cores", ("nodes", "R1.5", "cores")),
+        ("nodes.big one.cores", ("nodes", "big one", "cores")),
+        ("links[1].delay_ms.lognormal.cv", ("links", 1, "delay_ms", "lognormal", "cv")),
+        ("links[0]", ("links", 0)),
+        ("objective.caps.latency_ms", ("objective", "caps", "latency_ms")),
+    ],
+)
+def test_paths_are_split_by_what_is_there(path: str, steps: tuple[str | int, ...]) -> None:
+    assert steps_of(path, DOCUMENT) == steps
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("", "not a path"),
+        (".", "not a path"),
+        ("nodes.", "not a path"),
+        ("links[x]", "not a path"),
+        ("links[0]delay_ms", "not a path"),
+        ("links.delay_ms", r"links is a list; take one of its items, as `links\[0\]`"),
+        ("links[2].delay_ms", r"there is no links\[2\]; links has 2 items, from \[0\]"),
+        ("nodes[0].cores", r"nodes is no list; it has no item \[0\]"),
+        ("links[0].delay_ms.lognormal", r"links\[0\].delay_ms is 1; it has no key 'lognormal'"),
+        ("nodes.R2.cores", "the cell's nodes have no 'R2'; known: R1, R1.5, big one"),
+    ],
+)
+def test_paths_that_lead_nowhere_are_refused(path: str, message: str) -> None:
+    with pytest.raises(ProblemError, match=message):
+        steps_of(path, DOCUMENT)
+
+
+def test_what_is_put_changes_nothing_else() -> None:
+    before = yaml.safe_dump(DOCUMENT)
+    found = put(DOCUMENT, ("links", 1, "delay_ms"), 5)
+    assert found["links"] == [{"delay_ms": 1}, {"delay_ms": 5}]
+    assert found["nodes"] == DOCUMENT["nodes"]
+    assert put(DOCUMENT, ("objective", "caps", "edge"), 1)["objective"] == {"caps": {"edge": 1}}
+    assert yaml.safe_dump(DOCUMENT) == before
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return load(EXAMPLE)
+
+
+def test_settings_leave_all_that_is_drawn(problem: Problem) -> None:
+    found = with_settings(problem, {"controller.min_dwell": 7, "objective.caps.utilisation": 0.5})
+    assert found.controller.min_dwell == 7
+    assert found.objective.caps.utilisation == 0.5
+    assert found.objective.weights == problem.objective.weights
+    for part in ("name", "pipeline", "fabric", "candidates", "scenarios", "window_cycles"):
+        assert getattr(found, part) == getattr(problem, part)
+
+
+def test_settings_that_are_wrong_are_told_at_once(problem: Problem) -> None:
+    with pytest.raises(ProblemError) as caught:
+        with_settings(problem, {"nodes.E.cores": 3, "period_ms": 3, "controller..x": 1})
+    assert [fault.path for fault in caught.value.faults] == [
+        "nodes.E.cores",
+        "period_ms",
+        "controller..x",
+    ]
+    with pytest.raises(ProblemError) as caught:
+        with_settings(problem, {"controller.min_dwell": -1, "objective.weights.egde": 3})
+    assert {fault.path for fault in caught.value.faults} == {
+        "controller.min_dwell",
+        "objective.weights.egde",
+    }
