@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 UV := $(BIN)/uv
 # The folders that hold Python.
-CODE := $(shell find src tests examples benchmarks docs -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
+CODE := $(shell find src tests examples benchmarks docs reproduction -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
 
 # uv installs exactly what a lock file says; `sync` also removes what it does not say.
 SYNC := $(UV) pip sync --quiet --python $(BIN)/python --require-hashes
@@ -12,7 +12,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench faults chaos soak fuzz audit sbom lock clean
+.PHONY: help env demo test check bench paper faults chaos soak fuzz audit sbom lock clean
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-6s %s\n", $$1, $$2}' Makefile
@@ -55,6 +55,9 @@ check: env ## Lint, formatting, types and the borders between packages
 
 bench: env ## Run the benchmarks
 	$(BIN)/python -m benchmarks $(ARGS)
+
+paper: env ## Ask the paper's questions; hours (ARGS="--scale quick": minutes; --help)
+	$(BIN)/python -m reproduction $(ARGS)
 
 faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on where it was stopped
 	$(BIN)/python -m tests.live.faults $(ARGS)

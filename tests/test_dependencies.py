@@ -69,9 +69,15 @@ def project() -> dict[str, Any]:
 def test_the_package_uses_what_it_declares_and_no_more(project: dict[str, Any]) -> None:
     declared = project["project"]["dependencies"]
     extras = project["project"]["optional-dependencies"].values()
-    groups = [project["dependency-groups"][name] for name in ("demo", "sobol")]
-    all_of_them = [*declared, *(one for extra in [*extras, *groups] for one in extra)]
+    demo = project["dependency-groups"]["demo"]
+    all_of_them = [*declared, *(one for extra in [*extras, demo] for one in extra)]
     assert imported("src") == named(all_of_them) - {project["project"]["name"]}
+
+
+def test_the_reproduction_needs_the_package_and_its_own_group(project: dict[str, Any]) -> None:
+    own = named(project["dependency-groups"]["reproduction"])
+    assert own <= imported("reproduction")
+    assert imported("reproduction") - own <= imported("src") | {"dwell", "reproduction"}
 
 
 def test_every_extra_names_the_packages_that_messages_say_it_brings(

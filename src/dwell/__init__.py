@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dwell.cellfile import load
+    from dwell.errors import DwellError
     from dwell.record import Run, open_run
     from dwell.sim import Realisation, draw, simulate, simulate_realisation
 
 __all__ = [
+    "DwellError",
     "Realisation",
     "Run",
     "draw",
@@ -23,6 +25,7 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOME = {
+    "DwellError": "dwell.errors",
     "load": "dwell.cellfile",
     "Run": "dwell.record",
     "open_run": "dwell.record",

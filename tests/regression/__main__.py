@@ -26,7 +26,7 @@ KINDS: dict[str, Callable[[], None]] = {"commands": _write_commands, "runs": _wr
 
 USAGE = f"""\
 usage: python -m tests.regression {{{",".join(KINDS)}}}...
-       python -m tests.regression paper|paper-full FOLDER     of `dwell study paper`"""
+       python -m tests.regression paper|paper-full FOLDER     of `make paper`"""
 
 if __name__ == "__main__":
     words = sys.argv[1:]

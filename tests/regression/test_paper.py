@@ -1,6 +1,6 @@
-"""The paper's study gives the means that were written down: one chapter, at the scale of a look.
+"""The paper's questions give the means that were written down: one, at the scale of a look.
 
-All chapters take minutes: `dwell study paper --quick`, then `python -m tests.regression paper
+All of them take minutes: `make paper ARGS="--scale quick"`, then `python -m tests.regression paper
 FOLDER` writes `paper-quick.csv` again, for `git diff` to show.
 """
 
@@ -10,19 +10,13 @@ from pathlib import Path
 
 import polars as pl
 from polars.testing import assert_frame_equal
-from typer.testing import CliRunner
 
-from dwell.cli.commands import app
+from reproduction.__main__ import main
 from tests.regression.paper import FULL, KEYS, METRICS, QUICK, means, read
 
-ROOT = Path(__file__).parents[2]
 
-
-def test_the_means_of_a_chapter_are_those_that_were_written_down(tmp_path: Path) -> None:
-    words = ["study", "paper", "--quick", "--chapter", "table", "--out", str(tmp_path / "out")]
-    words += ["--examples", str(ROOT / "examples")]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
+def test_the_means_of_a_question_are_those_that_were_written_down(tmp_path: Path) -> None:
+    assert main(["--scale", "quick", "--only", "table", "--out", str(tmp_path / "out")]) == 0
     found = means([tmp_path / "out" / "runs" / "table"])
     known = read(QUICK).filter(pl.col("study") == "table").fill_null("")
     assert known.height == 45

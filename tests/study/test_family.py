@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.errors import SimulationError
-from dwell.study.family import Family, cannot_tell, holm
+from dwell.errors import MetricError, SimulationError
+from dwell.study.family import Family, cannot_tell, holm, seed_values
 from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
 
 chances = st.lists(st.floats(0, 1), max_size=12)
@@ -133,6 +134,7 @@ def test_the_table_has_all_numbers() -> None:
         "n": 20,
         "p": cheap.p,
         "p_holm": 3 * cheap.p,
+        "p_least": 3 * 2 / 2**cheap.n,
         "verdict": "lower",
     }
 
@@ -148,3 +150,47 @@ def test_the_table_takes_medians_and_nothing() -> None:
     empty = Family("q", "m", {}).table()
     assert empty.is_empty()
     assert empty.columns == make_family().table().columns
+
+
+# --------------------------------------------------------------------------------- of runs
+
+RUNS = pl.DataFrame(
+    {
+        "policy": ["a", "a", "a", "b", "b", "b"],
+        "seed": [3, 1, 2, 1, 2, 3],
+        "cost": [3.0, 1.0, 2.0, 0.5, 1.5, 2.5],
+        "tracking_rms_mm": [3.0, 1.0, float("inf"), 0.5, 1.5, float("inf")],
+    }
+)
+PAIR = ({"policy": "a"}, {"policy": "b"})
+
+
+def test_values_come_in_the_order_of_seeds() -> None:
+    assert seed_values(RUNS, "cost", {"policy": "a"}).tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("labels", [{"policy": "c"}, {}])
+def test_labels_that_leave_no_run_or_several_are_refused(labels: dict[str, object]) -> None:
+    with pytest.raises(SimulationError, match="must leave one a seed"):
+        seed_values(RUNS, "cost", labels)
+
+
+def test_a_metric_that_runs_do_not_have_is_refused() -> None:
+    with pytest.raises(MetricError, match="unknown metric 'costs'; did you mean 'cost'"):
+        Family.of_runs(RUNS, "which?", "costs", {"one": PAIR})
+
+
+def test_a_family_of_runs_has_a_comparison_for_each_pair() -> None:
+    found = Family.of_runs(RUNS, "which?", "cost", {"one": PAIR, "other": PAIR[::-1]})
+    assert list(found.comparisons) == ["one", "other"]
+    first = found.comparisons["one"]
+    assert isinstance(first, PairedDifference)
+    assert first.mean == first.low == first.high == 0.5
+    assert found.comparisons["other"].direction == -1
+    # Three pairs have no p value below 2 / 2^3, and the least of two is doubled.
+    assert found.table()["p_least"].to_list() == [0.5, 0.5]
+
+
+def test_what_may_be_infinite_is_compared_by_its_median() -> None:
+    found = Family.of_runs(RUNS, "which?", "tracking_rms_mm", {"one": PAIR})
+    assert isinstance(found.comparisons["one"], PairedMedian)

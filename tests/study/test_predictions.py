@@ -7,7 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pytest
 
-from dwell.study.predictions import PAPER, applies, judge_claim, judge_placement
+from dwell.study.predictions import (
+    PAPER,
+    applies,
+    judge_claim,
+    judge_placement,
+    paper_predictions,
+)
 from tests.study.cell import SEEDS, make_comparison
 
 BY_SCENARIO = {prediction.scenario: prediction for prediction in PAPER}
@@ -132,3 +138,18 @@ def test_what_was_not_run_is_open() -> None:
 def test_predictions_are_about_the_papers_scenarios() -> None:
     assert applies(make_comparison({}))
     assert not applies(make_comparison({}, scenarios=("radio-outage",)))
+
+
+def test_all_predictions_are_rows() -> None:
+    shown = {("baseline", "dtp"): shares(0.7, 0.1), ("baseline", "atp"): shares(0.2, 0.6)}
+    comparison = make_comparison(
+        shown, scenarios=("baseline",), policies=("LOC", "SO", "HYB", "dtp", "atp")
+    )
+    rows = paper_predictions(comparison, ("dtp", "atp"))
+    answers = dict(rows.select("policy", "answer").rows()[:2])
+    assert answers == {"dtp": "agrees", "atp": "differs"}
+    assert rows["leader"].to_list()[:2] == ["LOC", "SO"]
+    claims = [claim for mine in BY_SCENARIO["baseline"].claims.values() for claim in mine]
+    assert rows["words"].to_list()[2:] == [claim.words for claim in claims]
+    assert rows["share"].null_count() == len(claims)
+    assert paper_predictions(make_comparison({}, scenarios=("radio-outage",))).is_empty()

@@ -186,9 +186,7 @@ def run(
 def study(
     file: Annotated[
         Path,
-        typer.Argument(
-            metavar="FILE", help="Study file (YAML), or `paper` for the paper's whole Phase 1."
-        ),
+        typer.Argument(metavar="FILE", help="Study file (YAML)."),
     ],
     out: Annotated[
         Path | None,
@@ -209,43 +207,21 @@ def study(
     windows: Annotated[
         int | None, typer.Option(min=1, help="Length of each run; what the file says if not given.")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Of `paper`: a look, in about a minute.")
-    ] = False,
-    chapter: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Of `paper`: this chapter only; may be repeated."),
-    ] = None,
-    real: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Of `paper`: replay the measurements in this folder, too."
-        ),
-    ] = None,
-    examples: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER", help="Of `paper`: where the example cells are, if not found."
-        ),
-    ] = None,
+    # Options of what was `dwell study paper`; they say where that is.
+    quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
+    chapter: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
+    real: Annotated[Path | None, typer.Option(hidden=True)] = None,
+    examples: Annotated[Path | None, typer.Option(hidden=True)] = None,
     as_json: Json = False,
 ) -> None:
     """Simulate every scenario, policy, parameter and seed of a study.
 
     What is finished stays in the folder, whatever ends the work: the same command goes on.
     """
-    if str(file) == "paper":
-        from dwell.cli.paper import Request as PaperRequest
-        from dwell.cli.paper import run_paper
-
-        chapters = tuple(chapter or ())
-        asked = PaperRequest(quick, out, processes, dask, seeds, windows, chapters, real, examples)
-        if not run_paper(asked, as_json=as_json):
-            raise typer.Exit(FAILED)
-        return
-    if quick or chapter or real or examples:
+    if str(file) == "paper" or quick or chapter or real or examples:
         raise typer.BadParameter(
-            "--quick, --chapter, --real and --examples are for `dwell study paper`"
+            "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
+            "(reproduction/README.md)"
         )
     from dwell.cli.study import Request, run_study_file
 

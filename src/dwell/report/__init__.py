@@ -2,7 +2,6 @@
 
 from dwell.report.comparison_page import comparison_html
 from dwell.report.comparison_text import comparison_text
-from dwell.report.paper_report import paper_report
 from dwell.report.run_page import run_html
 from dwell.report.trace_events import trace_events
 from dwell.report.validation_page import validation_html
@@ -11,7 +10,6 @@ from dwell.report.validation_text import validation_text
 __all__ = [
     "comparison_html",
     "comparison_text",
-    "paper_report",
     "run_html",
     "trace_events",
     "validation_html",

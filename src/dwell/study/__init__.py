@@ -1,12 +1,14 @@
 """Studies: many runs, and the statistics over their seeds."""
 
 from dwell.study.comparison import AIM, Comparison, Example, compare
-from dwell.study.demo import canonical_demo, real_demo, tenants_demo
+from dwell.study.demo import canonical_demo, longest_run, real_demo, tenants_demo
 from dwell.study.engine import StudyResult, run_study
 from dwell.study.family import Family
-from dwell.study.intervals import Interval, under
+from dwell.study.hindsight import Hindsight
+from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
+from dwell.study.over_seeds import over_seeds
 from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
-from dwell.study.sensitivity import Parameter, sobol_design, sobol_indices, sobol_pairs
+from dwell.study.predictions import paper_predictions
 from dwell.study.study import Contender, Point, Study, load_study
 from dwell.study.validation import Validation, validate
 
@@ -16,10 +18,10 @@ __all__ = [
     "Contender",
     "Example",
     "Family",
+    "Hindsight",
     "Interval",
     "PairedDifference",
     "PairedMedian",
-    "Parameter",
     "Point",
     "Study",
     "StudyResult",
@@ -27,13 +29,16 @@ __all__ = [
     "canonical_demo",
     "compare",
     "load_study",
+    "longest_run",
+    "mean_interval",
+    "median_interval",
+    "over_seeds",
     "paired_difference",
     "paired_median",
+    "paper_predictions",
     "real_demo",
     "run_study",
-    "sobol_design",
-    "sobol_indices",
-    "sobol_pairs",
+    "share_interval",
     "tenants_demo",
     "under",
     "validate",

@@ -1,6 +1,6 @@
 """RQ1 and RQ2 asked of what was measured, as the paper's studies ask them of what is simulated.
 
-The same differences, tests and families as in `dwell.study.paper`; a repetition stands for a
+The same differences, tests and families as of what is simulated; a repetition stands for a
 seed. Repetitions on a testbed are few: from n pairs a sign-flip test gives no p below 2 / 2^n, so
 that for m comparisons nothing can be shown below some n, whatever is measured. Every question says
 how many that takes.
@@ -15,17 +15,14 @@ from typing import TYPE_CHECKING
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
 from dwell.model.scenario import is_always_on
 from dwell.study.campaign import Measured
-from dwell.study.chapter import Answer, Chapter, Outcome, Table
-from dwell.study.family import Family
+from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
+from dwell.study.comparison import AIM
+from dwell.study.differences import centre, difference_table, shown_as
+from dwell.study.family import Contrast, Difference, Family
 from dwell.study.intervals import CONFIDENCE
 from dwell.study.over_seeds import over_seeds
 from dwell.study.paired import PairedDifference
-from dwell.study.paper.concurrent import HEADINGS, MAIN
-from dwell.study.paper.contrasts import Contrast, contrast
-from dwell.study.paper.differences import centre, difference_table, shown_as
-from dwell.study.paper.rates import rates_figure
-from dwell.study.paper.reversion import links_finding
-from dwell.study.paper.sentences import counted, listed, number, points
+from dwell.study.sentences import counted, listed, number, points
 
 if TYPE_CHECKING:
     import polars as pl
@@ -45,6 +42,24 @@ METRICS = ("violation_rate", "l95_ms", "u_robot", "cost")
 TOGETHER, SINGLE = ("dtp", "cusum"), "atp"
 #: The placement with T2 on E and T3 on R2, and those that binary reversion knows.
 HYBRID, BINARY = "HYB", ("LOC", "SO")
+
+MAIN: Mapping[str, Unit] = {
+    "scenario": "text",
+    "policy": "text",
+    "violation_rate": "percent",
+    "l95_ms": "ms",
+    "u_robot": "percent",
+    "u_edge": "percent",
+    "cost": "cost",
+    "migrations": "number",
+}
+HEADINGS = {
+    "violation_rate": "V_D",
+    "l95_ms": "L95 (ms)",
+    "u_robot": "U_r",
+    "u_edge": "U_e",
+    "cost": "J",
+}
 
 
 def questions(measured: Measured) -> tuple[Chapter, ...]:
@@ -94,7 +109,7 @@ def compared(runs: pl.DataFrame, question: str, pairs: Mapping[str, Contrast]) -
 
     found: dict[str, Family] = {}
     for metric in METRICS:
-        differences = {}
+        differences: dict[str, Difference] = {}
         for name, (first, second) in pairs.items():
             sides = [
                 runs.filter(*(pl.col(key) == value for key, value in one.items()))
@@ -103,7 +118,8 @@ def compared(runs: pl.DataFrame, question: str, pairs: Mapping[str, Contrast]) -
             both = set(sides[0]["seed"]) & set(sides[1]["seed"])
             if both:
                 shared = runs.filter(pl.col("seed").is_in(sorted(both)))
-                differences[name] = contrast(shared, metric, (first, second))
+                one = Family.of_runs(shared, question, metric, {name: (first, second)})
+                differences |= one.comparisons
         found[metric] = Family(question, metric, differences)
     return found
 
@@ -346,3 +362,62 @@ def main_table(runs: pl.DataFrame, slug: str, title: str) -> Table:
         headings={**HEADINGS, "seeds": "runs"},
         note="Means over the runs with 95 % intervals.",
     )
+
+
+def rates_figure(main: Table, title: str) -> Figure:
+    """V_D with its interval, by policy and scenario, beside the aim.
+
+    Parameters
+    ----------
+    main : Table
+        With columns ``scenario``, ``policy``, ``violation_rate`` and its limits.
+    title : str
+    """
+    return Figure(
+        slug=f"{main.slug}-rates",
+        title=title,
+        kind="intervals",
+        frame=main.frame.select(
+            "scenario",
+            "policy",
+            y="violation_rate",
+            y_low="violation_rate_low",
+            y_high="violation_rate_high",
+        ),
+        x="policy",
+        y="y",
+        series="policy",
+        facet="scenario",
+        y_label="V_D",
+        y_unit="percent",
+        line_at=AIM,
+        line_label=f"{number(100 * AIM, 0)} %",
+        note=main.note,
+    )
+
+
+def links_finding(problem: Problem) -> str:
+    """Say which links each placement crosses, and who shares all of them."""
+    found = {
+        name: tuple(
+            dict.fromkeys(
+                f"{place[flow.source]}->{place[flow.target]}"
+                for flow in problem.pipeline.flows
+                if place[flow.source] != place[flow.target]
+            )
+        )
+        for name, place in problem.candidates.items()
+    }
+    each = "; ".join(f"{name}: {listed(links)}" for name, links in found.items())
+    alike = [
+        name
+        for name in BINARY
+        if HYBRID in found and name in found and set(found[name]) == set(found[HYBRID])
+    ]
+    text = f"Links crossed: {each}."
+    if alike:
+        text += (
+            f" {HYBRID} and {listed(alike)} cross the same ones: what slows those alike cannot "
+            "make the one better than the other."
+        )
+    return text

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import Problem
 from dwell.model.semantics import nearest
-from dwell.study.engine import Progress, play_in_memory
+from dwell.study.engine import Progress, StudyResult, play_in_memory
 from dwell.study.intervals import Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
 from dwell.study.player import Example, Player
@@ -59,7 +59,7 @@ class Comparison:
         Distribution of final latencies over all seeds: ``share`` of the cycles that finished
         within ``latency_ms``, by scenario and policy. It stays below 1 where cycles were lost.
     examples : mapping of (scenario, policy) to Example
-        The runs of the first seed.
+        The runs of the first seed; empty where they were not kept.
     versions : mapping of str to str
         Of the software that made the runs.
     """
@@ -74,6 +74,33 @@ class Comparison:
     latencies: pl.DataFrame
     examples: Mapping[tuple[str, str], Example]
     versions: Mapping[str, str]
+
+    @classmethod
+    def of_study(cls, result: StudyResult) -> Comparison:
+        """Return the runs of a study with one point.
+
+        Raises
+        ------
+        SimulationError
+            If the study has several points.
+        """
+        study = result.study
+        if len(study.points) != 1:
+            raise SimulationError(
+                f"study {study.name} has {len(study.points)} points; a comparison is of one"
+            )
+        return cls(
+            problem=study.points[0].problem,
+            scenarios=study.scenarios,
+            policies=study.policies,
+            seeds=study.seeds,
+            windows=study.windows,
+            runs=result.runs,
+            costs=result.costs,
+            latencies=result.latencies,
+            examples={},
+            versions=result.versions,
+        )
 
     @property
     def statics(self) -> tuple[str, ...]:

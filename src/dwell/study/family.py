@@ -13,15 +13,29 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.study.intervals import CONFIDENCE
-from dwell.study.paired import PairedDifference, PairedMedian, least_p
+from dwell.study.intervals import CONFIDENCE, median_interval, share_interval
+from dwell.study.over_seeds import interval_of, metric_values
+from dwell.study.paired import (
+    PairedDifference,
+    PairedMedian,
+    least_p,
+    paired_difference,
+    paired_median,
+)
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Difference", "Family", "cannot_tell", "holm"]
+__all__ = ["Contrast", "Difference", "Family", "Labels", "cannot_tell", "holm", "seed_values"]
+
+Floats: TypeAlias = NDArray[np.float64]
+#: Columns of runs and what they have to be, for one run a seed to be left.
+Labels: TypeAlias = Mapping[str, object]
+#: Two groups of runs, one run a seed each.
+Contrast: TypeAlias = "tuple[Labels, Labels]"
 
 #: ``lower``, ``higher``, ``no difference shown``, or what `cannot_tell` says.
 Comparative: TypeAlias = str
@@ -46,6 +60,33 @@ class Family:
     question: str
     metric: str
     comparisons: Mapping[str, Difference]
+
+    @classmethod
+    def of_runs(
+        cls, runs: pl.DataFrame, question: str, metric: str, pairs: Mapping[str, Contrast]
+    ) -> Family:
+        """Compare a metric between pairs of groups of runs, seed by seed.
+
+        Metrics that may be infinite are compared by medians, the others by means.
+
+        Parameters
+        ----------
+        runs : DataFrame
+            One row a run, with a column ``seed``; see `dwell.study.StudyResult`.
+        question, metric : str
+        pairs : mapping of str to (labels, labels)
+            By a name; what columns are in the runs of each group. Both leave one run a seed.
+
+        Raises
+        ------
+        SimulationError
+            If labels leave no run, or several a seed.
+        MetricError
+            If there is no such column; with the nearest name.
+        """
+        return cls(
+            question, metric, {name: _contrast(runs, metric, pair) for name, pair in pairs.items()}
+        )
 
     @property
     def adjusted(self) -> dict[str, float]:
@@ -85,16 +126,61 @@ class Family:
         DataFrame
             ``question``, ``metric``, ``comparison``; ``centre`` (mean or median), ``difference``,
             ``low``, ``high``; ``d_z`` (null for medians), ``superiority``; ``n`` (pairs), ``p``,
-            ``p_holm`` and ``verdict``. What is NaN is null.
+            ``p_holm``, ``p_least`` (the smallest that ``p_holm`` can be with so many pairs and
+            comparisons) and ``verdict``. What is NaN is null.
         """
         import polars as pl
 
         adjusted, verdicts = self.adjusted, self.verdicts
         rows = [
-            (self.question, self.metric, name, *_numbers(item), adjusted[name], verdicts[name])
+            (
+                *(self.question, self.metric, name),
+                *_numbers(item),
+                *(adjusted[name], self._least(item.n), verdicts[name]),
+            )
             for name, item in self.comparisons.items()
         ]
         return pl.DataFrame(rows, schema=_schema(), orient="row").fill_nan(None)
+
+    def _least(self, pairs: int) -> float:
+        return min(1.0, len(self.comparisons) * least_p(pairs))
+
+
+def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
+    """Return one number a seed, in the order of the seeds.
+
+    Parameters
+    ----------
+    runs : DataFrame
+        One row a run.
+    column : str
+    labels : mapping of str to object
+        Leave one run a seed.
+
+    Raises
+    ------
+    SimulationError
+        If they leave none, or several a seed.
+    MetricError
+        If there is no such column; with the nearest name.
+    """
+    import polars as pl
+
+    mine = runs.filter(*(pl.col(name) == value for name, value in labels.items()))
+    if mine.is_empty() or mine["seed"].n_unique() != mine.height:
+        raise SimulationError(
+            f"{dict(labels)} leaves {mine.height} runs of {mine['seed'].n_unique()} seeds; it must "
+            "leave one a seed"
+        )
+    return metric_values(mine.sort("seed"), column)
+
+
+def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
+    """Compare the first of a pair to the second; by medians where a column may be infinite."""
+    first, second = (seed_values(runs, metric, labels) for labels in pair)
+    if interval_of(metric) is median_interval:
+        return paired_median(first, second)
+    return paired_difference(first, second, shares=interval_of(metric) is share_interval)
 
 
 def cannot_tell(seeds: int, comparisons: int = 1) -> str:
@@ -162,7 +248,7 @@ def _schema() -> dict[str, pl.DataType]:
     text = ("question", "metric", "comparison", "centre", "verdict")
     order = (
         *("question", "metric", "comparison", "centre", "difference", "low", "high", "d_z"),
-        *("superiority", "n", "p", "p_holm", "verdict"),
+        *("superiority", "n", "p", "p_holm", "p_least", "verdict"),
     )
     return {
         name: pl.String() if name in text else pl.Int64() if name == "n" else pl.Float64()

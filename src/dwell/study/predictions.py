@@ -8,9 +8,9 @@ seeds says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from dwell.study.intervals import (
 )
 from dwell.study.over_seeds import difference_of
 
+if TYPE_CHECKING:
+    import polars as pl
+
 __all__ = [
     "PAPER",
     "Answer",
@@ -35,6 +38,7 @@ __all__ = [
     "applies",
     "judge_claim",
     "judge_placement",
+    "paper_predictions",
 ]
 
 Answer: TypeAlias = Literal["agrees", "agrees in part", "differs", "open"]
@@ -313,6 +317,54 @@ def judge_claim(comparison: Comparison, scenario: str, claim: Claim) -> Answer:
     """Hold the words on a static placement against its runs."""
     holds = claim.holds(Evidence(comparison, scenario))
     return "open" if holds is None else "agrees" if holds else "differs"
+
+
+def paper_predictions(comparison: Comparison, policies: Sequence[str] = (DTP,)) -> pl.DataFrame:
+    """Hold every prediction of the paper's table against runs of its cell.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of the candidates LOC, SO and HYB, in some of the paper's scenarios.
+    policies : sequence of str
+        Those that the predictions about DTP are held against.
+
+    Returns
+    -------
+    DataFrame
+        One row a prediction: ``scenario``; ``policy``, or the placement that it is about; the
+        paper's ``words`` and their ``reading``; ``answer`` (agrees, agrees in part, differs,
+        open); of a policy also ``leader``, the placement with most windows, and the ``share`` of
+        the predicted one in them with ``share_low`` and ``share_high``. No rows for another cell.
+    """
+    import polars as pl
+
+    rows: list[tuple[object, ...]] = []
+    mine = [one for one in PAPER if one.scenario in comparison.scenarios]
+    for one in mine if applies(comparison) else ():
+        for policy in policies:
+            found = judge_placement(comparison, one, policy)
+            rows.append(
+                (
+                    one.scenario,
+                    policy,
+                    one.dtp,
+                    one.reading,
+                    found.answer,
+                    found.leader,
+                    *found.share,
+                )
+            )
+        for placement, claims in one.claims.items():
+            for claim in claims:
+                answer = judge_claim(comparison, one.scenario, claim)
+                rows.append(
+                    (one.scenario, placement, claim.words, claim.reading, answer, *[None] * 4)
+                )
+    texts = ("scenario", "policy", "words", "reading", "answer", "leader")
+    numbers = ("share", "share_low", "share_high")
+    schema = {**dict.fromkeys(texts, pl.String), **dict.fromkeys(numbers, pl.Float64)}
+    return pl.DataFrame(rows, schema=schema, orient="row").fill_nan(None)
 
 
 def _sign(difference: Interval) -> bool | None:

@@ -1,0 +1,131 @@
+"""The paper's cell, its scenarios, what is changed about it, and who plays on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from dwell.model import Episodes, Exponential, FrozenDict, Placement, Problem, Scenario
+from dwell.study import Contender, load_study
+
+__all__ = [
+    "DYNAMIC",
+    "EXAMPLES",
+    "PAPERS_DTP",
+    "RANDOM",
+    "STEADY",
+    "TIMETABLE",
+    "believing",
+    "by_length",
+    "on_and_off",
+    "paper_cell",
+    "rules",
+    "statics",
+    "with_candidate",
+    "with_candidates",
+    "with_scenarios",
+]
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+
+#: One placement is best from the first cycle to the last.
+STEADY = (
+    "baseline",
+    "robot-cpu-stress",
+    "edge-cpu-stress",
+    "network-impairment",
+    "network-impairment-mild",
+)
+#: The best placement changes while the run goes on, by a timetable of 300 windows.
+TIMETABLE = ("step", "drift")
+#: It changes at random, from the begin of a run to its end, however long that is.
+RANDOM = ("bursts", "flapping", "mixture")
+DYNAMIC = (*TIMETABLE, *RANDOM)
+
+#: DTP as we read the paper's: with the estimator that it calls static profiling.
+PAPERS_DTP = "dtp+profile"
+
+
+def paper_cell() -> Problem:
+    """Return the canonical cell, with the dynamic scenarios beside its own."""
+    return load_study(EXAMPLES / "studies" / "dynamic.yaml").points[0].problem
+
+
+def by_length(
+    names: Iterable[str], windows: int, timetable_windows: int
+) -> Iterator[tuple[str, tuple[str, ...], int]]:
+    """Part scenarios by how long their runs have to be, as a study has one length.
+
+    Yields
+    ------
+    (str, tuple of str, int)
+        What to add to the name of a study, its scenarios and the windows of its runs.
+    """
+    mine = tuple(names)
+    usual = tuple(name for name in mine if name not in TIMETABLE)
+    timed = tuple(name for name in mine if name in TIMETABLE)
+    yield from (("", usual, windows),) if usual else ()
+    yield from (("-timetable", timed, timetable_windows),) if timed else ()
+
+
+# ------------------------------------------------------------------------------ contenders
+
+
+def believing(
+    policy: str, estimator: str, settings: Mapping[str, object] | None = None, *, name: str = ""
+) -> Contender:
+    """Return a policy with an estimator, called ``dtp+corrected`` unless it is given a name."""
+    return Contender(name or f"{policy}+{estimator}", policy, estimator, settings or {})
+
+
+def statics(problem: Problem) -> tuple[Contender, ...]:
+    """Return every candidate's placement, which never moves."""
+    return tuple(Contender(name, name) for name in problem.candidates)
+
+
+def rules() -> tuple[Contender, ...]:
+    """Return the two rules whose candidates are varied, with the estimator corrected."""
+    return believing("dtp", "corrected"), believing("cusum", "corrected")
+
+
+# -------------------------------------------------------------------------------- variants
+
+
+def with_candidates(problem: Problem, names: Sequence[str]) -> Problem:
+    """Return the problem with some of its candidates; it starts on the first where it has to."""
+    controller = replace(
+        problem.controller,
+        initial=problem.initial if problem.initial in names else names[0],
+        fallbacks=tuple(name for name in problem.controller.fallbacks if name in names),
+    )
+    kept = FrozenDict({name: problem.candidates[name] for name in names})
+    return replace(problem, candidates=kept, controller=controller)
+
+
+def with_candidate(problem: Problem, name: str, moves: Mapping[str, str]) -> Problem:
+    """Return the problem with one more candidate: the first one, some of its tasks elsewhere."""
+    first = next(iter(problem.candidates.values()))
+    placement = Placement({**first, **moves})
+    return replace(problem, candidates=FrozenDict({**problem.candidates, name: placement}))
+
+
+def with_scenarios(problem: Problem, scenarios: Mapping[str, Scenario]) -> Problem:
+    """Return the problem with other scenarios than its own."""
+    return replace(problem, scenarios=FrozenDict(scenarios))
+
+
+def on_and_off(scenario: Scenario, *, off_s: float, on_s: float, name: str) -> Scenario:
+    """Return a steady scenario that comes and goes instead.
+
+    Parameters
+    ----------
+    scenario : tuple of disturbances
+        All the time.
+    off_s, on_s : float
+        Mean lengths, seconds; exponential.
+    name : str
+        Of the episodes: disturbances with one name come and go together.
+    """
+    episodes = Episodes(name, every_s=Exponential(off_s), for_s=Exponential(on_s))
+    return tuple(replace(item, episodes=episodes) for item in scenario)

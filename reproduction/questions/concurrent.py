@@ -1,0 +1,171 @@
+"""RQ1: placing T2 and T3 together against moving one stage, under CPU stress of the robots.
+
+Two comparisons, because the first mixes two things. Against ATP, whose stage, thresholds and dwell
+are tuned on seeds of their own, another rule with another estimator plays on more candidates. So
+the same rule with the same estimator also plays on the candidates between which one stage alone
+moves: what then differs is the other stage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import polars as pl
+
+from dwell.model import NodeDisturbance, Problem, Scenario
+from dwell.policies import ATP
+from dwell.study import Contender, Point, Study, over_seeds
+from reproduction.cell import (
+    PAPERS_DTP,
+    believing,
+    on_and_off,
+    rules,
+    statics,
+    with_candidates,
+    with_scenarios,
+)
+from reproduction.questions import Run
+from reproduction.scale import Scale, thinned
+from reproduction.tuning import best, scores
+from reproduction.verdicts import Answer, compare, policies
+
+TITLE = "RQ1: Does placing T2 and T3 together reduce V_D further than moving one stage (ATP)?"
+
+RULES = ("dtp+corrected", "cusum+corrected")
+TUNED, BEST_HERE = "atp-tuned", "atp best here"
+#: Candidates between which one stage alone moves: on a robot in the first, on E in the second.
+STAGES = {"T2": ("LOC", "HYB"), "T3": ("HYB", "SO")}
+METRICS = ("violation_rate", "u_robot", "cost")
+
+#: Robots that are stressed, with how many threads a core; one is the paper's `stress-ng --cpu 0`.
+STRESSED = {"R1": ("R1",), "R2": ("R2",), "R1+R2": ("R1", "R2")}
+THREADS_A_CORE = (1, 2)
+#: Mean time that stress which comes and goes is off, and on: about twelve windows.
+OFF_S = ON_S = 40.0
+
+#: ATP's settings that are tried: L95 over the deadline, U_r, U_e (infinite: none) and N_min.
+GRID = ((0.8, 1.0, 1.2), (0.7, 0.95, np.inf), (0.7, np.inf), (0, 3))
+
+
+def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
+    """Compare the rules to tuned ATP, to themselves with one stage, and to standing still."""
+    stressed = with_scenarios(cell, stress_scenarios(cell))
+    tuning = run(tuning_study(stressed, scale))
+    score = scores(tuning.runs, "violation_rate")
+    who = tuning.study.contenders
+    overall = best([one for one in who if one.name not in cell.candidates], score)
+    static = best([one for one in who if one.name in cell.candidates], score).name
+    here = {
+        scenario: best(
+            [one for one in who if one.name not in cell.candidates],
+            scores(tuning.runs.filter(scenario=scenario), "violation_rate"),
+        )
+        for scenario in tuning.study.scenarios
+    }
+    favourites = {one.name: Contender(f"atp {one.name}", one.policy) for one in here.values()}
+    main = replace(
+        tuning.study,
+        name="concurrent",
+        contenders=(
+            *statics(cell),
+            Contender("atp", "atp"),
+            Contender(TUNED, overall.policy),
+            *favourites.values(),
+            believing("dtp", "profile", name=PAPERS_DTP),
+            *rules(),
+        ),
+        seeds=scale.all_seeds,
+    )
+    runs = [run(main).runs]
+    for stage, names in STAGES.items():
+        point = Point({}, with_candidates(stressed, names))
+        one = replace(main, name=f"concurrent-{stage}", points=(point,), contenders=rules())
+        alone = {rule: f"{rule} {stage} only" for rule in RULES}
+        runs.append(run(one).runs.with_columns(pl.col("policy").replace_strict(alone)))
+    own = [
+        runs[0]
+        .filter(scenario=scenario, policy=f"atp {one.name}")
+        .with_columns(policy=pl.lit(BEST_HERE))
+        for scenario, one in here.items()
+    ]
+    everybody = pl.concat([*runs, *own], how="diagonal").filter(
+        ~pl.col("policy").is_in([one.name for one in favourites.values()])
+    )
+    against = [(rule, other) for rule in RULES for other in (TUNED, BEST_HERE, static)]
+    single = [(rule, f"{rule} {stage} only") for rule in RULES for stage in STAGES]
+    verdicts = [
+        compare(everybody, claim, METRICS, policies(main.scenarios, pairs), main)
+        for claim, pairs in (
+            ("T2 and T3 together beat tuned ATP", against),
+            ("Both stages beat either alone, under the same rule", single),
+        )
+    ]
+    settings = pl.DataFrame(
+        [
+            {"setting": name, "violation_rate": value}
+            for name, value in sorted(score.items(), key=lambda item: item[1])
+        ]
+    )
+    columns = ("violation_rate", "l95_ms", "u_robot", "u_edge", "cost", "migrations")
+    return Answer(
+        pl.concat(verdicts),
+        {
+            "Every policy under every stress": over_seeds(
+                everybody, ("scenario", "policy"), columns
+            ),
+            "ATP's settings on the held-out seeds: stage, L95 over D, U_r, U_e, N_min": settings,
+        },
+    )
+
+
+def stress_scenarios(cell: Problem) -> dict[str, Scenario]:
+    """Return CPU stress on either robot and on both, weaker and stronger, steady and on and off."""
+    found: dict[str, Scenario] = {}
+    for each, (label, nodes) in product(THREADS_A_CORE, STRESSED.items()):
+        steady: Scenario = tuple(
+            NodeDisturbance(node, stress_threads=each * cell.fabric.nodes[node].cores)
+            for node in nodes
+        )
+        found[f"{label} {each} a core"] = steady
+        found[f"{label} {each} a core on-off"] = on_and_off(
+            steady, off_s=OFF_S, on_s=ON_S, name="stress"
+        )
+    return found
+
+
+def tuning_study(cell: Problem, scale: Scale) -> Study:
+    """Return ATP's grid on held-out seeds, and the static placements."""
+    grids = [thinned(one, max(2, scale.grid // 3)) for one in GRID]
+    grid = [
+        Contender(f"{stage} {latency:g} {robot:g} {edge:g} {dwell:g}", atp(cell, names, setting))
+        for stage, names in STAGES.items()
+        for setting in product(*grids)
+        for latency, robot, edge, dwell in (setting,)
+    ]
+    return Study(
+        name="concurrent-tuning",
+        points=(Point({}, cell),),
+        scenarios=tuple(name for name in cell.scenarios if name != "baseline"),
+        contenders=(*statics(cell), *grid),
+        seeds=scale.held_out,
+        windows=scale.windows,
+    )
+
+
+def atp(cell: Problem, names: tuple[str, str], setting: tuple[float, ...]) -> ATP:
+    """Return ATP on a pair of candidates, starting on the local one where it has to."""
+    local, offload = names
+    latency, robot, edge, dwell = setting
+    return ATP(
+        candidates=cell.candidates,
+        initial=cell.initial if cell.initial in names else local,
+        objective=cell.objective,
+        local=local,
+        offload=offload,
+        latency_ms=latency * cell.pipeline.deadline_ms,
+        robot=robot,
+        edge=edge,
+        min_dwell=int(dwell),
+    )

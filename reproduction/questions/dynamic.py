@@ -1,0 +1,269 @@
+"""Dynamic scenarios: regret over the reference in hindsight, and which part of it costs what.
+
+The aim of an adaptive policy, scenario by scenario, with a real estimator paid for: its cost is at
+most 10 % over the reference; V_D is under 5 % wherever the reference's is; it migrates no more
+than DTP. Settings are tuned on seeds of their own. The same rules with `Hindsight` are told, one
+window late, what every candidate alone showed: their regret is what rule and lag cost, and the
+rest is the estimate's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import polars as pl
+
+from dwell.model import Problem
+from dwell.policies import Cusum
+from dwell.study import (
+    AIM,
+    Contender,
+    Hindsight,
+    Interval,
+    Point,
+    Study,
+    StudyResult,
+    mean_interval,
+    over_seeds,
+    share_interval,
+    under,
+)
+from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, statics
+from reproduction.questions import Run, study_file
+from reproduction.scale import Scale, thinned
+from reproduction.tuning import best, scores
+from reproduction.verdicts import Answer, compare, judge, policies
+
+TITLE = (
+    "In dynamic scenarios, is the cost within 10 % of the reference, V_D under 5 % wherever the "
+    "reference's is, with no more migrations than DTP?"
+)
+
+DTP, CUSUM = "dtp+corrected", "cusum+corrected"
+TUNED_DTP, TUNED_CUSUM = "dtp-tuned+corrected", "cusum-tuned+corrected"
+ESCAPE, WORK = "dtp-escape+corrected", "work-function+corrected"
+#: What the same rule would make of knowing, one window late, what every candidate cost.
+TOLD = {
+    name: name.replace("+corrected", "+hindsight") for name in (DTP, CUSUM, TUNED_DTP, TUNED_CUSUM)
+}
+REFERENCES = ("clairvoyant", "clairvoyant-dwell")
+#: What a policy may cost beyond the reference.
+OVER_REFERENCE = 0.10
+#: Shares of the cycles that are sent through each alternative as well.
+FRACTIONS = (0.01, 0.02, 0.05, 0.1)
+METRICS = ("regret", "cost", "violation_rate", "share_kept", "migrations", "aoi_mean_ms")
+
+
+def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
+    """Measure regret, part it, and hold it against the aim."""
+    tuning = run(tuning_study(cell, scale))
+    chosen = tuned(tuning)
+    dynamic = study_of("dynamic", cell, contenders(cell, chosen), scale)
+    steady = replace(dynamic, name="dynamic-steady", scenarios=STEADY, windows=scale.windows)
+    runs = pl.concat([run(study).runs for study in (dynamic, steady)])
+    fractions = run(fractions_study(cell, scale))
+    shadows = run(replace(study_file("shadows"), seeds=scale.some_seeds, windows=scale.windows))
+    studies, scenarios = (dynamic, steady), (*DYNAMIC, *STEADY)
+    others = (CUSUM, TUNED_CUSUM, WORK, ESCAPE, TUNED_DTP)
+    pairs = {
+        "The estimator corrected lowers DTP's regret": [
+            (DTP, f"dtp+{name}") for name in ("profile", "shadow", "scaling")
+        ],
+        "Another rule lowers DTP's regret": [(other, DTP) for other in others],
+    }
+    verdicts = [
+        *aims(runs, tuple(cell.candidates), studies),
+        *(
+            compare(runs, claim, ("regret",), policies(scenarios, mine), *studies)
+            for claim, mine in pairs.items()
+        ),
+        compare(
+            shadows.runs,
+            "Shadow jobs raise V_D",
+            ("violation_rate",),
+            policies(
+                shadows.study.scenarios,
+                [
+                    (f"{name} shadows {share:g}", name)
+                    for name in cell.candidates
+                    for share in FRACTIONS
+                ],
+            ),
+            shadows.study,
+        ),
+    ]
+    keys = ("scenario", "policy")
+    return Answer(
+        pl.concat(verdicts),
+        {
+            "The parts of regret": parts(runs, tuple(cell.candidates)),
+            "Every contender in every scenario": over_seeds(runs, keys, METRICS),
+            "Settings on the held-out seeds": over_seeds(tuning.runs, keys, ("regret",)),
+            "Shares of cycles that are sent through each alternative": over_seeds(
+                fractions.runs, keys, ("regret",)
+            ),
+            "Placements with shadow jobs": over_seeds(
+                shadows.runs, keys, ("violation_rate", *(f"node_{n}" for n in cell.fabric.nodes))
+            ),
+        },
+    )
+
+
+# --------------------------------------------------------------------------------- studies
+
+
+def study_of(name: str, cell: Problem, who: Sequence[Contender], scale: Scale) -> Study:
+    """Return a study of the dynamic scenarios, with references."""
+    return Study(
+        name=name,
+        points=(Point({}, cell),),
+        scenarios=DYNAMIC,
+        contenders=tuple(who),
+        seeds=scale.all_seeds,
+        windows=scale.dynamic_windows,
+        references=True,
+    )
+
+
+def tuning_study(cell: Problem, scale: Scale) -> Study:
+    """Return the grid of both rules on held-out seeds."""
+    size = max(2, scale.grid // 3)
+    grids = ((0.2, 0.4, 0.8), (0.05, 0.15, 0.3), (0.7, 0.95))
+    who = [
+        Contender(
+            f"cusum {threshold:g} {slack:g} {memory:g}",
+            Cusum(
+                candidates=cell.candidates,
+                initial=cell.initial,
+                objective=cell.objective,
+                threshold=threshold,
+                slack=slack,
+                memory=memory,
+            ),
+            "corrected",
+        )
+        for threshold, slack, memory in product(*(thinned(grid, size) for grid in grids))
+    ]
+    who += [
+        believing(
+            "dtp",
+            "corrected",
+            {"controller.min_dwell": dwell, "controller.min_improvement": improvement},
+            name=f"dtp {dwell} {improvement:g}",
+        )
+        for dwell, improvement in product(thinned((0, 1, 3), size), thinned((0.05, 0.2, 0.4), size))
+    ]
+    return replace(study_of("dynamic-tuning", cell, who, scale), seeds=scale.held_out)
+
+
+def tuned(tuning: StudyResult) -> dict[str, Contender]:
+    """Return the best of each rule under the name that it is compared by."""
+    score = scores(tuning.runs, "regret")
+    who = tuning.study.contenders
+    return {
+        TUNED_DTP: best([one for one in who if one.name.startswith("dtp ")], score),
+        TUNED_CUSUM: best([one for one in who if one.name.startswith("cusum ")], score),
+    }
+
+
+def contenders(cell: Problem, chosen: Mapping[str, Contender]) -> tuple[Contender, ...]:
+    """Return who plays: real estimators, and those that are told."""
+    real = (
+        believing("dtp", "profile", name=PAPERS_DTP),
+        believing("dtp", "shadow"),
+        believing("dtp", "scaling"),
+        believing("dtp", "corrected", name=DTP),
+        believing("dtp", "corrected", {"controller.escape": True}, name=ESCAPE),
+        believing("cusum", "corrected", name=CUSUM),
+        believing("work-function", "corrected", name=WORK),
+        *(replace(one, name=name) for name, one in chosen.items()),
+    )
+    told = [
+        replace(one, name=TOLD[one.name], estimator=Hindsight()) for one in real if one.name in TOLD
+    ]
+    return (*statics(cell), *real, *told)
+
+
+def fractions_study(cell: Problem, scale: Scale) -> Study:
+    """Return what more or fewer shadow jobs are worth to a rule."""
+    who = [
+        believing(
+            policy,
+            "corrected",
+            {"controller.shadow_fraction": share},
+            name=f"{policy}+corrected {share:g}",
+        )
+        for policy, share in product(("dtp", "cusum"), (0.0, *FRACTIONS))
+    ]
+    return replace(study_of("dynamic-fractions", cell, who, scale), seeds=scale.some_seeds)
+
+
+# ----------------------------------------------------------------------------------- aims
+
+
+def values(runs: pl.DataFrame, scenario: str, policy: str, column: str) -> np.ndarray:
+    """Return one number a seed, in the order of the seeds."""
+    mine = runs.filter(scenario=scenario, policy=policy).sort("seed")
+    return mine[column].cast(pl.Float64).to_numpy()
+
+
+def reference_rates(runs: pl.DataFrame, scenario: str, candidates: Sequence[str]) -> np.ndarray:
+    """V_D of the reference, one a seed: of the cheapest candidate or clairvoyant sequence."""
+    costs, rates = (
+        np.stack([values(runs, scenario, name, column) for name in (*candidates, *REFERENCES)])
+        for column in ("cost", "violation_rate")
+    )
+    found: np.ndarray = rates[costs.argmin(axis=0), np.arange(rates.shape[1])]
+    return found
+
+
+def aims(
+    runs: pl.DataFrame, candidates: Sequence[str], studies: Sequence[Study]
+) -> list[pl.DataFrame]:
+    """Hold each tuned and untuned rule against the three parts of the aim."""
+    found = []
+    for scenario, name in product((*DYNAMIC, *STEADY), TOLD):
+        regret = mean_interval(values(runs, scenario, name, "regret"))
+        word = within(regret, OVER_REFERENCE)
+        cost = (f"Cost at most {OVER_REFERENCE:.0%} over the reference", scenario, name, "regret")
+        found.append(judge(*cost, regret, word, *studies))
+        rates = values(runs, scenario, name, "violation_rate")
+        asked = under(reference_rates(runs, scenario, candidates), AIM) == "under"
+        word = under(rates, AIM) if asked else "not asked"
+        rate = ("V_D under 5 % where the reference's is", scenario, name, "violation_rate")
+        found.append(judge(*rate, share_interval(rates), word, *studies))
+        for other in (PAPERS_DTP, DTP):
+            if other != name:
+                moves = (values(runs, scenario, who, "migrations") for who in (name, other))
+                more = mean_interval(np.subtract(*moves))
+                claim = (f"No more migrations than {other}", scenario, name, "migrations")
+                found.append(judge(*claim, more, within(more, 0.0), *studies))
+    return found
+
+
+def within(known: Interval, bound: float) -> str:
+    """Say whether a number is at most a bound, by its interval."""
+    return "met" if known.high <= bound else "missed" if known.low > bound else "not shown"
+
+
+def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
+    """Part regret into what rule and lag make of it, and what the estimate adds, seed by seed."""
+    rows = []
+    for scenario, (name, told) in product((*DYNAMIC, *STEADY), TOLD.items()):
+        mine, rule = (values(runs, scenario, who, "regret") for who in (name, told))
+        static = np.min([values(runs, scenario, one, "regret") for one in candidates], axis=0)
+        row: dict[str, object] = {"scenario": scenario, "policy": name}
+        shown = {
+            "regret": mine,
+            "rule_and_lag": rule,
+            "estimate": mine - rule,
+            "best_static": static,
+        }
+        for column, sample in shown.items():
+            known = mean_interval(sample)
+            row |= {column: known.value, f"{column}_low": known.low, f"{column}_high": known.high}
+        rows.append(row)
+    return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)

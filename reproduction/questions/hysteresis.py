@@ -1,0 +1,146 @@
+"""Dwell and threshold: what they buy in calm, and what they cost in reaction.
+
+N_min windows without a decision after each move bound the migrations of K windows by
+⌊K / (N_min + 1)⌋, whatever the metrics do: a property of the rule, and no finding. What it buys is
+one: a policy that may not move cannot chatter, and cannot react either. Two settings beside them
+are tried: `escape` (an incumbent over a cap may leave early) and cold migrations (a moved task
+waits for its state and its start), which make every move dearer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+
+import polars as pl
+
+from dwell.model import FrozenDict, Problem
+from dwell.study import Contender, Point, Study, over_seeds
+from reproduction.cell import PAPERS_DTP, believing, by_length
+from reproduction.questions import Run
+from reproduction.scale import Scale
+from reproduction.verdicts import Answer, Pairs, between, compare
+
+TITLE = "Does hysteresis calm DTP without making it worse?"
+
+DWELLS, FEW_DWELLS = (0, 1, 3, 6, 12), (0, 3, 12)
+THRESHOLDS, FEW_THRESHOLDS = (0.0, 0.05, 0.2, 0.8), (0.0, 0.05, 0.8)
+#: What is compared to no hysteresis at all: as in the cell, dwell alone, threshold alone, strong.
+NONE, SETTINGS = (0, 0.0), ((3, 0.05), (3, 0.0), (0, 0.05), (12, 0.8))
+
+SCENARIOS = ("baseline", "flapping", "bursts", "mixture", "step")
+ESCAPES = ("edge-cpu-stress", "network-impairment", "bursts", "mixture", "step")
+COLD = ("flapping", "mixture", "step")
+#: A process that loads a model, and what it hands over: 0.17 s on a gigabit link.
+START_MS, STATE_BYTES = 500.0, 20_000_000
+
+METRICS = ("migrations", "cost", "violation_rate")
+#: Policies whose migrations are tried cold: the policy, its estimator and settings.
+MOVERS: Mapping[str, tuple[str, str, Mapping[str, object]]] = {
+    PAPERS_DTP: ("dtp", "profile", {}),
+    "cusum+corrected": ("cusum", "corrected", {}),
+    **{
+        f"dtp+corrected, N_min = {dwell}": ("dtp", "corrected", {"controller.min_dwell": dwell})
+        for dwell in (0, 3, 12)
+    },
+}
+
+
+def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
+    """Vary N_min and Δ_min; try escape and cold migrations."""
+    dwells = FEW_DWELLS if scale.coarse else DWELLS
+    thresholds = FEW_THRESHOLDS if scale.coarse else THRESHOLDS
+    grid = [
+        believing(
+            "dtp",
+            "corrected",
+            {"controller.min_dwell": dwell, "controller.min_improvement": threshold},
+            name=grid_name(dwell, threshold),
+        )
+        for dwell, threshold in product(dwells, thresholds)
+    ]
+    escaping = [
+        believing("dtp", belief, {"controller.escape": on}, name=escape_name(belief, on))
+        for belief, on in product(("profile", "corrected"), (False, True))
+    ]
+    moving = [
+        believing(
+            policy, belief, {**settings, "controller.migration": kind}, name=f"{name}, {kind}"
+        )
+        for (name, (policy, belief, settings)), kind in product(MOVERS.items(), ("warm", "cold"))
+    ]
+    verdicts, tables = [], {}
+    for name, claim, problem, scenarios, who, seeds, pairs in (
+        (
+            "hysteresis",
+            "Hysteresis calms DTP, against none",
+            cell,
+            SCENARIOS,
+            grid,
+            scale.some_seeds,
+            [(grid_name(*one), grid_name(*NONE)) for one in SETTINGS],
+        ),
+        (
+            "hysteresis-escape",
+            "Escape helps DTP",
+            cell,
+            ESCAPES,
+            escaping,
+            scale.all_seeds,
+            [(escape_name(one, True), escape_name(one, False)) for one in ("profile", "corrected")],
+        ),
+        (
+            "hysteresis-cold",
+            "A cold migration costs more than a warm one",
+            heavy(cell),
+            COLD,
+            moving,
+            scale.all_seeds,
+            [(f"{one}, cold", f"{one}, warm") for one in MOVERS],
+        ),
+    ):
+        studies = studies_of(name, problem, scale, scenarios, who, seeds)
+        runs = pl.concat([run(study).runs for study in studies])
+        named: Pairs = {
+            (scenario, *pair): between(scenario, *pair)
+            for scenario, pair in product(scenarios, pairs)
+        }
+        verdicts.append(compare(runs, claim, METRICS, named, *studies))
+        columns = ("migrations", "returns", "cost", "regret", "violation_rate", "l95_ms")
+        tables[f"{claim}: every setting"] = over_seeds(runs, ("scenario", "policy"), columns)
+    return Answer(pl.concat(verdicts), tables)
+
+
+def studies_of(
+    name: str,
+    cell: Problem,
+    scale: Scale,
+    scenarios: Sequence[str],
+    who: Sequence[Contender],
+    seeds: tuple[int, ...],
+) -> list[Study]:
+    """Return one study for each length that runs have, with references."""
+    return [
+        Study(name + suffix, (Point({}, cell),), mine, tuple(who), seeds, windows, references=True)
+        for suffix, mine, windows in by_length(scenarios, scale.windows, scale.dynamic_windows)
+    ]
+
+
+def grid_name(dwell: int, threshold: float) -> str:
+    """Name of a contender of the grid."""
+    return f"N_min = {dwell}, Δ_min = {threshold:g}"
+
+
+def escape_name(estimator: str, on: bool) -> str:
+    """Name of a contender with or without escape."""
+    return f"dtp+{estimator}, escape {'on' if on else 'off'}"
+
+
+def heavy(cell: Problem) -> Problem:
+    """Return the cell with relocatable tasks that take time to start and have state to move."""
+    tasks = {
+        name: task if task.anchored else replace(task, start_ms=START_MS, state_bytes=STATE_BYTES)
+        for name, task in cell.pipeline.tasks.items()
+    }
+    return replace(cell, pipeline=replace(cell.pipeline, tasks=FrozenDict(tasks)))

@@ -1,0 +1,61 @@
+"""Cells that replay recorded measurements: what was found in the model, held against them.
+
+The unit is the run: a seed chooses where in the recording replay starts. Runs share rows of it, so
+that they are not quite independent: intervals are, if anything, too narrow, and a short recording
+is no more than one sample of its radio. Played where the recordings are (`--real FOLDER`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import polars as pl
+
+import dwell
+from dwell.study import Contender, Point, Study, longest_run, over_seeds
+from reproduction.cell import EXAMPLES, PAPERS_DTP, believing, rules, statics
+from reproduction.questions import Run
+from reproduction.scale import Scale
+from reproduction.verdicts import Answer, compare, policies, under_aim
+
+TITLE = "Do the findings hold where recorded measurements are replayed?"
+
+CELLS = ("real.yaml", "real-5g.yaml")
+METRICS = ("violation_rate", "cost", "migrations")
+
+
+def answer(traces: Path, scale: Scale, run: Run) -> Answer:
+    """Play the policies on both cells, for as long as their recordings last."""
+    frames, studies = [], []
+    for file in CELLS:
+        cell = dwell.load(EXAMPLES / file, traces=traces)
+        study = Study(
+            name=f"real-{cell.name.removeprefix('real-')}",
+            points=(Point({}, cell),),
+            scenarios=tuple(cell.scenarios),
+            contenders=(
+                *statics(cell),
+                Contender("atp", "atp"),
+                believing("dtp", "profile"),
+                *rules(),
+            ),
+            seeds=scale.all_seeds,
+            windows=longest_run(cell, scale.windows),
+        )
+        # One frame for both: a scenario is called after its cell, too.
+        called = pl.format("{}: {}", pl.lit(cell.name), pl.col("scenario"))
+        frames.append(run(study).runs.with_columns(scenario=called))
+        studies.append(study)
+    runs = pl.concat(frames, how="diagonal")
+    dtp, cusum = (one.name for one in rules())
+    candidates = [one.name for one in statics(cell)]
+    pairs = [(dtp, other) for other in (PAPERS_DTP, "atp", *candidates)]
+    pairs += [(cusum, PAPERS_DTP), (cusum, dtp)]
+    columns = ("violation_rate", "l95_ms", "u_robot", "cost", "migrations", "aoi_mean_ms")
+    main = over_seeds(runs, ("scenario", "policy"), columns)
+    named = policies(dict.fromkeys(runs["scenario"]), pairs)
+    verdicts = [
+        under_aim(main, runs, *studies),
+        compare(runs, "The findings hold on recorded traces", METRICS, named, *studies),
+    ]
+    return Answer(pl.concat(verdicts), {"Every policy on the recorded traces": main})

@@ -1,0 +1,215 @@
+"""RQ2: T3 to R2 during network faults, against going back and forth between R1 and E.
+
+HYB (T2 on E, T3 on R2) crosses the same links as SO in this cell, and in the same direction. So
+the paper's fault, which slows all directions of both, cannot tell them apart by the links; it is
+therefore also put on one direction and on one link, made smaller and larger, and joined by stress
+of the nodes that the other two placements live on. What HYB is worth under that stress without any
+fault is measured as well: only what goes beyond it is the fault's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+
+import polars as pl
+
+from dwell.model import LinkDisturbance, NodeDisturbance, Normal, Problem, Scenario
+from dwell.study import Contender, Point, Study, over_seeds
+from reproduction.cell import on_and_off, rules, statics, with_candidates, with_scenarios
+from reproduction.questions import Run
+from reproduction.scale import Scale, thinned
+from reproduction.verdicts import Answer, compare, policies
+
+TITLE = "RQ2: Does routing T3 to R2 during network faults outperform binary R1/E reversion?"
+
+RULES = ("dtp+corrected", "cusum+corrected")
+METRICS = ("violation_rate", "cost")
+#: What having HYB changes about them, seed by seed.
+CHANGES = ("change_of_violation_rate", "change_of_cost")
+#: The placements that binary reversion knows, and the one it lacks.
+BINARY, HYBRID = ("LOC", "SO"), "HYB"
+
+#: The paper's fault, with the share that its standard deviation is of its mean.
+MEAN_MS, SPREAD, LOSS = 25.0, 0.2, 0.02
+#: Where faults are: directed links by name.
+PLACES: Mapping[str, tuple[str, ...]] = {
+    "both links": ("R1->E", "E->R1", "E->R2", "R2->E"),
+    "link R1-E": ("R1->E", "E->R1"),
+    "link E-R2": ("E->R2", "R2->E"),
+    "R1 to E": ("R1->E",),
+    "E to R1": ("E->R1",),
+    "E to R2": ("E->R2",),
+    "R2 to E": ("R2->E",),
+    "link R1-R2": ("R1->R2", "R2->R1"),
+}
+NONE = "no fault"
+#: A link without delay or loss that is slow: a trajectory takes 16 ms there, poses take 4.
+SLOW, SLOW_MBPS = "E to R2 slow", 2.0
+#: Faults that are also met with nodes stressed, and those nodes with their threads a core.
+JOINED = (NONE, "both links", "R1 to E", "E to R2", "link R1-R2", SLOW)
+CONDITIONS: Mapping[str, Mapping[str, float]] = {
+    "": {},
+    "R1 stressed": {"R1": 1.0},
+    "R1 and E stressed": {"R1": 1.0, "E": 1.5},
+}
+#: Mean time that a fault is off, and on.
+OFF_S = ON_S = 40.0
+
+#: Means of the delay in the sweep, milliseconds, and probabilities of loss.
+MEANS_MS, LOSSES = (0.0, 2.0, 5.0, 10.0, 15.0, 25.0, 40.0), (0.0, LOSS)
+#: Places of the sweep: alone, and where R1 is no refuge; the other direction is the same to all.
+SWEPT = (("both links", ""), ("both links", "R1 stressed"), ("E to R2", "R1 stressed"))
+STEADY, PARAMETERS = "fault", ("fault.place", "fault.mean_ms", "fault.loss")
+
+
+def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
+    """Compare the rules with HYB to the same without, and that to the same without a fault."""
+    faulty = with_scenarios(cell, fault_scenarios(cell))
+    whole = Study(
+        name="reversion",
+        points=(Point({}, faulty),),
+        scenarios=tuple(name for name in faulty.scenarios if name != "baseline"),
+        contenders=(*statics(cell), Contender("atp", "atp"), *rules()),
+        seeds=scale.all_seeds,
+        windows=scale.windows,
+    )
+    binary = Study(
+        name="reversion-binary",
+        points=(Point({}, with_candidates(faulty, BINARY)),),
+        scenarios=whole.scenarios,
+        contenders=rules(),
+        seeds=whole.seeds,
+        windows=whole.windows,
+    )
+    without = {rule: f"{rule} {' or '.join(BINARY)}" for rule in RULES}
+    reverting = run(binary).runs.with_columns(pl.col("policy").replace_strict(without))
+    runs = pl.concat([run(whole).runs, reverting], how="diagonal")
+    sweep = run(sweep_study(cell, scale))
+    faults = [name for name in whole.scenarios if control(name) != name]
+    pairs = [(rule, other) for rule, less in without.items() for other in (less, "atp")]
+    verdicts = [
+        compare(runs, claim, METRICS, policies(whole.scenarios, mine), whole)
+        for claim, mine in (
+            ("Having HYB helps a rule during network faults", pairs),
+            ("HYB that never moves beats LOC and SO", [(HYBRID, other) for other in BINARY]),
+        )
+    ]
+    changes = pl.concat(
+        change(runs, scenario, rule, less)
+        for scenario, (rule, less) in product(whole.scenarios, without.items())
+    )
+    beyond = {
+        (scenario, rule, control(scenario)): (
+            {"scenario": scenario, "policy": rule},
+            {"scenario": control(scenario), "policy": rule},
+        )
+        for scenario, rule in product(faults, RULES)
+    }
+    claim = "Having HYB helps more with the fault than under the same stress without it"
+    verdicts.append(compare(changes, claim, CHANGES, beyond, whole))
+    keys, columns = ("scenario", "policy"), ("violation_rate", "l95_ms", "cost", "migrations")
+    return Answer(
+        pl.concat(verdicts),
+        {
+            "Every policy under every fault": over_seeds(runs, keys, columns),
+            "Bytes that cross each link under each placement": crossed(cell),
+            "Steady faults of every size": sweep.table(METRICS),
+        },
+    )
+
+
+def fault(
+    links: Sequence[str], *, mean_ms: float = MEAN_MS, loss: float = LOSS
+) -> tuple[LinkDisturbance, ...]:
+    """Return a Gaussian delay and a loss on links, all the time; nothing where both are 0."""
+    if mean_ms == 0 and loss == 0:
+        return ()
+    delay = Normal(mean_ms, SPREAD * mean_ms) if mean_ms > 0 else None
+    ends = (link.split("->") for link in links)
+    return tuple(LinkDisturbance(a, b, add_delay_ms=delay, loss=loss) for a, b in ends)
+
+
+def fault_scenarios(cell: Problem) -> dict[str, Scenario]:
+    """Return no fault and every fault, coming and going, alone and with nodes stressed."""
+    steady: dict[str, Scenario] = {NONE: ()}
+    steady |= {place: fault(links) for place, links in PLACES.items()}
+    steady[SLOW] = (LinkDisturbance("E", "R2", rate_mbps=SLOW_MBPS),)
+    found = {
+        place: on_and_off(items, off_s=OFF_S, on_s=ON_S, name="fault")
+        for place, items in steady.items()
+    }
+    for condition, place in product(filter(None, CONDITIONS), JOINED):
+        found[f"{place} + {condition}"] = (*found[place], *stress(cell, condition))
+    return found
+
+
+def stress(cell: Problem, condition: str) -> Scenario:
+    """Return the stress of a condition, all the time."""
+    return tuple(
+        NodeDisturbance(node, stress_threads=round(each * cell.fabric.nodes[node].cores))
+        for node, each in CONDITIONS[condition].items()
+    )
+
+
+def control(scenario: str) -> str:
+    """Return the scenario with the same stress and no fault."""
+    _, plus, condition = scenario.partition(" + ")
+    return f"{NONE}{plus}{condition}"
+
+
+def change(runs: pl.DataFrame, scenario: str, rule: str, less: str) -> pl.DataFrame:
+    """Return what having HYB changes for a rule, one row a seed."""
+    having, lacking = (
+        runs.filter(scenario=scenario, policy=name).sort("seed") for name in (rule, less)
+    )
+    differences = {
+        name: having[metric] - lacking[metric]
+        for name, metric in zip(CHANGES, METRICS, strict=True)
+    }
+    return having.select("scenario", "policy", "seed").with_columns(**differences)
+
+
+def crossed(cell: Problem) -> pl.DataFrame:
+    """Return the bytes that each flow puts on a link, under each placement."""
+    rows = [
+        (
+            name,
+            f"{placement[flow.source]}->{placement[flow.target]}",
+            flow.source,
+            flow.payload_bytes,
+        )
+        for name, placement in cell.candidates.items()
+        for flow in cell.pipeline.flows
+        if placement[flow.source] != placement[flow.target]
+    ]
+    return pl.DataFrame(rows, schema=["placement", "link", "after", "bytes"], orient="row")
+
+
+def sweep_study(cell: Problem, scale: Scale) -> Study:
+    """Return steady faults of every size in some of the places, in runs of half the length."""
+    points = [
+        Point(
+            dict(zip(PARAMETERS, (" + ".join(filter(None, where)), mean_ms, loss), strict=True)),
+            with_scenarios(
+                cell,
+                {
+                    STEADY: (
+                        *fault(PLACES[where[0]], mean_ms=mean_ms, loss=loss),
+                        *stress(cell, where[1]),
+                    )
+                },
+            ),
+        )
+        for where in SWEPT
+        for mean_ms in thinned(MEANS_MS, max(2, scale.grid))
+        for loss in LOSSES
+    ]
+    return Study(
+        name="reversion-sweep",
+        points=tuple(points),
+        scenarios=(STEADY,),
+        contenders=(*statics(cell), rules()[0]),
+        seeds=scale.all_seeds,
+        windows=max(scale.windows // 2, cell.warmup_windows + 2),
+    )

@@ -1,0 +1,184 @@
+"""RQ4: the five weights of J: how much DTP's results depend on them, in every scenario.
+
+Two designs. A Sobol design varies all five together, each over a factor of four to either side of
+the cell's value, evenly in the logarithm: weights are exchange rates, of which factors and not
+differences mean something. The other design changes one weight at a time, to nothing, a half and
+the double. The rule is the same where all five weights *and* the threshold Δ_min are multiplied by
+one number; Δ_min is kept, so that five weights are four exchange rates and a scale against Δ_min.
+
+The variance of an output is parted among the weights (Sobol 2001, DOI
+10.1016/S0378-4754(00)00270-6), with Saltelli's design (2010, DOI 10.1016/j.cpc.2009.09.018), by
+SALib. What is analysed contains no weight that is varied: V_D, L95, migrations, the tracking error,
+and J by the cell's own weights, which says what it costs to weigh otherwise. A changed weight may
+turn one decision, after which everything differs: `luck` estimates the part of the variance over
+weights that is that of the few realisations that were played.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import polars as pl
+from SALib.analyze import sobol as analysis
+from SALib.sample import sobol as sampling
+
+from dwell.model import Problem
+from dwell.study import Contender, Point, Study, StudyResult
+from reproduction.cell import DYNAMIC, STEADY, believing, by_length
+from reproduction.questions import Run
+from reproduction.scale import Scale
+from reproduction.verdicts import Answer, compare, policies
+
+TITLE = "RQ4: Does it matter how the five weights are chosen?"
+
+#: The weights of an objective, and what the paper calls them.
+WEIGHTS = {
+    "latency": "α_L",
+    "violations": "α_V",
+    "robot": "α_r",
+    "edge": "α_e",
+    "switching": "α_S",
+}
+#: The cell's weights are multiplied, and divided, by at most this.
+FACTOR = 4.0
+OUTPUTS = ("violation_rate", "l95_ms", "migrations", "tracking_rms_mm", "cost")
+#: The design is made for the unit cube; its range is ours to apply.
+SALIB = {"num_vars": len(WEIGHTS), "names": list(WEIGHTS), "bounds": [[0.0, 1.0]] * len(WEIGHTS)}
+
+#: One at a time: factors by the words that stand for them.
+STEPS = {"× 0": 0.0, "× ½": 0.5, "× 2": 2.0}
+ONE_AT_A_TIME = ("baseline", "step", "bursts")
+AS_IT_IS = "as in the cell"
+
+
+def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
+    """Vary the weights, all together and one at a time."""
+    shares = sampling.sample(SALIB, scale.sobol_n, calc_second_order=False, scramble=True, seed=1)
+    weights = np.array([getattr(cell.objective.weights, name) for name in WEIGHTS])
+    rows = weights / FACTOR * (FACTOR * FACTOR) ** shares
+    together = [
+        Study(f"weights{suffix}", (Point({}, cell),), mine, weighing(rows), seeds, windows)
+        for seeds in (tuple(range(1, scale.sobol_seeds + 1)),)
+        for suffix, mine, windows in by_length(
+            (*STEADY, *DYNAMIC), scale.sobol_windows, scale.dynamic_windows
+        )
+    ]
+    alone = [
+        Study(
+            f"weights-one{suffix}",
+            (Point({}, cell),),
+            mine,
+            stepping(cell),
+            scale.all_seeds,
+            windows,
+        )
+        for suffix, mine, windows in by_length(ONE_AT_A_TIME, scale.windows, scale.dynamic_windows)
+    ]
+    swept = pl.concat([indices(run(study), scale.sobol_n) for study in together])
+    runs = pl.concat([run(study).runs for study in alone])
+    pairs = [(one.name, AS_IT_IS) for one in alone[0].contenders if one.name != AS_IT_IS]
+    claim = "One weight changed changes a metric"
+    return Answer(
+        compare(runs, claim, OUTPUTS, policies(ONE_AT_A_TIME, pairs), *alone),
+        {"Outputs over the weights, the part of it that is luck, and Sobol indices": swept},
+    )
+
+
+def weighing(rows: np.ndarray) -> tuple[Contender, ...]:
+    """Return a DTP for every row of a design."""
+    return tuple(
+        believing(
+            "dtp",
+            "corrected",
+            {
+                f"objective.weights.{name}": float(value)
+                for name, value in zip(WEIGHTS, row, strict=True)
+            },
+            name=f"{index:04d}",
+        )
+        for index, row in enumerate(rows)
+    )
+
+
+def stepping(cell: Problem) -> tuple[Contender, ...]:
+    """Return a DTP with the cell's weights, and one for every step of one of them."""
+    weights = cell.objective.weights
+    changed = [
+        believing(
+            "dtp",
+            "corrected",
+            {f"objective.weights.{name}": getattr(weights, name) * factor},
+            name=f"{symbol} {step}",
+        )
+        for (name, symbol), (step, factor) in product(WEIGHTS.items(), STEPS.items())
+    ]
+    return (believing("dtp", "corrected", name=AS_IT_IS), *changed)
+
+
+def indices(result: StudyResult, n: int) -> pl.DataFrame:
+    """Return one row a scenario, output and weight: the output's range, its luck, S1 and ST.
+
+    Indices have the ends of their 95 % intervals over base points of the design; small ones may
+    seem to be negative. They are null where the output is the same at every point, or infinite.
+    """
+    study = result.study
+    shape = (len(study.contenders), len(study.seeds))
+    rows: list[dict[str, object]] = []
+    for scenario, output in product(study.scenarios, OUTPUTS):
+        mine = result.runs.filter(scenario=scenario)[output].cast(pl.Float64)
+        outputs = mine.to_numpy().reshape(shape).T
+        mean = outputs.mean(axis=0)
+        finite = bool(np.isfinite(outputs).all())
+        found = None
+        # The points of the design proper: all others mix two of them.
+        base = np.concatenate([mean[:: len(mean) // n], mean[len(mean) // n - 1 :: len(mean) // n]])
+        if finite and np.ptp(base) > 1e-12 * np.abs(base).max():
+            found = analysis.analyze(
+                SALIB, mean, calc_second_order=False, num_resamples=500, conf_level=0.95, seed=1
+            )
+        low, middle, high = np.quantile(mean, (0.05, 0.5, 0.95))
+        for index, symbol in enumerate(WEIGHTS.values()):
+            row: dict[str, object] = {
+                "scenario": scenario,
+                "metric": output,
+                "weight": symbol,
+                "low": low,
+                "median": middle,
+                "high": high,
+                "luck": luck(outputs) if finite else None,
+            }
+            for name in ("S1", "ST"):
+                value, half = (
+                    (float(found[name][index]), float(found[f"{name}_conf"][index]))
+                    if found is not None
+                    else (np.nan, np.nan)
+                )
+                row |= {name: value, f"{name}_low": value - half, f"{name}_high": value + half}
+            rows.append(row)
+    return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
+
+
+def luck(outputs: np.ndarray) -> float:
+    """Share of an output's variance over points that other seeds would not repeat.
+
+    Parameters
+    ----------
+    outputs : float64 array, shape (seeds, points)
+
+    Returns
+    -------
+    float
+        What seeds and points make only together, in a two-way table without replication, divided
+        by the number of seeds and by the variance of the mean over seeds; at most 1. NaN for one
+        seed, 0 where nothing varies.
+    """
+    seeds, points = outputs.shape
+    if seeds < 2:
+        return float("nan")
+    mean = outputs.mean(axis=0)
+    if np.ptp(mean) <= 1e-12 * np.abs(mean).max():
+        return 0.0
+    residual = outputs - mean - outputs.mean(axis=1, keepdims=True) + outputs.mean()
+    together = float((residual**2).sum()) / ((seeds - 1) * (points - 1))
+    return float(min(together / seeds / mean.var(ddof=1), 1.0))

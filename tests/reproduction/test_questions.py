@@ -1,0 +1,64 @@
+"""The paper's questions: every one is asked and answered, at the least that its designs take."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from reproduction.__main__ import main
+from reproduction.questions import QUESTIONS
+from reproduction.questions.jitter import turning_point
+from reproduction.questions.weights import luck
+
+WORDS = {"lower", "higher", "no difference shown", "under", "over", "not shown", "met", "missed"}
+WORDS |= {"not asked", "turns", "never", "always", "cannot tell", "cannot tell with 2 seeds"}
+
+
+@pytest.mark.parametrize("name", [name for name in QUESTIONS if name not in ("weights", "real")])
+def test_a_question_is_answered(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--scale", "tiny", "--only", name, "--out", str(tmp_path), "--processes", "1"]
+    assert main(words) == 0
+    assert capsys.readouterr().out == f"report: {tmp_path / 'report.html'}\n"
+    verdicts = pl.read_csv(tmp_path / "tables" / name / "verdicts.csv")
+    assert verdicts.height > 0
+    assert set(verdicts["word"]) <= WORDS
+    # Two seeds can show nothing by a test, whatever was simulated.
+    assert not set(verdicts.filter(pl.col("p").is_not_null())["word"]) & {"lower", "higher"}
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f'<h2 id="{name}">' in page
+
+
+def test_traces_that_are_missing_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--scale", "tiny", "--only", "real", "--real", str(tmp_path / "none")]
+    assert main([*words, "--out", str(tmp_path)]) == 1
+    assert str(tmp_path / "none") in capsys.readouterr().err
+
+
+# --------------------------------------------------------------------------------- numbers
+
+
+@pytest.mark.parametrize(
+    ("excess", "turn"),
+    [([1.0, 1.0, 1.0], 0.0), ([-1.0, -1.0, -1.0], np.inf), ([-1.0, -1.0, 1.0], 10**1.5)],
+)
+def test_where_offloading_ceases_to_pay(excess: list[float], turn: float) -> None:
+    assert turning_point((1.0, 10.0, 100.0), np.array(excess)) == pytest.approx(turn)
+
+
+def test_points_that_differ_alike_under_every_seed_are_no_luck() -> None:
+    points = np.array([1.0, 2.0, 4.0])
+    assert luck(np.stack([points, points + 10.0])) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_points_that_differ_otherwise_under_every_seed_are_luck() -> None:
+    draws = np.random.default_rng(1).normal(size=(4, 500))
+    assert luck(draws) == pytest.approx(1.0, abs=0.15)
+    assert np.isnan(luck(draws[:1]))
+    assert luck(np.ones((3, 5))) == 0.0
