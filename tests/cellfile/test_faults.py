@@ -472,14 +472,19 @@ def test_a_candidate_needs_its_links() -> None:
     assert "E->R2 for planning -> actuation" in faults[0].message
 
 
-def test_shadows_of_all_alternatives_are_at_most_all_cycles() -> None:
+@pytest.mark.parametrize("estimator", ["shadow", "corrected"])
+def test_shadows_of_all_alternatives_are_at_most_all_cycles(estimator: str) -> None:
     document = copy.deepcopy(DOCUMENT)
-    document["controller"] |= {"estimator": "shadow", "shadow_fraction": 0.6}
+    document["controller"] |= {"estimator": estimator, "shadow_fraction": 0.6}
     (fault,) = _faults(document)
     assert fault.path == "controller.shadow_fraction"
     assert "each of 2 alternatives is more than all cycles; at most 0.5" in fault.message
     document["controller"] |= {"shadow_fraction": 0.5}
     assert from_document(document)
+    # An estimator without shadows asks for none.
+    for other in ("profile", "scaling"):
+        document["controller"] |= {"estimator": other, "shadow_fraction": 1.0}
+        assert from_document(document)
 
 
 def test_state_needs_a_link_to_be_carried_over() -> None:

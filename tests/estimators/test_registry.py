@@ -6,16 +6,11 @@ import pytest
 
 from dwell.errors import ProblemError
 from dwell.estimators import Estimator, Profile, by_name
-from dwell.estimators.registry import REGISTRY
+from dwell.estimators.registry import REGISTRY, shadowing
 from dwell.model import Constant, Execution, Node, Task
-from dwell.model.problem import ESTIMATORS
 from tests.generate import make_problem
 
 PROBLEM = make_problem([Node("R1", "robot")], [Task("only", {"R1": Execution(Constant(1.0))})])
-
-
-def test_the_registry_has_the_names_that_a_cell_may_use() -> None:
-    assert tuple(REGISTRY) == ESTIMATORS
 
 
 @pytest.mark.parametrize("name", list(REGISTRY))
@@ -32,3 +27,13 @@ def test_the_default_profile() -> None:
 def test_an_unknown_name() -> None:
     with pytest.raises(ProblemError, match="unknown estimator 'profil'; did you mean 'profile'"):
         by_name("profil", PROBLEM)
+
+
+@pytest.mark.parametrize("name", list(REGISTRY))
+def test_those_that_send_shadow_jobs_say_so(name: str) -> None:
+    sent = getattr(by_name(name, PROBLEM), "shadow_fraction", 0.0) > 0
+    assert sent == (name in shadowing())
+
+
+def test_every_estimator_has_a_style_of_its_own() -> None:
+    assert sorted(entry.style for entry in REGISTRY.values()) == list(range(len(REGISTRY)))

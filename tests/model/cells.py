@@ -7,6 +7,7 @@ import math
 from hypothesis import strategies as st
 
 from dwell.errors import ProblemError
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import (
     AR1,
     Bursts,
@@ -41,8 +42,9 @@ from dwell.model import (
 )
 from dwell.model.fabric import Scheduler
 from dwell.model.objective import TIERS
-from dwell.model.problem import ESTIMATORS, MIGRATIONS, POLICIES
+from dwell.model.problem import MIGRATIONS
 from dwell.model.servo import PLANTS
+from dwell.policies.registry import REGISTRY as POLICIES
 
 # Names that YAML 1.1, numbers or paths might trip over.
 NAMES = (
@@ -231,12 +233,12 @@ def _controller(draw: st.DrawFn, nodes: list[str], candidates: list[str]) -> Con
     most = 1 / max(len(candidates) - 1, 1)
     return ControllerSettings(
         on=draw(st.none() | st.sampled_from(nodes)),
-        policy=draw(st.sampled_from(POLICIES) | some),
+        policy=draw(st.sampled_from(list(POLICIES)) | some),
         initial=draw(st.none() | some),
         min_dwell=draw(_whole(0, 1_000_000)),
         min_improvement=draw(_reals(0, 1e9)),
         escape=draw(st.booleans()),
-        estimator=draw(st.sampled_from(ESTIMATORS)),
+        estimator=draw(st.sampled_from(list(ESTIMATORS))),
         shadow_fraction=draw(_reals(0, most)),
         half_life_windows=draw(_reals(0, 1e6, exclude_min=True)),
         migration=draw(st.sampled_from(MIGRATIONS)),
@@ -277,7 +279,7 @@ def problems(draw: st.DrawFn) -> Problem:
     }
     candidates = {
         name: Placement({task: draw(st.sampled_from(list(tasks[task].on))) for task in tasks})
-        for name in draw(_names(1, 3, but=POLICIES))
+        for name in draw(_names(1, 3, but=tuple(POLICIES)))
     }
     items = _disturbance(list(nodes), [link.name for link in links])
     period_ms = draw(_reals(1e-3, 1e9))

@@ -133,7 +133,6 @@ PLACED = {"a": "R", "b": "R"}
         (lambda: Objective(Weights(cloud=1), Targets(1)), "targets.cloud", "missing"),
         (lambda: ControllerSettings(guard_cycles=1), "guard_cycles", "from 2"),
         (lambda: ControllerSettings(probe_cycles=0), "probe_cycles", "from 1"),
-        (lambda: ControllerSettings(estimator="x"), "estimator", "shadow, scaling, corrected"),
         (lambda: ControllerSettings(migration="hot"), "migration", "warm, cold"),
         (lambda: ControllerSettings(shadow_fraction=-0.1), "shadow_fraction", "from 0 to 1"),
         (lambda: ControllerSettings(shadow_fraction=1.1), "shadow_fraction", "from 0 to 1"),
@@ -196,41 +195,18 @@ def test_every_fault_of_meaning_is_reported_at_once() -> None:
         lambda: replace(
             good,
             pipeline=loop,
-            candidates={"dtp": Placement({"a": "E", "b": "R"})},
-            controller=ControllerSettings(on="X", initial="Y", fallbacks=("Z",), policy="W"),
+            candidates={"C": Placement({"a": "E", "b": "R"})},
+            controller=ControllerSettings(on="X", initial="Y", fallbacks=("Z",)),
         )
     )
     assert [fault.path for fault in faults] == [
         "flows[2].to",
         "flows",
-        "candidates.dtp",
-        "candidates.dtp.a",
+        "candidates.C.a",
         "controller.on",
         "controller.initial",
         "controller.fallbacks[0]",
-        "controller.policy",
     ]
-
-
-@pytest.mark.parametrize("estimator", ["shadow", "corrected"])
-def test_all_alternatives_together_get_at_most_all_cycles(estimator: str) -> None:
-    placed = {name: Placement(PLACED) for name in ("LOC", "A", "B", "C")}
-    for fraction in (0.0, 0.1, 1 / 3):
-        settings = ControllerSettings(estimator=estimator, shadow_fraction=fraction)
-        assert replace(_problem(), candidates=placed, controller=settings)
-    settings = ControllerSettings(estimator=estimator, shadow_fraction=0.34)
-    (fault,) = _faults(lambda: replace(_problem(), candidates=placed, controller=settings))
-    assert fault.path == "controller.shadow_fraction"
-    assert fault.message == (
-        "0.34 of the cycles through each of 3 alternatives is more than all cycles; at most 0.3333"
-    )
-    # One candidate has no alternative, and an estimator without shadows asks for none.
-    one = {"LOC": Placement(PLACED)}
-    whole = ControllerSettings(estimator=estimator, shadow_fraction=1.0)
-    assert replace(_problem(), candidates=one, controller=whole)
-    for other in ("profile", "scaling"):
-        unused = ControllerSettings(estimator=other, shadow_fraction=1.0)
-        assert replace(_problem(), candidates=placed, controller=unused)
 
 
 def test_a_cold_migration_needs_links_for_its_state() -> None:

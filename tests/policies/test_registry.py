@@ -6,16 +6,11 @@ import pytest
 
 from dwell.errors import PolicyError
 from dwell.model import ControllerSettings
-from dwell.model.problem import POLICIES
 from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Policy, Static, WorkFunction, by_name
 from dwell.policies.registry import REGISTRY
 from tests.policies.cell import CANDIDATES, OBJECTIVE, place, problem
 
 SETTINGS = ControllerSettings(initial="HYB", min_dwell=7, min_improvement=0.25, escape=True)
-
-
-def test_the_registry_has_the_names_that_a_cell_may_use() -> None:
-    assert tuple(REGISTRY) == POLICIES
 
 
 @pytest.mark.parametrize("name", [*REGISTRY, *CANDIDATES])
@@ -96,3 +91,8 @@ def test_atp_without_a_pair_explains_itself() -> None:
     one = {"LOC": place("R1", "R2")}
     with pytest.raises(PolicyError, match="among LOC"):
         by_name("atp", problem(one))
+
+
+def test_a_name_that_is_a_policys_and_a_candidates_is_refused() -> None:
+    with pytest.raises(PolicyError, match="'dtp' is a policy's name and a candidate's"):
+        by_name("dtp", problem({"dtp": place("R1", "R2"), "SO": place("E", "E")}))

@@ -21,6 +21,7 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.errors import PolicyError, ProblemError, RunError, SimulationError
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import (
     Constant,
     ControllerSettings,
@@ -37,8 +38,8 @@ from dwell.model import (
     Uniform,
 )
 from dwell.model.document import to_document
-from dwell.model.problem import ESTIMATORS, POLICIES
 from dwell.policies import DTP
+from dwell.policies.registry import REGISTRY as POLICIES
 from dwell.record import Run
 from dwell.sim import Phase, describe
 from tests.generate import MS, make_problem
@@ -408,7 +409,7 @@ def test_the_callers_policy_is_not_changed(canonical: Problem) -> None:
 
 
 @pytest.mark.parametrize("guard", [False, True])
-@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("estimator", list(ESTIMATORS))
 def test_a_run_is_described_before_it_is_played(
     canonical: Problem, estimator: str, guard: bool
 ) -> None:

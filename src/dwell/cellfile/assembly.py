@@ -24,6 +24,7 @@ from dwell.cellfile.entries import (
 )
 from dwell.cellfile.faults import Faults
 from dwell.cellfile.traces import Source, Tables
+from dwell.estimators import registry as estimators
 from dwell.model import (
     Bursts,
     Caps,
@@ -56,9 +57,9 @@ from dwell.model import (
 )
 from dwell.model.bounds import require
 from dwell.model.frozen import FrozenDict
-from dwell.model.problem import POLICIES
 from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.semantics import Parts, find_faults
+from dwell.policies import registry as policies
 
 __all__ = ["Assembly"]
 
@@ -130,6 +131,8 @@ class Assembly:
             for name, items in (entry.scenarios or {}).items()
         }
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
+        # A record names what its machine had, whatever this one has.
+        judged = self.tables is not None
         parts = Parts(
             nodes=nodes,
             links=links,
@@ -142,7 +145,9 @@ class Assembly:
             scenarios=scenarios,
             controller=controller,
             tiers=objective.tiers if objective is not None else (),
-            reserved=POLICIES,
+            policies=policies.names() if judged else None,
+            estimators=estimators.names() if judged else None,
+            shadowing=estimators.shadowing() if judged else (),
             live=live,
         )
         if not self.anchored:

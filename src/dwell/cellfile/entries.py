@@ -23,8 +23,10 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from dwell.cellfile.rendering import as_read
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import bounds
 from dwell.model.bounds import Bound
+from dwell.policies.registry import REGISTRY as POLICIES
 
 __all__ = [
     "BurstsEntry",
@@ -648,6 +650,7 @@ class ControllerEntry(Entry):
     policy: str | None = Field(
         None,
         description="A policy (`dtp`, default), or a candidate: the placement that never moves.",
+        examples=list(POLICIES),
     )
     initial: str | None = Field(None, description="Candidate to start with; default: the first.")
     min_dwell: Annotated[int, Number(bounds.MIN_DWELL)] | None = Field(
@@ -663,8 +666,8 @@ class ControllerEntry(Entry):
     )
     estimator: str | None = Field(
         None,
-        description="How the QoS of candidates is estimated: `profile` (default), `shadow`, "
-        "`scaling` or `corrected`.",
+        description="How the QoS of candidates is estimated; default `profile`.",
+        examples=list(ESTIMATORS),
     )
     shadow_fraction: Annotated[float, Number(bounds.SHADOW_FRACTION)] | None = Field(
         None,

@@ -20,8 +20,8 @@ from dwell.cellfile.faults import Faults, Step, dotted
 from dwell.cellfile.rendering import as_read
 from dwell.cellfile.study_paths import SETTINGS, put, steps_of
 from dwell.errors import ProblemError
+from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
-from dwell.model.problem import ESTIMATORS
 from dwell.model.semantics import LONGEST_NAME, NAME, nearest, nearest_of
 from dwell.policies.registry import names as policy_names
 
@@ -387,8 +387,9 @@ class _Reading:
                 f"{policy.name!r} is a candidate's name, for the placement that never moves; give "
                 f"{policy.policy!r} another one",
             )
-        if policy.estimator is not None and policy.estimator not in ESTIMATORS:
-            hint = nearest(policy.estimator, ESTIMATORS)
+        estimators = estimator_names()
+        if policy.estimator is not None and policy.estimator not in estimators:
+            hint = nearest(policy.estimator, estimators)
             shown = f"unknown estimator {policy.estimator!r}; {hint}"
             self.faults.add(f"{path}.estimator", shown)
 
@@ -403,7 +404,7 @@ class _Reading:
                 for key, found in steps.items()
                 if found is not None
             ]
-            if policy.estimator in ESTIMATORS:
+            if policy.estimator in estimator_names():
                 place = f"{path}.estimator"
                 overrides.append(_Override(place, ("controller", "estimator"), policy.estimator))
             if overrides:

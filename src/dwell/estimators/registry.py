@@ -1,28 +1,97 @@
-"""Estimators by the names that a cell file uses."""
+"""Estimators by the names that a cell file and the command line use.
+
+Each estimator of ours is declared here, and nowhere else by name. The declarations load without the
+classes: these are imported when an estimator is made. Another package adds one by an entry point of
+the group ``dwell.estimators``; its class is imported only when that estimator is asked for.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import ProblemError, RunError
-from dwell.estimators.corrected import Corrected
-from dwell.estimators.profile import Profile
-from dwell.estimators.protocol import Estimator
-from dwell.estimators.scaling import Scaling
-from dwell.estimators.shadow import Shadow
-from dwell.model.problem import Problem
+from dwell.model.entry_points import class_at, installed, loaded
 from dwell.model.semantics import nearest_of
 
-__all__ = ["REGISTRY", "by_name", "name_in_run"]
+if TYPE_CHECKING:
+    from dwell.estimators.protocol import Estimator
+    from dwell.model.problem import Problem
 
-#: Makers by name; the same names as ``dwell.model.problem.ESTIMATORS``.
-REGISTRY: dict[str, Callable[[Problem], Estimator]] = {
-    "profile": Profile,
-    "shadow": Shadow,
-    "scaling": Scaling,
-    "corrected": Corrected,
-}
+__all__ = ["GROUP", "REGISTRY", "EstimatorEntry", "by_name", "name_in_run", "names", "shadowing"]
+
+#: Group of the entry points by which other packages add estimators.
+GROUP = "dwell.estimators"
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorEntry:
+    """An estimator of ours.
+
+    Parameters
+    ----------
+    path : str
+        ``module:Class``; the class takes the problem.
+    sentence : str
+        What it does, for the legend of a report; the estimator is its subject.
+    style : int
+        Which marker and dashes a policy that believes it has in figures, from 0.
+    shadows : bool
+        Whether it sends shadow jobs through candidates that do not run.
+    """
+
+    path: str
+    sentence: str
+    style: int
+    shadows: bool = False
+
+
+#: The estimators of ours by name, in the order in which messages list them.
+REGISTRY: Mapping[str, EstimatorEntry] = MappingProxyType(
+    {
+        "profile": EstimatorEntry(
+            "dwell.estimators.profile:Profile",
+            "prices what is not active by a static profile, as if nothing disturbed it; only "
+            "the utilisation follows what is seen. This is how we read the paper's static "
+            "profiling.",
+            style=1,
+        ),
+        "shadow": EstimatorEntry(
+            "dwell.estimators.shadow:Shadow",
+            "sends some cycles through the other placements as well, and prices these by what "
+            "the copies took. The copies cost compute time and bandwidth, which are paid for here.",
+            style=2,
+            shadows=True,
+        ),
+        "scaling": EstimatorEntry(
+            "dwell.estimators.scaling:Scaling",
+            "prices the other placements by upper bounds: what was measured where the pipeline "
+            "runs, times the known ratio of the nodes' compute times, plus the links' declared "
+            "bounds.",
+            style=3,
+        ),
+        "corrected": EstimatorEntry(
+            "dwell.estimators.corrected:Corrected",
+            "keeps the times of every task on every node and of every message on every link, "
+            "begins with the profile's, corrects them by what active and shadow jobs reveal, and "
+            "forgets them with age. It is ours.",
+            style=0,
+            shadows=True,
+        ),
+    }
+)
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all estimators: ours, then those of installed packages by name."""
+    return (*REGISTRY, *sorted(installed(GROUP, REGISTRY)))
+
+
+def shadowing() -> frozenset[str]:
+    """Return the names of the estimators of ours that send shadow jobs."""
+    return frozenset(name for name, entry in REGISTRY.items() if entry.shadows)
 
 
 def by_name(name: str, problem: Problem) -> Estimator:
@@ -31,12 +100,15 @@ def by_name(name: str, problem: Problem) -> Estimator:
     Raises
     ------
     ProblemError
-        If there is none of that name; the message lists the known ones.
+        If there is none of that name (the message lists the known ones), or the package that
+        declares it cannot be imported.
     """
-    if name not in REGISTRY:
-        hint = nearest_of(name, REGISTRY, "estimators")
-        raise ProblemError(f"unknown estimator {name!r}; {hint}")
-    return REGISTRY[name](problem)
+    if name in REGISTRY:
+        return cast("Estimator", class_at(REGISTRY[name].path)(problem))
+    others = installed(GROUP, REGISTRY)
+    if name in others:
+        return _made(loaded(others[name], "estimator", ProblemError), problem)
+    raise ProblemError(f"unknown estimator {name!r}; {nearest_of(name, names(), 'estimators')}")
 
 
 def name_in_run(meta: Mapping[str, Any]) -> str:
@@ -53,8 +125,14 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
         If it is none of these.
     """
     told = str(meta.get("estimator") or "profile")
-    names = {getattr(maker, "__name__", name): name for name, maker in REGISTRY.items()}
-    name = names.get(told, told)
+    classes = {entry.path.partition(":")[2]: name for name, entry in REGISTRY.items()}
+    name = classes.get(told, told)
     if name not in REGISTRY:
         raise RunError(f"estimator {told!r} is not known (here: {', '.join(REGISTRY)})")
     return name
+
+
+def _made(kind: Any, problem: Problem) -> Estimator:
+    """Make an estimator by its class's ``from_problem``, else of the problem."""
+    make = getattr(kind, "from_problem", None)
+    return cast("Estimator", kind(problem) if make is None else make(problem))

@@ -29,10 +29,8 @@ from dwell.model.scenario import Scenario
 from dwell.model.semantics import Parts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
-__all__ = ["ESTIMATORS", "MIGRATIONS", "POLICIES", "ControllerSettings", "Problem"]
+__all__ = ["MIGRATIONS", "ControllerSettings", "Problem"]
 
-POLICIES = ("dtp", "atp", "atp-thresholds", "latency-first", "work-function", "cusum")
-ESTIMATORS = ("profile", "shadow", "scaling", "corrected")
 MIGRATIONS = ("warm", "cold")
 
 
@@ -106,8 +104,6 @@ class ControllerSettings:
         object.__setattr__(self, "fallbacks", tuple(self.fallbacks))
         SHADOW_FRACTION.check("shadow_fraction", self.shadow_fraction)
         HALF_LIFE_WINDOWS.check("half_life_windows", self.half_life_windows)
-        bound = f"one of {', '.join(ESTIMATORS)}"
-        require(self.estimator in ESTIMATORS, "estimator", self.estimator, bound)
         bound = f"one of {', '.join(MIGRATIONS)}"
         require(self.migration in MIGRATIONS, "migration", self.migration, bound)
 
@@ -191,7 +187,6 @@ class Problem:
             },
             controller=self.controller,
             tiers=self.objective.tiers,
-            reserved=POLICIES,
             live=self.live,
         )
 

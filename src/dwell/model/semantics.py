@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
+from dwell.model.bounds import shown
 from dwell.model.fabric import Link, Node
 from dwell.model.live import LiveSettings
 from dwell.model.pipeline import Flow, Task
@@ -32,8 +33,7 @@ __all__ = ["Parts", "find_faults", "nearest", "nearest_of", "too_many_shadows"]
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
 LONGEST_NAME = 64
-# Estimators that send shadow jobs, and how far shares may sum up beyond 1 by rounding.
-SHADOWING = ("shadow", "corrected")
+# How far shares may sum up beyond 1 by rounding.
 SHARE_TOLERANCE = 1e-9
 
 
@@ -43,6 +43,10 @@ class Parts:
 
     A value of None is a part whose name is known but whose content could not be read (its own
     fault is reported elsewhere): references to it resolve, and nothing more is asked of it.
+
+    ``policies`` and ``estimators`` are the names that there are, and ``shadowing`` the estimators
+    that send shadow jobs. Where they are None names are not judged: whoever makes a policy or an
+    estimator does that.
     """
 
     nodes: Mapping[str, Node | None] = field(default_factory=dict)
@@ -56,7 +60,9 @@ class Parts:
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
     controller: ControllerSettings | None = None
     tiers: Iterable[str] = ()
-    reserved: Iterable[str] = ()
+    policies: Sequence[str] | None = None
+    estimators: Sequence[str] | None = None
+    shadowing: Collection[str] = ()
     live: LiveSettings | None = None
 
 
@@ -224,7 +230,7 @@ def _candidates(parts: Parts) -> Iterator[Fault]:
         yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
     for name, moves in parts.candidates.items():
         path = f"candidates.{name}"
-        if name in parts.reserved:
+        if name in (parts.policies or ()):
             yield Fault(path, f"the name {name!r} is a policy's; choose another for the placement")
         faults = list(_placed(parts, path, moves))
         yield from faults
@@ -347,9 +353,15 @@ def _controller(parts: Parts) -> Iterator[Fault]:
         yield from _unknown("controller.initial", "candidate", settings.initial, names)
     for index, name in enumerate(settings.fallbacks):
         yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
-    known = [*parts.reserved, *names]
-    yield from _unknown("controller.policy", "policy", settings.policy, known)
-    yield from _shadow_budget(settings, len(names))
+    if parts.policies is not None:
+        known = [*parts.policies, *names]
+        yield from _unknown("controller.policy", "policy", settings.policy, known)
+    if parts.estimators is not None and settings.estimator not in parts.estimators:
+        bound = f"one of {', '.join(parts.estimators)}"
+        message = f"{shown(settings.estimator)} is not allowed; it must be {bound}"
+        yield Fault("controller.estimator", message)
+    if settings.estimator in parts.shadowing:
+        yield from _shadow_budget(settings, len(names))
     if settings.migration == "cold" and parts.links_complete:
         yield from _state_transfers(parts)
 
@@ -373,9 +385,8 @@ def _live(parts: Parts) -> Iterator[Fault]:
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:
-    """Shadow jobs that the estimator does not ask for cost nothing."""
     message = too_many_shadows(settings.shadow_fraction, candidates)
-    if message and settings.estimator in SHADOWING:
+    if message:
         yield Fault("controller.shadow_fraction", message)
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import PolicyError
+from dwell.model.entry_points import class_at, installed, loaded
 from dwell.model.semantics import nearest_of
 
 if TYPE_CHECKING:
@@ -121,7 +120,7 @@ FAMILIES: Mapping[str, PolicyEntry] = MappingProxyType(
 
 def names() -> tuple[str, ...]:
     """Return the names of all policies: ours, then those of installed packages by name."""
-    return (*REGISTRY, *sorted(_installed()))
+    return (*REGISTRY, *sorted(installed(GROUP, REGISTRY)))
 
 
 def by_name(name: str, problem: Problem) -> Policy:
@@ -136,22 +135,23 @@ def by_name(name: str, problem: Problem) -> Policy:
     Raises
     ------
     PolicyError
-        If there is none of that name (the message lists the known ones), the problem has no
-        candidates that the policy could work with, or the package that declares the policy cannot
-        be imported.
+        If there is none of that name (the message lists the known ones), a candidate has it, too,
+        the problem has no candidates that the policy could work with, or the package that declares
+        the policy cannot be imported.
     """
+    if name in REGISTRY and name in problem.candidates:
+        raise PolicyError(f"{name!r} is a policy's name and a candidate's; rename the candidate")
     if name in REGISTRY:
-        module, _, attribute = REGISTRY[name].path.partition(":")
-        return _made(getattr(import_module(module), attribute), problem)
+        return _made(class_at(REGISTRY[name].path), problem)
     if name in problem.candidates:
-        static = import_module("dwell.policies.static").Static
+        static = class_at("dwell.policies.static:Static")
         return cast(
             "Policy",
             static(candidates=problem.candidates, initial=name, objective=problem.objective),
         )
-    installed = _installed()
-    if name in installed:
-        return _made(_loaded(installed[name]), problem)
+    others = installed(GROUP, REGISTRY)
+    if name in others:
+        return _made(loaded(others[name], "policy", PolicyError), problem)
     known = [*names(), *problem.candidates]
     raise PolicyError(f"unknown policy {name!r}; {nearest_of(name, known, 'policies')}")
 
@@ -167,22 +167,6 @@ def name_of_class(kind: str) -> str | None:
         if entry.path.partition(":")[2] == kind:
             return name
     return None
-
-
-def _installed() -> dict[str, EntryPoint]:
-    """Return the policies of other packages; none takes a name of ours."""
-    return {one.name: one for one in entry_points(group=GROUP) if one.name not in REGISTRY}
-
-
-def _loaded(entry: EntryPoint) -> Any:
-    try:
-        return entry.load()
-    except Exception as error:
-        package = entry.dist.name if entry.dist is not None else "an unnamed package"
-        raise PolicyError(
-            f"policy {entry.name!r} of the package {package} ({entry.value}) cannot be imported: "
-            f"{type(error).__name__}: {error}"
-        ) from error
 
 
 def _made(kind: Any, problem: Problem) -> Policy:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
 from dwell.policies.registry import FAMILIES
 from dwell.report.formatting import OURS, shown_contender
@@ -22,15 +23,7 @@ POLICIES = {
 }
 #: By what stands in brackets behind a policy.
 BELIEFS = {
-    "profile": "prices what is not active by a static profile, as if nothing disturbed it; only "
-    "the utilisation follows what is seen. This is how we read the paper's static profiling.",
-    "shadow": "sends some cycles through the other placements as well, and prices these by what "
-    "the copies took. The copies cost compute time and bandwidth, which are paid for here.",
-    "scaling": "prices the other placements by upper bounds: what was measured where the pipeline "
-    "runs, times the known ratio of the nodes' compute times, plus the links' declared bounds.",
-    "corrected": "keeps the times of every task on every node and of every message on every link, "
-    "begins with the profile's, corrects them by what active and shadow jobs reveal, and forgets "
-    "them with age. It is ours.",
+    **{name: estimator.sentence for name, estimator in ESTIMATORS.items()},
     "hindsight": "is told, one window late, what every placement would have cost: what the rule "
     "does with estimates that are right.",
 }

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.policies import registry
 
 __all__ = [
@@ -63,7 +64,7 @@ FAMILIES = {
     "best static": MUTED,
 }
 #: Places of what a policy believes: each has its marker and dashes, whoever else is shown.
-BELIEFS = ("corrected", "profile", "shadow", "scaling", "hindsight")
+BELIEFS = (*sorted(ESTIMATORS, key=lambda name: ESTIMATORS[name].style), "hindsight")
 VARIANTS = ("tuned", "escape", "dwell", "thresholds")
 
 
