@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import tempfile
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import ProfileError
+from dwell.files import write_whole
 from dwell.model.semantics import LONGEST_NAME, NAME
 
 __all__ = [
@@ -168,7 +167,8 @@ def write_profile(path: Path, measurements: Sequence[Measurement]) -> None:
     text = json.dumps({"format": FORMAT, "measurements": about}, allow_nan=False)
     written = io.BytesIO()
     frame.write_parquet(written, metadata={KEY: text})
-    _put(path, written.getvalue())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, written.getvalue())
 
 
 def _require_one_length(rows: Mapping[str, int]) -> None:
@@ -178,19 +178,6 @@ def _require_one_length(rows: Mapping[str, int]) -> None:
             f"numbers of rows differ ({listed}), and the columns of one file share their rows; "
             "measure as many runs everywhere, or keep separate files (a cell may name several)"
         )
-
-
-def _put(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}-", dir=path.parent)
-    draft = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        draft.chmod(0o644)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def read_profile(path: Path) -> tuple[Measurement, ...]:

@@ -10,15 +10,16 @@ import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dwell.cellfile.rendering import as_read
 from dwell.errors import RunError, SimulationError
+from dwell.files import write_whole
 
-__all__ = ["Claim", "Description", "claimed", "unwritable", "write_whole"]
+__all__ = ["Claim", "Description", "claimed", "unwritable"]
 
 # How many differences from other work are listed.
 LISTED = 4
@@ -99,8 +100,8 @@ def _require_kind(folder: Path, claim: Claim) -> None:
     if (folder / claim.file).is_file():
         return
     # Killed at its very beginning, the work leaves these.
-    known: Collection[str] = {*claim.folders, f".{claim.file}.draft"}
-    if any(path.name not in known for path in folder.iterdir()):
+    drafts = f".{claim.file}*.draft"
+    if any(one.name not in claim.folders and not one.match(drafts) for one in folder.iterdir()):
         raise RunError(f"{folder} exists and is no {claim.what}; choose another folder")
 
 
@@ -122,7 +123,7 @@ def _take(folder: Path, claim: Claim, description: Description) -> None:
         return
     try:
         text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)
-        write_whole(path, f"{text}\n".encode())
+        write_whole(path, f"{text}\n")
     except OSError as error:
         raise unwritable(path, error) from None
 
@@ -158,28 +159,3 @@ def _shown(value: object) -> str:
         text = ", ".join(str(item) for item in value)
         return text if len(text) <= 60 else f"{text[:57]}..."
     return as_read(value)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that appears complete or not at all, and stays when the power goes.
-
-    Raises
-    ------
-    OSError
-        If that fails; an older file of the name stays then.
-    """
-    draft = path.with_name(f".{path.name}.draft")
-    try:
-        with draft.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
-    handle = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Self
 
 from dwell.errors import LiveError
+from dwell.files import write_whole
 
 __all__ = ["CLOCKS", "ClockFile", "wrong_clock"]
 
@@ -58,10 +59,8 @@ class ClockFile:
         names = json.dumps(self.nodes).encode()
         content = bytearray(_HEAD.size + _NODE_BYTES * len(self.nodes))
         _HEAD.pack_into(content, 0, _MAGIC, len(names))
-        draft = path.with_name(f"{path.name}.new")
         try:
-            draft.write_bytes(content + names)
-            draft.replace(path)
+            write_whole(path, bytes(content + names), durable=False)
             with path.open("r+b") as file:
                 self._map = mmap.mmap(file.fileno(), len(content))
         except OSError as error:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import psutil
 
+from dwell.files import write_whole
 from dwell.live.files import InFlight
 from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running
 from dwell.live.log import printable
@@ -224,12 +225,12 @@ class Supervisor:
 
     def _write_mark(self, child: Child) -> None:
         """Write who runs; the mark of somebody before it must not stay."""
-        draft = child.mark.with_suffix(".new")
         try:
             child.mark.unlink(missing_ok=True)
             started = psutil.Process(child.pid).create_time()
-            draft.write_text(json.dumps({"pid": child.pid, "started": started}))
-            draft.replace(child.mark)
+            mark = json.dumps({"pid": child.pid, "started": started})
+            # Nobody waits for a slow disk: after a loss of power no process runs.
+            write_whole(child.mark, mark, durable=False)
         except OSError as error:
             self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
         except psutil.NoSuchProcess:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import ProblemError, RunError
+from dwell.files import write_whole
 from dwell.model import Problem, Scenario
 from dwell.record.journal import JOURNAL, Journal, read_journal
 from dwell.record.schema import SCHEMA_VERSION, TABLES
@@ -336,32 +337,22 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
         try:
             for name, table in found._tables.items():
                 frame = table() if callable(table) else table
-                _write(folder / f"{name}.parquet", partial(_write_table, frame))
+                write_whole(folder / f"{name}.parquet", partial(_write_table, frame))
             # From here on the folder is a finished run.
-            _write(file, lambda draft: draft.write_text(text, encoding="utf-8"))
+            write_whole(file, text)
         except OSError as error:
             raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
     elif meta:
         text = json.dumps({**open_run(folder).meta, **meta}, indent=2) + "\n"
         try:
-            _write(file, lambda draft: draft.write_text(text, encoding="utf-8"))
+            write_whole(file, text)
         except OSError as error:
             raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    # Whoever was killed at sealing it left a draft.
+    for draft in folder.glob(".*.draft"):
+        draft.unlink(missing_ok=True)
     journal.unlink(missing_ok=True)
     return open_run(folder)
-
-
-def _write(file: Path, write: Callable[[Path], object]) -> None:
-    """Write a file so that it is there as a whole, also after a loss of power, or not at all."""
-    draft = file.with_name(f".{file.name}.draft")
-    try:
-        write(draft)
-        with draft.open("rb") as stream:
-            os.fsync(stream.fileno())
-        draft.replace(file)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
 
 
 def _write_table(table: pl.DataFrame, file: Path) -> None:

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dwell.cellfile.work_folder import Claim, Description, claimed, unwritable, write_whole
+from dwell.cellfile.work_folder import Claim, Description, claimed, unwritable
 from dwell.errors import RunError
+from dwell.files import write_whole
 
 if TYPE_CHECKING:
     import polars as pl

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
+from dwell.files import write_whole
 from dwell.model import Problem, Trace
 from dwell.testbed.measured import Measured, look_at, usable
 from dwell.testbed.message_costs import OnTheWay, floors, hops, own_delays
@@ -398,9 +399,7 @@ def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[
     )
     head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
     head += f"# Runs: {names}\n"
-    draft = out.with_name(f".{out.name}.draft")
-    draft.write_text(head + text, encoding="utf-8")
-    draft.replace(out)
+    write_whole(out, head + text)
 
 
 def _missing(

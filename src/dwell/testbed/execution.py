@@ -17,8 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from dwell.cellfile.work_folder import Claim, claimed, unwritable, write_whole
+from dwell.cellfile.work_folder import Claim, claimed, unwritable
 from dwell.errors import DwellError, LiveError, RunError
+from dwell.files import write_whole
 from dwell.model import Problem
 from dwell.record import Run, open_run
 from dwell.testbed.campaign import TRACES, Campaign, Entrant, Planned
@@ -269,7 +270,7 @@ class _Attempts:
         target = place / (f"{planned.name}.{number}" if run is None else planned.name)
         try:
             text = json.dumps(record, indent=2, allow_nan=False)
-            write_whole(source / ATTEMPT, f"{text}\n".encode())
+            write_whole(source / ATTEMPT, f"{text}\n")
             source.rename(target)
         except OSError as error:
             raise unwritable(target, error) from None

@@ -18,6 +18,7 @@ from types import TracebackType
 from typing import Self, cast
 
 from dwell.errors import LiveError
+from dwell.files import write_whole
 from dwell.testbed.cgroups import Cgroups, find_cgroups
 from dwell.testbed.groups import group_name, remove_group
 from dwell.testbed.hosts import namespace_name, namespace_path, remove_namespace
@@ -162,9 +163,8 @@ class Claim:
             )
 
     def _write(self) -> None:
-        draft = self._record.with_suffix(".draft")
-        draft.write_text(json.dumps({"pid": os.getpid(), "namespaces": self._namespaces}))
-        draft.replace(self._record)
+        record = json.dumps({"pid": os.getpid(), "namespaces": self._namespaces})
+        write_whole(self._record, record, durable=False)
 
 
 def _same(handle: int, path: Path) -> bool:

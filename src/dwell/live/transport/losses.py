@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Self
 
 from dwell.errors import LiveError
+from dwell.files import write_whole
 
 __all__ = ["LOSSES", "LossFile", "Losses", "target_of"]
 
@@ -69,10 +70,8 @@ class LossFile:
         names = json.dumps(self.nodes).encode()
         content = bytearray(_HEAD.size + _VALUE_BYTES * len(self.nodes) ** 2)
         _HEAD.pack_into(content, 0, _MAGIC, seed, len(names))
-        draft = path.with_name(f"{path.name}.new")
         try:
-            draft.write_bytes(content + names)
-            draft.replace(path)
+            write_whole(path, bytes(content + names), durable=False)
         except OSError as error:
             raise LiveError(f"{path}: cannot be written ({error.strerror})") from None
         self._values = _values(path, len(self.nodes), mmap.ACCESS_WRITE)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 from dwell.errors import TrustError
+from dwell.files import write_whole
 
 __all__ = ["ROLES", "Role", "Roster", "Subject", "write_private"]
 
@@ -176,14 +175,7 @@ def write_private(path: Path, data: bytes | str) -> None:
     TrustError
         If it cannot be written.
     """
-    content = data.encode() if isinstance(data, str) else data
     try:
-        # mkstemp makes files with mode 0600.
-        descriptor, draft = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(draft).replace(path)
+        write_whole(path, data, private=True)
     except OSError as error:
         raise TrustError(f"{path}: cannot be written ({error.strerror})") from None
