@@ -119,6 +119,31 @@ def test_a_simulation_without_a_package_says_how_to_get_it(module: str, tmp_path
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("module", "work", "extra"),
+    [
+        ("numba", "import dwell; dwell.simulate", "sim"),
+        (
+            "msgspec",
+            "from dwell.cli.process import main; "
+            "sys.exit(main(['--cell', 'live/cell.yaml', '--who', 'stamper@R1', '--state', '/']))",
+            "live",
+        ),
+    ],
+)
+def test_a_package_that_is_missing_is_named_to_programs(module: str, work: str, extra: str) -> None:
+    script = f"import sys; sys.modules[{module!r}] = None; {work}"
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=ROOT / "examples",
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode != 0
+    assert f"is not installed; pip install 'dwell-placement[{extra}]'" in done.stderr
+
+
 def test_the_tests_use_what_their_group_has(project: dict[str, Any]) -> None:
     group = named(project["dependency-groups"]["test"]) - NOT_IMPORTED
     assert group <= imported("tests", "benchmarks")

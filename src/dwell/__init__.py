@@ -37,10 +37,21 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for, and nothing else (PEP 562)."""
+    """Import what is asked for, and nothing else (PEP 562).
+
+    Raises
+    ------
+    DwellError
+        If it needs a package that is not installed; with the command that installs it.
+    """
     if name not in _HOME:
         raise AttributeError(f"module 'dwell' has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+    try:
+        return getattr(import_module(_HOME[name]), name)
+    except ModuleNotFoundError as error:
+        from dwell.errors import missing_package
+
+        raise missing_package(error) or error from error
 
 
 def __dir__() -> list[str]:

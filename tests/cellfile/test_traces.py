@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
+import yaml
 
-from dwell.cellfile import from_document
+from dwell.cellfile import from_document, load, load_without_traces
 from dwell.errors import ProblemError, TraceError
 from dwell.model import Problem, Trace, TraceTable
-from dwell.model.document import to_document
+from dwell.model.document import fingerprint, to_document
 
 REAL = Path(__file__).parents[2].parent / "shared" / "data"
 needs_real = pytest.mark.skipif(
@@ -262,6 +265,50 @@ def test_a_declaration_at_fault(
     assert fault.path == f"{LINK}.{path}"
     for word in words:
         assert word in fault.message
+
+
+@pytest.mark.parametrize(("file", "words"), [("t.csv", "up"), ("t.parquet", "needs Polars")])
+def test_traces_without_polars(recorded: Path, file: str, words: str) -> None:
+    """In a process of its own: this one has imported it."""
+    cell = {"file": file, "column": "up", "on_negative": "clip"}
+    document = _cell(cell, {**cell, "column": "run"})
+    (recorded / "cell.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
+    script = (
+        "import sys; sys.modules['polars'] = None\n"
+        "from dwell import load\n"
+        "from dwell.errors import TraceError\n"
+        "try:\n"
+        "    trace = load('cell.yaml').fabric.links['R->E'].delay_ms\n"
+        "    print(trace.column, trace.table.columns['up'].tolist())\n"
+        "except TraceError as error:\n"
+        "    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=recorded, check=True, capture_output=True, text=True
+    )
+    assert words in done.stdout
+    if file == "t.csv":
+        assert done.stdout == "up [1.0, 0.0, 3.0, 4.0, 5.0, 6.0, 7.0]\n"
+    else:
+        assert "pip install 'dwell-placement[sim]', or record the trace as CSV" in done.stdout
+
+
+def test_a_node_of_a_live_cell_reads_no_traces(recorded: Path) -> None:
+    cell = {"file": "t.csv", "column": "up", "on_negative": "clip"}
+    document = _cell(cell, {**cell, "column": "run"})
+    file = recorded / "cell.yaml"
+    file.write_text(yaml.safe_dump(document), encoding="utf-8")
+    there = load(file)
+    (recorded / "t.csv").unlink()
+    node = load_without_traces(file)
+    # They agree on the cell: its data are the controller's alone.
+    assert fingerprint(node) == fingerprint(there)
+    cell["column"] = "run"
+    file.write_text(yaml.safe_dump(_cell(cell, cell)), encoding="utf-8")
+    assert fingerprint(load_without_traces(file)) != fingerprint(there)
+    file.write_text("dwell: 1\nperiod_ms: 0", encoding="utf-8")
+    with pytest.raises(ProblemError, match="period_ms"):
+        load_without_traces(file)
 
 
 # ------------------------------------------------------------------------ recorded problems

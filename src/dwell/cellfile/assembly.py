@@ -90,12 +90,15 @@ class Assembly:
         Holds the faults so far, takes those found here.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
+    judged : bool
+        Whether policies and estimators must be known here. A record names what its machine had.
     """
 
     entry: CellEntry
     tables: Tables | None
     faults: Faults
     anchored: bool = False
+    judged: bool = True
 
     def problem(self, name: str) -> Problem:
         """Return the problem.
@@ -131,8 +134,6 @@ class Assembly:
             for name, items in (entry.scenarios or {}).items()
         }
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
-        # A record names what its machine had, whatever this one has.
-        judged = self.tables is not None
         parts = Parts(
             nodes=nodes,
             links=links,
@@ -145,9 +146,9 @@ class Assembly:
             scenarios=scenarios,
             controller=controller,
             tiers=objective.tiers if objective is not None else (),
-            policies=policies.names() if judged else None,
-            estimators=estimators.names() if judged else None,
-            shadowing=estimators.shadowing() if judged else (),
+            policies=policies.names() if self.judged else None,
+            estimators=estimators.names() if self.judged else None,
+            shadowing=estimators.shadowing() if self.judged else (),
             live=live,
         )
         if not self.anchored:

@@ -19,7 +19,7 @@ from dwell.model import Problem
 if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables
 
-__all__ = ["from_document", "from_record", "load", "read_problem"]
+__all__ = ["from_document", "from_record", "load", "load_without_traces", "read_problem"]
 
 
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
@@ -42,18 +42,56 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
         With every fault found in the file and in its traces, each with its line and field path; a
         TraceError where the traces alone are at fault.
     """
-    from dwell.cellfile.yaml_text import read_yaml
+    source = fspath(path)
+    faults = Faults(source)
+    text = _read_text(source, faults)
+    folder = Path(source).parent if traces is None else Path(traces)
+    return read_problem(text, faults, folder, Path(source).stem or "cell")
+
+
+def load_without_traces(path: str | PathLike[str]) -> Problem:
+    """Read a cell file and none of the traces that it names: a live cell draws nothing from them.
+
+    Parameters
+    ----------
+    path : str or path
+
+    Returns
+    -------
+    Problem
+        With an `UnreadTrace` for every trace.
+
+    Raises
+    ------
+    ProblemError
+        With every fault found in the file, each with its line and field path.
+    """
+    from dwell.cellfile.assembly import Assembly
+    from dwell.cellfile.structure import CELL, read_structure
 
     source = fspath(path)
     faults = Faults(source)
+    entry = read_structure(_read_text(source, faults), faults, CELL)
+    return Assembly(entry, None, faults).problem(Path(source).stem or "cell")
+
+
+def _read_text(source: str, faults: Faults) -> object:
+    """Return what a cell file says.
+
+    Raises
+    ------
+    ProblemError
+        If it is no YAML, or no cell.
+    """
+    from dwell.cellfile.yaml_text import read_yaml
+
     text = read_yaml(source, faults)
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
     if isinstance(text, dict) and "dwell-study" in text and "dwell" not in text:
         faults.add("dwell-study", "this is a study, not a cell; run it by `dwell study FILE`")
         raise faults.error()
-    folder = Path(source).parent if traces is None else Path(traces)
-    return read_problem(text, faults, folder, Path(source).stem or "cell")
+    return text
 
 
 def from_document(
@@ -114,7 +152,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
 
     faults = Faults()
     entry = read_structure(document, faults, CELL)
-    return Assembly(entry, None, faults, anchored=True).problem("cell")
+    return Assembly(entry, None, faults, anchored=True, judged=False).problem("cell")
 
 
 def read_problem(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.cellfile.columns import SUFFIXES, Column, UnreadableError, column_names, read_columns
 from dwell.cellfile.entries import TraceEntry
 from dwell.cellfile.faults import Faults
 from dwell.cellfile.traces import Source
@@ -20,15 +22,11 @@ from dwell.model.bounds import VALUE
 from dwell.model.document import digest
 from dwell.model.semantics import nearest
 
-if TYPE_CHECKING:
-    import polars as pl
-
 __all__ = ["Reading"]
 
 Floats: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
-
-SUFFIXES = (".parquet", ".csv")
+Frame: TypeAlias = Mapping[str, Column]
 
 RELATIVE = (
     "file names are relative to the cell file's folder, or to the one given as `traces` "
@@ -57,7 +55,7 @@ class Reading:
     faults: Faults
     failed: bool = field(default=False, init=False)
 
-    def table(self, frame: pl.DataFrame) -> TraceTable | None:
+    def table(self, frame: Frame) -> TraceTable | None:
         """Return the table of the columns read, or None beside at least one fault."""
         values = {name: _floats(frame[name]) for name in dict.fromkeys(self._columns())}
         starts = self._starts(frame)
@@ -66,7 +64,7 @@ class Reading:
             time = _floats(frame[self.source.time])
         keep, clipped = self._judge(values, time)
         if not self.failed and not keep.any():
-            self._fail("file", f"none of its {frame.height} rows is left after `on_negative: drop`")
+            self._fail("file", f"none of its {len(keep)} rows is left after `on_negative: drop`")
         if self.failed:
             return None
         if self.source.on_negative == "clip":
@@ -99,14 +97,10 @@ class Reading:
     def _columns(self) -> Iterator[str]:
         return (entry.column for _, entry in self.uses)
 
-    def frame(self) -> pl.DataFrame | None:
+    def frame(self) -> Frame | None:
         """Return the columns that the cell uses, of the right types, at least one row."""
-        import polars as pl
-        from polars.selectors import by_name
-
         path = self.folder / self.source.file
-        suffix = path.suffix.lower()
-        if suffix not in SUFFIXES:
+        if path.suffix.lower() not in SUFFIXES:
             endings = " or ".join(SUFFIXES)
             message = f"{self.source.file!r} must end in {endings}, which says how to read it"
             self._fail("file", message)
@@ -116,26 +110,17 @@ class Reading:
             self._fail("file", f"{path} {what}; {_beside(path)}")
             return None
         try:
-            lazy = (
-                pl.scan_parquet(path)
-                if suffix == ".parquet"
-                else pl.scan_csv(path, infer_schema_length=None)
-            )
-            if not self._has_columns(lazy.collect_schema().names()):
+            if not self._has_columns(column_names(path)):
                 return None
             wanted = [*self._columns(), *self.source.groups, self.source.time]
-            # By exact name: elsewhere polars takes ^x$ and * for patterns.
-            frame = lazy.select(by_name(*dict.fromkeys(filter(None, wanted)))).collect()
-        except pl.exceptions.NoDataError:
-            self._fail("file", f"{path} is empty; record it again, or name another")
-        except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-            reason = str(error).partition("\n")[0]
-            self._fail("file", f"{path} cannot be read: {reason}")
-        else:
-            if frame.height > 0:
-                return frame if self._has_numbers(frame.schema) else None
+            frame = read_columns(path, [name for name in wanted if name is not None])
+        except UnreadableError as error:
+            self._fail("file", str(error))
+            return None
+        if not len(next(iter(frame.values())).values):
             self._fail("file", f"{path} has no rows; record it again, or name another")
-        return None
+            return None
+        return frame if self._has_numbers(frame) else None
 
     def _named(self) -> Iterator[tuple[str, str, str]]:
         """Yield place, key and value of every column with numbers that is named."""
@@ -154,32 +139,35 @@ class Reading:
                 self._fail(key, message, path)
         return not self.failed
 
-    def _has_numbers(self, types: Mapping[str, pl.DataType]) -> bool:
+    def _has_numbers(self, frame: Frame) -> bool:
         for path, key, name in self._named():
-            if not types[name].is_numeric():
-                message = f"column {name!r} holds {types[name]}; it must hold numbers"
+            if frame[name].kind:
+                message = f"column {name!r} holds {frame[name].kind}; it must hold numbers"
                 self._fail(key, f"{message}: name another, or record it again", path)
         return not self.failed
 
-    def _starts(self, frame: pl.DataFrame) -> NDArray[np.int64]:
+    def _starts(self, frame: Frame) -> NDArray[np.int64]:
         """Return the first row of every group; each must stand in one piece."""
-        import polars as pl
-
         if not self.source.groups:
             return np.zeros(1, np.int64)
-        groups = frame[list(dict.fromkeys(self.source.groups))]
-        runs = groups.select(pl.struct(pl.all()).rle_id()).to_series().to_numpy()
-        starts = np.flatnonzero(np.diff(runs, prepend=-1)).astype(np.int64)
-        first = groups[starts].select(pl.struct(pl.all()).is_first_distinct()).to_series()
-        if not first.all():
-            row = int(starts[int((~first).arg_max() or 0)])
-            values = ", ".join(str(value) for value in groups.row(row))
-            self._fail(
-                "group",
-                f"group {values} begins again at row {row + 1} after another group; sort the file "
-                "so that the rows of each group stand together",
-            )
-        return starts
+        columns = [_labels(frame[name]) for name in dict.fromkeys(self.source.groups)]
+        starts: list[int] = []
+        before: tuple[object, ...] | None = None
+        seen: set[tuple[object, ...]] = set()
+        for row, labels in enumerate(zip(*columns, strict=True)):
+            if labels == before:
+                continue
+            if labels in seen and not self.failed:
+                values = ", ".join(map(_label, labels))
+                self._fail(
+                    "group",
+                    f"group {values} begins again at row {row + 1} after another group; sort the "
+                    "file so that the rows of each group stand together",
+                )
+            seen.add(labels)
+            starts.append(row)
+            before = labels
+        return np.array(starts, np.int64)
 
     def _judge(self, values: dict[str, Floats], time: Floats | None) -> tuple[Mask, int]:
         """Return which rows stay, and how many were clipped; what may not be is a fault."""
@@ -246,11 +234,20 @@ class Reading:
                 )
 
 
-def _floats(series: pl.Series) -> Floats:
-    """Return a column as float64, NaN where a value is missing."""
-    import polars as pl
+def _floats(column: Column) -> Floats:
+    return np.asarray(column.values, np.float64)
 
-    return series.cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+def _labels(column: Column) -> list[object]:
+    """Return the values of a group; one that is missing is equal to another."""
+    missing = (isinstance(value, float) and math.isnan(value) for value in column.values.tolist())
+    pairs = zip(column.values.tolist(), missing, strict=True)
+    return [None if absent else value for value, absent in pairs]
+
+
+def _label(value: object) -> str:
+    """Return a value of a group as its file has it: whole numbers without a point."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _kept_starts(starts: NDArray[np.int64], keep: Mask) -> NDArray[np.int64]:

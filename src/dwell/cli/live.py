@@ -90,14 +90,14 @@ def agent(
     insecure: Insecure = False,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
-    import dwell
+    from dwell.cellfile import load_without_traces
     from dwell.cli.process import server, words
     from dwell.live.lint import lint
     from dwell.live.node import run_agent
     from dwell.live.stage import load_function
     from dwell.live.wiring import roles
 
-    problem = dwell.load(cell)
+    problem = load_without_traces(cell)
     for caution in lint(problem):
         _say(f"warning: {caution}")
     folder = state or _state_folder() / problem.name / node
@@ -182,10 +182,10 @@ def status(
     """Show how a cell is, and first what is wrong with it."""
     if check and watch:
         raise typer.BadParameter("--check looks once; leave --watch out")
-    import dwell
+    from dwell.cellfile import load_without_traces
     from dwell.live.operator_client import OperatorClient
 
-    with OperatorClient(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
+    with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
         if watch:
             _watch(visitor, as_json=as_json)
         found = visitor.look()
@@ -321,10 +321,10 @@ def chaos(
 def _ask(
     cell: Path, what: str, about: str, keys: Path | None, *, insecure: bool, as_json: bool
 ) -> None:
-    import dwell
+    from dwell.cellfile import load_without_traces
     from dwell.live.operator_client import OperatorClient
 
-    with OperatorClient(dwell.load(cell), environment(keys, insecure=insecure)) as visitor:
+    with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
         found = visitor.ask(what, about)
     if as_json:
         print_json(found)

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from dwell.errors import DwellError
+from dwell.errors import DwellError, missing_package
 
 __all__ = ["main", "server", "words"]
 
@@ -75,17 +75,23 @@ def main(arguments: list[str] | None = None) -> int:
     except DwellError as error:
         print(error, file=sys.stderr)
         return 2
+    except ModuleNotFoundError as error:
+        missing = missing_package(error)
+        if missing is None:
+            raise
+        print(missing, file=sys.stderr)
+        return 2
     return 0
 
 
 def _serve(cell: Path) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
     from dwell.calibration import memory  # noqa: F401
-    from dwell.cellfile import load
+    from dwell.cellfile import load_without_traces
     from dwell.live import parent_death, process  # noqa: F401
     from dwell.live.launcher import serve
 
-    load(cell)
+    load_without_traces(cell)
     asked = serve()
     if asked is None:
         return 0
@@ -104,7 +110,7 @@ def _run(asked: argparse.Namespace) -> None:
     sys.path.insert(0, str(asked.cell.resolve().parent))
 
     from dwell.calibration.memory import keep_memory
-    from dwell.cellfile import load
+    from dwell.cellfile import load_without_traces
     from dwell.live.log import escape_output
     from dwell.live.parent_death import end_with_owner
     from dwell.live.process import run_process
@@ -113,7 +119,7 @@ def _run(asked: argparse.Namespace) -> None:
     escape_output()
     keep_memory()
     end_with_owner(stopped)
-    run_process(load(asked.cell), asked.who, asked.state, stopped)
+    run_process(load_without_traces(asked.cell), asked.who, asked.state, stopped)
 
 
 def _name(who: str) -> None:

@@ -326,8 +326,9 @@ def _dataclass(part: Any) -> Document:
 def fingerprint(problem: Problem) -> str:
     """Return a short digest of what all nodes of a live cell have to agree on.
 
-    Left out is what each node may say for itself: the code it runs, and how it reaches others. The
-    order of nodes and tasks is not left out: ports are given out by it.
+    Left out is what each node may say for itself: the code it runs, how it reaches others, and the
+    data of traces, which a node need not have. The order of nodes and tasks is not left out: ports
+    are given out by it.
     """
     document = to_document(problem)
     live = {**document.get("live", {})}
@@ -336,5 +337,15 @@ def fingerprint(problem: Problem) -> str:
     document["live"] = live
     for task in document["tasks"].values():
         task.pop("run", None)
-    text = json.dumps(document)
+    text = json.dumps(_without_data(document))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _without_data(part: Any) -> Any:
+    """Return a document whose traces say their file and column, and nothing of what is in them."""
+    if isinstance(part, dict):
+        trace = part.get("trace")
+        if isinstance(trace, dict):
+            return {"trace": {"file": trace["file"], "column": trace["column"]}}
+        return {key: _without_data(value) for key, value in part.items()}
+    return [_without_data(one) for one in part] if isinstance(part, list | tuple) else part

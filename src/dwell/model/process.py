@@ -429,7 +429,7 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class UnreadTrace:
-    """A trace that the record of a run names, and whose data are not in the record.
+    """A trace that is named, and whose data were not read: a record or a live node has none.
 
     Parameters
     ----------
