@@ -28,6 +28,7 @@ ALONE = (
     "cli/test_testbed.py",
     "live/test_real_faults.py",
     "live/transport",
+    "test_package.py",
     "testbed/test_netns_testbed.py",
     "testbed/test_real_campaign.py",
 )

@@ -1,15 +1,21 @@
-"""The built wheel: its name, what it holds, and the demo from it, away from the checkout."""
+"""The built wheel: what it holds, and what its extras can do in environments of their own."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+
+import dwell
+from tests.cli.live_cell import RealCell
 
 ROOT = Path(__file__).parents[1]
 
@@ -39,19 +45,87 @@ def test_the_wheel_has_the_examples_and_nothing_else(installed: Path) -> None:
     assert not list(installed.rglob("*.pyc"))
 
 
-def test_the_demo_of_an_installed_package_needs_no_checkout(
-    installed: Path, tmp_path: Path
-) -> None:
-    words = [sys.executable, "-P", "-m", "dwell", "demo", "--json"]
-    words += ["--seeds", "2", "--windows", "12", "--processes", "1", "--out", str(tmp_path / "out")]
-    done = subprocess.run(
-        words,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(installed)},
-        check=False,
-        capture_output=True,
-        text=True,
+# ----------------------------------------------------------------------- clean environments
+
+UV = Path(sys.executable).with_name("uv")
+
+
+def run(*words: str | Path, **how: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, away from the checkout and from this environment."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "VIRTUAL_ENV")
+    }
+    return subprocess.run(
+        list(map(str, words)), check=False, capture_output=True, text=True, env=kept, **how
     )
+
+
+@pytest.fixture
+def environment(installed: Path, tmp_path: Path) -> Callable[[str], Path]:
+    """Return what makes an environment with the wheel and one of its extras, pinned as here."""
+    if not UV.is_file():
+        pytest.skip("uv is not beside the interpreter; `make env` installs it")
+    (wheel,) = installed.parent.glob("*.whl")
+    pins = ROOT / "requirements" / "dev.txt"
+
+    def made(extra: str) -> Path:
+        folder = tmp_path / extra
+        run(UV, "venv", "--quiet", "--python", sys.executable, folder)
+        python = folder / "bin" / "python"
+        into = (UV, "pip", "install", "--quiet", "--python", python, "--constraint", pins)
+        reached = run(*into, "numpy")
+        if reached.returncode:
+            pytest.skip(f"no packages can be installed here: {reached.stderr.strip()[-200:]}")
+        done = run(*into, f"dwell-placement[{extra}] @ {wheel.as_uri()}")
+        assert done.returncode == 0, done.stderr
+        return python
+
+    return made
+
+
+def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
+    environment: Callable[[str], Path], tmp_path: Path
+) -> None:
+    python = environment("live")
+    listed = json.loads(run(UV, "pip", "list", "--python", python, "--format", "json").stdout)
+    names = {one["name"] for one in listed} - {"dwell-placement"}
+    said = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
+    told = re.search(r"brings these packages, (\d+) MB at most:(.*?)\.", said, re.DOTALL)
+    assert told is not None
+    assert set(re.findall(r"`([\w.-]+)`", told[2])) == names
+    size = sum(path.stat().st_size for path in python.parents[1].rglob("*") if path.is_file())
+    assert size / 1e6 <= int(told[1]) <= 150
+
+    cell = RealCell(tmp_path / "cell", python)
+    try:
+        cell.controller()
+        for node in ("R1", "R2", "E"):
+            cell.agent(node)
+        cell.until(lambda status: not status["silent"] and status["window"])
+        moved = run(python, "-m", "dwell", "live", "pin", "SO", "--cell", cell.file)
+        assert moved.returncode == 0, moved.stderr
+        there = cell.until(lambda status: status["placement"] == "SO")["window"]["number"]
+        cell.until(lambda status: status["window"]["number"] > there + 1)
+        assert cell.end("controller") == 0
+    finally:
+        cell.close()
+    (folder,) = (cell.folder / "runs").iterdir()
+    assert not (folder / "run.json").exists()
+    log = (cell.folder / "controller.log").read_text(encoding="utf-8")
+    assert "stays a journal, for Polars is not installed here" in log
+    # What the robot could not write, this environment reads of the journal.
+    assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
+
+
+def test_the_demo_runs_from_the_extra_all(
+    environment: Callable[[str], Path], tmp_path: Path
+) -> None:
+    python = environment("all")
+    words = ("--seeds", "2", "--windows", "12", "--processes", "1")
+    out = ("--out", tmp_path / "out")
+    done = run(python, "-m", "dwell", "demo", "--json", *words, *out, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)
     assert (tmp_path / "out" / "report.html").is_file()

@@ -17,7 +17,8 @@ from dwell.live.keys import Keys
 from dwell.live.messages import Order, Stamped, encode
 from dwell.live.security import INSECURE, Security
 from dwell.live.wiring import Role, wire
-from tests.cli.test_live import EXAMPLE, PATIENCE_S, RealCell, invoke
+from tests.cli.live_cell import EXAMPLE, PATIENCE_S, RealCell
+from tests.cli.test_live import invoke
 from tests.live.transport.test_secure import Intruder, tls
 
 PIN = ("live", "pin", "SO")

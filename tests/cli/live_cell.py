@@ -1,0 +1,167 @@
+"""The example's live cell on this machine: its commands, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import dwell
+from dwell.errors import LiveError
+from dwell.live.operator_client import OperatorClient
+from dwell.live.parent_death import OWNER
+from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.model.document import to_document
+
+__all__ = ["EXAMPLE", "MOODY", "PATIENCE_S", "RealCell"]
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "live"
+PATIENCE_S = 60.0
+
+#: Stages that do what the file `mood` beside them says, and an accelerator's utilisation.
+MOODY = """
+from pathlib import Path
+import stages
+from dwell.live.stage import Message
+
+MOOD = Path(__file__).with_name("mood")
+
+def perceive(inputs):
+    mood = MOOD.read_text() if MOOD.exists() else ""
+    if mood == "raise":
+        raise ValueError("no light")
+    if mood == "draw":
+        print("\\x1b[2Jnone\\r\\ntold", flush=True)
+        raise ValueError("\\x1b[2Jno\\r\\nlight")
+    if mood == "text":
+        return "left"
+    return stages.perceive(inputs)
+
+class Perception:
+    def start(self):
+        print("the old code", flush=True)
+    def process(self, inputs):
+        return perceive(inputs)
+
+def busy():
+    return 0.875
+"""
+
+
+def free_ports(count: int) -> int:
+    """Return the first of so many ports that nobody has."""
+    for first in range(20_000 + os.getpid() % 1_000, 32_000, count):
+        with ExitStack() as stack, suppress(OSError):
+            for port in range(first, first + count):
+                stack.enter_context(socket.create_server(("127.0.0.1", port)))
+            return first
+    raise AssertionError("no ports")
+
+
+class RealCell:
+    """The example's cell with other ports, in a folder of its own.
+
+    Parameters
+    ----------
+    folder : Path
+    python : path-like
+        What runs its commands; with this checkout's sources, if it is this one.
+    """
+
+    def __init__(self, folder: Path, python: str | Path = sys.executable) -> None:
+        self.python = str(python)
+        shutil.copytree(EXAMPLE, folder / "cell", ignore=shutil.ignore_patterns("__pycache__"))
+        self.folder, self.file = folder, folder / "cell" / "cell.yaml"
+        self.mood = folder / "cell" / "mood"
+        self.module = folder / "cell" / "moody.py"
+        self.module.write_text(MOODY)
+        document = to_document(dwell.load(self.file))
+        document["tasks"]["perception"]["run"] = "moody:Perception"
+        document["live"] |= {"release": "frames", "max_age_ms": 400}
+        # Other work on this machine shall not look like a fault.
+        document["controller"] |= {"guard_cycles": 20, "policy": "LOC"}
+        nodes = list(document["nodes"])
+        first = free_ports(3 * 40)
+        for i, node in enumerate(nodes):
+            document["live"]["hosts"][node]["port"] = first + 40 * i
+        self.document = document
+        self.file.write_text(yaml.safe_dump(document, sort_keys=False))
+        self.problem = dwell.load(self.file)
+        assert PORTS_PER_ROLE * len(roles(self.problem)) < 3 * 40
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.environment: dict[str, str] = dict(os.environ)
+
+    def start(self, name: str, *arguments: str | Path) -> subprocess.Popen[bytes]:
+        """Start a command; what it prints goes to a file."""
+        with (self.folder / f"{name}.log").open("ab") as log:
+            made = subprocess.Popen(
+                [self.python, "-m", "dwell", *map(str, arguments)],
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env={**os.environ, OWNER: str(os.getpid()), **self._sources()},
+            )
+        self.processes[name] = made
+        return made
+
+    def _sources(self) -> dict[str, str]:
+        return {"PYTHONPATH": str(ROOT / "src")} if self.python == sys.executable else {}
+
+    def agent(self, node: str, *more: str, cell: Path | None = None) -> None:
+        """Start a node."""
+        words = ("--node", node, "--cell", cell or self.file, "--state", self.state(node))
+        self.start(f"agent-{node}", "agent", *words, *more)
+
+    def controller(self) -> None:
+        """Start the controller."""
+        self.start("controller", "controller", "--cell", self.file, "--out", self.folder / "runs")
+
+    def end(self, name: str) -> int:
+        """End a command as systemd would."""
+        process = self.processes.pop(name)
+        process.send_signal(signal.SIGTERM)
+        return process.wait(timeout=PATIENCE_S)
+
+    def state(self, node: str) -> Path:
+        return self.folder / "state" / node
+
+    def log(self, node: str, who: str) -> str:
+        return (self.state(node) / f"{who}.log").read_text()
+
+    def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        """Ask for the status until something holds."""
+        limit_s = time.monotonic() + PATIENCE_S
+        found: dict[str, Any] = {}
+        with OperatorClient(self.problem, self.environment) as visitor:
+            while time.monotonic() < limit_s:
+                try:
+                    found = visitor.ask("status", patience_s=1.0)
+                except LiveError:
+                    continue
+                if holds(found):
+                    return found
+                time.sleep(0.02)
+        logs = "\n".join(f"{p.name}: {p.read_text()}" for p in self.folder.glob("*.log"))
+        raise AssertionError(f"it has not come about: {json.dumps(found, indent=1)}\n{logs}")
+
+    def note(self, who: str) -> Callable[[dict[str, Any]], str]:
+        return lambda status: str(status["processes"].get(who, {}).get("note", ""))
+
+    def close(self) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGTERM)
+        for process in self.processes.values():
+            process.wait(timeout=PATIENCE_S)
