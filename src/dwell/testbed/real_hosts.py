@@ -27,7 +27,7 @@ from dwell.live.operator_client import OperatorClient
 from dwell.live.parent_death import OWNER
 from dwell.model import Host, LinkDisturbance, NodeDisturbance, Normal, Problem
 from dwell.model.document import disturbance_document
-from dwell.policies import by_name
+from dwell.policies.registry import by_name
 from dwell.record import open_run, seal_run
 from dwell.testbed.inventory import Inventory
 from dwell.testbed.playing import come_up, longest_run, make_folder, play, undisturbed

@@ -10,7 +10,7 @@ from typing import Any
 from dwell.errors import LiveError
 from dwell.live.hosting import clock_of
 from dwell.model import NodeDisturbance, Problem
-from dwell.policies import by_name
+from dwell.policies.registry import by_name
 from dwell.record import Run, open_run
 from dwell.testbed.doctor import examine
 from dwell.testbed.netns_testbed import STARTING, NetnsTestbed
