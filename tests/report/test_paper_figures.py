@@ -20,7 +20,7 @@ from dwell.report.drawing import draw
 from dwell.report.palette import INK, MUTED, RAMP
 from dwell.report.panels import Place, Scale, folded, legend_lines, parted, scale_of
 from dwell.report.style import PageStyle
-from dwell.report.svg import drawn, in_page, pdf_file, svg_file
+from dwell.report.svg import drawn, in_page
 from dwell.study.chapter import Figure, FigureKind, Panel
 from tests.report.paper_chapters import STATICS, every_kind, figures, one_of
 from tests.study.cell import make_problem
@@ -359,31 +359,3 @@ def test_values_have_the_colours_of_the_page(canvas: Canvas) -> None:
     shown = in_page(drawn(canvas, "f"), "t")
     assert "var(--ramp-" in shown
     assert not any(colour in shown for colour in (INK, MUTED, *RAMP))
-
-
-def test_a_file_stands_alone_on_white(canvas: Canvas) -> None:
-    data = svg_file(drawn(canvas, "f"), "a < b").decode()
-    root = ElementTree.fromstring(data)
-    assert root.tag == "{http://www.w3.org/2000/svg}svg"
-    assert root.get("width", "").endswith("pt")
-    assert 'fill="#ffffff"' in data
-    assert "currentColor" not in data
-    assert "var(" not in data
-    assert "sans-serif" in data
-
-
-def test_symbols_have_an_index_in_a_pdf_too(look: PageStyle) -> None:
-    rows: list[dict[str, object]] = [{"x": x, "series": "S1", "y": 0.5} for x in ("α_L", "α_V")]
-    figure = Figure("f", "t", "bars", pl.DataFrame(rows), "x", "y", "series", y_label="V_D")
-    canvas = draw(figure, look)
-    pdf_file(canvas, "t")
-    labels = [label.get_text() for label in canvas.axes[0].get_yticklabels()]
-    assert labels == [r"α$_{\mathregular{L}}$", r"α$_{\mathregular{V}}$"]
-
-
-def test_letters_of_a_pdf_stay_letters(canvas: Canvas) -> None:
-    data = pdf_file(canvas, "t")
-    assert data.startswith(b"%PDF")
-    assert b"/Type3" not in data
-    assert b"/TrueType" in data or b"/CIDFontType2" in data
-    assert b"CreationDate" not in data

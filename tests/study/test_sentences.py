@@ -6,14 +6,12 @@ import math
 
 import pytest
 
-from dwell.study import Interval
 from dwell.study.sentences import (
     counted,
     listed,
     number,
     percent,
     points,
-    with_interval,
 )
 
 
@@ -27,8 +25,6 @@ from dwell.study.sentences import (
         (number(math.inf), "∞"),
         (number(-math.inf), "−∞"),
         (number(math.nan), "–"),
-        (with_interval(Interval(0.05, 0.04, 0.07), factor=100), "5.0 [4.0, 7.0]"),
-        (with_interval(Interval(5.0, math.nan, math.nan)), "5.0"),
         (listed([]), "none"),
         (listed(["a"]), "a"),
         (listed(["a", "b", "c"]), "a, b and c"),

@@ -1,4 +1,4 @@
-"""Tables of a chapter: as a part of a page, as CSV, and for LaTeX."""
+"""Tables of a chapter as parts of a page."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 from dwell.report.formatting import OURS, SYMBOL, Measure, Written
-from dwell.report.latex import tabular
 from dwell.report.page import Cell, marked, named, swatch, table
 from dwell.report.palette import contended
 from dwell.report.panels import floats
@@ -21,7 +20,7 @@ from dwell.study.chapter import Figure, Table, Unit
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["csv", "html", "latex", "noted"]
+__all__ = ["html", "noted"]
 
 HEADINGS = {
     "violation_rate": "V_D",
@@ -142,28 +141,6 @@ def html(item: Table, look: PageStyle, *, main: bool = False) -> str:
     return f"<h3>{marked(look.prose(item.title))}</h3>\n{caption}\n{text}"
 
 
-def csv(item: Table) -> str:
-    """Return the whole frame as CSV, with everything that is not shown."""
-    return item.frame.write_csv()
-
-
-def latex(item: Table, look: PageStyle, label: str) -> str:
-    """Return a table for LaTeX, with the package booktabs; intervals stand in brackets."""
-    shown = Shown.of(item)
-    rows: list[tuple[str, Sequence[str]]] = []
-    for group, row in shown.lines():
-        if group is not None:
-            rows.append((look.titled(group), ()))
-        rows.append(("", [str(_written(row, column, look, ends=True)) for column in shown.columns]))
-    return tabular(
-        [look.prose(column.heading) for column in shown.columns],
-        "".join("l" if column.unit == "text" else "r" for column in shown.columns),
-        rows,
-        caption=f"{look.prose(item.title)}. {noted(item, look)}".strip(),
-        label=f"tab:{label}",
-    )
-
-
 def noted(item: Table | Figure, look: PageStyle) -> str:
     """Return what has to be known of a table or figure, and what ATP is where it is in it."""
     own = look.prose(item.note).strip()
@@ -200,7 +177,7 @@ def _is_grouped(frame: pl.DataFrame, columns: Sequence[Column]) -> bool:
 
 
 def _cells(row: dict[str, object], column: Column, look: PageStyle) -> list[Cell]:
-    written = _written(row, column, look, ends=False)
+    written = _written(row, column, look)
     if column.unit == "text":
         kind = "nowrap" if len(written.value) <= SHORT else "text"
         return [Cell(_text(row.get(column.name), column, look), kind)]
@@ -224,7 +201,7 @@ def _text(value: object, column: Column, look: PageStyle) -> str:
     return marked(look.prose(look.shown(value)))
 
 
-def _written(row: dict[str, object], column: Column, look: PageStyle, *, ends: bool) -> Written:
+def _written(row: dict[str, object], column: Column, look: PageStyle) -> Written:
     value = row.get(column.name)
     if value is None:
         return Written("–", "")
@@ -235,5 +212,5 @@ def _written(row: dict[str, object], column: Column, look: PageStyle, *, ends: b
     low, high = row.get(f"{column.name}_low"), row.get(f"{column.name}_high")
     if isinstance(low, int | float) and isinstance(high, int | float):
         interval = Interval(value, low, high)
-        return write_over_seeds(interval, column.unit, column.measure, ends=ends)
+        return write_over_seeds(interval, column.unit, column.measure)
     return Written(write(value, column.unit, column.measure), "")

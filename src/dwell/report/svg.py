@@ -1,7 +1,4 @@
-"""Figures as files, and as SVG that stands in a page: text as text, no outside resource.
-
-In a page a figure has the page's colours and letters; as a file it has its own, on white.
-"""
+"""Figures as SVG that stands in a page: text as text, no outside resource, the page's colours."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from dwell.report.palette import INK, MUTED, PAPER, PARTS, RAMP, RULE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["WIDTH", "drawn", "in_page", "inline", "new_figure", "pdf_file", "svg_file"]
+__all__ = ["WIDTH", "drawn", "in_page", "inline", "new_figure"]
 
 #: Inches; the page shows a figure at most at 4/3 pixels a point, 9-point text at 12 pixels.
 WIDTH = 10.0
@@ -26,8 +23,6 @@ WIDTH = 10.0
 # Keys are literals that only some versions of matplotlib declare, so they have no type here.
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
-    # Letters stay letters: Type 3 fonts are refused by publishers.
-    "pdf.fonttype": 42,
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "axes.titlesize": 9,
@@ -136,47 +131,6 @@ def in_page(svg: str, description: str) -> str:
     return f'<svg {_viewbox(head)} role="img" aria-label="{label}">{body}'.rstrip()
 
 
-def svg_file(svg: str, description: str) -> bytes:
-    """Return what `drawn` gives as an SVG file, on white."""
-    head, _, body = svg.partition(">")
-    # Widths are those of DejaVu Sans, which is wide: what stands in for it fits.
-    body = re.sub(r"'?DejaVu Sans'?", "'DejaVu Sans', Verdana, Arial, sans-serif", body)
-    size = re.search(r'width="[^"]*" height="[^"]*"', _ordered(head))
-    title = f"<title>{escape(description, quote=False)}</title>"
-    paper = '<rect width="100%" height="100%" fill="#ffffff"/>'
-    return (
-        '<?xml version="1.0" encoding="utf-8"?>\n'
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size.group(0) if size else ""} '
-        f'{_viewbox(head)} stroke-linejoin="round">\n{title}\n{paper}{body}'
-    ).encode()
-
-
-def pdf_file(figure: Figure, description: str) -> bytes:
-    """Return a figure as a PDF file: letters stay letters. The figure is changed by that."""
-    import matplotlib as mpl
-    from matplotlib.text import Text
-
-    for text in figure.findobj(Text):
-        if isinstance(text, Text):
-            text.set_text(_as_mathtext(text.get_text()))
-    for ax in figure.axes:
-        for axis in (ax.xaxis, ax.yaxis):
-            # Tick labels are written anew whenever they are drawn.
-            places = axis.get_majorticklocs()
-            labels = axis.get_major_formatter().format_ticks(places.tolist())
-            if any(map(SYMBOL.search, labels)):
-                axis.set_ticks(places, labels=list(map(_as_mathtext, labels)))
-    buffer = io.BytesIO()
-    with mpl.rc_context(STYLE):
-        metadata = {"CreationDate": None, "Title": description}
-        figure.savefig(buffer, format="pdf", metadata=metadata)
-    return buffer.getvalue()
-
-
-def _as_mathtext(text: str) -> str:
-    return SYMBOL.sub(r"\1$_{\\mathregular{\2}}$", text)
-
-
 def drawn(figure: Figure, name: str) -> str:
     """Return the SVG of a figure as matplotlib draws it, without what nobody needs.
 
@@ -215,9 +169,3 @@ def _indexed(text: str) -> str:
 def _viewbox(head: str) -> str:
     box = re.search(r'viewBox="[^"]*"', head)
     return box.group(0) if box else ""
-
-
-def _ordered(head: str) -> str:
-    """Return the attributes of an element, width before height."""
-    found = dict(re.findall(r'(\w+)="([^"]*)"', head))
-    return " ".join(f'{name}="{found[name]}"' for name in ("width", "height") if name in found)

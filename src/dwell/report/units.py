@@ -67,9 +67,7 @@ def write(value: float, unit: Unit, measure: Measure | None = None) -> str:
     return write_number(value * measure.factor, measure.decimals, signed=measure.signed)
 
 
-def write_over_seeds(
-    interval: Interval, unit: Unit, measure: Measure | None = None, *, ends: bool = False
-) -> Written:
+def write_over_seeds(interval: Interval, unit: Unit, measure: Measure | None = None) -> Written:
     """Write a number over seeds with its interval, without the unit.
 
     Parameters
@@ -78,17 +76,7 @@ def write_over_seeds(
     unit : Unit
     measure : Measure, optional
         How the numbers that it stands among are written.
-    ends : bool
-        Whether the interval is always written by its ends.
     """
     if not interval.known:
         return Written(write(interval.value, unit, measure), "")
-    measure = measure or measure_of(unit, interval)
-    if not ends:
-        return write_interval(interval, measure)
-    value, *limits = (
-        write_number(end * measure.factor, measure.decimals, signed=measure.signed)
-        for end in interval
-    )
-    same = interval.low == interval.high
-    return Written(value, "" if same else f"[{', '.join(limits)}]")
+    return write_interval(interval, measure or measure_of(unit, interval))

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from dwell.study.intervals import Interval
-
-__all__ = ["counted", "listed", "number", "percent", "points", "with_interval"]
+__all__ = ["counted", "listed", "number", "percent", "points"]
 
 
 def percent(share: float, decimals: int = 1) -> str:
@@ -36,12 +34,6 @@ def number(value: float, decimals: int = 1) -> str:
     if float(text) == 0:
         text = text.removeprefix("-")
     return text.replace("-", "−")
-
-
-def with_interval(known: Interval, *, factor: float = 1.0, decimals: int = 1) -> str:
-    """``4.2 [3.9, 4.6]``; the number alone where there is no interval."""
-    value, low, high = (number(factor * end, decimals) for end in known)
-    return f"{value} [{low}, {high}]" if known.known else value
 
 
 def listed(items: Iterable[str], last: str = "and") -> str:
