@@ -140,7 +140,7 @@ def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path
     folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
     told = live_demo._Told(problem, "demo", 5)
     first = changes_of(problem, "demo")[0]
-    told.begun_ns[id(first.item)] = 20 * PERIOD_NS
+    told.begun_ns[first.index] = 20 * PERIOD_NS
     run = told.note(folder, **told.tracking(folder))
     assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
     # Interrupted: it was on until the end.

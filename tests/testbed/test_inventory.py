@@ -189,8 +189,8 @@ def test_disturbances_are_played_by_the_inventorys_commands(tmp_path: Path) -> N
     )
     cell = RealHosts(PROBLEM, inventory(tmp_path, **{LINK.name: commands}), tmp_path, name="one")
     item = LinkDisturbance(LINK.source, LINK.target, add_delay_ms=Normal(25.0, 5.0), loss=0.02)
-    cell.apply(Change(0.0, item, begins=True))
-    cell.apply(Change(1.0, item, begins=False))
+    cell.apply(Change(0.0, 0, item, begins=True))
+    cell.apply(Change(1.0, 0, item, begins=False))
     assert log.read_text().splitlines() == ["on 25.0 5.0 2.0", "off"]
 
 
@@ -205,10 +205,10 @@ def test_stress_runs_until_it_ends(tmp_path: Path) -> None:
     cell = RealHosts(PROBLEM, over_there, tmp_path, name="one")
     Path(cell.there("E")).mkdir(parents=True)
     item = NodeDisturbance("E", stress_threads=3)
-    cell.apply(Change(0.0, item, begins=True))
+    cell.apply(Change(0.0, 0, item, begins=True))
     until(lambda: threads.is_file() and threads.read_text() == "3\n")
     process = next(iter(cell.stress.values()))
-    cell.apply(Change(1.0, item, begins=False))
+    cell.apply(Change(1.0, 0, item, begins=False))
     assert process.poll() is not None
 
 

@@ -81,19 +81,19 @@ def test_a_run_begins_anew_with_everybody_there(bed: NetnsTestbed) -> None:
 
 def test_stress_is_in_the_group_of_its_node(bed: NetnsTestbed) -> None:
     stress = NodeDisturbance("R2", stress_threads=2)
-    bed.apply(Change(0.0, stress, begins=True))
+    bed.apply(Change(0.0, 0, stress, begins=True))
     begun_ns = bed.used_ns["R2"]()
     # Far less than its quota, far more than its stages take.
     wait_for(lambda: bed.used_ns["R2"]() - begun_ns > 2_000_000_000, "two seconds of CPU time")
-    bed.apply(Change(1.0, stress, begins=False))
+    bed.apply(Change(1.0, 0, stress, begins=False))
 
 
 def test_a_link_that_is_down_lets_nothing_through(bed: NetnsTestbed) -> None:
     link = bed.links[frozenset(("R1", "R2"))]
     cut = LinkDisturbance("R1", "R2", down=True, loss=0.5)
-    bed.apply(Change(0.0, cut, begins=True))
+    bed.apply(Change(0.0, 0, cut, begins=True))
     wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
-    bed.apply(Change(1.0, cut, begins=False))
+    bed.apply(Change(1.0, 0, cut, begins=False))
     link.read()
     wait_for(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
 
@@ -104,9 +104,9 @@ def test_a_node_that_was_down_comes_back(bed: NetnsTestbed) -> None:
         bed.begin(patience_s=PATIENCE_S)
     outage = NodeDisturbance("R2", down=True)
     there = set(bed._groups.pids("R2"))
-    bed.apply(Change(0.0, outage, begins=True))
+    bed.apply(Change(0.0, 0, outage, begins=True))
     assert bed._groups.pids("R2") == []
-    bed.apply(Change(1.0, outage, begins=False))
+    bed.apply(Change(1.0, 0, outage, begins=False))
 
     def ready() -> bool:
         heard = watcher.status(10.0)["processes"]

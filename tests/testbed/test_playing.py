@@ -70,7 +70,7 @@ def test_a_change_between_two_looks_is_not_late(
     clock = Clock(monkeypatch)
     made: list[float] = []
     item = problem.scenario("impaired")[-1]
-    changes = [Change(0.3, item, begins=True), Change(0.7, item, begins=False)]
+    changes = [Change(0.3, 0, item, begins=True), Change(0.7, 0, item, begins=False)]
     play(changes, 1.0, clock.now_s, lambda change: made.append(clock.at_s), lambda at_s: None)
     assert made == pytest.approx([0.3, 0.7])
 
@@ -78,9 +78,9 @@ def test_a_change_between_two_looks_is_not_late(
 def test_the_run_is_told_what_was_played_when(problem: Problem, tmp_path: Path) -> None:
     folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
     played = Played(problem, "impaired", 7)
-    node = problem.scenario("impaired")[-1]
-    played.begun_ns[id(node)] = 20 * PERIOD_NS
-    played.ended_ns[id(node)] = 30 * PERIOD_NS
+    last = len(problem.scenario("impaired")) - 1
+    played.begun_ns[last] = 20 * PERIOD_NS
+    played.ended_ns[last] = 30 * PERIOD_NS
     assert played.active() == []
     meta = played.note(folder, pressure={"failed": False}).meta
     assert (meta["scenario"], meta["seed"], meta["pressure"]) == ("impaired", 7, {"failed": False})

@@ -8,7 +8,7 @@ import pytest
 
 from dwell.cellfile import from_document
 from dwell.errors import LiveError, ProblemError
-from dwell.model import Constant, Problem
+from dwell.model import Constant, Disturbance, Problem
 from dwell.testbed.timeline import changes_of, is_down, link_changes, link_with, threads_on
 from tests.testbed.light_cell import document
 
@@ -25,6 +25,17 @@ def test_changes_come_in_the_order_of_time_ends_before_beginnings() -> None:
     found = [(change.at_s, change.begins) for change in changes_of(problem, "some")]
     # What lasts for ever never ends.
     assert found == [(2, True), (5, False), (5, True)]
+
+
+def test_equal_items_are_told_apart_by_their_places() -> None:
+    twice = {"node": "E", "at_s": 1, "for_s": 2, "stress_threads": 1}
+    problem = cell(twice, {**twice})
+    on: dict[int, Disturbance] = {}
+    threads = []
+    for change in changes_of(problem, "some"):
+        on = change.made(on)
+        threads.append(threads_on("E", on.values()))
+    assert threads == [1, 2, 1, 0]
 
 
 def test_threads_of_a_node_add_up() -> None:

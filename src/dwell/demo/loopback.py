@@ -114,7 +114,7 @@ class Loopback:
             environment={"DWELL_WORLD": str(self.world), **(environment or {})},
             cpus=cpus,
         )
-        self._on: list[Disturbance] = []
+        self._on: dict[int, Disturbance] = {}
         self._stack = ExitStack()
 
     @property
@@ -188,11 +188,13 @@ class Loopback:
         if isinstance(item, NodeDisturbance):
             burner = self.burners[item.node]
             nodes = [node for node, its in self.burners.items() if its is burner]
-            burner.set(sum(threads_on(node, self._on) for node in nodes))
+            burner.set(sum(threads_on(node, self._on.values()) for node in nodes))
             return
         usual = self.problem.fabric.links[item.link]
         link = self.links[frozenset((item.source, item.target))]
-        link.set(item.source, item.target, **link_changes(usual, before, self._on))
+        link.set(
+            item.source, item.target, **link_changes(usual, before.values(), self._on.values())
+        )
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""

@@ -176,7 +176,7 @@ class NetnsTestbed:
         self._usual = _links_of(self.problems)
         self._beside, self._more = beside, tuple(more)
         self._environment = dict(environment or {})
-        self._on: list[Disturbance] = []
+        self._on: dict[int, Disturbance] = {}
         self._claim = Claim(name, list(self.nodes))
         self._claimed = False
         # Run of each cell that is no part of any measurement any more.
@@ -389,21 +389,21 @@ class NetnsTestbed:
 
     def apply(self, change: Change) -> None:
         """Have nodes and links do what begins or ends."""
-        item, before = change.item, self._on
-        self._on = change.made(before)
+        item, before = change.item, list(self._on.values())
+        self._on = change.made(self._on)
         if isinstance(item, NodeDisturbance):
             self._apply_to_node(item.node, before)
         else:
             self._apply_to_link(self._usual[item.link], before)
 
     def _apply_to_node(self, node: str, before: Sequence[Disturbance]) -> None:
-        was, now = is_down(node, before), is_down(node, self._on)
+        was, now = is_down(node, before), is_down(node, self._on.values())
         if now and not was:
             self._take_down(node)
         elif was and not now:
             self._bring_up(node)
         elif not now:
-            self.stress[node].set(threads_on(node, self._on))
+            self.stress[node].set(threads_on(node, self._on.values()))
 
     def _take_down(self, node: str) -> None:
         """Kill everything on a node at once, as a loss of power does."""
@@ -414,17 +414,17 @@ class NetnsTestbed:
 
     def _bring_up(self, node: str) -> None:
         self._start_stress(node)
-        self.stress[node].set(threads_on(node, self._on))
+        self.stress[node].set(threads_on(node, self._on.values()))
         self._processes.start_agent(node)
         if any(problem.controller_node == node for problem in self.problems):
             self._processes.start_controller(node)
 
     def _apply_to_link(self, link: Link, before: Sequence[Disturbance]) -> None:
-        changes = link_changes(link, before, self._on)
+        changes = link_changes(link, before, self._on.values())
         if link.retransmit_ms is None and "loss" in changes:
             self._losses.set(link.source, link.target, changes.pop("loss"))
         way = self.links[frozenset((link.source, link.target))]
-        was, now = is_down(link.name, before), is_down(link.name, self._on)
+        was, now = is_down(link.name, before), is_down(link.name, self._on.values())
         if was != now:
             way.down(link.source, link.target, now)
         if changes:

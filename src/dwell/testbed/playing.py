@@ -56,7 +56,7 @@ class Played:
     scenario : str
     seed : int
     begun_ns, ended_ns : dict of int to int
-        By `id` of the disturbance.
+        By the index of the disturbance in the scenario.
     """
 
     problem: Problem
@@ -68,7 +68,7 @@ class Played:
     def changed(self, change: Change) -> None:
         """Note that a change has been made."""
         instants = self.begun_ns if change.begins else self.ended_ns
-        instants[id(change.item)] = clock_of(self.problem)()
+        instants[change.index] = clock_of(self.problem)()
 
     def plan(self) -> Scenario:
         """Return what is to be played."""
@@ -77,7 +77,7 @@ class Played:
     def active(self) -> list[Disturbance]:
         """Return what is on now."""
         on = self.begun_ns.keys() - self.ended_ns.keys()
-        return [item for item in self.plan() if id(item) in on]
+        return [item for index, item in enumerate(self.plan()) if index in on]
 
     def note(self, folder: Path, **more: object) -> Run:
         """Tell the run, whose time begins with the first release.
@@ -97,10 +97,10 @@ class Played:
                 {
                     **disturbance_document(item),
                     "at_s": round((begun_ns - origin_ns) / 1e9, 3),
-                    "for_s": round((self.ended_ns.get(id(item), end_ns) - begun_ns) / 1e9, 3),
+                    "for_s": round((self.ended_ns.get(index, end_ns) - begun_ns) / 1e9, 3),
                 }
-                for item in self.plan()
-                if (begun_ns := self.begun_ns.get(id(item))) is not None
+                for index, item in enumerate(self.plan())
+                if (begun_ns := self.begun_ns.get(index)) is not None
             ]
         return seal_run(folder, **notes, **more)
 

@@ -225,20 +225,20 @@ class RealHosts:
         item = change.item
         if isinstance(item, NodeDisturbance):
             if not change.begins:
-                self._end_stress(id(item))
+                self._end_stress(change.index)
             elif item.stress_threads:
                 line = self.inventory.hosts[item.node].stress.format(threads=item.stress_threads)
                 words = self._words(item.node, ["sh", "-c", line], whole=True)
-                self.stress[id(item)] = subprocess.Popen(  # noqa: S603 - the inventory's
+                self.stress[change.index] = subprocess.Popen(  # noqa: S603 - the inventory's
                     words,
                     env={**os.environ, OWNER: str(os.getpid())},
                     process_group=0,
                 )
         elif change.begins:
             self.shell(item.source, self.inventory.links[item.link].begin.format(**_filled(item)))
-            self._on[id(item)] = item
+            self._on[change.index] = item
         else:
-            self._on.pop(id(item), None)
+            self._on.pop(change.index, None)
             self.shell(item.source, self.inventory.links[item.link].end)
 
     def _end_stress(self, number: int) -> None:
@@ -346,7 +346,7 @@ def run_on_hosts(
 
         def apply(change: Change) -> None:
             hosts.apply(change)
-            instants[id(change.item), change.begins] = now_s()
+            instants[change.index, change.begins] = now_s()
 
         play(changes, seconds, now_s, apply, lambda at_s: None)
         hosts.processes.stop_controllers()
@@ -370,10 +370,10 @@ def _note(
     release_ns = open_run(folder).cycles["release_ns"]
     end_s = float(release_ns[-1]) / 1e9 if len(release_ns) else 0.0
     played = []
-    for item in problem.scenario(scenario):
-        begun_s = instants.get((id(item), True))
+    for index, item in enumerate(problem.scenario(scenario)):
+        begun_s = instants.get((index, True))
         if begun_s is not None:
-            ended_s = instants.get((id(item), False), max(end_s, begun_s))
+            ended_s = instants.get((index, False), max(end_s, begun_s))
             for_s = round(ended_s - begun_s, 3)
             times = {"at_s": round(begun_s, 3), "for_s": for_s}
             played.append({**disturbance_document(item), **times})

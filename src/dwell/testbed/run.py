@@ -217,12 +217,12 @@ def spans_of(run: Run, played: Played) -> list[Span]:
 def _stressed(played: Played, begin_ns: int, end_ns: int) -> Mapping[str, float]:
     """Return the capacity of nodes with as many foreign threads as cores all the time."""
     found: dict[str, float] = {}
-    for item in played.plan():
+    for index, item in enumerate(played.plan()):
         if not isinstance(item, NodeDisturbance):
             continue
         node = played.problem.fabric.nodes[item.node]
-        begun_ns = played.begun_ns.get(id(item))
-        ended_ns = played.ended_ns.get(id(item), end_ns)
+        begun_ns = played.begun_ns.get(index)
+        ended_ns = played.ended_ns.get(index, end_ns)
         if item.stress_threads < node.cores or begun_ns is None:
             continue
         if begun_ns <= begin_ns and ended_ns >= end_ns:

@@ -8,7 +8,7 @@ counts.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import combinations
 from typing import Any
@@ -28,18 +28,21 @@ class Change:
     Parameters
     ----------
     at_s : float
+    index : int
+        Of the item, in its scenario.
     item : Disturbance
     begins : bool
     """
 
     at_s: float
+    index: int
     item: Disturbance
     begins: bool
 
-    def made(self, on: Iterable[Disturbance]) -> list[Disturbance]:
-        """Return what is on after it, of what was on before."""
-        rest = [other for other in on if other is not self.item]
-        return [*rest, self.item] if self.begins else rest
+    def made(self, on: Mapping[int, Disturbance]) -> dict[int, Disturbance]:
+        """Return what is on after it, of what was on before; by index."""
+        rest = {index: other for index, other in on.items() if index != self.index}
+        return {**rest, self.index: self.item} if self.begins else rest
 
 
 def changes_of(problem: Problem, scenario: str, *, outages: bool = False) -> list[Change]:
@@ -65,10 +68,10 @@ def changes_of(problem: Problem, scenario: str, *, outages: bool = False) -> lis
     if faults:
         raise LiveError(f"scenario {scenario!r} cannot be played: {'; '.join(faults)}")
     found = []
-    for item in items:
-        found.append(Change(item.at_s, item, begins=True))
+    for index, item in enumerate(items):
+        found.append(Change(item.at_s, index, item, begins=True))
         if item.end_s < math.inf:
-            found.append(Change(item.end_s, item, begins=False))
+            found.append(Change(item.end_s, index, item, begins=False))
     # What ends makes room for what begins at the same time.
     return sorted(found, key=lambda change: (change.at_s, change.begins))
 
