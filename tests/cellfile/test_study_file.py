@@ -67,6 +67,40 @@ def test_the_least_study_has_defaults(folder: Path) -> None:
     assert (study.seeds, study.windows, study.references) == (tuple(range(1, 21)), 300, False)
 
 
+def test_a_policys_name_may_bring_its_estimator(folder: Path) -> None:
+    study = read(
+        folder,
+        """\
+        dwell-study: 1
+        cell: cell.yaml
+        policies:
+          cusum+corrected: cusum+corrected
+          dtp+shadow: {controller.min_dwell: 0}
+          believer: {policy: dtp+corrected, estimator: corrected}
+        """,
+    )
+    assert [(one.name, one.policy, one.estimator) for one in study.policies] == [
+        ("cusum+corrected", "cusum", "corrected"),
+        ("dtp+shadow", "dtp", "shadow"),
+        ("believer", "dtp", "corrected"),
+    ]
+
+
+def test_a_policy_with_two_estimators_or_an_unknown_one_is_refused(folder: Path) -> None:
+    wrong = """\
+        dwell-study: 1
+        cell: cell.yaml
+        policies:
+          a: {policy: dtp+corrected, estimator: shadow}
+          b: dtp+correct
+          c: dpt+corrected
+        """
+    told = faults(folder, wrong)
+    assert "'dtp+corrected' names its estimator" in told["policies.a.estimator"]
+    assert "unknown estimator 'correct'" in told["policies.b.estimator"]
+    assert "unknown policy 'dpt'" in told["policies.c"]
+
+
 def test_everything_that_a_study_may_say(folder: Path) -> None:
     study = read(
         folder,

@@ -85,7 +85,7 @@ def call(*arguments: str | Path) -> Result:
 def measure(node: str, *more: str | Path, runs: int = 40) -> Result:
     """Measure perception on a node, quickly."""
     task = "perception=profiled_stages:perceive"
-    return call("--node", node, "--task", task, "--runs", str(runs), "--warmup", "3", *more)
+    return call("--node", node, "--task", task, "--samples", str(runs), "--warmup", "3", *more)
 
 
 @pytest.fixture
@@ -180,7 +180,7 @@ def test_several_tasks_with_inputs_of_their_own(folder: Path) -> None:
     ]
     assert (
         call(
-            *("--node", "E", "--runs", "2", "--task", "plan=profiled_stages:plan"),
+            *("--node", "E", "--samples", "2", "--task", "plan=profiled_stages:plan"),
             *("--inputs", "profiled_stages:inputs", "--period-ms", "1"),
         ).stdout.count("one every 1 ms")
         == 1
@@ -206,7 +206,7 @@ def test_a_second_measurement_replaces_the_first_but_nothing_else(folder: Path) 
     assert measure("R1").exit_code == 0
     assert measure("R1", runs=50).exit_code == 0
     assert len(read_profile(Path("profiles/R1.parquet"))[0].samples) == 50
-    other = call("--node", "R1", "--task", "plan=profiled_stages:perceive", "--runs", "2")
+    other = call("--node", "R1", "--task", "plan=profiled_stages:perceive", "--samples", "2")
     assert other.exit_code == 2
     assert "holds perception@R1, which would be lost" in other.stderr
 
@@ -237,7 +237,7 @@ def test_a_second_measurement_replaces_the_first_but_nothing_else(folder: Path) 
         (("--node", "R1", "--task", "a=os:getpid", "--core", "x"), ("'x'", "0-3")),
         (("--node", "R1", "--task", "a=os:getpid", "--period-ms", "0"), ("period_ms: 0.0",)),
         (("--node", "R1", "--task", "a=os:getpid", "--out", "a.csv"), ("a.csv", ".parquet")),
-        (("--runs", "5", "merge", "a.parquet", "--out", "b.parquet"), ("--runs", "'merge'")),
+        (("--samples", "5", "merge", "a.parquet", "--out", "b.parquet"), ("--samples", "'merge'")),
         (("merge", "a.parquet", "--out", "b.parquet"), ("a.parquet: no such file",)),
         (("link", "edge", "--from", "R1", "--to", "E"), ("'edge'", "HOST:PORT")),
         (("link", "e:1", "--from", "R1", "--to", "R1"), ("to: 'R1'",)),
@@ -250,7 +250,9 @@ def test_a_mistake_writes_nothing(
     refused(call(*arguments), 2, *words)
 
 
-@pytest.mark.parametrize("arguments", [("--runs", "0"), ("--warmup", "-1"), ("nope",), ("merge",)])
+@pytest.mark.parametrize(
+    "arguments", [("--samples", "0"), ("--warmup", "-1"), ("nope",), ("merge",)]
+)
 def test_arguments_have_bounds(folder: Path, arguments: tuple[str, ...]) -> None:
     result = call(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")
@@ -311,7 +313,7 @@ def test_files_that_cannot_be_merged(folder: Path) -> None:
 def test_a_link_is_measured_and_goes_into_a_cell(folder: Path, port: int) -> None:
     result = call(
         *("link", f"127.0.0.1:{port}", "--from", "R1", "--to", "E"),
-        *("--count", "40", "--warmup", "2", "--bytes", "100000"),
+        *("--samples", "40", "--warmup", "2", "--bytes", "100000"),
     )
     assert result.exit_code == 0, result.output
     assert "as if both ways took equally long" in result.stdout

@@ -10,7 +10,7 @@ import pytest
 
 import dwell
 from dwell.control import ClosedWindow, Controller, Evidence
-from dwell.errors import MetricError, ProblemError
+from dwell.errors import DwellError, MetricError, ProblemError
 from dwell.estimators import Corrected, Learner, Scaling, Shadow, Support
 from dwell.model import Problem, QoS
 from tests.estimators.cell import MOVES, cell
@@ -50,6 +50,38 @@ def test_who_learns_and_who_wants_shadows(name: str, fraction: float) -> None:
     assert controller.learns == (name != "profile")
     assert controller.supports == (name in ("shadow", "corrected"))
     assert controller.shadow_fraction == fraction
+
+
+def test_a_policys_name_may_bring_its_estimator() -> None:
+    problem = cell(estimator="profile")
+    named = Controller(problem, "cusum+corrected")
+    apart = Controller(problem, "cusum", "corrected")
+    assert named.described() == apart.described()
+    assert named.described()["estimator"] == "Corrected"
+    assert Controller(problem, "cusum").described()["estimator"] == "Profile"
+    assert Controller(problem, "dtp+shadow", "shadow").described()["estimator"] == "Shadow"
+
+
+def test_a_candidate_may_have_a_plus_in_its_name() -> None:
+    problem = cell()
+    name = next(iter(problem.candidates))
+    both = replace(problem, candidates={**problem.candidates, "a+b": problem.candidates[name]})
+    assert Controller(both, "a+b").incumbent == "a+b"
+
+
+@pytest.mark.parametrize(
+    ("policy", "estimator", "message"),
+    [
+        ("cusum+corrected", "shadow", "'cusum\\+corrected' names its estimator"),
+        ("cusum+corected", None, "unknown estimator 'corected'"),
+        ("cusumm+corrected", None, "unknown policy 'cusumm'"),
+    ],
+)
+def test_a_wrong_name_with_an_estimator_is_refused(
+    policy: str, estimator: str | None, message: str
+) -> None:
+    with pytest.raises(DwellError, match=message):
+        Controller(cell(), policy, estimator)
 
 
 @pytest.mark.parametrize("estimator", [Shadow, Corrected])

@@ -10,7 +10,7 @@ import itertools
 import json
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -165,6 +165,7 @@ class _Reading:
         cell = self._with_scenarios(cell)
         scenarios = self._scenarios(cell.problem)
         points = self._points(cell, grid)
+        policies = [self._with_estimator(policy, cell.problem) for policy in policies]
         for policy in policies:
             self._check_names(policy, cell.problem)
             self._check_settings(policy, [cell for _, cell in points] or [cell])
@@ -373,6 +374,18 @@ class _Reading:
             return []
         policy = texts.get("policy", name)
         return [DeclaredPolicy(name, policy, texts.get("estimator"), settings)]
+
+    def _with_estimator(self, declared: DeclaredPolicy, problem: Problem) -> DeclaredPolicy:
+        """Return the policy with the estimator that its name asks for, as ``cusum+corrected``."""
+        policy, estimator = problem.policy_and_estimator(declared.policy)
+        if estimator is None:
+            return declared
+        if declared.estimator not in (None, estimator):
+            self.faults.add(
+                f"policies.{declared.name}.estimator",
+                f"{declared.policy!r} names its estimator; leave {declared.estimator!r} out",
+            )
+        return replace(declared, policy=policy, estimator=estimator)
 
     def _check_names(self, policy: DeclaredPolicy, problem: Problem) -> None:
         """Check that the names that a policy gives are known."""

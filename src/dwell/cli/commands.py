@@ -11,6 +11,23 @@ from typer.core import TyperGroup
 from dwell import __version__
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
+from dwell.cli.options import (
+    CellArgument,
+    Estimator,
+    Insecure,
+    Json,
+    Keys,
+    Policy,
+    Processes,
+    Scenario,
+    Seconds,
+    Seed,
+    Traces,
+    Windows,
+    require_one_length,
+    respelt,
+    windows_of,
+)
 from dwell.cli.profile import profile
 from dwell.cli.testbed import testbed
 from dwell.errors import (
@@ -43,6 +60,10 @@ MISTAKES = (
 
 class Commands(TyperGroup):
     """All commands; an error that is meant for the user is printed and becomes an exit code."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the arguments; old spellings of options work, with a warning."""
+        return super().parse_args(ctx, respelt(args))
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that the arguments name."""
@@ -81,13 +102,6 @@ app = typer.Typer(
 )
 app.add_typer(profile, name="profile")
 
-Cell = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
-Traces = Annotated[
-    Path | None,
-    typer.Option(metavar="FOLDER", help="Where its trace files are; beside it if not given."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
-
 
 def _show_version(asked: bool) -> None:
     if asked:
@@ -109,7 +123,7 @@ def options(
 
 @app.command()
 def check(
-    cell: Cell,
+    cell: CellArgument,
     traces: Traces = None,
     node: Annotated[
         str | None,
@@ -118,14 +132,8 @@ def check(
             "make its stages and actuators."
         ),
     ] = None,
-    keys: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", envvar="DWELL_KEYS", help="The node's keyring."),
-    ] = None,
-    insecure: Annotated[
-        bool,
-        typer.Option("--insecure", envvar="DWELL_INSECURE", help="The node is to do without keys."),
-    ] = False,
+    keys: Keys = None,
+    insecure: Insecure = False,
     as_json: Json = False,
 ) -> None:
     """Find every fault in a cell, or say what it amounts to.
@@ -141,20 +149,13 @@ def check(
 
 @app.command()
 def run(
-    cell: Cell,
-    scenario: Annotated[str, typer.Option(help="One of the cell's scenarios.")] = "baseline",
-    policy: Annotated[
-        str | None,
-        typer.Option(
-            help="A policy, or a candidate's name for the placement that never moves; "
-            "what the cell says if not given."
-        ),
-    ] = None,
-    estimator: Annotated[
-        str | None, typer.Option(help="An estimator; what the cell says if not given.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 1,
-    windows: Annotated[int, typer.Option(min=1, help="Length of the run.")] = 300,
+    cell: CellArgument,
+    scenario: Scenario = "baseline",
+    policy: Policy = None,
+    estimator: Estimator = None,
+    seed: Seed = 1,
+    windows: Windows = None,
+    seconds: Seconds = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -172,11 +173,19 @@ def run(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate a policy on a scenario, save the run, sum it up."""
+    """Simulate a policy on a scenario, save the run, sum it up.
+
+    300 windows, if neither --windows nor --seconds is given.
+    """
+    import dwell
     from dwell.cli.run import Request, run_cell
 
+    require_one_length(windows, seconds)
+    problem = dwell.load(cell, traces=traces)
+    if seconds is not None:
+        windows = windows_of(problem, seconds)
     request = Request(
-        cell, scenario, policy, estimator, seed, windows, out, traces, jobs, guard, force
+        problem, scenario, policy, estimator, seed, windows or 300, out, jobs, guard, force
     )
     if not run_cell(request, as_json=as_json):
         raise typer.Exit(FAILED)
@@ -194,19 +203,18 @@ def study(
             metavar="FOLDER", help="Where parts and tables go; studies/NAME if not given."
         ),
     ] = None,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="How many to use; one a CPU if not given.")
-    ] = None,
+    processes: Processes = None,
     dask: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that does the work."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(min=1, help="1 to this; what the file says if not given.")
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Seeds 1 to N of every run; the file's if not given."
+        ),
     ] = None,
-    windows: Annotated[
-        int | None, typer.Option(min=1, help="Length of each run; what the file says if not given.")
-    ] = None,
+    windows: Windows = None,
     # Options of what was `dwell study paper`; they say where that is.
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
     chapter: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
@@ -216,7 +224,8 @@ def study(
 ) -> None:
     """Simulate every scenario, policy, parameter and seed of a study.
 
-    What is finished stays in the folder, whatever ends the work: the same command goes on.
+    What is finished stays in the folder, whatever ends the work: the same command goes on. Runs are
+    as long as the file says, if --windows is not given.
     """
     if str(file) == "paper" or quick or chapter or real or examples:
         raise typer.BadParameter(
@@ -257,14 +266,14 @@ def validate(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that were measured.")
     ],
-    cell: Annotated[Path, typer.Option(metavar="CELL", help="Calibrated cell file (YAML).")],
+    cell: Annotated[Path, typer.Option(metavar="FILE", help="Calibrated cell file (YAML).")],
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER", help="Where page and table go; validations/CELL if not given."
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=2, help="Simulations of every run.")] = 20,
+    seeds: Annotated[int, typer.Option(min=2, metavar="N", help="Seeds 1 to N of every run.")] = 20,
     calibrated_from: Annotated[
         list[Path] | None,
         typer.Option(
@@ -274,9 +283,7 @@ def validate(
         ),
     ] = None,
     traces: Traces = None,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="How many to use; one a CPU if not given.")
-    ] = None,
+    processes: Processes = None,
     as_json: Json = False,
 ) -> None:
     """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
@@ -303,8 +310,8 @@ def demo(
         Path | None,
         typer.Option(metavar="FOLDER", help="Replay the measurements in this folder instead."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds: 1 to this.")] = 20,
-    windows: Annotated[int, typer.Option(min=1, help="Length of each run.")] = 150,
+    seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 to N of every run.")] = 20,
+    windows: Windows = 150,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html goes.")] = Path(
         "demo-out"
     ),
@@ -312,9 +319,7 @@ def demo(
         Path | None,
         typer.Option(metavar="FOLDER", help="Where the example cells are, if not found."),
     ] = None,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="How many to use; one a CPU if not given.")
-    ] = None,
+    processes: Processes = None,
     as_json: Json = False,
 ) -> None:
     """Compare all policies in all scenarios of an example, and write the report."""
@@ -323,7 +328,7 @@ def demo(
     run_demo(
         real,
         seeds=seeds,
-        windows=windows,
+        windows=windows or 150,
         out=out,
         examples=examples,
         processes=processes,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dwell.cli.options import Json
 from dwell.cli.output import aligned, print_json
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ __all__ = ["keys"]
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the authority.")]
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Node of the cell, or another subject.")]
 Days = Annotated[int, typer.Option(help="How long certificates hold.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 keys = typer.Typer(
     no_args_is_help=True,
@@ -35,7 +35,7 @@ def init(
         Path, typer.Option(metavar="FOLDER", help="Where the authority and all keyrings go.")
     ],
     days: Days = 365,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Make a cell's own authority, and keyrings for its nodes, its controller and an operator."""
     import dwell
@@ -77,7 +77,7 @@ def issue(
         typer.Option(metavar="HOST", help="Where it is reached; may be repeated."),
     ] = None,
     days: Days = 365,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Issue a certificate with a new key; the one that the subject had is revoked."""
     from dwell.live.trust.authority import Authority
@@ -89,7 +89,7 @@ def issue(
 
 
 @keys.command()
-def revoke(folder: Folder, name: Name, as_json: AsJson = False) -> None:
+def revoke(folder: Folder, name: Name, as_json: Json = False) -> None:
     """Take a subject's certificate back."""
     from dwell.live.trust.authority import Authority
 
@@ -104,7 +104,7 @@ def show(
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Folder of an authority, or a keyring.")
     ],
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """List the subjects, with what they may do and until when."""
     from dwell.live.trust.authority import AUTHORITY, Authority

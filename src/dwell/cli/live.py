@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from dwell.cli.options import CellOption, Insecure, Json, Keys, Policy, Seed
 from dwell.cli.output import json_text, print_json
 
 if TYPE_CHECKING:
@@ -28,28 +29,10 @@ T = TypeVar("T")
 #: Time between two looks of ``status --watch``.
 WATCH_S = 1.0
 
-Cell = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file.")]
 Cpus = Annotated[
     str | None,
     typer.Option(metavar="LIST", help="CPUs to use, as 0,2-3; those of this process if not given."),
 ]
-Keys = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FOLDER",
-        envvar="DWELL_KEYS",
-        help="Keyring: all connections are encrypted and authenticated with it.",
-    ),
-]
-Insecure = Annotated[
-    bool,
-    typer.Option(
-        "--insecure",
-        envvar="DWELL_INSECURE",
-        help="Without keys: leave this computer all the same, in a network that you trust.",
-    ),
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 live = typer.Typer(
     no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
@@ -58,7 +41,7 @@ live = typer.Typer(
 
 def agent(
     node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
-    cell: Cell,
+    cell: CellOption,
     state: Annotated[
         Path | None,
         typer.Option(
@@ -128,9 +111,7 @@ def controller(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
         "runs"
     ),
-    policy: Annotated[
-        str | None, typer.Option(help="Instead of the policy that the cells name.")
-    ] = None,
+    policy: Policy = None,
     name: Annotated[
         str | None, typer.Option(help="Of this controller; its process id if not given.")
     ] = None,
@@ -167,7 +148,7 @@ def controller(
 
 @live.command()
 def status(
-    cell: Cell,
+    cell: CellOption,
     check: Annotated[
         bool, typer.Option("--check", help="Exit with 1 unless the cell's health is ok.")
     ] = False,
@@ -177,7 +158,7 @@ def status(
     ] = False,
     keys: Keys = None,
     insecure: Insecure = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Show how a cell is, and first what is wrong with it."""
     if check and watch:
@@ -228,10 +209,10 @@ def _drawn(lines: list[str]) -> str:
 @live.command()
 def pin(
     candidate: Annotated[str, typer.Argument(metavar="CANDIDATE")],
-    cell: Cell,
+    cell: CellOption,
     keys: Keys = None,
     insecure: Insecure = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Have a cell stay on one candidate, whatever its policy would do."""
     _ask(cell, "pin", candidate, keys, insecure=insecure, as_json=as_json)
@@ -239,7 +220,7 @@ def pin(
 
 @live.command()
 def unpin(
-    cell: Cell, keys: Keys = None, insecure: Insecure = False, as_json: AsJson = False
+    cell: CellOption, keys: Keys = None, insecure: Insecure = False, as_json: Json = False
 ) -> None:
     """Let the policy decide again."""
     _ask(cell, "unpin", "", keys, insecure=insecure, as_json=as_json)
@@ -248,10 +229,10 @@ def unpin(
 @live.command()
 def drain(
     node: Annotated[str, typer.Argument(metavar="NODE")],
-    cell: Cell,
+    cell: CellOption,
     keys: Keys = None,
     insecure: Insecure = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Have no stage run on a node, so that it can be stopped or its code changed."""
     _ask(cell, "drain", node, keys, insecure=insecure, as_json=as_json)
@@ -260,10 +241,10 @@ def drain(
 @live.command()
 def undrain(
     node: Annotated[str, typer.Argument(metavar="NODE")],
-    cell: Cell,
+    cell: CellOption,
     keys: Keys = None,
     insecure: Insecure = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Let stages run on a node again."""
     _ask(cell, "undrain", node, keys, insecure=insecure, as_json=as_json)
@@ -274,11 +255,15 @@ def demo(
     out: Annotated[
         Path, typer.Option(metavar="FOLDER", help="Where logs, the run and its report go.")
     ] = Path("live-demo-out"),
-    scenario: Annotated[str, typer.Option(help="What is played: demo, or baseline.")] = "demo",
-    seconds: Annotated[float, typer.Option(min=5, help="Length.")] = 116,
-    policy: Annotated[str | None, typer.Option(help="Instead of the cell's.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of delays and losses.")] = 1,
-    as_json: AsJson = False,
+    scenario: Annotated[
+        str, typer.Option(metavar="NAME", help="What is played: demo, or baseline.")
+    ] = "demo",
+    seconds: Annotated[
+        float, typer.Option(min=5, metavar="S", help="Length, the warm-up included.")
+    ] = 116,
+    policy: Policy = None,
+    seed: Seed = 1,
+    as_json: Json = False,
 ) -> None:
     """Run a real visual-servoing cell on this machine for two minutes, and report on it."""
     from dwell.cli.live_demo import play
@@ -294,7 +279,7 @@ def chaos(
     ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
     faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the timeline.")] = 1,
+    seed: Seed = 1,
     only: Annotated[
         int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
     ] = None,
@@ -306,7 +291,7 @@ def chaos(
         bool,
         typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
     ] = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Have faults befall a cell on this machine, and watch whether it keeps its promises.
 

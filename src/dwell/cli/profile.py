@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dwell.cli.options import Json, Samples, Warmup
 from dwell.cli.output import aligned, print_json
 from dwell.errors import ProfileError
 
@@ -31,7 +32,6 @@ Period = Annotated[
     float | None,
     typer.Option(metavar="MS", help="Begin one every so often; one after another if not given."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 
 @profile.callback(invoke_without_command=True)
@@ -54,10 +54,8 @@ def measure(
             "(all tasks, or the one named).",
         ),
     ] = None,
-    runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Samples of each task.")] = 500,
-    warmup: Annotated[
-        int, typer.Option(min=0, max=1_000_000, help="Runs before them that are left out.")
-    ] = 50,
+    samples: Samples = 500,
+    warmup: Warmup = 50,
     core: Annotated[
         str | None,
         typer.Option(metavar="CORES", help="Core to run on, or several: 2, 0,2 or 0-3."),
@@ -82,7 +80,7 @@ def measure(
         node,
         task,
         inputs or (),
-        runs=runs,
+        samples=samples,
         warmup=warmup,
         core=core,
         period_ms=period_ms,
@@ -133,10 +131,8 @@ def link(
     payload_bytes: Annotated[
         int, typer.Option("--bytes", help="Payload of the larger message.")
     ] = 307_200,
-    count: Annotated[int, typer.Option(min=1, max=1_000_000, help="Samples.")] = 500,
-    warmup: Annotated[
-        int, typer.Option(min=0, max=1_000_000, help="Rounds before them that are left out.")
-    ] = 50,
+    samples: Samples = 500,
+    warmup: Warmup = 50,
     period_ms: Period = None,
     out: Out = None,
     as_json: Json = False,
@@ -160,7 +156,7 @@ def link(
         host,
         port,
         payload_bytes=payload_bytes,
-        settings=Settings(count, warmup, period_ms),
+        settings=Settings(samples, warmup, period_ms),
     )
     write_profile(path, [measured])
     _print_measured(path, [measured], as_json=as_json)
@@ -180,7 +176,7 @@ def _measure_tasks(
     declared: Sequence[str],
     inputs: Sequence[str],
     *,
-    runs: int,
+    samples: int,
     warmup: int,
     core: str | None,
     period_ms: float | None,
@@ -199,7 +195,7 @@ def _measure_tasks(
         from dwell.calibration.memory import keep_memory
         from dwell.calibration.profile_file import require_free, task_name, write_profile
 
-        settings = Settings(runs, warmup, period_ms)
+        settings = Settings(samples, warmup, period_ms)
         require_free(out, [task_name(task, node) for task in sources])
         keep_memory()  # as the processes of a live cell do
         measured = _measured(node, sources, factories, settings)

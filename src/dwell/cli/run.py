@@ -27,14 +27,13 @@ __all__ = ["Request", "run_cell"]
 class Request:
     """What a run was asked to be; None is what the cell says, or the default folder."""
 
-    cell: Path
+    problem: Problem
     scenario: str
     policy: str | None
     estimator: str | None
     seed: int
     windows: int
     out: Path | None
-    traces: Path | None
     jobs: bool
     guard: bool = False
     force: bool = False
@@ -53,7 +52,7 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
     DwellError
         If anything named is unknown, or the folder holds something else than a run.
     """
-    problem = dwell.load(request.cell, traces=request.traces)
+    problem = request.problem
     policy = request.policy or problem.controller.policy
     folder = request.out or _folder(problem, request.scenario, policy, request.seed)
     require_free(folder)
@@ -116,7 +115,7 @@ def _require_same(folder: Path, problem: Problem, request: Request, policy: str)
 def _folder(problem: Problem, scenario: str, policy: str, seed: int) -> Path:
     """Return the folder of a run that names none; a name may hold what a file name may not."""
     name = f"{problem.name}-{scenario}-{policy}-{seed}"
-    return Path("runs", re.sub(r"[^\w.-]", "_", name))
+    return Path("runs", re.sub(r"[^\w.+-]", "_", name))
 
 
 def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -> str:

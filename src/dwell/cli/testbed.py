@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from dwell.cli.options import (
+    CellArgument,
+    Json,
+    Policy,
+    Scenario,
+    Seconds,
+    Seed,
+    Windows,
+    require_one_length,
+)
 from dwell.cli.output import aligned, print_json
 
 __all__ = ["testbed"]
 
 FAILED = 1
 
-Cell = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
 Name = Annotated[str, typer.Option(help="Of the testbed, among others on this machine.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 testbed = typer.Typer(
     no_args_is_help=True,
@@ -25,32 +33,14 @@ testbed = typer.Typer(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Length:
-    """How long a run is: so many windows, or so many seconds."""
-
-    windows: int | None
-    seconds: float | None
-
-    def __post_init__(self) -> None:
-        if self.windows is not None and self.seconds is not None:
-            raise typer.BadParameter("--windows and --seconds: give one of them")
-
-
 @testbed.command()
 def run(
-    cell: Cell,
-    scenario: Annotated[str, typer.Option(help="What is played.")] = "baseline",
-    policy: Annotated[
-        str | None, typer.Option(help="A policy or a candidate, instead of the cell's policy.")
-    ] = None,
-    windows: Annotated[
-        int | None, typer.Option(min=1, help="Length, the warm-up included; 60 if not given.")
-    ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=1, help="Length instead, the warm-up included.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of delays and losses.")] = 1,
+    cell: CellArgument,
+    scenario: Scenario = "baseline",
+    policy: Policy = None,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    seed: Seed = 1,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -60,20 +50,23 @@ def run(
     ] = None,
     name: Name = "bed",
     jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job of the run.")] = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
-    """Play a scenario once, and take everything down again. Needs root."""
+    """Play a scenario once, and take everything down again. Needs root.
+
+    60 windows, if neither --windows nor --seconds is given.
+    """
     import dwell
     from dwell.testbed.run import length_s, run_once
 
-    length = _Length(windows, seconds)
+    require_one_length(windows, seconds)
     problem = dwell.load(cell)
     folder = out or _folder(problem.name, scenario, policy or problem.controller.policy, seed)
     found = run_once(
         problem,
         scenario=scenario,
         policy=policy,
-        seconds=length.seconds or length_s(problem, length.windows or 60),
+        seconds=seconds or length_s(problem, windows or 60),
         seed=seed,
         out=folder,
         name=name,
@@ -141,7 +134,7 @@ def doctor(
             min=0, metavar="SECONDS", help="Watch for so long whether the machine stands still."
         ),
     ] = 0.0,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Say what this machine can do as a testbed and what it cannot, and what to install."""
     import dwell
@@ -168,7 +161,7 @@ def doctor(
 
 @testbed.command()
 def campaign(
-    cell: Cell,
+    cell: CellArgument,
     scenarios: Annotated[
         str | None,
         typer.Option(metavar="NAME,NAME", help="The paper's four if not given."),
@@ -182,10 +175,9 @@ def campaign(
         ),
     ] = None,
     repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,
-    seconds: Annotated[
-        float, typer.Option(min=1, help="Length of each run, the warm-up included.")
-    ] = 120.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the order, of delays and losses.")] = 1,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    seed: Seed = 1,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Of the campaign; campaigns/CELL if not given."),
@@ -201,20 +193,34 @@ def campaign(
     report: Annotated[
         bool, typer.Option("--report", help="Measure nothing: report on what is there.")
     ] = False,
-    as_json: AsJson = False,
+    as_json: Json = False,
 ) -> None:
     """Measure every policy in every scenario again and again, in random order, and report.
 
-    What is done stays in the folder, whatever ends the work: the same command goes on.
+    What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
+    120 s, if neither --windows nor --seconds is given.
     """
     from dwell.cli.campaign import Request, run_campaign_file
 
+    length = _run_s(cell, windows, seconds)
+
     request = Request(
-        cell, _names(scenarios), _names(policies), repetitions, seconds, seed, out, name
+        cell, _names(scenarios), _names(policies), repetitions, length, seed, out, name
     )
     request = replace(request, minutes=minutes, inventory=inventory, report=report)
     if not run_campaign_file(request, as_json=as_json):
         raise typer.Exit(FAILED)
+
+
+def _run_s(cell: Path, windows: int | None, seconds: float | None) -> float:
+    """Return how long each run of several takes, seconds."""
+    import dwell
+    from dwell.testbed.run import length_s
+
+    require_one_length(windows, seconds)
+    if windows is not None:
+        return length_s(dwell.load(cell), windows)
+    return 120.0 if seconds is None else seconds
 
 
 def _names(text: str | None) -> tuple[str, ...]:
@@ -223,7 +229,7 @@ def _names(text: str | None) -> tuple[str, ...]:
 
 @testbed.command()
 def calibrate(
-    cell: Cell,
+    cell: CellArgument,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Cell file to write.")],
     runs: Annotated[
         list[Path] | None,
@@ -233,23 +239,26 @@ def calibrate(
             "the baseline is run under every candidate.",
         ),
     ] = None,
-    seconds: Annotated[
-        float, typer.Option(min=1, help="Of each run that is made, the warm-up included.")
-    ] = 120.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of its delays and losses.")] = 1,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    seed: Seed = 1,
     name: Name = "calibrate",
     real: Annotated[
         bool,
-        typer.Option("--real", help="The links are real: their delays are what was measured."),
+        typer.Option("--real-links", help="Links are real: their delays are what was measured."),
     ] = False,
 ) -> None:
-    """Put what runs have shown of tasks and links into a cell file."""
+    """Put what runs have shown of tasks and links into a cell file.
+
+    A run that is made takes 120 s, if neither --windows nor --seconds is given.
+    """
     from dwell.testbed.calibrate import calibrate as write_calibrated
     from dwell.testbed.calibrate import make_runs
 
     if not runs:
         folder = out.with_name(f"{out.stem}.runs")
-        runs = make_runs(cell, folder, seconds=seconds, seed=seed, name=name, tell=_say)
+        length = _run_s(cell, windows, seconds)
+        runs = make_runs(cell, folder, seconds=length, seed=seed, name=name, tell=_say)
     write_calibrated(cell, runs, out, emulated=not real, say=typer.echo)
     typer.echo(f"written to {out}")
 

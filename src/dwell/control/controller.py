@@ -81,15 +81,16 @@ class Controller:
     ----------
     problem : Problem
     policy : policy, str, or None
-        An object with `decide`, a policy's or candidate's name, or None for the cell file's
-        choice. The caller's object is copied, never changed.
+        An object with `decide`, a policy's or candidate's name, a policy's with an estimator's
+        (``cusum+corrected``), or None for the cell file's choice. The caller's object is copied,
+        never changed.
     estimator : Estimator, str, or None
         Likewise.
 
     Raises
     ------
     PolicyError
-        If the policy is unknown or is no policy.
+        If the policy is unknown or is no policy, or names another estimator than is given.
     ProblemError
         If the estimator is unknown, or wants more shadows than there are cycles.
     """
@@ -101,6 +102,8 @@ class Controller:
         estimator: Estimator | str | None = None,
     ) -> None:
         self.problem = problem
+        if isinstance(policy, str):
+            policy, estimator = _without_estimator(policy, estimator, problem)
         self.policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):
             name = estimator or problem.controller.estimator
@@ -440,6 +443,16 @@ class Controller:
             reason="migrate" if migrated else "hold",
             dwell=0 if migrated else self.dwell + 1,
         )
+
+
+def _without_estimator(
+    name: str, estimator: Estimator | str | None, problem: Problem
+) -> tuple[str, Estimator | str | None]:
+    """Split ``cusum+corrected``; the estimator stays as it is where the name has none."""
+    policy, named = problem.policy_and_estimator(name)
+    if named is not None and estimator is not None and estimator != named:
+        raise PolicyError(f"policy {name!r} names its estimator; leave the other one out")
+    return policy, named or estimator
 
 
 def _prepared_policy(policy: MinimalPolicy | str | None, problem: Problem) -> MinimalPolicy:

@@ -195,16 +195,34 @@ class Problem:
         """Name of the candidate that a run starts with."""
         return self.controller.initial or next(iter(self.candidates))
 
-    def under(self, policy: str) -> Problem:
+    def policy_and_estimator(self, name: str) -> tuple[str, str | None]:
+        """Return the policy that a name means, and the estimator that the name asks for.
+
+        Parameters
+        ----------
+        name : str
+            ``cusum`` or ``LOC``, for which the estimator is None, or ``cusum+corrected``.
+        """
+        policy, plus, estimator = name.rpartition("+")
+        return (policy, estimator) if plus and name not in self.candidates else (name, None)
+
+    def under(self, name: str) -> Problem:
         """Return the problem with another policy, which begins where it belongs.
 
         Parameters
         ----------
-        policy : str
-            Its name; a candidate's for the placement that never moves, and so begins on it.
+        name : str
+            As ``cusum`` or ``cusum+corrected``; a candidate's name for the placement that never
+            moves, and so begins on it.
         """
-        initial = policy if policy in self.candidates else self.controller.initial
-        return replace(self, controller=replace(self.controller, policy=policy, initial=initial))
+        policy, estimator = self.policy_and_estimator(name)
+        controller = replace(
+            self.controller,
+            policy=policy,
+            estimator=estimator or self.controller.estimator,
+            initial=policy if policy in self.candidates else self.controller.initial,
+        )
+        return replace(self, controller=controller)
 
     @property
     def censor_ms(self) -> float:

@@ -59,8 +59,9 @@ def simulate(
     scenario : str
         Name of one of the problem's scenarios; ``baseline`` exists always.
     policy : policy, str, or None
-        An object with ``decide``, a policy's name, a candidate's name for the placement that never
-        moves, or None for what the cell file says. The caller's object is not changed.
+        An object with ``decide``, a policy's name (``cusum``, or with its estimator
+        ``cusum+corrected``), a candidate's name for the placement that never moves, or None for
+        what the cell file says. The caller's object is not changed.
     estimator : Estimator, str, or None
         Likewise.
     seed : int

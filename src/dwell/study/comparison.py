@@ -195,10 +195,10 @@ def compare(
     """
     scenarios = tuple(problem.scenarios if scenarios is None else scenarios)
     if isinstance(policies, Mapping):
-        contenders = [Contender(name, policy) for name, policy in policies.items()]
+        contenders = [_contender(problem, name, policy) for name, policy in policies.items()]
     else:
         contenders = [
-            one if isinstance(one, Contender) else Contender(one, one) for one in policies
+            one if isinstance(one, Contender) else _contender(problem, one, one) for one in policies
         ]
     study = Study(
         name=problem.name,
@@ -222,3 +222,10 @@ def compare(
         examples={(item.scenario, policy): one for (item, _, policy), one in kept.items()},
         versions=versions(),
     )
+
+
+def _contender(problem: Problem, name: str, policy: MinimalPolicy | str) -> Contender:
+    """Return a policy of a comparison; ``cusum+corrected`` names its estimator."""
+    if isinstance(policy, str):
+        return Contender(name, *problem.policy_and_estimator(policy))
+    return Contender(name, policy)

@@ -213,10 +213,10 @@ def entrant(problem: Problem, name: str) -> Entrant:
     PolicyError
         If it is neither a policy nor a candidate of the cell.
     """
-    policy, plus, estimator = name.partition("+")
+    policy, estimator = problem.policy_and_estimator(name)
     if policy not in names() and policy not in problem.candidates:
         by_name(policy, problem)
-    if not plus:
+    if estimator is None:
         # With the profile no shadow jobs load the nodes.
         blind = not estimates(policy) or policy in problem.candidates
         estimator = "profile" if blind else problem.controller.estimator

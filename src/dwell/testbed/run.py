@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
+from dwell.estimators import registry as estimators
 from dwell.live.hosting import clock_of
 from dwell.model import NodeDisturbance, Problem
 from dwell.policies.registry import by_name
@@ -111,8 +112,9 @@ def run_once(
         here; later, if the cell does not come up, or has written no run.
     """
     if policy is not None:
-        by_name(policy, problem)
         problem = problem.under(policy)
+        by_name(problem.controller.policy, problem)
+        estimators.by_name(problem.controller.estimator, problem)
     changes = changes_of(problem, scenario, outages=True)
     arguments = ["--jobs"] if jobs else []
     bed = NetnsTestbed(problem, out, name=name, seed=seed, beside=beside, more=arguments)

@@ -1,0 +1,134 @@
+"""Options that several commands have: one spelling, one meaning, declared once."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from dwell.model import Problem
+
+__all__ = [
+    "CellArgument",
+    "CellOption",
+    "Estimator",
+    "Insecure",
+    "Json",
+    "Keys",
+    "Policy",
+    "Processes",
+    "Samples",
+    "Scenario",
+    "Seconds",
+    "Seed",
+    "Traces",
+    "Warmup",
+    "Windows",
+    "require_one_length",
+    "respelt",
+    "windows_of",
+]
+
+CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
+CellOption = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file (YAML).")]
+Traces = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Where its trace files are; beside it if not given."),
+]
+Scenario = Annotated[str, typer.Option(metavar="NAME", help="One of the cell's scenarios.")]
+Policy = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="A policy, as dtp, or with its estimator, as cusum+corrected; or a candidate's name "
+        "for the placement that never moves; what the cell says if not given.",
+    ),
+]
+Estimator = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="An estimator; what the cell says if not given."),
+]
+Seed = Annotated[
+    int,
+    typer.Option(
+        min=0, metavar="S", help="Seed of all that is drawn; one seed, one course of events."
+    ),
+]
+Windows = Annotated[
+    int | None, typer.Option(min=1, metavar="N", help="Length in windows, the warm-up included.")
+]
+Seconds = Annotated[
+    float | None,
+    typer.Option(min=1, metavar="S", help="Length in seconds instead, the warm-up included."),
+]
+Processes = Annotated[
+    int | None, typer.Option(min=1, metavar="N", help="How many to use; one a CPU if not given.")
+]
+Samples = Annotated[
+    int, typer.Option(min=1, max=1_000_000, metavar="N", help="Samples of each measurement.")
+]
+Warmup = Annotated[
+    int,
+    typer.Option(
+        min=0, max=1_000_000, metavar="N", help="Rounds before the samples that are left out."
+    ),
+]
+Keys = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FOLDER",
+        envvar="DWELL_KEYS",
+        help="Keyring: all connections are encrypted and authenticated with it.",
+    ),
+]
+Insecure = Annotated[
+    bool,
+    typer.Option(
+        "--insecure",
+        envvar="DWELL_INSECURE",
+        help="Without keys: leave this computer all the same, in a network that you trust.",
+    ),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+
+#: Old spellings, which work until the next minor version, by the command that has them.
+OLD_SPELLINGS = {
+    "profile": {"--runs": "--samples", "--count": "--samples"},
+    "testbed": {"--real": "--real-links"},
+}
+
+
+def respelt(arguments: Sequence[str]) -> list[str]:
+    """Return a command line with today's spellings; a warning on stderr names each old one."""
+    known = OLD_SPELLINGS.get(arguments[0], {}) if arguments else {}
+    found = []
+    for argument in arguments:
+        option, equals, value = argument.partition("=")
+        today = known.get(option, option)
+        if today != option:
+            typer.echo(f"warning: {option} is now {today}; the old spelling will go", err=True)
+        found.append(f"{today}{equals}{value}")
+    return found
+
+
+def require_one_length(windows: int | None, seconds: float | None) -> None:
+    """Refuse a length that is given twice.
+
+    Raises
+    ------
+    typer.BadParameter
+        If it is.
+    """
+    if windows is not None and seconds is not None:
+        raise typer.BadParameter("--windows and --seconds: give one of them")
+
+
+def windows_of(problem: Problem, seconds: float) -> int:
+    """Return the least number of whole windows that last so many seconds, at least 1."""
+    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    return max(1, math.ceil(round(seconds / window_s, 9)))

@@ -1,0 +1,100 @@
+"""Options that mean the same are called the same, and old spellings work, with a warning."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import cast
+
+import click
+import pytest
+import typer
+from typer.testing import CliRunner
+
+import dwell
+from dwell.cli.commands import app
+from dwell.cli.options import windows_of
+
+ROOT = Path(__file__).parents[2]
+CANONICAL = ROOT / "examples" / "canonical.yaml"
+
+#: Options that mean the same wherever they are.
+SHARED = (
+    *("--scenario", "--scenarios", "--policy", "--policies", "--estimator", "--seed", "--seeds"),
+    *("--windows", "--seconds", "--processes", "--samples", "--warmup", "--traces", "--json"),
+    *("--cell", "--keys", "--insecure"),
+)
+
+
+def options(command: click.Command) -> Iterator[click.Option]:
+    """Yield the options of a command and of all below it."""
+    for one in command.params:
+        if one.param_type_name == "option":
+            yield cast(click.Option, one)
+    for inner in getattr(command, "commands", {}).values():
+        yield from options(inner)
+
+
+def test_a_shared_option_takes_the_same_in_every_command() -> None:
+    taken = defaultdict(set)
+    for one in options(cast(click.Command, typer.main.get_command(app))):
+        for name in one.opts:
+            taken[name].add((one.metavar, one.is_flag, one.envvar))
+    assert {name: taken[name] for name in SHARED if len(taken[name]) != 1} == {}
+
+
+def test_no_command_takes_a_length_in_windows_or_seconds_alone_where_it_has_one_cell() -> None:
+    root = cast(click.Group, typer.main.get_command(app))
+    testbed = cast(click.Group, root.commands["testbed"])
+    for command in (root.commands["run"], *map(testbed.commands.get, ("run", "campaign"))):
+        assert command is not None
+        assert {"--windows", "--seconds"} <= {name for one in options(command) for name in one.opts}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "old", "today"),
+    [
+        (("profile", "--runs", "0"), "--runs", "--samples"),
+        (("profile", "--runs=0"), "--runs", "--samples"),
+        (("profile", "link", "e:1", "--count", "0"), "--count", "--samples"),
+        (("testbed", "calibrate", "no.yaml", "--out", "o.yaml", "--real", "a"), "--real", ""),
+    ],
+)
+def test_an_old_spelling_works_with_a_warning(
+    arguments: tuple[str, ...], old: str, today: str
+) -> None:
+    found = CliRunner().invoke(app, list(arguments), prog_name="dwell")
+    assert f"warning: {old} is now {today or '--real-links'}; " in found.stderr
+    assert "No such option" not in found.stderr
+    # What the option was given is judged under its name of today.
+    assert today in found.stderr
+    assert found.exit_code == 2
+
+
+def test_seconds_are_whole_windows() -> None:
+    problem = dwell.load(CANONICAL)
+    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    assert windows_of(problem, 3 * window_s) == 3
+    assert windows_of(problem, 3.01 * window_s) == 4
+    assert windows_of(problem, window_s / 10) == 1
+
+
+def test_a_run_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
+    problem = dwell.load(CANONICAL)
+    seconds = str(4 * problem.window_cycles * problem.pipeline.period_ms / 1e3)
+    words = ["run", str(CANONICAL), "--policy", "cusum+corrected", "--out", str(tmp_path / "run")]
+    done = CliRunner().invoke(app, [*words, "--seconds", seconds])
+    assert done.exit_code == 0, done.output
+    made = dwell.open_run(tmp_path / "run")
+    assert made.meta["windows"] == 4
+    assert (made.meta["estimator"], made.meta["policy"][:5]) == ("Corrected", "Cusum")
+    both = CliRunner().invoke(app, [*words, "--seconds", seconds, "--windows", "4"])
+    assert (both.exit_code, "give one of them" in both.stderr) == (2, True)
+
+
+def test_an_estimator_that_is_named_twice_is_refused(tmp_path: Path) -> None:
+    words = ["run", str(CANONICAL), "--policy", "cusum+corrected", "--estimator", "shadow"]
+    refused = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "run")])
+    assert refused.exit_code == 2
+    assert "'cusum+corrected' names its estimator" in refused.stderr
