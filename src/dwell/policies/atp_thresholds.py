@@ -26,13 +26,7 @@ from dwell.model.objective import Objective, Tier
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import (
-    NOT_PRICED,
-    Incumbent,
-    check_candidates,
-    check_name,
-    check_parameter,
-)
+from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy, check_name, check_parameter
 from dwell.policies.pricing import Pricing
 
 __all__ = ["ATPThresholds", "Pair", "find_pairs"]
@@ -63,7 +57,7 @@ def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -
     return tuple(pairs)
 
 
-class ATPThresholds:
+class ATPThresholds(CandidatePolicy):
     """Toggles one task between a robot and the edge by thresholds (our reconstruction).
 
     Parameters
@@ -108,8 +102,7 @@ class ATPThresholds:
         edge: float | None = None,
         min_dwell: int = 3,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
+        super().__init__(candidates, initial)
         self.objective = objective
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self._pricing = Pricing(self.candidates, objective)
@@ -124,7 +117,6 @@ class ATPThresholds:
         check_parameter("latency_ms", self.latency_ms, THRESHOLD)
         check_parameter("robot", self.robot, THRESHOLD)
         check_parameter("edge", self.edge, THRESHOLD)
-        self._incumbent = Incumbent(self.candidates, self.initial)
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Self:
@@ -190,11 +182,6 @@ class ATPThresholds:
         return next((pair for pair in pairs if self.initial in pair[:2]), pairs[0])
 
     @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
-    @property
     def local(self) -> str:
         """The candidate with the task on a robot."""
         return self.pair.local
@@ -203,14 +190,6 @@ class ATPThresholds:
     def offload(self) -> str:
         """The candidate with the task on the edge or in the cloud."""
         return self.pair.offload
-
-    def start(self, problem: Problem) -> None:
-        """Begin again: the initial candidate, n_d = 0."""
-        self._incumbent.begin(self.initial)
-
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
         """Toggle the task if a metric of the last window is above its threshold.

@@ -31,13 +31,13 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.dtp import cheapest
-from dwell.policies.incumbent import Incumbent, check_candidates, check_name, check_parameter
+from dwell.policies.incumbent import CandidatePolicy, check_parameter
 from dwell.policies.pricing import Pricing
 
 __all__ = ["Cusum"]
 
 
-class Cusum:
+class Cusum(CandidatePolicy):
     """Moves to the cheapest candidate whose advantage over the incumbent has added up.
 
     A candidate over a cap is not eligible, as in DTP, and the reasons are the same; if none is
@@ -75,14 +75,12 @@ class Cusum:
         slack: float = 0.05,
         memory: float = 0.7,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
+        super().__init__(candidates, initial)
         self.objective = objective
         self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
         self.slack = check_parameter("slack", slack, MIN_IMPROVEMENT)
         self.memory = check_parameter("memory", memory, CUSUM_MEMORY)
         self._pricing = Pricing(self.candidates, objective)
-        self._incumbent = Incumbent(self.candidates, self.initial)
         self._sums = dict.fromkeys(self.candidates, 0.0)
 
     @classmethod
@@ -102,23 +100,18 @@ class Cusum:
         )
 
     @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
-    @property
     def sums(self) -> Mapping[str, float]:
         """G of every candidate; the incumbent's is 0."""
         return dict(self._sums)
 
     def start(self, problem: Problem) -> None:
         """Begin again: the initial candidate, all sums 0."""
-        self._incumbent.begin(self.initial)
+        super().start(problem)
         self._sums = dict.fromkeys(self.candidates, 0.0)
 
     def adopt(self, name: str) -> None:
         """Take over `name` as the incumbent, all sums 0: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
+        super().adopt(name)
         self._sums = dict.fromkeys(self.candidates, 0.0)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:

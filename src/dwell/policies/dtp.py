@@ -32,19 +32,13 @@ from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import (
-    NOT_PRICED,
-    Incumbent,
-    check_candidates,
-    check_name,
-    check_parameter,
-)
+from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy, check_parameter
 from dwell.policies.pricing import Pricing
 
 __all__ = ["DTP"]
 
 
-class DTP:
+class DTP(CandidatePolicy):
     """Moves to the cheapest candidate once it is cheap enough and the dwell is over.
 
     Parameters
@@ -79,14 +73,12 @@ class DTP:
         min_improvement: float = 0.05,
         escape: bool = False,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
+        super().__init__(candidates, initial)
         self.objective = objective
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self.min_improvement = check_parameter("min_improvement", min_improvement, MIN_IMPROVEMENT)
         self.escape = escape
         self._pricing = Pricing(self.candidates, objective)
-        self._incumbent = Incumbent(self.candidates, self.initial)
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Self:
@@ -105,19 +97,6 @@ class DTP:
             f"DTP(initial={self.initial!r}, min_dwell={self.min_dwell}, "
             f"min_improvement={self.min_improvement:g}{', escape=True' if self.escape else ''})"
         )
-
-    @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
-    def start(self, problem: Problem) -> None:
-        """Begin again: the initial candidate, n_d = 0."""
-        self._incumbent.begin(self.initial)
-
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
         """Decide the placement for the next window (one pass of the loop of Algorithm 1).

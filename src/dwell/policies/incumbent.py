@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from dwell.errors import PolicyError
 from dwell.model.bounds import Bound
@@ -13,7 +13,10 @@ from dwell.model.placement import Placement
 from dwell.model.qos import Decision, Reason
 from dwell.model.semantics import nearest_of
 
-__all__ = ["Incumbent", "check_candidates", "check_name", "check_parameter"]
+if TYPE_CHECKING:
+    from dwell.model.problem import Problem
+
+__all__ = ["CandidatePolicy", "Incumbent", "check_parameter"]
 
 Number = TypeVar("Number", int, float)
 
@@ -133,3 +136,41 @@ class Incumbent:
         """Decide for another candidate; n_d restarts."""
         self.previous, self.name, self.dwell = self.name, name, 0
         return Decision(self.candidates[name], name, True, reason, costs, 0, delta_j)
+
+
+class CandidatePolicy:
+    """What policies of ours have in common: their candidates, and which of them is active.
+
+    Parameters
+    ----------
+    candidates : mapping of str to Placement
+        Over the same tasks.
+    initial : str, optional
+        The candidate it starts on; the first where None.
+
+    Raises
+    ------
+    PolicyError
+        If `initial` is no candidate, or candidates place different tasks.
+    """
+
+    def __init__(self, candidates: Mapping[str, Placement], initial: str | None) -> None:
+        self.candidates = check_candidates(candidates)
+        self.initial = check_name("initial", initial, self.candidates)
+        self._incumbent = Incumbent(self.candidates, self.initial)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(initial={self.initial!r})"
+
+    @property
+    def incumbent(self) -> str:
+        """Name of the active candidate."""
+        return self._incumbent.name
+
+    def start(self, problem: Problem) -> None:
+        """Begin again on the initial candidate, n_d = 0."""
+        self._incumbent.begin(self.initial)
+
+    def adopt(self, name: str) -> None:
+        """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
+        self._incumbent.adopt(name)

@@ -9,13 +9,13 @@ from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import NOT_PRICED, Incumbent, check_candidates, check_name
+from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy
 from dwell.policies.pricing import Pricing, check_metrics, explain_estimate
 
 __all__ = ["LatencyFirst"]
 
 
-class LatencyFirst:
+class LatencyFirst(CandidatePolicy):
     """Moves to the lowest estimated L95 in every window, with neither hysteresis nor dwell.
 
     This is latency-driven service selection, what FogROS2-LS (Chen et al., ICRA 2024) does among
@@ -43,11 +43,9 @@ class LatencyFirst:
         initial: str | None = None,
         objective: Objective | None = None,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
+        super().__init__(candidates, initial)
         self.objective = objective
         self._pricing = None if objective is None else Pricing(self.candidates, objective)
-        self._incumbent = Incumbent(self.candidates, self.initial)
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Self:
@@ -57,22 +55,6 @@ class LatencyFirst:
             initial=problem.initial,
             objective=problem.objective,
         )
-
-    def __repr__(self) -> str:
-        return f"LatencyFirst(initial={self.initial!r})"
-
-    @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
-    def start(self, problem: Problem) -> None:
-        """Begin again on the initial candidate."""
-        self._incumbent.begin(self.initial)
-
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
         """Choose the candidate with the lowest estimated L95.

@@ -6,15 +6,14 @@ from collections.abc import Mapping
 
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import NOT_PRICED, Incumbent, check_candidates, check_name
+from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy
 from dwell.policies.pricing import Pricing, check_metrics
 
 __all__ = ["Static"]
 
 
-class Static:
+class Static(CandidatePolicy):
     """Wants its candidate whatever happens; every decision is a hold there.
 
     Where somebody else has moved the cell, every decision is for the way back.
@@ -40,27 +39,9 @@ class Static:
         initial: str | None = None,
         objective: Objective | None = None,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
+        super().__init__(candidates, initial)
         self.objective = objective
         self._pricing = None if objective is None else Pricing(self.candidates, objective)
-        self._incumbent = Incumbent(self.candidates, self.initial)
-
-    def __repr__(self) -> str:
-        return f"Static(initial={self.initial!r})"
-
-    @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
-    def start(self, problem: Problem) -> None:
-        """Begin again on the initial candidate."""
-        self._incumbent.begin(self.initial)
-
-    def adopt(self, name: str) -> None:
-        """Take over `name` as the incumbent: somebody else moved the cell there."""
-        self._incumbent.adopt(name)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS] | None = None) -> Decision:
         """Hold, or return to the candidate.

@@ -42,7 +42,7 @@ from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import Incumbent, check_candidates, check_name
+from dwell.policies.incumbent import CandidatePolicy
 from dwell.policies.pricing import Pricing
 
 __all__ = ["TIE_TOLERANCE", "WorkFunction"]
@@ -51,7 +51,7 @@ __all__ = ["TIE_TOLERANCE", "WorkFunction"]
 TIE_TOLERANCE = 1e-9
 
 
-class WorkFunction:
+class WorkFunction(CandidatePolicy):
     """Moves once the optimum in hindsight justifies it, with neither threshold nor dwell.
 
     * A tie is a move: staying where the optimum would as soon have left is what an adversary
@@ -86,8 +86,7 @@ class WorkFunction:
         initial: str | None = None,
         objective: Objective,
     ) -> None:
-        self.candidates = check_candidates(candidates)
-        self.initial = check_name("initial", initial, self.candidates)
+        super().__init__(candidates, initial)
         self.objective = objective
         self._pricing = Pricing(self.candidates, objective)
         self._index = {name: i for i, name in enumerate(self.candidates)}
@@ -96,7 +95,6 @@ class WorkFunction:
             tuple(weight * moved for moved in self._pricing.switching(name).values())
             for name in self.candidates
         )
-        self._incumbent = Incumbent(self.candidates, self.initial)
         self._work = self._distances[self._index[self.initial]]
 
     @classmethod
@@ -108,14 +106,6 @@ class WorkFunction:
             objective=problem.objective,
         )
 
-    def __repr__(self) -> str:
-        return f"WorkFunction(initial={self.initial!r})"
-
-    @property
-    def incumbent(self) -> str:
-        """Name of the active candidate."""
-        return self._incumbent.name
-
     @property
     def work(self) -> FrozenDict[str, float]:
         """w_k less its minimum, by candidate, in units of J."""
@@ -123,7 +113,7 @@ class WorkFunction:
 
     def start(self, problem: Problem) -> None:
         """Begin again: the initial candidate, and no window seen."""
-        self._incumbent.begin(self.initial)
+        super().start(problem)
         self._work = self._distances[self._index[self.initial]]
 
     def adopt(self, name: str) -> None:
@@ -131,7 +121,7 @@ class WorkFunction:
 
         The work function stays: it is about what was possible, not about where the cell was.
         """
-        self._incumbent.adopt(name)
+        super().adopt(name)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
         """Add a window to the work function and decide the placement for the next one.
