@@ -341,21 +341,21 @@ def beat(life: int, sent_ns: int, *heard: Heard) -> Beat:
 @pytest.mark.parametrize("false", [(1, HUGE * S), (HUGE, 0), (HUGE, HUGE * S)])
 @pytest.mark.parametrize("direct", [True, False])
 def test_one_false_beat_silences_nobody_for_ever(false: tuple[int, int], direct: bool) -> None:
-    hearing = FailureDetector("controller@R1", S)
-    hearing.hear(beat(1, 0), 0)
-    hearing.hear(beat(*false), 1, direct=direct)
+    detector = FailureDetector("controller@R1", S)
+    detector.hear(beat(1, 0), 0)
+    detector.hear(beat(*false), 1, direct=direct)
     for n in range(1, 10):
-        hearing.hear(beat(1, n * S), n * S)
-    assert hearing.age_ns("perception@E", 9 * S) == 0
-    last = hearing.last("perception@E")
+        detector.hear(beat(1, n * S), n * S)
+    assert detector.age_ns("perception@E", 9 * S) == 0
+    last = detector.last("perception@E")
     assert last is not None
     assert (last.life, last.sent_ns) == (1, 9 * S)
 
 
 def test_late_beats_over_the_detour_are_no_news() -> None:
-    hearing = FailureDetector("controller@R1", S)
-    hearing.hear(beat(1, 100), 100)
-    assert not any(hearing.hear(beat(1, n), 100 + n, direct=False) for n in range(50))
+    detector = FailureDetector("controller@R1", S)
+    detector.hear(beat(1, 100), 100)
+    assert not any(detector.hear(beat(1, n), 100 + n, direct=False) for n in range(50))
 
 
 def test_a_false_completion_stops_no_intervals() -> None:

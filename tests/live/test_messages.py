@@ -312,7 +312,7 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
         pulse = getattr(role, "pulse", None)
         if isinstance(pulse, Pulse):
             assert len(pulse.strangers) <= MAX_STRANGERS
-            known = {name for name, _, _ in pulse.hearing.everybody(now_ns)}
+            known = {name for name, _, _ in pulse.detector.everybody(now_ns)}
             assert known <= set(world.roles) | {"controller@E"}
     for _, role in roles_of(world):
         if hasattr(role, "_jobs"):
@@ -325,5 +325,5 @@ def test_a_beat_of_an_unknown_process_is_not_heard(world: World) -> None:
     stamper = world.stamper
     beat = Beat("ghost@E", "E", 1, 1, True, cell=fingerprint(world.problem))
     stamper.receive(Sample(stamper.place.keys.beat("E", "ghost@E"), encode(beat)), 0)
-    assert stamper.pulse.hearing.last("ghost@E") is None
+    assert stamper.pulse.detector.last("ghost@E") is None
     assert "ghost@E on E is no process of cell 'canonical'" in stamper.place.complaints

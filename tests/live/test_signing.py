@@ -359,7 +359,7 @@ def test_orders_take_no_detour(world: World, seals: dict[str, Seals]) -> None:
 
 
 def beat_of(world: World, who: str, node: str, **more: object) -> Beat:
-    last = world.stamper.pulse.hearing.last(who)
+    last = world.stamper.pulse.detector.last(who)
     assert last is not None
     return msgspec.structs.replace(last, sent_ns=world.network.now_ns + 10**9, **more)
 
@@ -368,25 +368,25 @@ def test_a_relay_cannot_make_beats_up(world: World, seals: dict[str, Seals]) -> 
     keys, who = Keys(world.problem.name), "control@R2"
     beat = beat_of(world, who, "R2", ready=False)
     key = keys.beat("R2", who)
-    before = world.stamper.pulse.hearing.last(who)
+    before = world.stamper.pulse.detector.last(who)
     for data in (encode(beat), seals["E"].seal("beat", encode(beat))):
         assert give(world, carried(world, (key, data))) == 1
-        assert world.stamper.pulse.hearing.last(who) == before
+        assert world.stamper.pulse.detector.last(who) == before
     assert give(world, carried(world, (key, seals["R2"].seal("beat", encode(beat))))) == 0
-    assert world.stamper.pulse.hearing.last(who) == beat
+    assert world.stamper.pulse.detector.last(who) == beat
 
 
 def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]) -> None:
     """The key is what a certificate is let through for."""
     keys, who = Keys(world.problem.name), "control@R2"
     beat = beat_of(world, who, "R2", ready=False)
-    before = world.stamper.pulse.hearing.last(who)
+    before = world.stamper.pulse.detector.last(who)
     data = seals["E"].seal("beat", encode(beat))
     assert give(world, Sample(keys.beat("E", "perception@E"), data)) == 1
     later = encode(msgspec.structs.replace(beat, sent_ns=beat.sent_ns + 1))
     for sealed in (seals["E"].seal("beat", later), seals["R2"].seal("beat", later)):
         assert give(world, carried(world, (keys.beat("E", "perception@E"), sealed))) == 1
-    assert world.stamper.pulse.hearing.last(who) == before
+    assert world.stamper.pulse.detector.last(who) == before
 
 
 # ----------------------------------------------------------------------- the controller's

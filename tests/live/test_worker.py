@@ -120,14 +120,14 @@ def test_what_went_wrong_stands_in_the_beats_for_a_while(problem: Problem) -> No
 
     world = World(problem, exec_ms=EXEC_MS, stages={"perception": Once})
     world.run(1_000)
-    beat = world.stamper.pulse.hearing.last("perception@R1")
+    beat = world.stamper.pulse.detector.last("perception@R1")
     assert beat is not None
     assert (beat.ready, beat.note) == (
         True,
         "perception on R1: cycle 10: process() raised ValueError: no light",
     )
     world.run(11_000)
-    beat = world.stamper.pulse.hearing.last("perception@R1")
+    beat = world.stamper.pulse.detector.last("perception@R1")
     assert beat is not None
     assert beat.note == ""
 
@@ -140,7 +140,7 @@ def test_a_stage_that_hangs_says_so_and_the_guard_moves(problem: Problem) -> Non
     assert isinstance(bench, Bench)
     bench.exec_ns = 10_000 * MS
     world.run(3_000)
-    beat = world.stamper.pulse.hearing.last("perception@E")
+    beat = world.stamper.pulse.detector.last("perception@E")
     assert beat is not None
     assert not beat.ready
     assert "perception on E: cycle " in beat.note

@@ -81,8 +81,8 @@ def play(
     `down` says from when until when, in milliseconds, nodes and links are down.
     """
     changes, segments = [], []
-    for name, spells in (down or {}).items():
-        for begin, end in spells:
+    for name, intervals in (down or {}).items():
+        for begin, end in intervals:
             for at_ms, is_down in ((begin, True), (end, False)):
                 if "->" in name:
                     segments.append(

@@ -23,15 +23,15 @@ def drawn(
     return drawn_intervals(every, length, float(S), rngs, begin_ns, horizon_ns)
 
 
-def level(spells: OnOffIntervals, at_ns: int) -> int:
-    return int(spells.levels(np.array([at_ns]))[0])
+def level(intervals: OnOffIntervals, at_ns: int) -> int:
+    return int(intervals.levels(np.array([at_ns]))[0])
 
 
 # ------------------------------------------------------------------------------------- ramps
 
 
 def test_a_ramp_is_a_staircase_up_and_its_mirror_image_down() -> None:
-    spells = ramp(10 * S, 100 * S, 31 * S)
+    intervals = ramp(10 * S, 100 * S, 31 * S)
     for at_s, steps in (
         (0, 0),
         (10.999, 0),  # the first step is reached 1/31 of the ramp after the begin
@@ -49,18 +49,18 @@ def test_a_ramp_is_a_staircase_up_and_its_mirror_image_down() -> None:
         (99, 0),
         (1000, 0),
     ):
-        assert level(spells, round(at_s * S)) == steps, at_s
+        assert level(intervals, round(at_s * S)) == steps, at_s
 
 
 def test_a_ramp_that_lasts_for_ever_does_not_fall() -> None:
-    spells = ramp(0, LONGEST_NS, 31 * S)
-    assert [level(spells, at_s * S) for at_s in (0, 1, 30, 31, 10_000_000)] == [0, 1, 30, 31, 31]
+    intervals = ramp(0, LONGEST_NS, 31 * S)
+    assert [level(intervals, at_s * S) for at_s in (0, 1, 30, 31, 10_000_000)] == [0, 1, 30, 31, 31]
 
 
 def test_a_ramp_of_half_its_time_falls_as_soon_as_it_has_grown() -> None:
-    spells = ramp(0, 62 * S, 31 * S)
-    assert [level(spells, at_s * S) for at_s in (30, 31, 32, 33)] == [30, 30, 29, 28]
-    assert spells.levels(np.arange(0, 62 * S, S // 7)).max() == 30
+    intervals = ramp(0, 62 * S, 31 * S)
+    assert [level(intervals, at_s * S) for at_s in (30, 31, 32, 33)] == [30, 30, 29, 28]
+    assert intervals.levels(np.arange(0, 62 * S, S // 7)).max() == 30
 
 
 @given(
@@ -73,12 +73,12 @@ def test_a_ramp_is_never_a_step_off_the_line(
     begin: int, ramp_ns: int, flat_ns: int, shares: list[float]
 ) -> None:
     end = begin + 2 * ramp_ns + flat_ns
-    spells = ramp(begin, end, ramp_ns)
-    assert (np.diff(spells.begin) >= 0).all()
+    intervals = ramp(begin, end, ramp_ns)
+    assert (np.diff(intervals.begin) >= 0).all()
     at = np.array([begin + round(share * (end - begin)) for share in shares])
     since = np.minimum(at - begin, end - at)
     line = np.ones(len(at)) if ramp_ns == 0 else np.minimum(since / ramp_ns, 1)
-    found = spells.levels(at) / RAMP_STEPS
+    found = intervals.levels(at) / RAMP_STEPS
     near = 1 / max(ramp_ns, 1)  # a nanosecond, as a share of the ramp
     assert (found <= line + near).all()
     if ramp_ns > RAMP_STEPS:
@@ -86,8 +86,8 @@ def test_a_ramp_is_never_a_step_off_the_line(
 
 
 def test_a_spell_is_on_from_its_begin_until_before_its_end() -> None:
-    spells = interval(3, 5)
-    assert spells.levels(np.arange(7)).tolist() == [0, 0, 0, RAMP_STEPS, RAMP_STEPS, 0, 0]
+    intervals = interval(3, 5)
+    assert intervals.levels(np.arange(7)).tolist() == [0, 0, 0, RAMP_STEPS, RAMP_STEPS, 0, 0]
     none = OnOffIntervals(*np.empty((3, 0), np.int64))
     assert none.levels(np.arange(3)).tolist() == [0, 0, 0]
 
@@ -96,22 +96,22 @@ def test_a_spell_is_on_from_its_begin_until_before_its_end() -> None:
 
 
 def test_constant_episodes_begin_with_a_time_off() -> None:
-    spells = drawn(Constant(3), Constant(2), begin_ns=10 * S, horizon_ns=24 * S)
-    assert (spells.begin / S).tolist() == [13, 18, 23]
-    assert (spells.end / S).tolist() == [15, 20, 25]
-    assert set(spells.level) == {RAMP_STEPS}
+    intervals = drawn(Constant(3), Constant(2), begin_ns=10 * S, horizon_ns=24 * S)
+    assert (intervals.begin / S).tolist() == [13, 18, 23]
+    assert (intervals.end / S).tolist() == [15, 20, 25]
+    assert set(intervals.level) == {RAMP_STEPS}
 
 
 def test_what_ends_cuts_an_episode_short() -> None:
-    spells = drawn(Constant(3), Constant(2)).until(14 * S)
-    assert (spells.begin / S).tolist() == [3, 8, 13]
-    assert (spells.end / S).tolist() == [5, 10, 14]
+    intervals = drawn(Constant(3), Constant(2)).until(14 * S)
+    assert (intervals.begin / S).tolist() == [3, 8, 13]
+    assert (intervals.end / S).tolist() == [5, 10, 14]
     assert len(drawn(Constant(3), Constant(2)).until(3 * S).begin) == 0
 
 
 def test_nothing_is_drawn_of_what_begins_after_the_run() -> None:
-    spells = drawn(Exponential(1), Exponential(1), begin_ns=5 * S, horizon_ns=4 * S)
-    assert len(spells.begin) == 0
+    intervals = drawn(Exponential(1), Exponential(1), begin_ns=5 * S, horizon_ns=4 * S)
+    assert len(intervals.begin) == 0
 
 
 @pytest.mark.parametrize(
@@ -125,9 +125,9 @@ def test_nothing_is_drawn_of_what_begins_after_the_run() -> None:
 def test_episodes_have_the_moments_declared(
     every: Process, length: Process, off_deviation: float, on_deviation: float
 ) -> None:
-    spells = drawn(every, length, horizon_ns=200_000 * S)
-    on = (spells.end - spells.begin) / S
-    off = (spells.begin[1:] - spells.end[:-1]) / S
+    intervals = drawn(every, length, horizon_ns=200_000 * S)
+    on = (intervals.end - intervals.begin) / S
+    off = (intervals.begin[1:] - intervals.end[:-1]) / S
     expected = 200_000 / (every.expectation + length.expectation)
     assert len(on) == pytest.approx(expected, rel=0.1)
     for values, process, deviation in (

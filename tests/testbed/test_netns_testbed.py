@@ -1,4 +1,4 @@
-"""The bed as a whole: what it refuses, and that it harms nodes and links as a scenario says."""
+"""The testbed as a whole: what it refuses, and that it harms nodes and links as a scenario says."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ PATIENCE_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def bed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetnsTestbed]:
+def testbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetnsTestbed]:
     """One that runs."""
     if why := no_hosts() or no_groups():
         pytest.skip(why)
-    folder = tmp_path_factory.mktemp("bed")
+    folder = tmp_path_factory.mktemp("testbed")
     cell = write_cell(folder)
     with NetnsTestbed(dwell.load(cell), folder / "out", name=own_name(), beside=folder) as one:
         one.come_up(patience_s=PATIENCE_S)
@@ -62,64 +62,64 @@ def test_cells_that_share_a_link_have_to_agree_on_it(tmp_path: Path) -> None:
     assert len(NetnsTestbed([one, replace(one, name="third")], tmp_path, name="fine").problems) == 2
 
 
-def test_a_run_begins_anew_with_everybody_there(bed: NetnsTestbed) -> None:
-    (watcher,) = bed.watchers
+def test_a_run_begins_anew_with_everybody_there(testbed: NetnsTestbed) -> None:
+    (watcher,) = testbed.watchers
     begun_ns = time.monotonic_ns()
-    before = {bed.begin(patience_s=PATIENCE_S)[0]}
+    before = {testbed.begin(patience_s=PATIENCE_S)[0]}
     # Nothing of the time until everybody was there is part of it.
     assert min(before) > begun_ns
     status = watcher.status(10.0)
     assert status["placement"] == "SO"
     assert status["origin_ns"] in before
-    assert set(bed.expected(bed.problems[0])) <= status["processes"].keys()
-    bed.stop_controllers()
+    assert set(testbed.expected(testbed.problems[0])) <= status["processes"].keys()
+    testbed.stop_controllers()
     # Another one is another run.
-    again = bed.begin(patience_s=PATIENCE_S)[0]
+    again = testbed.begin(patience_s=PATIENCE_S)[0]
     assert again not in before
     assert watcher.status(10.0)["run"] != status["run"]
 
 
-def test_stress_is_in_the_group_of_its_node(bed: NetnsTestbed) -> None:
+def test_stress_is_in_the_group_of_its_node(testbed: NetnsTestbed) -> None:
     stress = NodeDisturbance("R2", stress_threads=2)
-    bed.apply(Change(0.0, 0, stress, begins=True))
-    begun_ns = bed.used_ns["R2"]()
+    testbed.apply(Change(0.0, 0, stress, begins=True))
+    begun_ns = testbed.used_ns["R2"]()
     # Far less than its quota, far more than its stages take.
-    wait_for(lambda: bed.used_ns["R2"]() - begun_ns > 2_000_000_000, "two seconds of CPU time")
-    bed.apply(Change(1.0, 0, stress, begins=False))
+    wait_for(lambda: testbed.used_ns["R2"]() - begun_ns > 2_000_000_000, "two seconds of CPU time")
+    testbed.apply(Change(1.0, 0, stress, begins=False))
 
 
-def test_a_link_that_is_down_lets_nothing_through(bed: NetnsTestbed) -> None:
-    link = bed.links[frozenset(("R1", "R2"))]
+def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None:
+    link = testbed.links[frozenset(("R1", "R2"))]
     cut = LinkDisturbance("R1", "R2", down=True, loss=0.5)
-    bed.apply(Change(0.0, 0, cut, begins=True))
+    testbed.apply(Change(0.0, 0, cut, begins=True))
     wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
-    bed.apply(Change(1.0, 0, cut, begins=False))
+    testbed.apply(Change(1.0, 0, cut, begins=False))
     link.read()
     wait_for(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
 
 
-def test_a_node_that_was_down_comes_back(bed: NetnsTestbed) -> None:
-    (watcher,) = bed.watchers
-    if "controller@E" not in bed._processes.running:
-        bed.begin(patience_s=PATIENCE_S)
+def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
+    (watcher,) = testbed.watchers
+    if "controller@E" not in testbed._processes.running:
+        testbed.begin(patience_s=PATIENCE_S)
     outage = NodeDisturbance("R2", down=True)
-    there = set(bed._groups.pids("R2"))
-    bed.apply(Change(0.0, 0, outage, begins=True))
-    assert bed._groups.pids("R2") == []
-    bed.apply(Change(1.0, 0, outage, begins=False))
+    there = set(testbed._groups.pids("R2"))
+    testbed.apply(Change(0.0, 0, outage, begins=True))
+    assert testbed._groups.pids("R2") == []
+    testbed.apply(Change(1.0, 0, outage, begins=False))
 
     def ready() -> bool:
         heard = watcher.status(10.0)["processes"]
-        names = [who for who in bed.expected(bed.problems[0]) if "@R2" in who]
+        names = [who for who in testbed.expected(testbed.problems[0]) if "@R2" in who]
         return all(who in heard and heard[who]["age_ms"] < 1_000 for who in names)
 
     wait_for(ready, "the processes of R2")
-    assert not there & set(bed._groups.pids("R2"))
+    assert not there & set(testbed._groups.pids("R2"))
 
 
-def test_nothing_is_left(bed: NetnsTestbed) -> None:
-    """The last: it takes the bed down."""
-    namespaces = [namespace_path(bed._hosts.namespace(node)) for node in bed.nodes]
+def test_nothing_is_left(testbed: NetnsTestbed) -> None:
+    """The last: it takes the testbed down."""
+    namespaces = [namespace_path(testbed._hosts.namespace(node)) for node in testbed.nodes]
     assert all(path.exists() for path in namespaces)
-    bed.close()
+    testbed.close()
     assert not any(path.exists() for path in namespaces)

@@ -36,7 +36,7 @@ __all__ = ["Campaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"
 Staging: TypeAlias = Callable[[int], tuple[Stage, str | None]]
 
 LIGHT_HOME = "SO"
-#: What is on its way to an ear.
+#: What is on its way to a tap.
 HEARD_S = 0.15
 
 
@@ -75,14 +75,14 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
     def stage(number: int) -> tuple[Stage, str | None]:
         problem, folder, environment, home = _cell(cell, out, number, quotas=True)
         beside = None if cell is None else cell.parent
-        bed = NetnsTestbed(
+        testbed = NetnsTestbed(
             *(problem, folder),
             name=f"chaos{os.getpid() % 10_000}",
             seed=seed,
             beside=beside,
             environment=environment,
         )
-        return OnHosts(bed), home
+        return OnHosts(testbed), home
 
     return stage
 

@@ -30,12 +30,12 @@ class Observer:
 
     def __init__(self, stage: Stage, cell: Path) -> None:
         self.judge = Judge(stage.problem)
-        self._ears: list[Wiretap] = []
+        self._taps: list[Wiretap] = []
         self._records: list[Records] = []
         self._stack = ExitStack()
-        for name, prefix in stage.ears().items():
+        for name, prefix in stage.taps().items():
             out = stage.folder / f"heard-{name}"
-            self._ears.append(Wiretap(cell, stage.heard_at(name), out, prefix))
+            self._taps.append(Wiretap(cell, stage.heard_at(name), out, prefix))
             self._records.append(Records(out))
 
     def __enter__(self) -> Self:
@@ -47,8 +47,8 @@ class Observer:
             If nothing is.
         """
         try:
-            for ear in self._ears:
-                self._stack.enter_context(ear)
+            for tap in self._taps:
+                self._stack.enter_context(tap)
             until = time.monotonic() + HEARD_S
             while not {"stamped", "done", "in"} <= self.judge.counts.keys():
                 if time.monotonic() > until:

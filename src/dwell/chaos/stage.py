@@ -67,14 +67,14 @@ class Stage(Protocol):
         """Return what the controller says; a LiveError if it does not."""
         ...
 
-    def ears(self) -> Mapping[str, Sequence[str]]:
+    def taps(self) -> Mapping[str, Sequence[str]]:
         """Return how to run a command that reaches nodes directly: by name, prefix of the words.
 
         One name for each place that a listener is needed at; the nodes it is for are `heard_at`.
         """
         ...
 
-    def heard_at(self, ear: str) -> Sequence[str]:
+    def heard_at(self, tap: str) -> Sequence[str]:
         """Return the nodes that are listened to from there."""
         ...
 
@@ -154,11 +154,11 @@ class OnLoopback:
             raise LiveError("nobody has been asked yet")
         return self._visitor.ask("status", patience_s=patience_s)
 
-    def ears(self) -> Mapping[str, Sequence[str]]:
+    def taps(self) -> Mapping[str, Sequence[str]]:
         """Return one place, from which all are reached."""
         return {"loopback": ()}
 
-    def heard_at(self, ear: str) -> Sequence[str]:
+    def heard_at(self, tap: str) -> Sequence[str]:
         """Return all nodes."""
         return tuple(self.problem.fabric.nodes)
 
@@ -175,71 +175,73 @@ class OnHosts:
 
     Parameters
     ----------
-    bed : NetnsTestbed
+    testbed : NetnsTestbed
         Of one cell; not entered yet.
     """
 
-    def __init__(self, bed: NetnsTestbed) -> None:
-        self._bed = bed
+    def __init__(self, testbed: NetnsTestbed) -> None:
+        self._testbed = testbed
 
     @property
     def folder(self) -> Path:
         """Of cell file, states, logs and runs."""
-        return self._bed.folder
+        return self._testbed.folder
 
     @property
     def problem(self) -> Problem:
         """The cell, with its hosts."""
-        return self._bed.problems[0]
+        return self._testbed.problems[0]
 
     @property
     def processes(self) -> dict[str, subprocess.Popen[bytes]]:
         """Agents and controller, by name."""
-        return self._bed.processes.running
+        return self._testbed.processes.running
 
     def begin(self) -> None:
         """Start everything."""
-        self._bed.__enter__()
-        self._bed.come_up()
-        self._bed.begin()
+        self._testbed.__enter__()
+        self._testbed.come_up()
+        self._testbed.begin()
 
     def start_agent(self, node: str) -> None:
         """Start a node's agent again."""
-        self._bed.processes.start_agent(node)
+        self._testbed.processes.start_agent(node)
 
     def start_controller(self) -> None:
         """Start the controller again."""
-        self._bed.processes.start_controllers()
+        self._testbed.processes.start_controllers()
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
-        self._bed.stop_controllers()
+        self._testbed.stop_controllers()
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Cut a direction of a link; returns when that was."""
-        return self._bed.links[frozenset((source, target))].down(source, target, True, at_ns=at_ns)
+        return self._testbed.links[frozenset((source, target))].down(
+            source, target, True, at_ns=at_ns
+        )
 
     def heal(self, source: str, target: str) -> None:
         """End that."""
-        self._bed.links[frozenset((source, target))].down(source, target, False)
+        self._testbed.links[frozenset((source, target))].down(source, target, False)
 
     def stress(self, node: str, threads: int) -> bool:
         """Have so many busy threads share a node's CPUs."""
-        self._bed.stress[node].set(threads)
+        self._testbed.stress[node].set(threads)
         return True
 
     def ask(self, patience_s: float) -> Mapping[str, Any]:
         """Return what the controller says."""
-        return self._bed.watchers[0].status(patience_s)
+        return self._testbed.watchers[0].status(patience_s)
 
-    def ears(self) -> Mapping[str, Sequence[str]]:
+    def taps(self) -> Mapping[str, Sequence[str]]:
         """Return the hosts: what a node's processes say is listened to beside them."""
-        return {node: self._bed.beside(node) for node in self.problem.fabric.nodes}
+        return {node: self._testbed.beside(node) for node in self.problem.fabric.nodes}
 
-    def heard_at(self, ear: str) -> Sequence[str]:
+    def heard_at(self, tap: str) -> Sequence[str]:
         """Return the node."""
-        return (ear,)
+        return (tap,)
 
     def close(self) -> None:
         """End everything."""
-        self._bed.close()
+        self._testbed.close()

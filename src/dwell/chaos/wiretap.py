@@ -38,7 +38,7 @@ def entry_for(wiring: Wiring, nodes: Sequence[str]) -> Entry:
         if entry.role.node in nodes:
             for session, end in entry.listen.items():
                 connect.setdefault(session, []).append(end)
-    role = Role(f"ear.{os.getpid()}", nodes[0], "visitor")
+    role = Role(f"tap.{os.getpid()}", nodes[0], "visitor")
     ends = {name: tuple(connect[name]) for name in SESSIONS if name in connect}
     return Entry(role, {}, ends)
 
@@ -66,7 +66,7 @@ class Wiretap(Started):
             "nodes": list(nodes),
             "out": str(out),
         }
-        self._child = Child("dwell.chaos.wiretap", f"ear at {','.join(nodes)}", prefix=prefix)
+        self._child = Child("dwell.chaos.wiretap", f"tap at {','.join(nodes)}", prefix=prefix)
 
     def start(self) -> None:
         """Start it.

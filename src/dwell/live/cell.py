@@ -573,9 +573,9 @@ class Cell:
 
     def _staffed(self, name: str, now_ns: int) -> bool:
         """Whether all workers of a candidate were heard lately, and ready."""
-        hearing, silent_ns = self.pulse.hearing, silent_after_ns(self.place.problem)
+        detector, silent_ns = self.pulse.detector, silent_after_ns(self.place.problem)
         workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].items()]
-        beats = [hearing.last(who) for who in workers if hearing.fresh(who, now_ns, silent_ns)]
+        beats = [detector.last(who) for who in workers if detector.fresh(who, now_ns, silent_ns)]
         return len(beats) == len(workers) and all(beat is not None and beat.ready for beat in beats)
 
     def _overruled(self) -> str:
@@ -710,7 +710,7 @@ class Cell:
                 "ready": beat.ready and age_ns <= silent_ns,
                 "note": beat.note,
             }
-            for who, beat, age_ns in self.pulse.hearing.everybody(now_ns)
+            for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
         }
 
     def _missing(self, now_ns: int) -> dict[str, Any]:
@@ -719,7 +719,7 @@ class Cell:
         differ = {
             who: why for who, (why, at_ns) in strangers.items() if now_ns - at_ns < REPEATED_NS
         }
-        heard = {who for who, _, _ in self.pulse.hearing.everybody(now_ns)}
+        heard = {who for who, _, _ in self.pulse.detector.everybody(now_ns)}
         silent = [
             role.who
             for role in roles(self.place.problem)

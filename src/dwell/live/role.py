@@ -334,7 +334,7 @@ class Pulse:
     ) -> None:
         self.place = place
         self._hears = (place.stamper,) if hears is None else tuple(hears)
-        self.hearing = FailureDetector(place.who, place.patience_ns)
+        self.detector = FailureDetector(place.who, place.patience_ns)
         self._state, self._holds = state, holds
         self._every_ns = every * place.period_ns
         self._digest = fingerprint(place.problem)
@@ -379,7 +379,7 @@ class Pulse:
         direct = sample.key.startswith(self._prefix[0])
         if direct:
             self._look_for_rival(beat)
-        return beat if self.hearing.hear(beat, now_ns, direct=direct) else None
+        return beat if self.detector.hear(beat, now_ns, direct=direct) else None
 
     def _is_copy(self, sample: Sample) -> bool:
         """Whether a beat is the copy of the last that came directly, or of one of its own."""
@@ -423,7 +423,7 @@ class Pulse:
 
     def _look_for_rival(self, beat: Beat) -> None:
         """Notice two processes of one name: the earlier one of two lives goes on beating."""
-        last = self.hearing.last(beat.who)
+        last = self.detector.last(beat.who)
         if last is None or beat.life >= last.life:
             return
         count = self._rivals.get(beat.who, 0) + 1
@@ -464,7 +464,7 @@ class Pulse:
         ready, note = self._state()
         note = note or self._repeated(now_ns)
         term, placement = self._holds() if self._holds is not None else (0, "")
-        heard = self.hearing.heard()
+        heard = self.detector.heard()
         beat = Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
             *(self._digest, printable(note)[:2000], __version__),

@@ -444,11 +444,11 @@ class Worker:
         """Whether it works: it stands by for nobody, or for somebody who is silent."""
         if not self.stands_by:
             return True
-        hearing = self.pulse.hearing
-        beat = hearing.last(self.stands_by)
+        detector = self.pulse.detector
+        beat = detector.last(self.stands_by)
         patience_ns = 2 * self.place.period_ns
         return not (
-            beat and beat.ready and hearing.fresh(self.stands_by, self._now_ns, patience_ns)
+            beat and beat.ready and detector.fresh(self.stands_by, self._now_ns, patience_ns)
         )
 
     def rest_s(self, now_ns: int) -> float:

@@ -298,7 +298,7 @@ class _Draw:
         rngs = self._rng(f"bursts/{part.name}/every"), self._rng(f"bursts/{part.name}/for")
         return drawn_intervals(every, length, NS_PER_MS, rngs, 0, int(self.release_ns[-1]))
 
-    def _spells(self, item: Disturbance) -> OnOffIntervals:
+    def _intervals(self, item: Disturbance) -> OnOffIntervals:
         """Say when a disturbance is on, up to the end of the run."""
         begin_ns = round(item.at_s * NS_PER_S)
         end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS)))
@@ -323,7 +323,7 @@ class _Draw:
             if node.bursts is not None and node.bursts.threads:
                 steps.append(_steps(self._bursts(node), node.bursts.threads))
             steps += [
-                _steps(self._spells(item), item.stress_threads, item.down)
+                _steps(self._intervals(item), item.stress_threads, item.down)
                 for item in self.scenario
                 if isinstance(item, NodeDisturbance) and item.node == node.name
             ]
@@ -343,8 +343,8 @@ class _Draw:
         tables_f = [np.empty((0, 2))]
         for row, link in enumerate(self.problem.fabric.links.values()):
             bursts = self._bursts(link)
-            active = [(item, self._spells(item)) for item in self._on_link(link.name)]
-            edges = [edge for _, spells in active for edge in (spells.begin, spells.end)]
+            active = [(item, self._intervals(item)) for item in self._on_link(link.name)]
+            edges = [edge for _, intervals in active for edge in (intervals.begin, intervals.end)]
             start = np.zeros(1, np.int64)
             cuts = np.unique(np.concatenate((start, *edges, bursts.begin, bursts.end)))
             table = np.zeros((len(cuts), 4), np.int64)
@@ -354,8 +354,8 @@ class _Draw:
             rate = np.full(len(cuts), link.rate_mbps)
             table[:, 3] = bursts.levels(cuts) > 0
             layer = int(link.bursts is not None)
-            for item, spells in active:
-                level = spells.levels(cuts)
+            for item, intervals in active:
+                level = intervals.levels(cuts)
                 on = level > 0
                 table[on, 2] |= int(item.down)
                 survives *= 1 - item.loss * (level / RAMP_STEPS)
@@ -387,11 +387,11 @@ def _rates(own_mbps: float, mbps: float, level: Ints) -> Floats:
     return rates
 
 
-def _steps(spells: OnOffIntervals, threads: int, down: bool = False) -> Ints:
-    """Steps at the begins and ends of spells: rows at, change of threads, change of outages."""
-    steps = np.empty((3, 2 * len(spells.begin)), np.int64)
-    steps[0, 0::2], steps[0, 1::2] = spells.begin, spells.end
-    steps[1, 0::2] = np.rint(threads * (spells.level / RAMP_STEPS))
+def _steps(intervals: OnOffIntervals, threads: int, down: bool = False) -> Ints:
+    """Steps at the begins and ends of intervals: rows at, change of threads, change of outages."""
+    steps = np.empty((3, 2 * len(intervals.begin)), np.int64)
+    steps[0, 0::2], steps[0, 1::2] = intervals.begin, intervals.end
+    steps[1, 0::2] = np.rint(threads * (intervals.level / RAMP_STEPS))
     steps[2, 0::2] = down
     steps[1:, 1::2] = -steps[1:, 0::2]
     return steps

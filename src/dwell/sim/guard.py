@@ -210,13 +210,13 @@ class _Outages:
         if part in self.problem.fabric.nodes:
             nodes, table = self._changes.nodes, self._changes.table
             mine = table[table[:, 1] == nodes.index(part)] if part in nodes else table[:0]
-            return _joined(_spells(mine[:, 0], mine[:, 3]))
+            return _joined(_intervals(mine[:, 0], mine[:, 3]))
         links, table = self._segments.links, self._segments.table
         mine = table[table[:, 1] == links.index(part)] if part in links else table[:0]
-        return _joined(_spells(mine[:, 0], mine[:, 2]))
+        return _joined(_intervals(mine[:, 0], mine[:, 2]))
 
 
-def _spells(at_ns: NDArray[np.int64], down: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+def _intervals(at_ns: NDArray[np.int64], down: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     """Yield from when until when something is down."""
     begun: int | None = None
     for at, is_down in zip(at_ns.tolist(), down.tolist(), strict=True):
@@ -229,10 +229,10 @@ def _spells(at_ns: NDArray[np.int64], down: NDArray[np.int64]) -> Iterator[tuple
         yield begun, NEVER_NS
 
 
-def _joined(spells: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Join spells of which one begins before the other has ended."""
+def _joined(intervals: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Join intervals of which one begins before the other has ended."""
     last: tuple[int, int] | None = None
-    for down, up in spells:
+    for down, up in intervals:
         if last is not None and down <= last[1]:
             last = (last[0], max(up, last[1]))
             continue

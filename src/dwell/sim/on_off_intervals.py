@@ -23,9 +23,9 @@ class OnOffIntervals(NamedTuple):
 
     Parameters
     ----------
-    begin, end : int64 array, shape (spells,)
+    begin, end : int64 array, shape (intervals,)
         Nanoseconds; the end is outside.
-    level : int64 array, shape (spells,)
+    level : int64 array, shape (intervals,)
         Strength, counted in steps of a ramp: `RAMP_STEPS` is the whole of it.
     """
 

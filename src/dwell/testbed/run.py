@@ -117,7 +117,7 @@ def run_once(
         estimators.by_name(problem.controller.estimator, problem)
     changes = changes_of(problem, scenario, outages=True)
     arguments = ["--jobs"] if jobs else []
-    bed = NetnsTestbed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
+    testbed = NetnsTestbed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
     require_machine([problem])
     rule = rule or Rule()
     played = Played(problem, scenario, seed)
@@ -126,33 +126,33 @@ def run_once(
         with interruptible():
             try:
                 # A folder that is replaced may be that of a testbed that runs.
-                bed.claim()
+                testbed.claim()
                 make_folder(out, MARK, "a testbed's")
-                bed.__enter__()
+                testbed.__enter__()
                 tell("starting the cell")
-                bed.come_up()
+                testbed.come_up()
                 tell(f"playing {scenario} for {seconds:g} s")
-                _play(bed, changes, seconds, played, samplers, rule)
+                _play(testbed, changes, seconds, played, samplers, rule)
             finally:
                 with undisturbed():
-                    bed.close()
+                    testbed.close()
     except KeyboardInterrupt:
         # Before it was played, what is there may be a run of long ago.
         folder = longest_run(out / "runs") if samplers else None
         if folder is not None:
-            _seal(folder, bed, played, samplers, rule, interrupted=True)
+            _seal(folder, testbed, played, samplers, rule, interrupted=True)
             tell(f"interrupted; run: {folder}")
         raise
     folder = longest_run(out / "runs")
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    _seal(folder, bed, played, samplers, rule, interrupted=False)
+    _seal(folder, testbed, played, samplers, rule, interrupted=False)
     shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder
 
 
 def _play(
-    bed: NetnsTestbed,
+    testbed: NetnsTestbed,
     changes: Sequence[Change],
     seconds: float,
     played: Played,
@@ -160,22 +160,24 @@ def _play(
     rule: Rule,
 ) -> None:
     clock = clock_of(played.problem)
-    (origin_ns,) = bed.begin()
-    links = {"-".join(link.nodes): link for link in bed.links.values()}
+    (origin_ns,) = testbed.begin()
+    links = {"-".join(link.nodes): link for link in testbed.links.values()}
 
     def apply(change: Change) -> None:
-        bed.apply(change)
+        testbed.apply(change)
         played.changed(change)
 
-    with Sampler(bed.cpus, bed.used_ns, bed.switches, links, clock, rule, bed.probing) as sampler:
+    with Sampler(
+        testbed.cpus, testbed.used_ns, testbed.switches, links, clock, rule, testbed.probing
+    ) as sampler:
         samplers.append(sampler)
         play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
-    bed.stop_controllers()
+    testbed.stop_controllers()
 
 
 def _seal(
     folder: Path,
-    bed: NetnsTestbed,
+    testbed: NetnsTestbed,
     played: Played,
     samplers: Sequence[Sampler],
     rule: Rule,
@@ -183,7 +185,7 @@ def _seal(
     interrupted: bool,
 ) -> Run:
     """Tell the run what was played, on what, and how the machine was."""
-    more: dict[str, object] = {"testbed": bed.facts()}
+    more: dict[str, object] = {"testbed": testbed.facts()}
     if interrupted:
         more["interrupted"] = True
     if samplers:
