@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from dataclasses import replace
 from importlib import import_module
@@ -21,7 +22,12 @@ REAL = "real"
 
 def main(words: list[str]) -> int:
     """Ask, write tables and the page, and return the exit code."""
-    asked = _parser().parse_args(words)
+    parser = _parser()
+    asked = parser.parse_args(words)
+    if REAL in (asked.only or ()) and asked.real is None:
+        parser.error(
+            f"question {REAL!r} replays recorded traces; say where they are: --real FOLDER"
+        )
     scale = SCALES[asked.scale]
     if asked.seeds is not None:
         scale = replace(scale, seeds=asked.seeds)
@@ -35,17 +41,20 @@ def main(words: list[str]) -> int:
     names = asked.only or [name for name in QUESTIONS if name != REAL or asked.real]
     try:
         done = [_ask(name, scale, run, asked.real, out) for name in names]
-    except dwell.DwellError as error:
+        text = page(done, scale=asked.scale, version=dwell.__version__)
+        (out / "report.html").write_text(text, encoding="utf-8")
+    except (dwell.DwellError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        print(f"error: {error.name} is not installed; `make env` installs it", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(
             f"interrupted: finished runs stay in {out}; the same command goes on", file=sys.stderr
         )
         return 130
-    file = out / "report.html"
-    file.write_text(page(done, scale=asked.scale, version=dwell.__version__), encoding="utf-8")
-    print(f"report: {file}")
+    print(f"report: {out / 'report.html'}")
     return 0
 
 
@@ -57,8 +66,16 @@ def _ask(name: str, scale: Scale, run: object, traces: Path | None, out: Path) -
     folder.mkdir(parents=True, exist_ok=True)
     answer.verdicts.write_csv(folder / "verdicts.csv")
     for title, frame in answer.tables.items():
-        frame.write_csv(folder / f"{title.split(':')[0].lower().replace(' ', '-')}.csv")
+        name_of_file = re.sub(r"[^a-z0-9]+", "-", title.partition(":")[0].lower()).strip("-")
+        frame.write_csv(folder / f"{name_of_file}.csv")
     return Question(name, module.TITLE, answer)
+
+
+def _count(text: str) -> int:
+    """Read a number from 1 on."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not allowed; it must be a number from 1 on")
+    return int(text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -72,8 +89,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--only", nargs="+", choices=QUESTIONS, metavar="QUESTION", help=", ".join(QUESTIONS)
     )
-    parser.add_argument("--seeds", type=int, metavar="N", help="seeds 1 to N of a comparison")
-    parser.add_argument("--processes", type=int, metavar="N", help="one a CPU if not given")
+    parser.add_argument("--seeds", type=_count, metavar="N", help="seeds 1 to N of a comparison")
+    parser.add_argument("--processes", type=_count, metavar="N", help="one a CPU if not given")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help="scheduler of a cluster that does the work"
     )

@@ -41,6 +41,33 @@ def test_traces_that_are_missing_are_named(
     assert str(tmp_path / "none") in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--only", "real"], "--real FOLDER"),
+        (["--only", "tables"], "invalid choice: 'tables'"),
+        (["--seeds", "0"], "'0' is not allowed; it must be a number from 1 on"),
+        (["--scale", "huge"], "invalid choice: 'huge'"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_simulated(
+    words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_folder_that_is_a_file_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    assert main(["--scale", "tiny", "--only", "table", "--out", str(file)]) == 1
+    assert str(file) in capsys.readouterr().err
+
+
 # --------------------------------------------------------------------------------- numbers
 
 
