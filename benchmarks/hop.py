@@ -24,7 +24,7 @@ from dwell.live.keys import MAIN, Keys
 from dwell.live.messages import Header, Stamp, decode, encode
 from dwell.live.routing import STAMPER
 from dwell.live.stage import Message
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import wire
 
@@ -69,7 +69,7 @@ class Hops:
         self._answered = threading.Event()
         last.subscribe(keys.inputs("last", "R1", MAIN), self._arrived)
 
-    def _arrived(self, sample: Sample) -> None:
+    def _arrived(self, sample: Arrival) -> None:
         header = decode(sample.header, Header)
         if header.stamp.cycle == self._cycle:
             ended_ns = {hop.task: hop.ended_ns for hop in header.hops}["first"]

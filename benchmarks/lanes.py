@@ -21,9 +21,9 @@ from statistics import median
 from benchmarks.figures import Figure, Goal, Section
 from dwell.demo.link import Forward, LinkProcess
 from dwell.demo.link_rate import Sharing
-from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.transport.transport import Arrival, Lane
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
-from dwell.live.wiring import Entry, Locator, Role, Session
+from dwell.live.wiring import Locator, Role, Session, WiringEntry
 from dwell.model import Constant
 from dwell.testbed.conditions import Conditions
 
@@ -149,15 +149,15 @@ def _through_zenoh(
         pairs = zip(case.sessions, ports, strict=True)
         return {name: Locator("127.0.0.1", port, case.protocol) for name, port in pairs}
 
-    there = Entry(Role("there@B", "B", "worker"), locators(_ports(case)), {})
+    there = WiringEntry(Role("there@B", "B", "worker"), locators(_ports(case)), {})
     ends = {name: (end,) for name, end in locators(link.ports).items()}
     with ExitStack() as stack:
         receiver = ZenohTransport(there, settings)
         stack.callback(receiver.close)
-        sender = ZenohTransport(Entry(Role("here@A", "A", "worker"), {}, ends), settings)
+        sender = ZenohTransport(WiringEntry(Role("here@A", "A", "worker"), {}, ends), settings)
         stack.callback(sender.close)
 
-        def arrived(sample: Sample) -> None:
+        def arrived(sample: Arrival) -> None:
             ages.take("images" if "/image/" in sample.key else "control", sample.payload)
 
         receiver.subscribe("dwell/bench/in/**", arrived)

@@ -17,9 +17,9 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Literal
 
-from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.transport.transport import Arrival, Lane
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import SESSIONS, Entry, Locator, Role, Session
+from dwell.live.wiring import SESSIONS, Locator, Role, Session, WiringEntry
 
 __all__ = ["Specification", "paced"]
 
@@ -186,13 +186,13 @@ def _thread(repeat: Callable[[], object]) -> None:
 # ------------------------------------------------------------------------------------ Zenoh
 
 
-def _entry(asked: Specification, flow: int) -> Entry:
+def _entry(asked: Specification, flow: int) -> WiringEntry:
     first = asked.port + len(SESSIONS) * flow
     names: dict[Session, int] = {"control": first, "images": first + 1}
     ends = {name: Locator(asked.address, port) for name, port in names.items()}
     if asked.side == "receive":
-        return Entry(Role(f"receiver{flow}@B", "B", "worker"), ends, {})
-    return Entry(
+        return WiringEntry(Role(f"receiver{flow}@B", "B", "worker"), ends, {})
+    return WiringEntry(
         Role(f"sender{flow}@A", "A", "worker"), {}, {name: (end,) for name, end in ends.items()}
     )
 
@@ -211,7 +211,7 @@ def _zenoh_sender(asked: Specification, stack: ExitStack) -> Callable[[int, byte
 
 
 def _zenoh_receiver(asked: Specification, receive: Receive, stack: ExitStack) -> None:
-    def taken(sample: Sample) -> None:
+    def taken(sample: Arrival) -> None:
         receive(_sent_ns(sample.payload))
 
     for flow in range(asked.flows):

@@ -24,7 +24,7 @@ from dwell.errors import LiveError
 from dwell.live.messages import Header, decode
 from dwell.live.operator_client import OperatorClient
 from dwell.live.stage import Message
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.worker import Worker
 from dwell.model import Problem
 
@@ -62,7 +62,7 @@ class Counting(Passing):
         file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         take = Worker._input
 
-        def write(worker: Worker, sample: Sample, kind: str, now_ns: int) -> None:
+        def write(worker: Worker, sample: Arrival, kind: str, now_ns: int) -> None:
             os.write(file, NUMBER.pack(decode(sample.header, Header).stamp.cycle))
             take(worker, sample, kind, now_ns)
 

@@ -24,9 +24,9 @@ from typing import Any
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.hop import PAUSE_S, SIZES, hops
 from benchmarks.timing import ROOT
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
-from dwell.live.wiring import SESSIONS, Entry, Locator, Role
+from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
 
 __all__ = ["measure"]
 
@@ -243,7 +243,7 @@ def _open(kind: str, port: int, who: str, arrived: Arrived) -> Iterator[Put]:
     node = ("E" if kind == "ours" else "R1") if here else "R1"
     key = f"dwell/bench/in/{'ask' if here else 'answer'}/{node}/main"
 
-    def received(sample: Sample) -> None:
+    def received(sample: Arrival) -> None:
         arrived(sample.payload)
 
     transport.subscribe(f"dwell/bench/in/{'answer' if here else 'ask'}/**", received)
@@ -255,12 +255,12 @@ def _open(kind: str, port: int, who: str, arrived: Arrived) -> Iterator[Put]:
         transport.close()
 
 
-def _entry(who: str, other: str, port: int) -> Entry:
+def _entry(who: str, other: str, port: int) -> WiringEntry:
     ends = {name: Locator("127.0.0.1", port + i) for i, name in enumerate(SESSIONS)}
     role = Role(who, who.partition("@")[2], "worker")
     if who == HERE:
-        return Entry(role, ends, {})
-    return Entry(role, {}, {name: (end,) for name, end in ends.items()})
+        return WiringEntry(role, ends, {})
+    return WiringEntry(role, {}, {name: (end,) for name, end in ends.items()})
 
 
 def _free_ports(count: int) -> int:

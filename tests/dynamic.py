@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dwell.cellfile import from_document
-from dwell.cellfile.faults import Faults
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.model import Problem
 

@@ -38,8 +38,8 @@ from dwell.model import (
 from dwell.sim import arrays as sim_arrays
 from dwell.sim import tables as sim_tables
 from dwell.sim.arrays import lay_out, ordered_flows
-from dwell.sim.drawing import draw_shadows
 from dwell.sim.engine import play as advance_to_end
+from dwell.sim.random_draws import draw_shadows
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from dwell.sim.tables import make_tables
 from tests.generate import (
@@ -481,7 +481,9 @@ def play_stamped(
         assert advance_to_end(arrays) == FINISHED
     controller = Controller(problem, problem.initial)
     first = np.arange(real.windows) * problem.window_cycles
-    tables = make_tables(sim_tables.Played(problem, real, controller, arrays, first), jobs=True)
+    tables = make_tables(
+        sim_tables.PlayedRealisation(problem, real, controller, arrays, first), jobs=True
+    )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
     log = arrays.tables.log_arrived.reshape(2, real.cycles, len(flows)).tolist()
     arrived = {

@@ -14,8 +14,8 @@ import dwell
 from dwell.calibration.cell_yaml import cell_yaml
 from dwell.calibration.measure import Settings, measure_task
 from dwell.calibration.profile_file import Measurement, write_profile
-from dwell.calibration.summary import percentile
-from dwell.cellfile.faults import Faults
+from dwell.calibration.sample_statistics import percentile
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.estimators import Profile
 from dwell.model import Problem, Trace

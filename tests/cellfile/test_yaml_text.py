@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.cellfile.faults import Faults, dotted
+from dwell.cellfile.document_faults import Faults, dotted
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.errors import Fault
 

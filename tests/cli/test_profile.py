@@ -19,8 +19,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import dwell
-from dwell.calibration.link import listen
 from dwell.calibration.profile_file import read_profile
+from dwell.calibration.round_trips import listen
 from dwell.cli.commands import app
 from dwell.estimators import Profile
 

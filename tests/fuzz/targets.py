@@ -21,13 +21,13 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 import dwell
 from dwell.errors import LiveError, TrustError
 from dwell.live import messages
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import Keys
 from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Completion, Header, Order, encode
 from dwell.live.payloads import read_payload
 from dwell.live.role import TWICE
 from dwell.live.stage import Message
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.roster import Roster
@@ -156,7 +156,7 @@ def read_any_payload(data: bytes) -> None:
 def read_bundle(data: bytes) -> None:
     """As it comes over the detour."""
     place = _world(keys=False).stamper.place
-    for sample in place.around(Sample(place.keys.carried(), data)):
+    for sample in place.around(Arrival(place.keys.carried(), data)):
         assert place.keys.word(sample.key) in TWICE
         assert len(sample.payload) <= len(data)
 
@@ -209,7 +209,7 @@ def keep_deciding(data: bytes) -> None:
     A byte chooses the message; then come a byte for each field and eight for what it is to be.
     """
     world = _deciding()
-    cell = next(role for role in world.roles.values() if isinstance(role, Cell))
+    cell = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
     key, true = _next_messages(world, cell)[data[0] % 3 if data else 0]
     found = msgspec.to_builtins(true)
     stamp = found[0] if isinstance(true, Completion) else found
@@ -217,7 +217,7 @@ def keep_deciding(data: bytes) -> None:
         place = data[at] % len(stamp)
         if type(stamp[place]) is int:
             stamp[place] = int.from_bytes(data[at + 1 : at + 9], "big") >> 2
-    cell.receive(Sample(key, msgspec.msgpack.encode(found)), world.network.now_ns)
+    cell.receive(Arrival(key, msgspec.msgpack.encode(found)), world.network.now_ns)
     before = cell.status(world.network.now_ns)["windows"]
     world.run(1_500)
     status = cell.status(world.network.now_ns)
@@ -244,7 +244,7 @@ def _deciding() -> World:
     return found
 
 
-def _next_messages(world: World, cell: Cell) -> list[tuple[str, msgspec.Struct]]:
+def _next_messages(world: World, cell: ControlledCell) -> list[tuple[str, msgspec.Struct]]:
     """What the controller may hear next: a stamp, a completion, an answer."""
     stamper, now_ns = world.stamper, world.network.now_ns
     who = stamper.run, stamper.cycle, stamper.term, stamper.placement
@@ -261,7 +261,7 @@ def _next_messages(world: World, cell: Cell) -> list[tuple[str, msgspec.Struct]]
 def _hear(world: World, data: bytes) -> None:
     key = _keys()[int.from_bytes(data[:2], "big") % len(_keys())]
     length = int.from_bytes(data[2:4], "big")
-    sample = Sample(key, data[4 + length :], data[4 : 4 + length])
+    sample = Arrival(key, data[4 + length :], data[4 : 4 + length])
     for role in world.roles.values():
         hears = role.worker if isinstance(role, Bench) else role
         hears.receive(sample, world.network.now_ns)  # type: ignore[attr-defined]

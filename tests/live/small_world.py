@@ -7,17 +7,17 @@ from dataclasses import dataclass, field, replace
 
 from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import CONTROLLER, Keys
+from dwell.live.live_windows import Resume, Rows
 from dwell.live.messages import Ask, Order, encode
-from dwell.live.role import Place, Sealing
+from dwell.live.role import RolePlace, Sealing
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
-from dwell.live.stamper import Entry, Stamper
+from dwell.live.stamper import Stamper, StamperState
 from dwell.live.supervision import Supervisor
-from dwell.live.transport.memory import Clock, Conditions, MemoryTransport, Network
-from dwell.live.transport.protocol import Sample
-from dwell.live.windows import Resume, Rows
+from dwell.live.transport.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles, wire
 from dwell.live.worker import Worker
 from dwell.model import Host, Problem
@@ -30,12 +30,12 @@ class MemoryBook:
     """A book that outlives its stamper."""
 
     def __init__(self) -> None:
-        self.entry: Entry | None = None
+        self.entry: StamperState | None = None
 
-    def read(self) -> Entry | None:
+    def read(self) -> StamperState | None:
         return self.entry
 
-    def write(self, entry: Entry) -> None:
+    def write(self, entry: StamperState) -> None:
         self.entry = entry
 
 
@@ -129,7 +129,7 @@ class Bench:
     def subscriptions(self) -> Iterable[str]:
         return self.worker.subscriptions()
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:
         self.worker.receive(sample, now_ns)
         self.work(now_ns)
 
@@ -219,8 +219,8 @@ class World:
         end = self.network.transport(who, role.node, clock=clock)
         subject = CONTROLLER if role.kind == "controller" else role.node
         seals = self.seals.get(subject)
-        place = Place(self.problem, who, role.node, end, self.lives, seals=seals)
-        made: Stamper | Sink | Quiet | Cell | Bench
+        place = RolePlace(self.problem, who, role.node, end, self.lives, seals=seals)
+        made: Stamper | Sink | Quiet | ControlledCell | Bench
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.run_id, end.now_ns)
         elif role.kind == "sink":
@@ -229,7 +229,7 @@ class World:
             made = Quiet(place)
         elif role.kind == "controller":
             controller = Controller(self.problem, self.policy)
-            made = Cell(place, controller, self.recorder, f"c{self.lives}", end.now_ns)
+            made = ControlledCell(place, controller, self.recorder, f"c{self.lives}", end.now_ns)
         else:
             stage = self.stages.get(role.task, Passing)(role.task)
             standby = f"{role.task}@{role.node}" if role.kind == "standby" else ""
@@ -249,9 +249,9 @@ class World:
         """Let time pass."""
         self.network.advance(self.network.now_ns + round(ms * MS))
 
-    def sample(self, order: Order) -> Sample:
+    def sample(self, order: Order) -> Arrival:
         """An order as it arrives."""
-        return Sample(Keys(self.problem.name).order(), encode(order))
+        return Arrival(Keys(self.problem.name).order(), encode(order))
 
     def order(self, placement: str, *, run: int = 0, term: int = 0, controller: str = "me") -> str:
         """Order a placement; returns why it was refused, or nothing."""
@@ -263,15 +263,15 @@ class World:
         return stamper._answered[2].refused
 
     @staticmethod
-    def losing(share: float) -> Conditions:
+    def losing(share: float) -> NetworkConditions:
         """Conditions that lose a share of the messages."""
-        return Conditions(loss=share)
+        return NetworkConditions(loss=share)
 
     def pin(self, candidate: str) -> None:
         """Have the controller move the cell, as a person does."""
-        cell = next(role for role in self.roles.values() if isinstance(role, Cell))
+        cell = next(role for role in self.roles.values() if isinstance(role, ControlledCell))
         ask = Ask("me", "pin", candidate)
-        cell.receive(Sample(Keys(self.problem.name).ask(), encode(ask)), self.network.now_ns)
+        cell.receive(Arrival(Keys(self.problem.name).ask(), encode(ask)), self.network.now_ns)
 
     @property
     def stamper(self) -> Stamper:
@@ -291,5 +291,5 @@ class World:
 class Quiet(Agent):
     """An agent without processes to look after."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: RolePlace) -> None:
         super().__init__(place, Supervisor(None, print), CpuCount())  # type: ignore[arg-type]

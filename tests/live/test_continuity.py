@@ -10,11 +10,11 @@ import msgspec
 import pytest
 
 import dwell
-from dwell.live.cell import Cell
 from dwell.live.continuity import COMPANY, RESERVED, Continuity, Retreat
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.failure_detector import FailureDetector
-from dwell.live.intervals import Intervals
 from dwell.live.keys import Keys
+from dwell.live.latencies import Intervals
 from dwell.live.loads import NodeLoad
 from dwell.live.messages import (
     Accepted,
@@ -27,7 +27,7 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.live.offsets import Offsets
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
@@ -66,8 +66,8 @@ def world(problem: Problem) -> World:
     return made
 
 
-def cell_of(world: World) -> Cell:
-    return next(role for role in reversed(world.roles.values()) if isinstance(role, Cell))
+def cell_of(world: World) -> ControlledCell:
+    return next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
 
 
 def status(world: World) -> dict[str, Any]:
@@ -81,7 +81,7 @@ def windows(world: World) -> int:
 
 
 def hear(world: World, key: str, message: msgspec.Struct) -> None:
-    cell_of(world).receive(Sample(key, encode(message)), world.network.now_ns)
+    cell_of(world).receive(Arrival(key, encode(message)), world.network.now_ns)
 
 
 def stamped(world: World, **false: object) -> None:

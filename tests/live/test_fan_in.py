@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import dwell
-from dwell.live.transport.memory import Clock
+from dwell.live.transport.memory_transport import Clock
 from dwell.model import Problem
 from tests.live.small_world import MS, Counting, World
 

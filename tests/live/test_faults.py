@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 import dwell
 from dwell.live.messages import Order, State, encode
-from dwell.live.transport.memory import Clock
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.memory_transport import Clock
+from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from tests.live.small_world import MS, Counting, World
 
@@ -425,7 +425,7 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     run, cycle = worker.state_at
     late = State(run, cycle - 5, "planning", "R2", number=7)
     key = world.stamper.place.keys.state("planning", "E")
-    worker.receive(Sample(key, b"3", encode(late)), world.network.now_ns)
+    worker.receive(Arrival(key, b"3", encode(late)), world.network.now_ns)
     world.run(1_000)
     require_whole(world)
 

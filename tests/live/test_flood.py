@@ -16,7 +16,7 @@ from dwell.live.loads import MOST_PROCESSES, ProcessLoads
 from dwell.live.messages import MAX_CONTROL_BYTES, Carried, Stamped, decode, encode
 from dwell.live.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBatch
 from dwell.live.role import MAX_COMPLAINTS
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.worker import MAX_JOINS
 from dwell.model import Problem
 from tests.fuzz.targets import EXEC_MS, seeds
@@ -58,7 +58,7 @@ class Flood:
             junk = bytearray(data)
             junk[self.random.randrange(4, len(junk))] ^= 1 << self.random.randrange(8)
             key = self.random.choice(KEYS).format(root=world.stamper.place.keys.root)
-            sample = Sample(key, self.random.choice([b"\xc1" + bytes(junk), bytes(200)]), b"\xc1")
+            sample = Arrival(key, self.random.choice([b"\xc1" + bytes(junk), bytes(200)]), b"\xc1")
             for role in world.roles.values():
                 role.receive(sample, world.network.now_ns)  # type: ignore[attr-defined]
             self.count += 1
@@ -132,7 +132,7 @@ def test_who_floods_the_relay_does_not_silence_the_detour(key: str, payload: byt
 
     def flood() -> None:
         for _ in range(2_000):
-            relay.receive(Sample(keys.relay(key), payload), network.now_ns)
+            relay.receive(Arrival(keys.relay(key), payload), network.now_ns)
         network.call_at(network.now_ns + 5 * MS, flood)
 
     flood()
@@ -179,7 +179,9 @@ def test_the_controller_believes_no_placement_that_is_no_candidate() -> None:
     controller: Any = next(r for who, r in world.roles.items() if who.startswith("controller"))
     held = controller.held
     stamp = Stamped(held.run, 99, held.term + 5, "none", 0)
-    controller.receive(Sample(controller.place.keys.stamped(), encode(stamp)), world.network.now_ns)
+    controller.receive(
+        Arrival(controller.place.keys.stamped(), encode(stamp)), world.network.now_ns
+    )
     assert controller.held == held
     assert "'none' holds, which is no candidate" in controller.place.last_complaint
 

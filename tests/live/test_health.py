@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import dwell
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.health import diagnose, silent_after_ns, window_late_ns
 from dwell.live.stage import Message
 from dwell.live.wiring import roles
@@ -40,7 +40,7 @@ def running(problem: Problem, **more: Any) -> World:
 
 
 def status(world: World) -> dict[str, Any]:
-    cell = next(role for role in reversed(world.roles.values()) if isinstance(role, Cell))
+    cell = next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
     return cell.status(world.network.now_ns)
 
 
@@ -159,7 +159,7 @@ def test_who_differs_is_named_and_not_called_silent(problem: Problem) -> None:
 def test_of_a_node_that_is_drained_nothing_need_be_heard(problem: Problem) -> None:
     cell = replace(problem, live=replace(problem.live, relay="R1"))
     world = running(cell)
-    role = next(role for role in world.roles.values() if isinstance(role, Cell))
+    role = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
     role.drained.add("E")
     for process in roles(world.problem):
         if process.node == "E" and process.kind != "controller":

@@ -9,8 +9,8 @@ import threading
 import pytest
 
 from dwell.live.hosting import Hosted, take_turns
-from dwell.live.transport.memory import MemoryTransport, Network
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.memory_transport import MemoryTransport, Network
+from dwell.live.transport.transport import Arrival
 
 FAR_NS = 1 << 62
 
@@ -26,7 +26,7 @@ class Waiting:
     def subscriptions(self) -> tuple[str, ...]:
         return ("dwell/c/stamped",)
 
-    def receive(self, sample: Sample, now_ns: int) -> int | None:
+    def receive(self, sample: Arrival, now_ns: int) -> int | None:
         return self.wanted_ns
 
     def wake(self, now_ns: int) -> int:
@@ -69,7 +69,7 @@ class Due:
     def subscriptions(self) -> tuple[str, ...]:
         return ()
 
-    def receive(self, sample: Sample, now_ns: int) -> int | None:
+    def receive(self, sample: Arrival, now_ns: int) -> int | None:
         return None
 
     def wake(self, now_ns: int) -> int:
@@ -117,7 +117,7 @@ def test_a_clock_that_is_set_back_keeps_nobody_asleep(back_ms: int) -> None:
 
 def test_a_message_that_a_role_fails_at_is_told_and_the_next_one_is_taken() -> None:
     class Failing(Waiting):
-        def receive(self, sample: Sample, now_ns: int) -> int | None:
+        def receive(self, sample: Arrival, now_ns: int) -> int | None:
             if sample.payload == b"poison":
                 return 1 // len(sample.header)
             self.taken = sample.payload
@@ -144,7 +144,7 @@ from dataclasses import replace
 import dwell
 from dwell.live.hosting import Hosted, work
 from dwell.live.role import Pulse
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from tests.live.small_world import Passing, World
 
 problem = dwell.load("examples/canonical.yaml")
@@ -161,7 +161,7 @@ work(worker, worker.place.transport, stopped=threading.Event())
     "a message under dwell/canonical/x failed: SystemExit: 3": """
 worker.receive = lambda *_: sys.exit(3)
 hosted = Hosted(worker, worker.place.transport, complain=worker.place.complain)
-hosted._receive(Sample("dwell/canonical/x", b""))
+hosted._receive(Arrival("dwell/canonical/x", b""))
 """,
     "thread 'frames' failed: SystemExit": """
 class Camera(Passing):

@@ -15,13 +15,13 @@ import pytest
 import dwell
 from dwell.live import payloads
 from dwell.live.agent import CpuCount
-from dwell.live.cell import Cell
 from dwell.live.control_group import ControlGroup, Counts, own_group
+from dwell.live.controlled_cell import ControlledCell
+from dwell.live.live_windows import Resume, Rows
 from dwell.live.loads import ProcessLoads
 from dwell.live.recording import RunRecorder
+from dwell.live.run_rows import columns_of
 from dwell.live.sink import Sink
-from dwell.live.tables import columns_of
-from dwell.live.windows import Resume, Rows
 from dwell.model import Problem
 from dwell.record import column_types
 from tests.live.small_world import MS, MemoryRecorder, World
@@ -158,10 +158,10 @@ def test_reading_its_inputs_is_part_of_a_jobs_cpu_time(
     assert jobs["cpu_ns"].unique().to_list() == [CPU_NS]
 
 
-def cell_of(world: World) -> Cell:
+def cell_of(world: World) -> ControlledCell:
     """Return the controller's side of the cell."""
     cell = world.roles[f"controller@{world.problem.controller_node}"]
-    assert isinstance(cell, Cell)
+    assert isinstance(cell, ControlledCell)
     return cell
 
 

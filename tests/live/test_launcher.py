@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from dwell.live.launcher import UNKNOWN_CODE, ForkServer, Running
-from dwell.live.supervision import Child, Supervisor
+from dwell.live.supervision import SupervisedProcess, Supervisor
 
 PATIENCE_S = 30.0
 
@@ -134,7 +134,7 @@ def test_a_server_ends_with_its_agent_and_leaves_what_it_has_forked(tmp_path: Pa
 def test_a_killed_worker_is_forked_again(server: ForkServer, tmp_path: Path) -> None:
     said: list[str] = []
     supervisor = Supervisor(tmp_path, said.append, launcher=server)
-    child: Child = supervisor.keep("worker@E", ["time.sleep(1000)"])
+    child: SupervisedProcess = supervisor.keep("worker@E", ["time.sleep(1000)"])
 
     def started(count: int) -> bool:
         supervisor.step()

@@ -34,7 +34,7 @@ from dwell.live.messages import (
 from dwell.live.role import MAX_COMPLAINTS, MAX_STRANGERS, Pulse
 from dwell.live.routing import MAX_KNOWN
 from dwell.live.stage import Message
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.worker import MAX_JOINS
 from dwell.model import Problem
 from dwell.model.document import fingerprint
@@ -205,7 +205,7 @@ def sizes(role: Any) -> int:
     return count(role, 0)
 
 
-def sample(data: st.DataObject, key: str) -> Sample:
+def sample(data: st.DataObject, key: str) -> Arrival:
     """A message that nobody meant: noise, cut short, oversized, or of the wrong type."""
     whole = data.draw(st.sampled_from(wholes()))
     junk = st.one_of(
@@ -217,7 +217,7 @@ def sample(data: st.DataObject, key: str) -> Sample:
         st.binary(min_size=1, max_size=9).map(lambda tail: encode(whole) + tail),
     )
     header = data.draw(st.one_of(st.just(b""), junk, st.just(bytes(MAX_HEADER_BYTES + 1))))
-    return Sample(key, data.draw(junk), header)
+    return Arrival(key, data.draw(junk), header)
 
 
 @settings(
@@ -249,7 +249,7 @@ def test_a_flood_of_nonsense_takes_no_memory(world: World) -> None:
             junk = msgspec.msgpack.encode([number, "x", [number] * 3])
             for key in keys:
                 for _, role in roles_of(world):
-                    role.receive(Sample(key, junk, junk), now_ns)
+                    role.receive(Arrival(key, junk, junk), now_ns)
 
     flood(120)
     before = {who: sizes(role) for who, role in roles_of(world)}
@@ -267,27 +267,27 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
     keys, digest = world.stamper.place.keys, fingerprint(world.problem)
     tasks = world.problem.pipeline.tasks
 
-    def say(number: int) -> list[Sample]:
+    def say(number: int) -> list[Arrival]:
         stamp = Stamp(9, number, 1, "LOC", 0, forks=((f"t{number}", "E"),))
         heard = (Heard(f"z{number}", f"n{number}", 1, 1),)
         unknown = Beat(f"x{number}", "E", 1, 1, True, cell=digest)
         stranger = Beat(f"y{number}", "E", 1, 1, True, cell=f"{number}")
         liar = Beat("agent@E", "E", 99, number, True, heard, cell=digest)
         found = [
-            *(Sample(keys.beat("E", b.who), encode(b)) for b in (unknown, stranger, liar)),
-            Sample(
+            *(Arrival(keys.beat("E", b.who), encode(b)) for b in (unknown, stranger, liar)),
+            Arrival(
                 keys.done("control"),
                 encode(Completion(stamp, f"s{number}", 1, "actuated", (), "R2")),
             ),
-            Sample(keys.ended(), encode(Completion(stamp, "control", 1, f"{number}", (), "R2"))),
-            Sample(keys.order(), encode(Order(number, f"c{number}", 1, 1, f"p{number}"))),
-            Sample(keys.stamped(), encode(stamp)),
+            Arrival(keys.ended(), encode(Completion(stamp, "control", 1, f"{number}", (), "R2"))),
+            Arrival(keys.order(), encode(Order(number, f"c{number}", 1, 1, f"p{number}"))),
+            Arrival(keys.stamped(), encode(stamp)),
         ]
         for task in tasks:
             for source in tasks:
                 head = encode(Header(stamp, source, "R1", "bytes"))
                 found += [
-                    Sample(keys.inputs(task, node, "main"), b"payload", head)
+                    Arrival(keys.inputs(task, node, "main"), b"payload", head)
                     for node in ("R1", "E")
                 ]
         return found
@@ -324,6 +324,6 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
 def test_a_beat_of_an_unknown_process_is_not_heard(world: World) -> None:
     stamper = world.stamper
     beat = Beat("ghost@E", "E", 1, 1, True, cell=fingerprint(world.problem))
-    stamper.receive(Sample(stamper.place.keys.beat("E", "ghost@E"), encode(beat)), 0)
+    stamper.receive(Arrival(stamper.place.keys.beat("E", "ghost@E"), encode(beat)), 0)
     assert stamper.pulse.detector.last("ghost@E") is None
     assert "ghost@E on E is no process of cell 'canonical'" in stamper.place.complaints

@@ -9,10 +9,10 @@ from itertools import pairwise
 import pytest
 
 import dwell
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import Keys
 from dwell.live.messages import Ask, encode
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from tests.live.small_world import World
@@ -29,14 +29,14 @@ def problem() -> Problem:
 def ask(world: World, what: str, about: str = "") -> str:
     """Ask as a person does; returns the refusal."""
     cell = controller(world)
-    sample = Sample(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
+    sample = Arrival(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
     before = cell._do(Ask("me", what, about), world.network.now_ns)
     cell.receive(sample, world.network.now_ns)
     return before
 
 
-def controller(world: World) -> Cell:
-    return next(role for role in world.roles.values() if isinstance(role, Cell))
+def controller(world: World) -> ControlledCell:
+    return next(role for role in world.roles.values() if isinstance(role, ControlledCell))
 
 
 def require_unbroken(cycles: Iterable[int], world: World) -> None:

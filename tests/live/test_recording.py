@@ -23,7 +23,7 @@ from dwell.chaos.disk import limit_file_size
 from dwell.cli.commands import app
 from dwell.control import Controller
 from dwell.errors import LiveError
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.node import run_controller
 from dwell.live.recording import RunRecorder
 from dwell.model import Problem
@@ -37,7 +37,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 import dwell
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.recording import RunRecorder
 from tests.live.small_world import World
 
@@ -51,7 +51,7 @@ problem = dwell.load("examples/canonical.yaml")
 problem = replace(problem, window_cycles=10, warmup_windows=0)
 exec_ms = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 world = World(problem, exec_ms=exec_ms, policy="dtp")
-cell = next(role for role in world.roles.values() if isinstance(role, Cell))
+cell = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
 cell._recorder = Telling(Path(sys.argv[1]), world.problem, cell.controller, lambda line: None)
 for _ in range(400):
     world.run(100)
@@ -89,8 +89,10 @@ class Recorded(World):
         super().start(who)
 
     @property
-    def cell(self) -> Cell:
-        return next(role for role in reversed(self.roles.values()) if isinstance(role, Cell))
+    def cell(self) -> ControlledCell:
+        return next(
+            role for role in reversed(self.roles.values()) if isinstance(role, ControlledCell)
+        )
 
     @property
     def windows(self) -> int:

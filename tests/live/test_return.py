@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 import dwell
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import Keys
 from dwell.live.messages import Ask, encode
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
@@ -62,12 +62,12 @@ def slow_cell(window_cycles: int, *fallbacks: str, mode: str = "control") -> Pro
     )
 
 
-def cell_of(world: World) -> Cell:
-    return next(role for role in reversed(world.roles.values()) if isinstance(role, Cell))
+def cell_of(world: World) -> ControlledCell:
+    return next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
 
 
 def ask(world: World, what: str, about: str = "") -> None:
-    sample = Sample(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
+    sample = Arrival(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
     cell_of(world).receive(sample, world.network.now_ns)
 
 
@@ -245,7 +245,7 @@ def test_the_record_has_no_move_that_was_none() -> None:
     ask(world, "pin", "SO")
     cycles_until(world, "SO", 60)
     world.run(3_000)
-    from dwell.live.tables import columns_of
+    from dwell.live.run_rows import columns_of
 
     names = list(columns_of(cell_of(world).controller)["decisions"])
     rows = [dict(zip(names, row, strict=True)) for row in world.recorder.rows["decisions"]]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import dwell
 from dwell.errors import TrustError
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import (
     Accepted,
@@ -29,9 +29,9 @@ from dwell.live.messages import (
     decode,
     encode,
 )
-from dwell.live.role import SIGNATURE_BYTES, Place
-from dwell.live.transport.memory import MemoryTransport
-from dwell.live.transport.protocol import Sample
+from dwell.live.role import SIGNATURE_BYTES, RolePlace
+from dwell.live.transport.memory_transport import MemoryTransport
+from dwell.live.transport.transport import Arrival
 from dwell.live.trust import signing
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
@@ -75,10 +75,10 @@ def world(problem: Problem, seals: dict[str, Seals]) -> World:
     return made
 
 
-def ordered(world: World, order: Order, seals: Seals | None, word: str = "order") -> Sample:
+def ordered(world: World, order: Order, seals: Seals | None, word: str = "order") -> Arrival:
     data = encode(order)
     key = Keys(world.problem.name).order()
-    return Sample(key, data if seals is None else seals.seal(word, data))
+    return Arrival(key, data if seals is None else seals.seal(word, data))
 
 
 def order_of(world: World, placement: str, number: int = 1 << 60, **more: object) -> Order:
@@ -87,7 +87,7 @@ def order_of(world: World, placement: str, number: int = 1 << 60, **more: object
     return msgspec.structs.replace(order, **more)
 
 
-def give(world: World, *samples: Sample) -> int:
+def give(world: World, *samples: Arrival) -> int:
     """Hand messages to the stamper alone; returns how many it complains of."""
     before = world.stamper.place.complained
     # Whoever is in charge has fallen silent.
@@ -237,7 +237,7 @@ def test_a_controller_whose_clock_is_behind_learns_the_numbers(
     far = order_of(world, "", 1 << 61, shadow_fraction=0.5)
     assert give(world, ordered(world, far, seals[CONTROLLER])) == 0
     world.run(3_000)
-    cell = next(role for role in world.roles.values() if isinstance(role, Cell))
+    cell = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
     assert cell._number > 1 << 61
     assert world.stamper._newest > 1 << 61
     assert world.stamper._fraction == cell.controller.shadow_fraction
@@ -266,8 +266,8 @@ def done_now(world: World, cycle: int, node: str = "R2", sink: str = "control") 
     return Completion(stamp, sink, world.network.now_ns, "actuated", (), node)
 
 
-def carried(world: World, *messages: tuple[str, bytes]) -> Sample:
-    return Sample(Keys(world.problem.name).carried(), encode(Carried(messages)))
+def carried(world: World, *messages: tuple[str, bytes]) -> Arrival:
+    return Arrival(Keys(world.problem.name).carried(), encode(Carried(messages)))
 
 
 @pytest.fixture
@@ -309,19 +309,19 @@ def test_no_other_task_speaks_for_a_sink(world: World, seals: dict[str, Seals]) 
     world.run(2 * world.problem.pipeline.period_ms)
     keys, cycle = Keys(world.problem.name), world.stamper.cycle - 1
     others = encode(done_now(world, cycle, node="E", sink="planning"))
-    give(world, Sample(keys.ended(), seals["E"].seal("ended", others)))
+    give(world, Arrival(keys.ended(), seals["E"].seal("ended", others)))
     assert world.stamper.guard.newest < cycle
     own = encode(done_now(world, cycle))
-    assert give(world, Sample(keys.done("control"), seals["R2"].seal("done", own))) == 0
+    assert give(world, Arrival(keys.done("control"), seals["R2"].seal("done", own))) == 0
     assert world.stamper.guard.newest == cycle
 
 
 def test_a_relay_that_repeats_itself_does_not_hide_a_fault(world: World) -> None:
     """Nothing comes from R2 any more, but what it has said before is told again and again."""
-    heard: list[Sample] = []
+    heard: list[Arrival] = []
     receive = world.stamper.receive
 
-    def listen(sample: Sample, now_ns: int) -> None:
+    def listen(sample: Arrival, now_ns: int) -> None:
         if sample.key == Keys(world.problem.name).carried():
             heard.append(sample)
         receive(sample, now_ns)
@@ -382,7 +382,7 @@ def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]
     beat = beat_of(world, who, "R2", ready=False)
     before = world.stamper.pulse.detector.last(who)
     data = seals["E"].seal("beat", encode(beat))
-    assert give(world, Sample(keys.beat("E", "perception@E"), data)) == 1
+    assert give(world, Arrival(keys.beat("E", "perception@E"), data)) == 1
     later = encode(msgspec.structs.replace(beat, sent_ns=beat.sent_ns + 1))
     for sealed in (seals["E"].seal("beat", later), seals["R2"].seal("beat", later)):
         assert give(world, carried(world, (keys.beat("E", "perception@E"), sealed))) == 1
@@ -392,14 +392,14 @@ def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]
 # ----------------------------------------------------------------------- the controller's
 
 
-def cell_of(world: World) -> Cell:
-    return next(role for role in world.roles.values() if isinstance(role, Cell))
+def cell_of(world: World) -> ControlledCell:
+    return next(role for role in world.roles.values() if isinstance(role, ControlledCell))
 
 
 def told(world: World, key: str, data: bytes) -> int:
     cell = cell_of(world)
     before = cell.place.complained
-    cell.receive(Sample(key, data), world.network.now_ns)
+    cell.receive(Arrival(key, data), world.network.now_ns)
     return cell.place.complained - before
 
 
@@ -438,7 +438,7 @@ def test_states_are_asked_for_by_the_controller(problem: Problem, seals: dict[st
     worker, key = world.worker("planning@R2"), Keys(problem.name).snapshot("planning", "R2")
     asked = encode(Snapshot(9, "planning", "R2", "E", 1, 1))
     for data in (asked, seals["E"].seal("snapshot", asked)):
-        worker.receive(Sample(key, data), world.network.now_ns)
+        worker.receive(Arrival(key, data), world.network.now_ns)
         assert worker._asked is None
     # And by orders the state moves as ever.
     world.pin("SO")
@@ -482,12 +482,12 @@ def test_what_is_remembered_is_bounded(seals: dict[str, Seals]) -> None:
 # -------------------------------------------------------------------------------- stamps
 
 
-def command_of(world: World, cycle: int, seal: bytes, *, term: int = 1) -> Sample:
+def command_of(world: World, cycle: int, seal: bytes, *, term: int = 1) -> Arrival:
     """What planning on E may send to the control task: a cycle that nobody has released."""
     stamper = world.stamper
     stamp = Stamp(stamper.run, cycle, term, stamper.placement, world.network.now_ns)
     header = Header(stamp, "planning", "E", "bytes", seal=seal)
-    return Sample(Keys(world.problem.name).inputs("control", "R2"), b"-", encode(header))
+    return Arrival(Keys(world.problem.name).inputs("control", "R2"), b"-", encode(header))
 
 
 def test_a_cycle_that_nobody_has_stamped_stops_no_arm(
@@ -519,7 +519,7 @@ def test_a_sources_guess_is_its_own(problem: Problem, seals: dict[str, Seals]) -
     """Term 0 may be said by nodes that a source runs on, and by the stamper's for no term 0."""
     tasks = dict(problem.pipeline.tasks)
     source = tasks["sensing"]
-    place = Place(
+    place = RolePlace(
         replace(problem, pipeline=replace(problem.pipeline, tasks={
             **tasks, "sensing": replace(source, on={**source.on, "R2": source.on["R1"]}),
         })),
@@ -530,7 +530,7 @@ def test_a_sources_guess_is_its_own(problem: Problem, seals: dict[str, Seals]) -
         stamp = Stamp(1, 7, term, "LOC", 0)
         seal = seals[by].seal("stamp", encode(stamp))[:SIGNATURE_BYTES]
         return place.header(
-            Sample("k", b"", encode(Header(stamp, "planning", "E", "x", seal=seal)))
+            Arrival("k", b"", encode(Header(stamp, "planning", "E", "x", seal=seal)))
         )
 
     assert read("R2", 0)

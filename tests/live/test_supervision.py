@@ -16,8 +16,8 @@ import pytest
 
 from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.live import supervision
-from dwell.live.files import InFlight
-from dwell.live.supervision import Child, Supervisor
+from dwell.live.state_files import InFlight
+from dwell.live.supervision import SupervisedProcess, Supervisor
 
 PATIENCE_S = 20.0
 
@@ -42,7 +42,7 @@ def until(supervisor: Supervisor, done: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-def keep(supervisor: Supervisor, who: str, code: str) -> Child:
+def keep(supervisor: Supervisor, who: str, code: str) -> SupervisedProcess:
     return supervisor.keep(who, [sys.executable, "-c", code])
 
 
@@ -73,7 +73,7 @@ def test_a_message_that_kills_twice_is_put_aside_with_its_bytes(
     code = (
         "import os, signal, sys, time\n"
         "from pathlib import Path\n"
-        "from dwell.live.files import InFlight\n"
+        "from dwell.live.state_files import InFlight\n"
         f"folder = Path({str(tmp_path)!r})\n"
         "again = folder / 'worker@E.again'\n"
         "first = not (folder / 'started').exists()\n"

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from dwell.errors import LiveError
 from dwell.live.wiring import (
     IMAGE_BYTES,
-    Entry,
     Locator,
     Passage,
     Role,
     Wiring,
+    WiringEntry,
     roles,
     session_of,
     wire,
@@ -187,12 +187,12 @@ def test_what_has_to_be_heard_can_be(problem: Problem, wiring: Wiring) -> None:
 
 def test_a_session_follows_from_lane_and_node() -> None:
     end = Locator("127.0.0.1", 1)
-    entry = Entry(Role("a@E", "E", "worker"), {"local": end}, {"images": (end,)})
+    entry = WiringEntry(Role("a@E", "E", "worker"), {"local": end}, {"images": (end,)})
     assert session_of(entry, "images", "dwell/c/in/task/E/main") == "local"
     assert session_of(entry, "images", "dwell/c/in/task/R1/main") == "images"
     assert session_of(entry, "images", "dwell/c/state/task/R1") == "images"
     assert session_of(entry, "control", "dwell/c/in/task/E/main") == "control"
-    alone = Entry(Role("a@E", "E", "worker"), {}, {"control": (end,)})
+    alone = WiringEntry(Role("a@E", "E", "worker"), {}, {"control": (end,)})
     assert session_of(alone, "images", "dwell/c/in/task/R1/main") == "control"
     assert entry.sessions == ("images", "local")
 

@@ -20,12 +20,12 @@ from dwell.live.hosting import work
 from dwell.live.loads import NodeLoad
 from dwell.live.log import Log
 from dwell.live.messages import Beat, Load, decode, encode
-from dwell.live.role import RIVAL_BEATS, Place, Pulse
+from dwell.live.role import RIVAL_BEATS, Pulse, RolePlace
 from dwell.live.stage import Message
 from dwell.live.stamper import Stamper
 from dwell.live.supervision import Supervisor
-from dwell.live.transport.memory import Network
-from dwell.live.transport.protocol import Receive, Sample
+from dwell.live.transport.memory_transport import Network
+from dwell.live.transport.transport import Arrival, Receive
 from dwell.live.worker import Worker
 from dwell.model import Problem
 from dwell.model.document import fingerprint
@@ -159,7 +159,7 @@ def test_other_cell_files_and_versions_are_named(problem: Problem) -> None:
 
     def beat(cell: str, version: str) -> str:
         one = Beat("agent@E", "E", 99, 1, True, cell=cell, version=version)
-        stamper.receive(Sample(key, encode(one)), world.network.now_ns)
+        stamper.receive(Arrival(key, encode(one)), world.network.now_ns)
         return stamper.place.last_complaint
 
     own = dwell.__version__
@@ -185,7 +185,7 @@ def test_a_process_of_another_cell_file_is_shown_by_the_controller(problem: Prob
     keys, now_ns = world.stamper.place.keys, world.network.now_ns
     for who, node in (("stamper@R1", "R1"), ("agent@E", "E")):
         one = Beat(who, node, 99, 1, True, cell="other", version=dwell.__version__)
-        cell.receive(Sample(keys.beat(node, who), encode(one)), now_ns)  # type: ignore[attr-defined]
+        cell.receive(Arrival(keys.beat(node, who), encode(one)), now_ns)  # type: ignore[attr-defined]
     found = cell.status(now_ns)  # type: ignore[attr-defined]
     assert found["strangers"]["agent@E"].startswith("agent@E has another cell file (other)")
     # Its candidates may be others of the same names: it is ordered nothing.
@@ -197,13 +197,13 @@ def test_a_process_of_another_cell_file_is_shown_by_the_controller(problem: Prob
 
 def test_two_processes_of_one_name_are_noticed(problem: Problem) -> None:
     end = Network(delay_ns=0, start_ns=MS).transport("me", "R1")
-    place = Place(problem, "stamper@R1", "R1", end)
+    place = RolePlace(problem, "stamper@R1", "R1", end)
     pulse = Pulse(place, lambda: (True, ""), hears=[("*", "*")])
     key = place.keys.beat("E", "agent@E")
 
     def beat(life: int, sent_ns: int) -> None:
         one = Beat("agent@E", "E", life, sent_ns, True, cell=fingerprint(problem))
-        pulse.receive(Sample(key, encode(one)), sent_ns)
+        pulse.receive(Arrival(key, encode(one)), sent_ns)
 
     beat(1, 1)
     beat(2, 2)
@@ -278,7 +278,7 @@ class Camera(Passing):
 def test_frames_begin_cycles(problem: Problem, stage: Passing) -> None:
     cell = replace(problem, live=replace(problem.live, release="frames"))
     wire = Wire()
-    place = Place(cell, "sensing@R1", "R1", wire)
+    place = RolePlace(cell, "sensing@R1", "R1", wire)
     worker = Worker(place, "sensing", stage)
     stopped = threading.Event()
     thread = threading.Thread(target=work, args=(worker, wire), kwargs={"stopped": stopped})
@@ -304,7 +304,7 @@ def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:
     period_ms = problem.pipeline.period_ms
     key = stamper.place.keys.frame()
     for _ in range(1_000):
-        stamper.receive(Sample(key, b""), world.network.now_ns)
+        stamper.receive(Arrival(key, b""), world.network.now_ns)
         world.run(period_ms / 100)
     assert 19 <= stamper.cycle <= 20
     assert stamper.skipped == 1_000 - stamper.cycle

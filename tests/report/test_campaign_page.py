@@ -13,7 +13,7 @@ from dwell.cli.commands import app
 from dwell.model.document import to_document
 from dwell.report.campaign_page import campaign_html
 from dwell.report.campaign_text import WIDTH, campaign_text
-from dwell.study.campaign import Measured, read_measured
+from dwell.study.measured_campaign import MeasuredCampaign, read_measured
 from dwell.testbed.campaign import Campaign, default_entrants, default_scenarios, entrant
 from dwell.testbed.execution import run_campaign
 from tests.report.pages import Page
@@ -38,12 +38,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def measured(folder: Path) -> Measured:
+def measured(folder: Path) -> MeasuredCampaign:
     return read_measured(folder)
 
 
 @pytest.fixture(scope="module")
-def page(measured: Measured) -> Page:
+def page(measured: MeasuredCampaign) -> Page:
     return Page(campaign_html(measured))
 
 
@@ -61,7 +61,7 @@ def test_the_page_says_what_kind_of_runs_they_are(page: Page) -> None:
     assert "simulated in place of measurements" in page.text
 
 
-def test_the_page_counts_what_does_not(measured: Measured, page: Page) -> None:
+def test_the_page_counts_what_does_not(measured: MeasuredCampaign, page: Page) -> None:
     text = page.text
     runs = measured.log.height
     assert f"{runs} of {4 * runs} windows after the warm-up were measured under pressure" in text
@@ -69,7 +69,7 @@ def test_the_page_counts_what_does_not(measured: Measured, page: Page) -> None:
     assert "whatever was measured" in text
 
 
-def test_the_text_fits_a_terminal(measured: Measured) -> None:
+def test_the_text_fits_a_terminal(measured: MeasuredCampaign) -> None:
     text = campaign_text(measured)
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "RQ1" in text

@@ -37,7 +37,7 @@ from dwell.model import (
     QoS,
     Task,
 )
-from dwell.sim.drawing import draw_shadows
+from dwell.sim.random_draws import draw_shadows
 from dwell.sim.realisation import NodeChange
 from tests.generate import MS, make_problem, make_realisation
 from tests.reference_simulator import ITSELF, SHADOW, shadow_stamp, simulate

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dwell.errors import MetricError, SimulationError
 from dwell.study.family import Family, cannot_tell, holm, seed_values
-from dwell.study.paired import PairedDifference, PairedMedian, paired_difference, paired_median
+from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
 
 chances = st.lists(st.floats(0, 1), max_size=12)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dwell.model import MovingTarget, Servo
 from dwell.model.instants import NEVER_NS
 from dwell.study.quality import (
-    Actuations,
+    EffectiveCommands,
     actuations,
     age_of_information,
     misses_in,
@@ -108,7 +108,7 @@ def test_a_lost_cycle_lets_one_tooth_grow_by_a_period() -> None:
 
 
 def test_before_the_first_actuation_the_age_counts_from_the_first_release() -> None:
-    nothing = Actuations(5 * MS, ns(), ns())
+    nothing = EffectiveCommands(5 * MS, ns(), ns())
     age = age_of_information(nothing, 15 * MS, 105 * MS)
     assert (age.mean_ms, age.peak_ms, age.mean_peak_ms) == (55.0, 100.0, 100.0)
     assert age.p95_ms == pytest.approx(95.5)

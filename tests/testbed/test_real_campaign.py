@@ -12,7 +12,7 @@ import dwell
 from dwell.errors import LiveError
 from dwell.record import open_run
 from dwell.report.campaign_page import campaign_html
-from dwell.study.campaign import read_measured
+from dwell.study.measured_campaign import read_measured
 from dwell.testbed.campaign import Campaign, entrant
 from dwell.testbed.execution import read_campaign, run_campaign
 from dwell.testbed.idle import Quiet

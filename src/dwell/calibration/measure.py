@@ -26,8 +26,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from dwell.calibration.conditions import Conditions, Watch, processor
 from dwell.calibration.error_origin import blamed, raised_here
+from dwell.calibration.machine_conditions import MachineConditions, MachineCounters, processor
 from dwell.calibration.profile_file import Measurement, stamp, task_name
 from dwell.errors import MeasurementError
 from dwell.model.bounds import MAX_COUNT, PERIOD_MS, Bound
@@ -120,7 +120,7 @@ class Timing:
         Runs that began after their release, because those before took too long.
     collections : tuple of int
         Garbage collections during the runs, by generation.
-    conditions : Conditions
+    conditions : MachineConditions
         During the runs.
     """
 
@@ -129,7 +129,7 @@ class Timing:
     first_ns: int
     late: int
     collections: tuple[int, ...]
-    conditions: Conditions
+    conditions: MachineConditions
 
 
 def time_runs(
@@ -157,7 +157,7 @@ def time_runs(
     gc.collect()
     warm_wall, _ = _series(call, inputs, settings.warmup, pace, "run {} of the warm-up")
     pace.late = 0
-    watch = Watch(os.sched_getaffinity(0))
+    watch = MachineCounters(os.sched_getaffinity(0))
     before = [generation["collections"] for generation in gc.get_stats()]
     wall_ns, cpu_ns = _series(call, inputs, settings.runs, pace, "run {}")
     after = [generation["collections"] for generation in gc.get_stats()]

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.entries import (
     BurstsEntry,
     CellEntry,
@@ -22,7 +23,6 @@ from dwell.cellfile.entries import (
     ServoEntry,
     TaskEntry,
 )
-from dwell.cellfile.faults import Faults
 from dwell.cellfile.traces import Source, Tables
 from dwell.estimators import registry as estimators
 from dwell.model import (
@@ -58,7 +58,7 @@ from dwell.model import (
 from dwell.model.bounds import require
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
-from dwell.model.semantics import Parts, find_faults
+from dwell.model.semantics import CellParts, find_faults
 from dwell.policies import registry as policies
 
 __all__ = ["Assembly"]
@@ -134,7 +134,7 @@ class Assembly:
             for name, items in (entry.scenarios or {}).items()
         }
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
-        parts = Parts(
+        parts = CellParts(
             nodes=nodes,
             links=links,
             links_complete=len(dict(links)) == len(entry.links or ()),
@@ -477,7 +477,7 @@ class Assembly:
                         f"{task_name} is anchored to {node}, in every candidate; leave it out",
                     )
 
-    def _judge(self, parts: Parts) -> None:
+    def _judge(self, parts: CellParts) -> None:
         """Add the faults of meaning, but for those that other faults cause."""
         self._assume(parts)
         known = all(
@@ -490,7 +490,7 @@ class Assembly:
             if not self.faults.at(fault.path):
                 self.faults.add(fault.path, fault.message)
 
-    def _assume(self, parts: Parts) -> None:
+    def _assume(self, parts: CellParts) -> None:
         """Take names for declared where the section that would declare them could not be read."""
         faults, controller = self.faults, parts.controller
         placed = list(parts.candidates.values())

@@ -13,7 +13,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dwell.cellfile.faults import Faults
+from dwell.cellfile.document_faults import Faults
 from dwell.model import Problem
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def read_problem(
         With every fault found.
     """
     from dwell.cellfile.assembly import Assembly
-    from dwell.cellfile.faults import dotted
+    from dwell.cellfile.document_faults import dotted
     from dwell.cellfile.structure import CELL, read_structure
     from dwell.cellfile.traces import declared_traces, read_traces
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import installing
 
-__all__ = ["SUFFIXES", "Column", "UnreadableError", "column_names", "read_columns"]
+__all__ = ["SUFFIXES", "FileColumn", "UnreadableError", "column_names", "read_columns"]
 
 Values: TypeAlias = "NDArray[np.float64] | NDArray[np.object_]"
 
@@ -23,7 +23,7 @@ class UnreadableError(Exception):
     """A file that holds no columns; what is wrong with it."""
 
 
-class Column(NamedTuple):
+class FileColumn(NamedTuple):
     """A column of a file.
 
     Parameters
@@ -62,7 +62,7 @@ def column_names(path: Path) -> list[str]:
     return names
 
 
-def read_columns(path: Path, names: Sequence[str]) -> dict[str, Column]:
+def read_columns(path: Path, names: Sequence[str]) -> dict[str, FileColumn]:
     """Read columns that a file has.
 
     Raises
@@ -90,16 +90,16 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, Column]:
     return dict(zip(wanted, map(_parsed, columns), strict=True))
 
 
-def _parsed(texts: Sequence[str]) -> Column:
+def _parsed(texts: Sequence[str]) -> FileColumn:
     """Return a column of numbers where all texts are some; nothing at all is a missing one."""
     try:
-        return Column(np.array([float(text) if text else np.nan for text in texts], np.float64))
+        return FileColumn(np.array([float(text) if text else np.nan for text in texts], np.float64))
     except ValueError:
         truth = {text.lower() for text in texts} <= {"true", "false", ""}
-        return Column(np.array(texts, object), "Boolean" if truth else "String")
+        return FileColumn(np.array(texts, object), "Boolean" if truth else "String")
 
 
-def _parquet(path: Path, names: list[str]) -> dict[str, Column]:
+def _parquet(path: Path, names: list[str]) -> dict[str, FileColumn]:
     pl = _polars(path)
     from polars.selectors import by_name
 
@@ -113,11 +113,11 @@ def _parquet(path: Path, names: list[str]) -> dict[str, Column]:
         series = frame[name]
         if series.dtype.is_numeric():
             numbers = series.cast(pl.Float64).fill_null(np.nan).to_numpy()
-            found[name] = Column(np.asarray(numbers, np.float64))
+            found[name] = FileColumn(np.asarray(numbers, np.float64))
         else:
             values = np.empty(len(series), object)
             values[:] = series.to_list()
-            found[name] = Column(values, str(series.dtype))
+            found[name] = FileColumn(values, str(series.dtype))
     return found
 
 

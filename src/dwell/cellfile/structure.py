@@ -17,8 +17,8 @@ from pydantic import ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from dwell.cellfile.document_faults import Faults, Step, dotted
 from dwell.cellfile.entries import CellEntry, Entry
-from dwell.cellfile.faults import Faults, Step, dotted
 from dwell.cellfile.rendering import as_read
 from dwell.model import bounds
 from dwell.model.document import VERSION

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
+from dwell.cellfile.document_faults import Step
 from dwell.cellfile.entries import Entry, Number, wrong
-from dwell.cellfile.faults import Step
 from dwell.cellfile.rendering import as_read
 from dwell.cellfile.structure import Form
 from dwell.model.bounds import MAX_COUNT, Bound

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.cellfile.cell import read_problem
-from dwell.cellfile.faults import Faults, Step, dotted
+from dwell.cellfile.document_faults import Faults, Step, dotted
 from dwell.cellfile.rendering import as_read
 from dwell.cellfile.study_paths import SETTINGS, put, steps_of
 from dwell.errors import ProblemError

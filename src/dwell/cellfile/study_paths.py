@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from dwell.cellfile.faults import Faults, Step, dotted
+from dwell.cellfile.document_faults import Faults, Step, dotted
 from dwell.cellfile.rendering import as_read
 from dwell.errors import Fault, ProblemError
 from dwell.model import Problem

@@ -12,9 +12,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cellfile.columns import SUFFIXES, Column, UnreadableError, column_names, read_columns
+from dwell.cellfile.columns import SUFFIXES, FileColumn, UnreadableError, column_names, read_columns
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.entries import TraceEntry
-from dwell.cellfile.faults import Faults
 from dwell.cellfile.traces import Source
 from dwell.errors import TraceError
 from dwell.model import Trace, TraceTable
@@ -26,7 +26,7 @@ __all__ = ["Reading"]
 
 Floats: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
-Frame: TypeAlias = Mapping[str, Column]
+Frame: TypeAlias = Mapping[str, FileColumn]
 
 RELATIVE = (
     "file names are relative to the cell file's folder, or to the one given as `traces` "
@@ -234,11 +234,11 @@ class Reading:
                 )
 
 
-def _floats(column: Column) -> Floats:
+def _floats(column: FileColumn) -> Floats:
     return np.asarray(column.values, np.float64)
 
 
-def _labels(column: Column) -> list[object]:
+def _labels(column: FileColumn) -> list[object]:
     """Return the values of a group; one that is missing is equal to another."""
     missing = (isinstance(value, float) and math.isnan(value) for value in column.values.tolist())
     pairs = zip(column.values.tolist(), missing, strict=True)

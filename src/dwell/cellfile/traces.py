@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from dwell.cellfile.document_faults import Faults, Step, dotted
 from dwell.cellfile.entries import CellEntry, Entry, TraceEntry
-from dwell.cellfile.faults import Faults, Step, dotted
 from dwell.model import TraceTable
 
 __all__ = ["Source", "Tables", "declared_traces", "read_traces"]

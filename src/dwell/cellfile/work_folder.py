@@ -19,7 +19,7 @@ from dwell.cellfile.rendering import as_read
 from dwell.errors import RunError, SimulationError
 from dwell.files import write_whole
 
-__all__ = ["Claim", "Description", "claimed", "unwritable"]
+__all__ = ["Description", "FolderMark", "claimed", "unwritable"]
 
 # How many differences from other work are listed.
 LISTED = 4
@@ -27,7 +27,7 @@ LISTED = 4
 Description = Mapping[str, Any]
 
 
-class Claim(NamedTuple):
+class FolderMark(NamedTuple):
     """What marks a folder.
 
     Parameters
@@ -49,13 +49,13 @@ class Claim(NamedTuple):
 
 
 @contextmanager
-def claimed(folder: Path, claim: Claim, description: Description) -> Iterator[None]:
+def claimed(folder: Path, claim: FolderMark, description: Description) -> Iterator[None]:
     """Open a folder for this process alone, and make it where there is none.
 
     Parameters
     ----------
     folder : Path
-    claim : Claim
+    claim : FolderMark
     description : mapping
         JSON-able: all that the results depend on.
 
@@ -93,7 +93,7 @@ def _lock(folder: Path, handle: int, what: str) -> None:
         raise RunError(f"{folder} is in use: another process works on this {what}") from None
 
 
-def _require_kind(folder: Path, claim: Claim) -> None:
+def _require_kind(folder: Path, claim: FolderMark) -> None:
     """Refuse a folder that holds something else."""
     if not folder.is_dir():
         raise RunError(f"{folder} is no folder; choose another one")
@@ -105,7 +105,7 @@ def _require_kind(folder: Path, claim: Claim) -> None:
         raise RunError(f"{folder} exists and is no {claim.what}; choose another folder")
 
 
-def _take(folder: Path, claim: Claim, description: Description) -> None:
+def _take(folder: Path, claim: FolderMark, description: Description) -> None:
     """Write whose folder it is, or refuse it where it is another's."""
     path = folder / claim.file
     text = json.dumps({f"dwell-{claim.what}-folder": claim.version, **description}, allow_nan=False)

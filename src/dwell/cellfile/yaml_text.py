@@ -14,7 +14,7 @@ from collections.abc import Hashable
 
 import yaml
 
-from dwell.cellfile.faults import Faults, Step, dotted
+from dwell.cellfile.document_faults import Faults, Step, dotted
 
 __all__ = ["read_yaml"]
 

@@ -16,8 +16,8 @@ from typing import Any, cast
 
 from dwell.errors import DwellError
 from dwell.live.keys import Keys
-from dwell.live.transport.protocol import Sample
-from dwell.live.wiring import SESSIONS, Entry, Role, Session, Wiring
+from dwell.live.transport.transport import Arrival
+from dwell.live.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
 from dwell.testbed.child import Child, Parent, Started
 
 __all__ = ["Records", "Wiretap", "entry_for", "heard"]
@@ -31,7 +31,7 @@ def heard(keys: Keys) -> tuple[str, ...]:
     return (*said, keys.inputs("*", "*", "*"))
 
 
-def entry_for(wiring: Wiring, nodes: Sequence[str]) -> Entry:
+def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
     """Return what has to be opened to hear all processes of some nodes, beside them."""
     connect: dict[Session, list[Any]] = {}
     for entry in wiring.entries.values():
@@ -40,7 +40,7 @@ def entry_for(wiring: Wiring, nodes: Sequence[str]) -> Entry:
                 connect.setdefault(session, []).append(end)
     role = Role(f"tap.{os.getpid()}", nodes[0], "visitor")
     ends = {name: tuple(connect[name]) for name in SESSIONS if name in connect}
-    return Entry(role, {}, ends)
+    return WiringEntry(role, {}, ends)
 
 
 class Wiretap(Started):
@@ -141,7 +141,7 @@ def main() -> None:
         lock = threading.Lock()
         inputs = Keys(problem.name).inputs("", "", "").rstrip("/")
 
-        def write(sample: Sample) -> None:
+        def write(sample: Arrival) -> None:
             at_ns = time.monotonic_ns()
             payload = b"" if sample.key.startswith(inputs) else sample.payload
             key = sample.key.encode()

@@ -16,7 +16,7 @@ from dwell.cli.output import print_json, working, write_file
 from dwell.model import Problem
 from dwell.report.campaign_page import campaign_html
 from dwell.report.campaign_text import campaign_text
-from dwell.study.campaign import Measured, read_measured
+from dwell.study.measured_campaign import MeasuredCampaign, read_measured
 from dwell.testbed.campaign import (
     Campaign,
     default_entrants,
@@ -27,14 +27,14 @@ from dwell.testbed.execution import Play, State, run_campaign
 from dwell.testbed.playing import interruptible
 from dwell.testbed.timeline import changes_of
 
-__all__ = ["Request", "report_campaign", "run_campaign_file"]
+__all__ = ["CampaignRequest", "report_campaign", "run_campaign_file"]
 
 INTERRUPTED = 130
 PAGE = "report.html"
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class CampaignRequest:
     """What was asked for; None is the default.
 
     Parameters
@@ -69,7 +69,7 @@ class Request:
     report: bool = False
 
 
-def run_campaign_file(request: Request, *, as_json: bool) -> bool:
+def run_campaign_file(request: CampaignRequest, *, as_json: bool) -> bool:
     """Measure, write the report, and print what it comes to.
 
     Returns
@@ -112,7 +112,9 @@ def run_campaign_file(request: Request, *, as_json: bool) -> bool:
     return not state.given_up and bool(state.done or state.left)
 
 
-def _player(request: Request, problem: Problem, scenarios: Sequence[str]) -> tuple[Play, str]:
+def _player(
+    request: CampaignRequest, problem: Problem, scenarios: Sequence[str]
+) -> tuple[Play, str]:
     """Return what makes a run, and where; refuse what can be played in no run."""
     outages = request.inventory is None
     changes = [one for name in scenarios for one in changes_of(problem, name, outages=outages)]
@@ -129,7 +131,7 @@ def _player(request: Request, problem: Problem, scenarios: Sequence[str]) -> tup
     return partial(run_once, beside=request.cell.resolve().parent), "testbed"
 
 
-def _run(campaign: Campaign, folder: Path, play: Play, request: Request) -> State:
+def _run(campaign: Campaign, folder: Path, play: Play, request: CampaignRequest) -> State:
     try:
         with interruptible():
             return run_campaign(
@@ -162,7 +164,7 @@ def report_campaign(folder: Path, page: Path, *, as_json: bool) -> None:
     _print(measured, folder, page, None, as_json=as_json)
 
 
-def _write_page(folder: Path, page: Path) -> Measured:
+def _write_page(folder: Path, page: Path) -> MeasuredCampaign:
     with working("writing the report"):
         measured = read_measured(folder)
         write_file(page, campaign_html(measured))
@@ -170,7 +172,7 @@ def _write_page(folder: Path, page: Path) -> Measured:
 
 
 def _print(
-    measured: Measured, folder: Path, page: Path, state: State | None, *, as_json: bool
+    measured: MeasuredCampaign, folder: Path, page: Path, state: State | None, *, as_json: bool
 ) -> None:
     if as_json:
         print_json(_told(measured, folder, page, state))
@@ -186,7 +188,9 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(names)
 
 
-def _told(measured: Measured, folder: Path, page: Path, state: State | None) -> dict[str, Any]:
+def _told(
+    measured: MeasuredCampaign, folder: Path, page: Path, state: State | None
+) -> dict[str, Any]:
     from dwell.study.campaign_questions import questions
 
     found: dict[str, Any] = {

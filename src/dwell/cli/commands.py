@@ -178,13 +178,13 @@ def run(
     300 windows, if neither --windows nor --seconds is given.
     """
     import dwell
-    from dwell.cli.run import Request, run_cell
+    from dwell.cli.run import RunRequest, run_cell
 
     require_one_length(windows, seconds)
     problem = dwell.load(cell, traces=traces)
     if seconds is not None:
         windows = windows_of(problem, seconds)
-    request = Request(
+    request = RunRequest(
         problem, scenario, policy, estimator, seed, windows or 300, out, jobs, guard, force
     )
     if not run_cell(request, as_json=as_json):
@@ -232,9 +232,9 @@ def study(
             "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
             "(reproduction/README.md)"
         )
-    from dwell.cli.study import Request, run_study_file
+    from dwell.cli.study import StudyRequest, run_study_file
 
-    run_study_file(Request(file, out, processes, dask, seeds, windows), as_json=as_json)
+    run_study_file(StudyRequest(file, out, processes, dask, seeds, windows), as_json=as_json)
 
 
 @app.command()
@@ -287,10 +287,10 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
-    from dwell.cli.validate import Request, validate_runs
+    from dwell.cli.validate import ValidationRequest, validate_runs
 
     used = tuple(calibrated_from or ())
-    request = Request(tuple(runs), cell, out, seeds, traces, used, processes)
+    request = ValidationRequest(tuple(runs), cell, out, seeds, traces, used, processes)
     validate_runs(request, as_json=as_json)
 
 

@@ -88,7 +88,7 @@ def _serve(cell: Path) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
     from dwell.calibration import memory  # noqa: F401
     from dwell.cellfile import load_without_traces
-    from dwell.live import parent_death, process  # noqa: F401
+    from dwell.live import parent_death, role_process  # noqa: F401
     from dwell.live.launcher import serve
 
     load_without_traces(cell)
@@ -113,7 +113,7 @@ def _run(asked: argparse.Namespace) -> None:
     from dwell.cellfile import load_without_traces
     from dwell.live.log import escape_output
     from dwell.live.parent_death import end_with_owner
-    from dwell.live.process import run_process
+    from dwell.live.role_process import run_process
 
     # What a user's code prints, and its exceptions, are shown on terminals.
     escape_output()

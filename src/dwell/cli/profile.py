@@ -112,7 +112,7 @@ def listen(
     once: Annotated[bool, typer.Option("--once", help="End after the first connection.")] = False,
 ) -> None:
     """Answer the messages of `dwell profile link`, until Ctrl-C."""
-    from dwell.calibration.link import listen as answer
+    from dwell.calibration.round_trips import listen as answer
 
     def announce(address: str, taken: int) -> None:
         typer.echo(f"listening on {address}:{taken}")
@@ -141,9 +141,9 @@ def link(
 
     The file is profiles/FROM-TO.parquet if not given.
     """
-    from dwell.calibration.link import measure_link, parse_address
     from dwell.calibration.measure import Settings
     from dwell.calibration.profile_file import link_name, require_free, write_profile
+    from dwell.calibration.round_trips import measure_link, parse_address
 
     host, port = parse_address(peer)
     path = out or FOLDER / f"{_file_name(source)}-{_file_name(target)}.parquet"
@@ -273,7 +273,7 @@ def _say(what: str) -> None:
 
 def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: bool) -> None:
     from dwell.calibration.cell_yaml import cell_yaml
-    from dwell.calibration.summary import describe, find_doubts
+    from dwell.calibration.sample_statistics import describe, find_doubts
 
     yaml = cell_yaml(path, measured)
     doubts = {one.name: list(find_doubts(one)) for one in measured}
@@ -300,7 +300,7 @@ def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: boo
 
 
 def _table(measured: Sequence[Measurement]) -> str:
-    from dwell.calibration.summary import describe
+    from dwell.calibration.sample_statistics import describe
 
     head = ("ms", "n", "mean", "median", "p95", "p99", "max", "cv", "lag 1", "cores used")
     rows = []
@@ -344,7 +344,7 @@ def _of_task(about: Mapping[str, Any]) -> list[str]:
 
 
 def _of_link(one: Measurement) -> list[str]:
-    from dwell.calibration.summary import percentile
+    from dwell.calibration.sample_statistics import percentile
 
     minimal = one.columns[f"{one.name}/round_trip_ms"]
     payload = one.columns[f"{one.name}/payload_round_trip_ms"]

@@ -20,11 +20,11 @@ from dwell.record import require_free
 from dwell.sim import describe
 from dwell.study.summary import STRETCHES, Row, summarise
 
-__all__ = ["Request", "run_cell"]
+__all__ = ["RunRequest", "run_cell"]
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class RunRequest:
     """What a run was asked to be; None is what the cell says, or the default folder."""
 
     problem: Problem
@@ -39,7 +39,7 @@ class Request:
     force: bool = False
 
 
-def run_cell(request: Request, *, as_json: bool) -> bool:
+def run_cell(request: RunRequest, *, as_json: bool) -> bool:
     """Simulate, save and print.
 
     Returns
@@ -91,7 +91,7 @@ def run_cell(request: Request, *, as_json: bool) -> bool:
     return True
 
 
-def _require_same(folder: Path, problem: Problem, request: Request, policy: str) -> None:
+def _require_same(folder: Path, problem: Problem, request: RunRequest, policy: str) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
@@ -118,7 +118,7 @@ def _folder(problem: Problem, scenario: str, policy: str, seed: int) -> Path:
     return Path("runs", re.sub(r"[^\w.+-]", "_", name))
 
 
-def _summary(problem: Problem, request: Request, policy: str, row: Row | None) -> str:
+def _summary(problem: Problem, request: RunRequest, policy: str, row: Row | None) -> str:
     warmup = problem.warmup_windows
     title = (
         f"{problem.name}, {request.scenario}, {policy}, seed {request.seed}: "

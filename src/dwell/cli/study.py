@@ -16,7 +16,7 @@ from dwell.report.formatting import Measure, shown_policy, shown_scenario, write
 from dwell.study import Interval, Study, StudyResult, load_study, run_study
 from dwell.study.over_seeds import over_seeds
 
-__all__ = ["Request", "run_study_file", "study_text"]
+__all__ = ["StudyRequest", "run_study_file", "study_text"]
 
 INTERRUPTED = 130
 # Groups of a point and a scenario that the terminal shows; the tables have all.
@@ -29,7 +29,7 @@ REGRET = Measure("regret", "regret", "%", 100.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class StudyRequest:
     """What was asked for; None is what the study file says, or the default."""
 
     file: Path
@@ -40,7 +40,7 @@ class Request:
     windows: int | None
 
 
-def run_study_file(request: Request, *, as_json: bool) -> None:
+def run_study_file(request: StudyRequest, *, as_json: bool) -> None:
     """Run a study, or go on with it, and print what it comes to.
 
     Raises

@@ -200,11 +200,11 @@ def campaign(
     What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
     120 s, if neither --windows nor --seconds is given.
     """
-    from dwell.cli.campaign import Request, run_campaign_file
+    from dwell.cli.campaign import CampaignRequest, run_campaign_file
 
     length = _run_s(cell, windows, seconds)
 
-    request = Request(
+    request = CampaignRequest(
         cell, _names(scenarios), _names(policies), repetitions, length, seed, out, name
     )
     request = replace(request, minutes=minutes, inventory=inventory, report=report)

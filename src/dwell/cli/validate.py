@@ -19,11 +19,11 @@ from dwell.report.validation_text import validation_text
 from dwell.study.validation import GOALS, Validation, validate
 from dwell.testbed.speeds import Usual
 
-__all__ = ["Request", "sidecar_of", "validate_runs"]
+__all__ = ["ValidationRequest", "sidecar_of", "validate_runs"]
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ValidationRequest:
     """What is to be validated; None is the default folder."""
 
     runs: Sequence[Path]
@@ -35,7 +35,7 @@ class Request:
     processes: int | None
 
 
-def validate_runs(request: Request, *, as_json: bool) -> None:
+def validate_runs(request: ValidationRequest, *, as_json: bool) -> None:
     """Simulate, write the page and the table, and print.
 
     Raises

@@ -1,6 +1,6 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
-from dwell.control.controller import ClosedWindow, Controller, Log, static_columns
+from dwell.control.controller import ClosedWindow, Controller, DecisionLog, static_columns
 from dwell.control.guard import Guard, Presence, Probation, parts_of, rest_cycles
 from dwell.control.shadows import shadow_stamps
 from dwell.control.windows import final_l95_ms
@@ -10,11 +10,11 @@ from dwell.policies import MinimalPolicy
 __all__ = [
     "ClosedWindow",
     "Controller",
+    "DecisionLog",
     "Estimator",
     "Evidence",
     "Guard",
     "Instants",
-    "Log",
     "MinimalPolicy",
     "Presence",
     "Probation",

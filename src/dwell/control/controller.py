@@ -21,7 +21,7 @@ from dwell.model.semantics import too_many_shadows
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
 
-__all__ = ["ClosedWindow", "Controller", "Log", "static_columns"]
+__all__ = ["ClosedWindow", "Controller", "DecisionLog", "static_columns"]
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
@@ -54,7 +54,7 @@ class ClosedWindow:
 
 
 @dataclass(slots=True)
-class Log:
+class DecisionLog:
     """What the controller saw and decided: one row of plain values a window.
 
     Rows are tuples of numbers and names, not the objects they came from: a run has many windows,
@@ -130,7 +130,7 @@ class Controller:
         self.wanted: str | None = None
         self.nodes = tuple(problem.fabric.nodes)
         self._names = tuple(problem.candidates)
-        self.log = Log()
+        self.log = DecisionLog()
         self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
         self._tiers = tier_nodes(problem.objective)
         self._moved = {

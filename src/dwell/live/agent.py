@@ -15,9 +15,9 @@ from dwell.live.control_group import ControlGroup
 from dwell.live.failures import start_thread
 from dwell.live.messages import Carried, Load, encode
 from dwell.live.relay_batch import MOST_MESSAGES, RelayBatch
-from dwell.live.role import TWICE, Place, Pulse
+from dwell.live.role import TWICE, Pulse, RolePlace
 from dwell.live.supervision import Supervisor
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.model.instants import NEVER_NS
 
 __all__ = ["Agent", "CpuCount", "Gauge"]
@@ -119,7 +119,7 @@ class Agent:
 
     Parameters
     ----------
-    place : Place
+    place : RolePlace
     supervisor : Supervisor
     cpu : CpuCount
     accelerator : Gauge, optional
@@ -128,7 +128,7 @@ class Agent:
 
     def __init__(
         self,
-        place: Place,
+        place: RolePlace,
         supervisor: Supervisor,
         cpu: CpuCount,
         accelerator: Gauge | None = None,
@@ -155,7 +155,7 @@ class Agent:
         if self._relays:
             yield self.place.keys.relay(f"{self.place.keys.root}/**")
 
-    def receive(self, sample: Sample, now_ns: int) -> int | None:
+    def receive(self, sample: Arrival, now_ns: int) -> int | None:
         """Take a message in; carry it on where this is the detour."""
         if self.pulse.hears(sample):
             self.pulse.receive(sample, now_ns)

@@ -68,7 +68,7 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     ----------
     problem : Problem
     status : mapping
-        Of `dwell.live.cell.Cell.status`.
+        Of `dwell.live.controlled_cell.ControlledCell.status`.
 
     Returns
     -------

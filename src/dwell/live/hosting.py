@@ -10,9 +10,9 @@ from collections.abc import Callable, Sequence
 from dwell.errors import LiveError
 from dwell.live.clocks import wrong_clock
 from dwell.live.failures import described, end_process, start_thread
-from dwell.live.role import Role
+from dwell.live.role import RoleLogic
 from dwell.live.stage import Message
-from dwell.live.transport.protocol import Sample, Transport
+from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.worker import Job, Worker
 from dwell.model import Problem
 
@@ -48,7 +48,7 @@ class Hosted:
 
     Parameters
     ----------
-    role : Role
+    role : RoleLogic
     transport : Transport
     clock : callable
         The node's clock, nanoseconds.
@@ -64,7 +64,7 @@ class Hosted:
 
     def __init__(
         self,
-        role: Role,
+        role: RoleLogic,
         transport: Transport,
         clock: Clock = time.monotonic_ns,
         heard: Callable[[], bool] | None = None,
@@ -82,7 +82,7 @@ class Hosted:
         for key in role.subscriptions():
             transport.subscribe(key, self._receive)
 
-    def _receive(self, sample: Sample) -> None:
+    def _receive(self, sample: Arrival) -> None:
         if self.stopped.is_set():
             return
         with self.lock:
@@ -95,7 +95,7 @@ class Hosted:
         if self._heard is not None and self._heard():
             self.news.release()
 
-    def _taken(self, sample: Sample) -> int | None:
+    def _taken(self, sample: Arrival) -> int | None:
         """Have the role take a message."""
         try:
             return self.role.receive(sample, self.clock())

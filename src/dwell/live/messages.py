@@ -94,7 +94,7 @@ class Stamped(Stamp, array_like=True, frozen=True, gc=False):
     ----------
     intervals : tuple of (int, int)
         Earlier cycles of the run, and how long they took by the stamper's clock alone, ns (see
-        `dwell.live.intervals`). Each is told once.
+        `dwell.live.latencies`). Each is told once.
     group_ns : int
         CPU time that the control group of the stamper's node had taken at the release; -1 where
         that is not known.
@@ -330,7 +330,7 @@ class Answer(msgspec.Struct, array_like=True, frozen=True, gc=False):
     refused : str
         Why not; empty if it was done.
     status : dict
-        How the cell is; see `dwell.live.cell.Cell.status`.
+        How the cell is; see `dwell.live.controlled_cell.ControlledCell.status`.
     """
 
     number: Name

@@ -14,14 +14,14 @@ from pathlib import Path
 from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.agent import Agent, CpuCount, Gauge
-from dwell.live.cell import Cell
 from dwell.live.control_group import own_group
-from dwell.live.files import make_folder
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, take_turns
 from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
 from dwell.live.security import Security
+from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.transport.zenoh import ZenohTransport
@@ -207,7 +207,7 @@ def run_controller(
             controller = Controller(problem, policy)
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
             clock = clock_of(problem, node)
-            cell = Cell(place, controller, recorder, name, time.time_ns())
+            cell = ControlledCell(place, controller, recorder, name, time.time_ns())
             hosted.append(
                 Hosted(
                     *(cell, transport, clock),
@@ -234,6 +234,6 @@ def _require_runs(out: Path) -> None:
             raise LiveError(f"{out}: cannot be made ({error.strerror})") from None
 
 
-def _finished(recorder: RunRecorder, cell: Cell) -> Path | None:
+def _finished(recorder: RunRecorder, cell: ControlledCell) -> Path | None:
     cell.write()
     return recorder.finish(cell.windows.rows(last=True) if cell.windows else None)

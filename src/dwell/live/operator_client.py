@@ -15,7 +15,7 @@ from dwell.live.keys import Keys
 from dwell.live.log import printable
 from dwell.live.messages import Answer, Ask, decode, encode
 from dwell.live.security import Security
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role
 from dwell.model import Problem
 
@@ -61,7 +61,7 @@ class OperatorClient:
         """Close the connection."""
         self._transport.close()
 
-    def _heard(self, sample: Sample) -> None:
+    def _heard(self, sample: Arrival) -> None:
         try:
             answer = decode(sample.payload, Answer)
         except LiveError:
@@ -107,7 +107,7 @@ class OperatorClient:
         Returns
         -------
         dict
-            The controller's status (`dwell.live.cell.Cell.status`) and ``answer_age_ms``. Without
+            The controller's status (`ControlledCell.status`) and ``answer_age_ms``. Without
             an answer: ``cell``, ``health`` (``absent``), ``headline``, and the age of the last
             answer to this visitor, None where there was none.
         """

@@ -26,7 +26,7 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.live.offsets import Offsets
-from dwell.live.transport.protocol import Sample, Transport
+from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import fingerprint
@@ -46,7 +46,7 @@ REPEATED_NS = 10_000_000_000
 #: Beats of an earlier life, one after another, that no late message explains.
 RIVAL_BEATS = 5
 
-__all__ = ["Place", "Pulse", "Role", "Sealing"]
+__all__ = ["Pulse", "RoleLogic", "RolePlace", "Sealing"]
 
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -64,7 +64,7 @@ class Sealing(Protocol):
         ...
 
 
-class Role(Protocol):
+class RoleLogic(Protocol):
     """A process of a cell, without its threads, sockets and clock.
 
     Whoever runs it calls one method at a time: `receive` for every message under its
@@ -75,7 +75,7 @@ class Role(Protocol):
         """Key expressions that it wants to hear."""
         ...
 
-    def receive(self, sample: Sample, now_ns: int) -> int | None:
+    def receive(self, sample: Arrival, now_ns: int) -> int | None:
         """Take a message in; returns an instant at which something is due since, if that is so."""
         ...
 
@@ -85,7 +85,7 @@ class Role(Protocol):
 
 
 @dataclass(slots=True)
-class Place:
+class RolePlace:
     """Where a role runs.
 
     Parameters
@@ -158,12 +158,12 @@ class Place:
         data = encode(message)
         return data if self.seals is None else self.seals.seal(self.keys.word(key), data)
 
-    def read(self, sample: Sample, kind: type[T], by: Callable[[T], str]) -> T:
+    def read(self, sample: Arrival, kind: type[T], by: Callable[[T], str]) -> T:
         """Read a message that `put` or `put_twice` has sent.
 
         Parameters
         ----------
-        sample : Sample
+        sample : Arrival
         kind : type
             What it has to be.
         by : callable
@@ -180,7 +180,7 @@ class Place:
         self._require(sample, by(message))
         return message
 
-    def _require(self, sample: Sample, name: str) -> None:
+    def _require(self, sample: Arrival, name: str) -> None:
         """Raise a LiveError unless a message was signed by a subject."""
         if self.seals is not None:
             try:
@@ -208,7 +208,7 @@ class Place:
                 return
         raise TrustError(f"stamp: cycle {header.stamp.cycle} is not signed by who may stamp it")
 
-    def completion(self, sample: Sample) -> Completion:
+    def completion(self, sample: Arrival) -> Completion:
         """Read what a sink, or a task where a cycle ended, says of a cycle.
 
         Raises
@@ -223,7 +223,7 @@ class Place:
             raise LiveError(f"{sample.key}: {done.sink} does not run on {done.node}")
         return done
 
-    def load(self, sample: Sample) -> Load:
+    def load(self, sample: Arrival) -> Load:
         """Read what an agent says of its node.
 
         Raises
@@ -236,7 +236,7 @@ class Place:
             raise LiveError(f"{sample.key}: the load of {load.node}")
         return load
 
-    def beat(self, sample: Sample) -> Beat:
+    def beat(self, sample: Arrival) -> Beat:
         """Read a beat.
 
         One that came directly was let through for its sender's certificate; one that somebody has
@@ -266,7 +266,7 @@ class Place:
         self.transport.put(key, payload)
         self.transport.put(self.keys.relay(key), payload)
 
-    def around(self, sample: Sample) -> list[Sample]:
+    def around(self, sample: Arrival) -> list[Arrival]:
         """Return the messages that came over the detour together."""
         try:
             carried = decode(sample.payload, Carried)
@@ -274,7 +274,7 @@ class Place:
             self.complain(error)
             return []
         keys = self.keys
-        told = [Sample(keys.detour(key), payload) for key, payload in carried.messages]
+        told = [Arrival(keys.detour(key), payload) for key, payload in carried.messages]
         fit = [one for one in told if keys.word(one.key) in TWICE]
         if len(fit) < len(told):
             self.complain(LiveError(f"{sample.key}: has what never takes the detour"))
@@ -291,7 +291,7 @@ class Place:
         if self.say is not None:
             self.say(what)
 
-    def header(self, sample: Sample) -> Header | None:
+    def header(self, sample: Arrival) -> Header | None:
         """Read the header of a data message; None, and a complaint, where it is none.
 
         Or where nobody has stamped the cycle who may: one with too high a number would keep all
@@ -312,7 +312,7 @@ class Pulse:
 
     Parameters
     ----------
-    place : Place
+    place : RolePlace
     state : callable
         Returns whether the process is ready, and what keeps it from that or went wrong last.
     holds : callable, optional
@@ -325,7 +325,7 @@ class Pulse:
 
     def __init__(
         self,
-        place: Place,
+        place: RolePlace,
         state: Callable[[], tuple[bool, str]],
         holds: Callable[[], tuple[int, str]] | None = None,
         *,
@@ -359,7 +359,7 @@ class Pulse:
         keys = self.place.keys
         return tuple(keys.beat(node, who) for node, who in self._hears)
 
-    def receive(self, sample: Sample, now_ns: int) -> Beat | None:
+    def receive(self, sample: Arrival, now_ns: int) -> Beat | None:
         """Take a beat in; None where it is none, or no news."""
         if not sample.key.startswith(self._prefix):
             return None
@@ -381,7 +381,7 @@ class Pulse:
             self._look_for_rival(beat)
         return beat if self.detector.hear(beat, now_ns, direct=direct) else None
 
-    def _is_copy(self, sample: Sample) -> bool:
+    def _is_copy(self, sample: Arrival) -> bool:
         """Whether a beat is the copy of the last that came directly, or of one of its own."""
         direct, detour = self._prefix
         if sample.key == self._returned:
@@ -433,13 +433,13 @@ class Pulse:
             self.place.complain(LiveError(told))
         self._rivals[beat.who] = count
 
-    def compare_clocks(self, sample: Sample, now_ns: int, offsets: Offsets) -> None:
+    def compare_clocks(self, sample: Arrival, now_ns: int, offsets: Offsets) -> None:
         """Take a beat in, and what it tells of the clocks if it came directly."""
         beat = self.receive(sample, now_ns)
         if beat is not None and self.place.keys.came_directly(sample.key):
             offsets.hear(beat, now_ns)
 
-    def hears(self, sample: Sample) -> bool:
+    def hears(self, sample: Arrival) -> bool:
         """Whether a message is a beat."""
         return sample.key.startswith(self._prefix)
 

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.failures import start_thread
-from dwell.live.transport.protocol import Transport
+from dwell.live.transport.transport import Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.trust import KEYS
 from dwell.live.wiring import Role, longest_message_bytes, wire
 from dwell.model import FrozenDict, Problem
 
 if TYPE_CHECKING:
-    from dwell.live.role import Place
+    from dwell.live.role import RolePlace
     from dwell.live.trust.keyring import Keyring
 
 __all__ = ["INSECURE", "KEYS", "Security", "exposed"]
@@ -127,16 +127,18 @@ class Security:
         wiring = wire(self.problem, protocol=self._protocol)
         return ZenohTransport(wiring.visitor(who, to), self._settings(VISITORS_AT_ONCE))
 
-    def place(self, who: str, node: str, transport: Transport, say: Callable[[str], None]) -> Place:
+    def place(
+        self, who: str, node: str, transport: Transport, say: Callable[[str], None]
+    ) -> RolePlace:
         """Return where a role runs that is just started."""
-        from dwell.live.role import Place
+        from dwell.live.role import RolePlace
 
         seals = None
         if self.keyring is not None:
             from dwell.live.trust.signing import Seals
 
             seals = Seals(self.keyring)
-        return Place(self.problem, who, node, transport, time.time_ns(), say=say, seals=seals)
+        return RolePlace(self.problem, who, node, transport, time.time_ns(), say=say, seals=seals)
 
     def warnings(self) -> Iterator[str]:
         """Yield what its log should say, again and again."""

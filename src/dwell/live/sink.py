@@ -9,9 +9,9 @@ from dwell.errors import LiveError
 from dwell.live.control_group import UNKNOWN
 from dwell.live.messages import Completion, Header
 from dwell.live.payloads import read_payload
-from dwell.live.role import Place, Pulse
+from dwell.live.role import Pulse, RolePlace
 from dwell.live.stage import Actuator, Message
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import longest_bytes
 
 __all__ = ["Highest", "Sink"]
@@ -36,7 +36,7 @@ class Sink:
 
     Parameters
     ----------
-    place : Place
+    place : RolePlace
     task : str
         Sink task whose commands it takes.
     actuator : Actuator
@@ -47,7 +47,7 @@ class Sink:
 
     def __init__(
         self,
-        place: Place,
+        place: RolePlace,
         task: str,
         actuator: Actuator,
         highest: Highest,
@@ -74,7 +74,7 @@ class Sink:
         yield from self.pulse.subscriptions()
         yield self.place.keys.command(self.task)
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:
         """Take a command or a beat in."""
         if self.pulse.hears(sample):
             self.pulse.compare_clocks(sample, now_ns, self.offsets)

@@ -11,8 +11,8 @@ from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
 from dwell.live.continuity import RESERVED
 from dwell.live.control_group import UNKNOWN
-from dwell.live.intervals import Intervals
 from dwell.live.keys import CONTROLLER
+from dwell.live.latencies import Intervals
 from dwell.live.messages import (
     Accepted,
     Beat,
@@ -23,11 +23,11 @@ from dwell.live.messages import (
     Stamped,
     encode,
 )
-from dwell.live.role import Place, Pulse
+from dwell.live.role import Pulse, RolePlace
 from dwell.live.routing import STAMPER, Destination, Routes
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 
-__all__ = ["Book", "Entry", "Stamper"]
+__all__ = ["Book", "Stamper", "StamperState"]
 
 #: Time after which a controller that is silent is in charge no more.
 LEASE_NS = 1_000_000_000
@@ -38,7 +38,7 @@ MAX_PARTIAL = 1_024
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class StamperState:
     """What outlives the stamper's process.
 
     Parameters
@@ -61,13 +61,13 @@ class Entry:
 
 
 class Book(Protocol):
-    """Keeps the `Entry` of a cell."""
+    """Keeps the `StamperState` of a cell."""
 
-    def read(self) -> Entry | None:
+    def read(self) -> StamperState | None:
         """Return it; None if there is none."""
         ...
 
-    def write(self, entry: Entry) -> None:
+    def write(self, entry: StamperState) -> None:
         """Keep it, before anything that it says happens."""
         ...
 
@@ -77,19 +77,19 @@ class Stamper:
 
     Parameters
     ----------
-    place : Place
+    place : RolePlace
     book : Book
     run : int
         Run id where the book has none; larger than any before.
     now_ns : int
     """
 
-    def __init__(self, place: Place, book: Book, run: int, now_ns: int) -> None:
+    def __init__(self, place: RolePlace, book: Book, run: int, now_ns: int) -> None:
         self.place, self._book = place, book
         problem = place.problem
         entry = book.read()
         if entry is None or entry.placement not in problem.candidates:
-            entry = Entry(run, 0, 1, problem.initial, False)
+            entry = StamperState(run, 0, 1, problem.initial, False)
         self.run, self.term = entry.run, entry.term
         self.placement = entry.placement
         self.cycle = entry.reserved
@@ -141,7 +141,7 @@ class Stamper:
         yield keys.order()
         yield keys.frame()
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:
         """Take a message in."""
         if sample.key == self.place.keys.carried():
             for one in self.place.around(sample):
@@ -330,7 +330,9 @@ class Stamper:
         self._probes.clear()
 
     def _write(self, *, on_fallback: bool) -> None:
-        self._book.write(Entry(self.run, self._reserved, self.term, self.placement, on_fallback))
+        self._book.write(
+            StamperState(self.run, self._reserved, self.term, self.placement, on_fallback)
+        )
 
     # -------------------------------------------------------------------------- cycles
 

@@ -17,11 +17,11 @@ from pathlib import Path
 import psutil
 
 from dwell.files import write_whole
-from dwell.live.files import InFlight
 from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running
 from dwell.live.log import printable
+from dwell.live.state_files import InFlight
 
-__all__ = ["Child", "Supervisor"]
+__all__ = ["SupervisedProcess", "Supervisor"]
 
 #: Waits between two starts of a process that keeps dying.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
@@ -43,7 +43,7 @@ LOG_BYTES = 8 << 20
 
 
 @dataclass(slots=True)
-class Child:
+class SupervisedProcess:
     """A process that is kept running.
 
     Parameters
@@ -123,14 +123,14 @@ class Supervisor:
     ) -> None:
         self.folder = folder
         self._warm_s, self._growth_bytes, self._log_bytes = warm_s, growth_bytes, log_bytes
-        self.children: list[Child] = []
+        self.children: list[SupervisedProcess] = []
         self._say = say
         self._oom_kills = _oom_kills()
         self._launcher = Launcher() if launcher is None else launcher
 
-    def keep(self, who: str, command: Sequence[str]) -> Child:
+    def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
-        child = Child(who, command, self.folder)
+        child = SupervisedProcess(who, command, self.folder)
         child.adopted = _survivor(child.mark)
         if child.adopted is not None:
             self._say(f"{who}: goes on (process {child.adopted.pid})")
@@ -145,7 +145,7 @@ class Supervisor:
             if not self._alive(child) and ready and time.monotonic() >= child.next_s:
                 self._start(child)
 
-    def _alive(self, child: Child) -> bool:
+    def _alive(self, child: SupervisedProcess) -> bool:
         if child.process is not None:
             code = child.process.poll()
             if code is None:
@@ -159,7 +159,7 @@ class Supervisor:
             self._died(child, ENDED)
         return False
 
-    def _died(self, child: Child, reason: str) -> None:
+    def _died(self, child: SupervisedProcess, reason: str) -> None:
         now_s = time.monotonic()
         lived_s = now_s - child.started_s
         last = _last_line(child.log)
@@ -177,7 +177,7 @@ class Supervisor:
         except OSError as error:
             self._say(f"{child.who}: what it died of cannot be kept ({error.strerror})")
 
-    def _starved(self, child: Child, reason: str, last: str) -> str:
+    def _starved(self, child: SupervisedProcess, reason: str, last: str) -> str:
         """Return that a process died for want of memory, and how; empty where it did not.
 
         The kernel counts the processes that it has killed for that, of the whole machine.
@@ -191,7 +191,7 @@ class Supervisor:
             return f"{reason} for want of memory{had}"
         return ""
 
-    def _blame(self, child: Child, reason: str) -> None:
+    def _blame(self, child: SupervisedProcess, reason: str) -> None:
         """Give the message that a worker died of to the next one, but not twice."""
         content = InFlight.read(child.inflight)
         again = child.folder / f"{child.who}.again"
@@ -211,7 +211,7 @@ class Supervisor:
         child.note = f"{child.who}: a message has killed it twice ({reason}); it is kept in {kept}"
         self._say(child.note)
 
-    def _start(self, child: Child) -> None:
+    def _start(self, child: SupervisedProcess) -> None:
         """Start a process; a disk that is full must not end the agent, and with it the node."""
         child.starts += 1
         child.started_s = time.monotonic()
@@ -223,7 +223,7 @@ class Supervisor:
         child.warm_bytes, child.growth = None, ""
         self._write_mark(child)
 
-    def _write_mark(self, child: Child) -> None:
+    def _write_mark(self, child: SupervisedProcess) -> None:
         """Write who runs; the mark of somebody before it must not stay."""
         try:
             child.mark.unlink(missing_ok=True)
@@ -236,7 +236,7 @@ class Supervisor:
         except psutil.NoSuchProcess:
             return
 
-    def _run(self, child: Child) -> None:
+    def _run(self, child: SupervisedProcess) -> None:
         with child.log.open("ab") as log:
             child.process = self._launcher.start(child.command, log)
 
@@ -249,7 +249,7 @@ class Supervisor:
                 self._write_mark(child)  # there was no room for it
             self._weigh(child)
 
-    def _weigh(self, child: Child) -> None:
+    def _weigh(self, child: SupervisedProcess) -> None:
         """Report a process whose memory has doubled since it had warmed up, at every doubling."""
         if child.pid is None:
             return

@@ -14,14 +14,13 @@ from typing import Literal, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
-from dwell.live.transport.protocol import Lane
+from dwell.live.transport.transport import Lane
 from dwell.model import Flow, FrozenDict, Problem
 
 __all__ = [
     "IMAGE_BYTES",
     "PORTS_PER_ROLE",
     "SESSIONS",
-    "Entry",
     "Kind",
     "Locator",
     "Passage",
@@ -29,6 +28,7 @@ __all__ = [
     "Session",
     "Wire",
     "Wiring",
+    "WiringEntry",
     "lane_of",
     "longest_bytes",
     "longest_message_bytes",
@@ -137,7 +137,7 @@ class Passage:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class WiringEntry:
     """What one process opens.
 
     Parameters
@@ -170,7 +170,7 @@ class Wiring:
     Parameters
     ----------
     cell : str
-    entries : mapping of str to Entry
+    entries : mapping of str to WiringEntry
         By who.
     wires : tuple of Wire
     passages : tuple of Passage
@@ -178,14 +178,14 @@ class Wiring:
     """
 
     cell: str
-    entries: Mapping[str, Entry]
+    entries: Mapping[str, WiringEntry]
     wires: tuple[Wire, ...]
     passages: tuple[Passage, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "entries", FrozenDict(self.entries))
 
-    def entry(self, who: str) -> Entry:
+    def entry(self, who: str) -> WiringEntry:
         """Return what a process opens.
 
         Raises
@@ -217,13 +217,13 @@ class Wiring:
         entry = self.entry(source)
         return session_of(entry, lane, key) in self.connected(source, target)
 
-    def visitor(self, who: str, to: str) -> Entry:
+    def visitor(self, who: str, to: str) -> WiringEntry:
         """Return what a process that is no part of the cell opens to talk to one that is."""
         host = self.entry(to)
         if "control" not in host.listen:
             raise LiveError(f"{to} of cell {self.cell!r} does not listen to anybody")
         role = Role(who, host.role.node, "visitor")
-        return Entry(role, {}, {"control": (host.listen["control"],)})
+        return WiringEntry(role, {}, {"control": (host.listen["control"],)})
 
 
 def roles(problem: Problem) -> tuple[Role, ...]:
@@ -307,7 +307,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
         if role.kind == "controller":  # somebody may want to ask it something
             listen[role.who]["control"] = locator(role.who, "control")
     entries = {
-        role.who: Entry(
+        role.who: WiringEntry(
             role,
             listen[role.who],
             {session: tuple(ends) for session, ends in connect[role.who].items()},
@@ -351,12 +351,12 @@ def longest_message_bytes(problem: Problem, session: Session) -> int:
     return max(longest, MAX_CONTROL_BYTES) + MAX_HEADER_BYTES + ENVELOPE_BYTES
 
 
-def session_of(entry: Entry, lane: Lane, key: str) -> Session:
+def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
     """Session that a process sends a message in.
 
     Parameters
     ----------
-    entry : Entry
+    entry : WiringEntry
     lane : str
     key : str
         ``dwell/CELL/in/TASK/NODE/...`` or ``dwell/CELL/state/TASK/NODE`` where the lane is

@@ -23,10 +23,10 @@ from dwell.live.messages import (
 )
 from dwell.live.offsets import Offsets
 from dwell.live.payloads import read_payload, write_payload
-from dwell.live.role import Place, Pulse
+from dwell.live.role import Pulse, RolePlace
 from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import Message, Stage, Stateful
-from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.transport.transport import Arrival, Lane
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import NEVER_NS
 
@@ -110,7 +110,7 @@ class _Source:
     goes on by itself for a while, with a guess that everybody who may need it gets.
     """
 
-    def __init__(self, place: Place, offsets: Offsets, offset_ns: int) -> None:
+    def __init__(self, place: RolePlace, offsets: Offsets, offset_ns: int) -> None:
         self._place, self._offsets, self._offset_ns = place, offsets, offset_ns
         self._guesses = place.problem.controller.guard_cycles
         self._alone = place.node != place.stamper[0] and place.problem.live.release == "timer"
@@ -171,7 +171,7 @@ class Worker:
 
     Parameters
     ----------
-    place : Place
+    place : RolePlace
     task : str
     stage : Stage
     shadow : bool
@@ -181,7 +181,13 @@ class Worker:
     """
 
     def __init__(
-        self, place: Place, task: str, stage: Stage, *, shadow: bool = False, stands_by: str = ""
+        self,
+        place: RolePlace,
+        task: str,
+        stage: Stage,
+        *,
+        shadow: bool = False,
+        stands_by: str = "",
     ) -> None:
         self.place, self.task, self.stage = place, task, stage
         self.shadow, self.stands_by = shadow, stands_by
@@ -265,7 +271,7 @@ class Worker:
             yield keys.snapshot(self.task, node)
             yield keys.state(self.task, node)
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:
         """Take a message in."""
         if self.pulse.hears(sample):
             self.pulse.compare_clocks(sample, now_ns, self.offsets)
@@ -279,7 +285,7 @@ class Worker:
             except LiveError as error:
                 self.place.complain(error)
 
-    def _input(self, sample: Sample, kind: str, now_ns: int) -> None:
+    def _input(self, sample: Arrival, kind: str, now_ns: int) -> None:
         header = self.place.header(sample)
         if header is None:
             return
@@ -330,7 +336,7 @@ class Worker:
         mine = self.routes.runs(self.task, self.place.node, job.header.stamp)
         return self._stateful and not mine and not job.shadow
 
-    def _about_state(self, sample: Sample) -> None:
+    def _about_state(self, sample: Arrival) -> None:
         if "/snapshot/" in sample.key:
             self._asked = self.place.read(sample, Snapshot, lambda _: CONTROLLER)
             return

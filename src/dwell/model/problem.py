@@ -26,7 +26,7 @@ from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.scenario import Scenario
-from dwell.model.semantics import Parts, find_faults, nearest_of
+from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
 __all__ = ["MIGRATIONS", "ControllerSettings", "Problem"]
@@ -172,9 +172,9 @@ class Problem:
             if task not in placement and len(on) == 1
         ]
 
-    def _parts(self) -> Parts:
+    def _parts(self) -> CellParts:
         links = self.fabric.links.values()
-        return Parts(
+        return CellParts(
             nodes=self.fabric.nodes,
             links=[(f"links[{i}]", link) for i, link in enumerate(links)],
             tasks=self.pipeline.tasks,

@@ -28,7 +28,7 @@ from dwell.model.scenario import (
 if TYPE_CHECKING:
     from dwell.model.problem import ControllerSettings
 
-__all__ = ["Parts", "find_faults", "nearest", "nearest_of", "too_many_shadows"]
+__all__ = ["CellParts", "find_faults", "nearest", "nearest_of", "too_many_shadows"]
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -38,7 +38,7 @@ SHARE_TOLERANCE = 1e-9
 
 
 @dataclass(slots=True)
-class Parts:
+class CellParts:
     """Parts of a cell, with the path each has in its file.
 
     A value of None is a part whose name is known but whose content could not be read (its own
@@ -82,7 +82,7 @@ def nearest_of(word: str, known: Iterable[str], what: str) -> str:
     return f"{hint} ({what} here: {', '.join(names)})" if hint.startswith("did") else hint
 
 
-def find_faults(parts: Parts) -> list[Fault]:
+def find_faults(parts: CellParts) -> list[Fault]:
     """Return every fault in the meaning of a cell's parts, in the order of the file."""
     return [
         *_names(parts),
@@ -104,7 +104,7 @@ def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[
         yield Fault(path, f"unknown {what} {word!r}; {nearest(word, names)}")
 
 
-def _names(parts: Parts) -> Iterator[Fault]:
+def _names(parts: CellParts) -> Iterator[Fault]:
     sections: dict[str, Iterable[str]] = {
         "nodes": parts.nodes,
         "tasks": parts.tasks,
@@ -128,7 +128,7 @@ def _bad_name(name: str) -> str:
     )
 
 
-def _nodes(parts: Parts) -> Iterator[Fault]:
+def _nodes(parts: CellParts) -> Iterator[Fault]:
     if not parts.nodes:
         yield Fault("nodes", "none is declared; a cell needs at least one node")
     for name, node in parts.nodes.items():
@@ -139,7 +139,7 @@ def _nodes(parts: Parts) -> Iterator[Fault]:
                 yield Fault(here, "is the node itself; its own foreign threads are no contention")
 
 
-def _links(parts: Parts) -> Iterator[Fault]:
+def _links(parts: CellParts) -> Iterator[Fault]:
     seen: dict[str, str] = {}
     for path, link in parts.links:
         yield from _unknown(f"{path}.from", "node", link.source, parts.nodes)
@@ -153,7 +153,7 @@ def _links(parts: Parts) -> Iterator[Fault]:
         seen.setdefault(link.name, path)
 
 
-def _tasks(parts: Parts) -> Iterator[Fault]:
+def _tasks(parts: CellParts) -> Iterator[Fault]:
     if not parts.tasks:
         yield Fault("tasks", "none is declared; a pipeline needs at least one task")
     targets = {flow.target for _, flow in parts.flows}
@@ -181,7 +181,7 @@ def _tasks(parts: Parts) -> Iterator[Fault]:
                 )
 
 
-def _flows(parts: Parts) -> Iterator[Fault]:
+def _flows(parts: CellParts) -> Iterator[Fault]:
     seen: dict[tuple[str, str], str] = {}
     for path, flow in parts.flows:
         yield from _unknown(f"{path}.from", "task", flow.source, parts.tasks)
@@ -225,7 +225,7 @@ def _cycle(tasks: Iterable[str], flows: Sequence[Flow]) -> list[str]:
     return []
 
 
-def _candidates(parts: Parts) -> Iterator[Fault]:
+def _candidates(parts: CellParts) -> Iterator[Fault]:
     if not parts.candidates and not list(parts.broken_candidates):
         yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
     for name, moves in parts.candidates.items():
@@ -238,7 +238,7 @@ def _candidates(parts: Parts) -> Iterator[Fault]:
             yield from _connected(parts, path, moves)
 
 
-def _placed(parts: Parts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
+def _placed(parts: CellParts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
     for task_name, node in moves.items():
         here = f"{path}.{task_name}"
         if task_name not in parts.tasks:
@@ -260,7 +260,7 @@ def _placed(parts: Parts, path: str, moves: Mapping[str, str]) -> Iterator[Fault
             yield Fault(path, f"relocatable task {task_name!r} is not placed; put it on {where}")
 
 
-def _connected(parts: Parts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
+def _connected(parts: CellParts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
     if not parts.links_complete:
         return
     links = {link.name for _, link in parts.links}
@@ -278,14 +278,14 @@ def _connected(parts: Parts, path: str, moves: Mapping[str, str]) -> Iterator[Fa
         yield Fault(path, f"needs the link {name} for {', '.join(flows)}; {remedy}")
 
 
-def _node_of(parts: Parts, moves: Mapping[str, str], task_name: str) -> str | None:
+def _node_of(parts: CellParts, moves: Mapping[str, str], task_name: str) -> str | None:
     if task_name in moves:
         return moves[task_name]
     task = parts.tasks.get(task_name)
     return next(iter(task.on)) if task is not None else None
 
 
-def _scenarios(parts: Parts) -> Iterator[Fault]:
+def _scenarios(parts: CellParts) -> Iterator[Fault]:
     links = [link.name for _, link in parts.links]
     for name, items in parts.scenarios.items():
         if name == "baseline" and items:
@@ -320,7 +320,7 @@ def _episodes(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
             )
 
 
-def _layers(parts: Parts, items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
+def _layers(parts: CellParts, items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
     """Extra delays of a link are bits of a number."""
     bursts = {link.name for _, link in parts.links if link.bursts is not None}
     taken: dict[str, int] = {}
@@ -337,12 +337,12 @@ def _layers(parts: Parts, items: Sequence[tuple[str, Disturbance]]) -> Iterator[
                 )
 
 
-def _objective(parts: Parts) -> Iterator[Fault]:
+def _objective(parts: CellParts) -> Iterator[Fault]:
     for name in parts.tiers:
         yield from _unknown(f"objective.tiers.{name}", "node", name, parts.nodes)
 
 
-def _controller(parts: Parts) -> Iterator[Fault]:
+def _controller(parts: CellParts) -> Iterator[Fault]:
     settings = parts.controller
     if settings is None:
         return
@@ -366,7 +366,7 @@ def _controller(parts: Parts) -> Iterator[Fault]:
         yield from _state_transfers(parts)
 
 
-def _live(parts: Parts) -> Iterator[Fault]:
+def _live(parts: CellParts) -> Iterator[Fault]:
     live = parts.live
     if live is None:
         return
@@ -404,7 +404,7 @@ def too_many_shadows(fraction: float, candidates: int) -> str:
     )
 
 
-def _state_transfers(parts: Parts) -> Iterator[Fault]:
+def _state_transfers(parts: CellParts) -> Iterator[Fault]:
     """A cold migration carries the state of a task over a direct link."""
     links = {f"{link.source}->{link.target}" for _, link in parts.links}
     for name, task in parts.tasks.items():

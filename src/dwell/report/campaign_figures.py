@@ -10,8 +10,8 @@ import numpy as np
 
 from dwell.report.scales import is_wide
 from dwell.study import AIM
-from dwell.study.campaign import Measured
 from dwell.study.chapter import Figure, Table, Unit
+from dwell.study.measured_campaign import MeasuredCampaign
 
 if TYPE_CHECKING:
     import polars as pl
@@ -40,7 +40,7 @@ POINTS = 200
 DEADLINES = 4
 
 
-def measures_figure(measured: Measured, measure: str) -> Figure:
+def measures_figure(measured: MeasuredCampaign, measure: str) -> Figure:
     """Return one measure of every policy and scenario, with its interval over repetitions."""
     import polars as pl
 
@@ -75,7 +75,7 @@ def measures_figure(measured: Measured, measure: str) -> Figure:
     )
 
 
-def window_figures(measured: Measured) -> Iterator[Figure]:
+def window_figures(measured: MeasuredCampaign) -> Iterator[Figure]:
     """Yield the empirical distributions over windows of every measure, a panel a scenario."""
     deadline_ms = measured.comparison.problem.pipeline.deadline_ms
     for measure, (name, unit) in MEASURES.items():
@@ -96,7 +96,7 @@ def window_figures(measured: Measured) -> Iterator[Figure]:
         )
 
 
-def _within(measured: Measured, measure: str, factor: float) -> pl.DataFrame:
+def _within(measured: MeasuredCampaign, measure: str, factor: float) -> pl.DataFrame:
     """Return steps of the distributions of a measure over windows."""
     import polars as pl
 
@@ -126,7 +126,7 @@ def _within(measured: Measured, measure: str, factor: float) -> pl.DataFrame:
 # ---------------------------------------------------------------------- profiles and links
 
 
-def profiles_figure(measured: Measured) -> Figure:
+def profiles_figure(measured: MeasuredCampaign) -> Figure:
     """Return what the jobs of each task took on each node in the baseline: 5 % to 95 % of them."""
     import polars as pl
 
@@ -152,7 +152,7 @@ def profiles_figure(measured: Measured) -> Figure:
     )
 
 
-def profiles_table(measured: Measured) -> Table:
+def profiles_table(measured: MeasuredCampaign) -> Table:
     """Return c_v(n): every task and node, beside what the cell says."""
     kinds: dict[str, Unit] = {"task": "text", "node": "text", "jobs": "count", "runs": "count"}
     times = ("cpu", "wall") if measured.profiles["cpu_ms"].is_not_null().any() else ("wall",)
@@ -179,7 +179,7 @@ def profiles_table(measured: Measured) -> Table:
     )
 
 
-def links_table(measured: Measured) -> Table:
+def links_table(measured: MeasuredCampaign) -> Table:
     """Return what messages took, by scenario, link and flow."""
     return Table(
         slug="links",
@@ -209,7 +209,7 @@ def links_table(measured: Measured) -> Table:
     )
 
 
-def delays_figure(measured: Measured) -> Figure:
+def delays_figure(measured: MeasuredCampaign) -> Figure:
     """Return the distributions of what messages took, a panel a scenario."""
     return Figure(
         slug="delays",
@@ -230,7 +230,7 @@ def delays_figure(measured: Measured) -> Figure:
 # ------------------------------------------------------------------------------- the record
 
 
-def log_table(measured: Measured) -> Table:
+def log_table(measured: MeasuredCampaign) -> Table:
     """Return what was run when."""
     import polars as pl
 
@@ -269,7 +269,7 @@ def log_table(measured: Measured) -> Table:
     )
 
 
-def failed_table(measured: Measured) -> Table:
+def failed_table(measured: MeasuredCampaign) -> Table:
     """Return the attempts that failed."""
     return Table(
         slug="failed",

@@ -21,9 +21,9 @@ from dwell.report.page import (
 )
 from dwell.report.style import PageStyle
 from dwell.report.svg import inline
-from dwell.study.campaign import Measured
 from dwell.study.campaign_questions import is_steady, main_table, needed_pairs, questions
 from dwell.study.chapter import Chapter, Figure
+from dwell.study.measured_campaign import MeasuredCampaign
 
 __all__ = ["campaign_html", "counted_windows", "limits_of"]
 
@@ -32,12 +32,12 @@ TITLE = "A campaign of measurements"
 SIMULATED = "Some of these runs, or all, were simulated in place of measurements."
 
 
-def campaign_html(measured: Measured) -> str:
+def campaign_html(measured: MeasuredCampaign) -> str:
     """Return a self-contained page about a campaign, finished or not.
 
     Parameters
     ----------
-    measured : Measured
+    measured : MeasuredCampaign
 
     Returns
     -------
@@ -65,7 +65,7 @@ def campaign_html(measured: Measured) -> str:
     return document(TITLE, body)
 
 
-def _subtitle(measured: Measured) -> str:
+def _subtitle(measured: MeasuredCampaign) -> str:
     comparison = measured.comparison
     where = "on the testbed" if measured.where == "testbed" else "on real hosts"
     return (
@@ -76,12 +76,12 @@ def _subtitle(measured: Measured) -> str:
     )
 
 
-def _told(measured: Measured, chapters: Sequence[Chapter]) -> Iterator[str]:
+def _told(measured: MeasuredCampaign, chapters: Sequence[Chapter]) -> Iterator[str]:
     yield _power(measured, chapters)
     yield counted_windows(measured)
 
 
-def _power(measured: Measured, chapters: Sequence[Chapter]) -> str:
+def _power(measured: MeasuredCampaign, chapters: Sequence[Chapter]) -> str:
     """Say what can be shown with so few repetitions."""
     count = len(measured.comparison.seeds)
     text = (
@@ -102,7 +102,7 @@ def _comparisons(chapter: Chapter) -> Sequence[object]:
     return chapter.tables[-1].frame.rows()
 
 
-def counted_windows(measured: Measured) -> str:
+def counted_windows(measured: MeasuredCampaign) -> str:
     """Say how many windows were excluded, and how many attempts failed."""
     windows, excluded = (int(measured.log[name].sum()) for name in ("windows", "excluded"))
     touched = int((measured.log["excluded"] > 0).sum())
@@ -124,7 +124,7 @@ def counted_windows(measured: Measured) -> str:
 # ----------------------------------------------------------------------------------- parts
 
 
-def _results(measured: Measured, look: PageStyle) -> Iterator[str]:
+def _results(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
     comparison = measured.comparison
     yield definitions(describe_contenders(comparison.problem, comparison.policies))
     yield paragraph(
@@ -144,7 +144,7 @@ def _results(measured: Measured, look: PageStyle) -> Iterator[str]:
         )
 
 
-def _is_complete(measured: Measured) -> bool:
+def _is_complete(measured: MeasuredCampaign) -> bool:
     """Whether every policy has a run in every scenario."""
     comparison = measured.comparison
     pairs = comparison.runs.select("scenario", "policy").unique().height
@@ -161,7 +161,7 @@ def _caption(measure: str) -> str:
     return f"{text}: mean over repetitions, with its 95 % interval as a bar where there is one."
 
 
-def _distributions(measured: Measured, look: PageStyle) -> Iterator[str]:
+def _distributions(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
     yield _drawn(
         figures.latency_figure(measured.comparison),
         look,
@@ -191,7 +191,7 @@ def _chapter(chapter: Chapter, look: PageStyle) -> str:
     return "\n".join([*parts, "</section>"])
 
 
-def _parts(measured: Measured, look: PageStyle) -> Iterator[str]:
+def _parts(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
     if measured.profiles.is_empty() and measured.links.is_empty():
         yield paragraph("The runs kept no jobs: there is nothing to take profiles from.")
         return
@@ -205,7 +205,7 @@ def _parts(measured: Measured, look: PageStyle) -> Iterator[str]:
         yield chapter_tables.html(shown.links_table(measured), look)
 
 
-def _record(measured: Measured, look: PageStyle) -> Iterator[str]:
+def _record(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
     busy = measured.log.height - int(measured.log["idle"].sum())
     yield paragraph(
         "Each repetition is a complete random order of all policies in all scenarios. Before a run "
@@ -221,7 +221,7 @@ def _record(measured: Measured, look: PageStyle) -> Iterator[str]:
         yield chapter_tables.html(shown.failed_table(measured), look)
 
 
-def _method(measured: Measured) -> Iterator[str]:
+def _method(measured: MeasuredCampaign) -> Iterator[str]:
     comparison = measured.comparison
     problem = comparison.problem
     yield paragraph(
@@ -253,7 +253,7 @@ def _method(measured: Measured) -> Iterator[str]:
     )
 
 
-def limits_of(measured: Measured) -> Iterator[str]:
+def limits_of(measured: MeasuredCampaign) -> Iterator[str]:
     """Yield what the numbers do not say."""
     yield (
         "One machine, or one set of hosts, at one time: intervals are over repetitions there, and "

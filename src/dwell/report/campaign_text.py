@@ -14,8 +14,8 @@ from dwell.report.formatting import (
     write_interval,
 )
 from dwell.report.style import PageStyle
-from dwell.study.campaign import Measured
 from dwell.study.campaign_questions import questions
+from dwell.study.measured_campaign import MeasuredCampaign
 
 __all__ = ["campaign_text"]
 
@@ -29,7 +29,7 @@ MEASURES = (
 )
 
 
-def campaign_text(measured: Measured) -> str:
+def campaign_text(measured: MeasuredCampaign) -> str:
     """Return the results of a campaign as plain text of at most 100 columns."""
     comparison = measured.comparison
     look = PageStyle(
@@ -56,7 +56,7 @@ def campaign_text(measured: Measured) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _rows(measured: Measured, scenario: str) -> list[list[str]]:
+def _rows(measured: MeasuredCampaign, scenario: str) -> list[list[str]]:
     comparison = measured.comparison
     rows = []
     for policy in comparison.policies:

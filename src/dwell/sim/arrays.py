@@ -11,8 +11,8 @@ from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.model.instants import NEVER_NS
-from dwell.sim.guard import back_ns
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
+from dwell.sim.simulated_guard import back_ns
 
 __all__ = ["Arrays", "lay_out"]
 
@@ -86,8 +86,7 @@ def lay_out(
     log_jobs : bool
         Whether every job's instants are kept.
     shadows : Realisation, optional
-        What the shadow jobs of a single cell meet (see `dwell.sim.drawing.draw_shadows`); it gets
-        a shadow then.
+        What the shadow jobs of a single cell meet (see `draw_shadows`); it gets a shadow then.
     """
     return _Layout(cells, shared, log_jobs, shadows).arrays()
 

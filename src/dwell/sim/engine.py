@@ -32,10 +32,10 @@ from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out, ordered_flows
 from dwell.sim.cold_migration import ColdMigration
-from dwell.sim.drawing import draw, draw_shadows
-from dwell.sim.guard import Watch
+from dwell.sim.random_draws import draw, draw_shadows
 from dwell.sim.realisation import NodeChanges, Realisation
-from dwell.sim.tables import Played, make_tables
+from dwell.sim.simulated_guard import SimulatedGuard
+from dwell.sim.tables import PlayedRealisation, make_tables
 
 __all__ = ["describe", "play", "simulate", "simulate_realisation"]
 
@@ -166,7 +166,7 @@ def _play(
     by_window: bool,
     *,
     shadow: bool = False,
-) -> Played:
+) -> PlayedRealisation:
     """Play a realisation with or without a shadow."""
     controller = Controller(problem, policy, estimator)
     shadow = shadow or controller.shadow_fraction > 0
@@ -229,13 +229,13 @@ def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int6
 
 def _play_static(
     problem: Problem, realisation: Realisation, controller: Controller, arrays: Arrays
-) -> Played:
+) -> PlayedRealisation:
     """Play everything in one call: no decision can change anything."""
     arrays.tables.stamps[:] = list(problem.candidates).index(controller.incumbent)
     with _quiet():
         play(arrays)
     first = np.arange(realisation.windows) * problem.window_cycles
-    return Played(problem, realisation, controller, arrays, first)
+    return PlayedRealisation(problem, realisation, controller, arrays, first)
 
 
 def _play_windows(
@@ -245,7 +245,7 @@ def _play_windows(
     arrays: Arrays,
     *,
     guarded: bool,
-) -> Played:
+) -> PlayedRealisation:
     """Play window by window; the controller looks at each and stamps what follows."""
     stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
     with _quiet():
@@ -254,7 +254,9 @@ def _play_windows(
                 stamper.step()
             else:
                 stamper.close_window()
-    return Played(problem, realisation, controller, arrays, np.array(stamper.first, np.int64))
+    return PlayedRealisation(
+        problem, realisation, controller, arrays, np.array(stamper.first, np.int64)
+    )
 
 
 class _Stamper:
@@ -288,7 +290,7 @@ class _Stamper:
         self.next_first = 0
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         arrays.tables.clock[k.PAUSE] = 1
-        self.watch = Watch(problem, realisation, arrays.tables) if guarded else None
+        self.watch = SimulatedGuard(problem, realisation, arrays.tables) if guarded else None
         self.stamped = self._reach(self.window_cycles)
         self._stamp(0, self.stamped)
 

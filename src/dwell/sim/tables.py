@@ -25,7 +25,7 @@ from dwell.sim.realisation import Realisation
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Played", "make_tables"]
+__all__ = ["PlayedRealisation", "make_tables"]
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
@@ -33,7 +33,7 @@ T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(slots=True)
-class Played:
+class PlayedRealisation:
     """A realisation that has been played to its end.
 
     Parameters
@@ -113,7 +113,9 @@ class Played:
         return missed
 
 
-def make_tables(played: Played, *, jobs: bool = False) -> dict[str, Callable[[], pl.DataFrame]]:
+def make_tables(
+    played: PlayedRealisation, *, jobs: bool = False
+) -> dict[str, Callable[[], pl.DataFrame]]:
     """Functions that make each table when it is first asked for; `jobs` asks for that of jobs."""
     controller = played.controller
     profile = None if controller.log.seen else controller.fixed_profile
@@ -143,7 +145,7 @@ def _names(codes: NDArray[np.integer], names: tuple[str, ...]) -> pl.Series:
     return pl.Series(codes.astype(np.uint32)).cat.to(pl.Enum(names))
 
 
-def _cycles(played: Played) -> pl.DataFrame:
+def _cycles(played: PlayedRealisation) -> pl.DataFrame:
     import polars as pl
 
     tables = played.arrays.tables
@@ -171,7 +173,7 @@ def _cycles(played: Played) -> pl.DataFrame:
     return frame.with_columns(pl.when(done).then(pl.col(*parts)))
 
 
-def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
+def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> pl.DataFrame:
     problem = played.problem
     stamps = played.by_window(played.arrays.tables.stamps[0])
     count = len(played.first)
@@ -196,7 +198,7 @@ def _windows(played: Played, seen: dict[str, Floats]) -> pl.DataFrame:
     )
 
 
-def _shadow_columns(played: Played) -> dict[str, NDArray[np.generic]]:
+def _shadow_columns(played: PlayedRealisation) -> dict[str, NDArray[np.generic]]:
     """What shadow jobs cost in each window: cycles sent twice, bytes, and share of the cores."""
     tables = played.arrays.tables
     if not played.features:
@@ -212,7 +214,7 @@ def _shadow_columns(played: Played) -> dict[str, NDArray[np.generic]]:
     }
 
 
-def _shadow_bytes(played: Played) -> Ints:
+def _shadow_bytes(played: PlayedRealisation) -> Ints:
     """Bytes that the shadow of every cycle put on links, shape (N,)."""
     problem, tables = played.problem, played.arrays.tables
     pipeline, cycles = problem.pipeline, played.realisation.cycles
@@ -236,7 +238,7 @@ def _shadow_bytes(played: Played) -> Ints:
     return total
 
 
-def _seen(played: Played) -> dict[str, Floats]:
+def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     controller = played.controller
     seen = np.array(controller.log.seen, np.float64).reshape(-1, 3)
     used = controller.utilisation(played.closed_windows())[:, 0]
@@ -257,7 +259,7 @@ def _decisions(controller: Controller) -> pl.DataFrame:
 
 
 def _static_decisions(
-    played: Played, estimated: dict[str, dict[str, NDArray[np.generic]]]
+    played: PlayedRealisation, estimated: dict[str, dict[str, NDArray[np.generic]]]
 ) -> pl.DataFrame:
     controller = played.controller
     candidates = tuple(controller.problem.candidates)
@@ -283,7 +285,7 @@ def _static_decisions(
     return frame_of("decisions", controller.problem, columns)
 
 
-def _log_running(played: Played, log: Ints) -> None:
+def _log_running(played: PlayedRealisation, log: Ints) -> None:
     """Note the start of jobs that were running when the run ended; they have no end."""
     tables = played.arrays.tables
     jobs = tables.jobs.reshape(len(tables.slots), -1, k.N_JOB)
@@ -293,7 +295,7 @@ def _log_running(played: Played, log: Ints) -> None:
         mine[running, k.LOG_START] = jobs[slot, : len(mine), k.STARTED][running]
 
 
-def _jobs(played: Played) -> pl.DataFrame:
+def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     import polars as pl
 
     problem, tables = played.problem, played.arrays.tables

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
 from dwell.model.scenario import is_always_on
-from dwell.study.campaign import Measured
-from dwell.study.chapter import Answer, Chapter, Figure, Outcome, Table, Unit
+from dwell.study.chapter import Answer, Chapter, ChapterOutcome, Figure, Table, Unit
 from dwell.study.comparison import AIM
 from dwell.study.differences import centre, difference_table, shown_as
 from dwell.study.family import Contrast, Difference, Family
 from dwell.study.intervals import CONFIDENCE
+from dwell.study.measured_campaign import MeasuredCampaign
 from dwell.study.over_seeds import over_seeds
-from dwell.study.paired import PairedDifference
+from dwell.study.pairs import PairedDifference
 from dwell.study.sentences import counted, listed, number, points
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ HEADINGS = {
 }
 
 
-def questions(measured: Measured) -> tuple[Chapter, ...]:
+def questions(measured: MeasuredCampaign) -> tuple[Chapter, ...]:
     """Return the questions that the runs have anything to say on, answered."""
     return tuple(one for one in (_rq1(measured), _rq2(measured)) if one is not None)
 
@@ -127,7 +127,7 @@ def compared(runs: pl.DataFrame, question: str, pairs: Mapping[str, Contrast]) -
 # ----------------------------------------------------------------------------------- RQ1
 
 
-def _rq1(measured: Measured) -> Chapter | None:
+def _rq1(measured: MeasuredCampaign) -> Chapter | None:
     comparison = measured.comparison
     scenarios = stress_scenarios(comparison.problem, comparison.scenarios)
     rules, singles = (_of_family(comparison.policies, names) for names in (TOGETHER, (SINGLE,)))
@@ -166,7 +166,7 @@ def _rq1(measured: Measured) -> Chapter | None:
 # ----------------------------------------------------------------------------------- RQ2
 
 
-def _rq2(measured: Measured) -> Chapter | None:
+def _rq2(measured: MeasuredCampaign) -> Chapter | None:
     comparison = measured.comparison
     scenarios = fault_scenarios(comparison.problem, comparison.scenarios)
     there = set(comparison.policies)
@@ -205,7 +205,7 @@ def _rq2(measured: Measured) -> Chapter | None:
     )
 
 
-def _binary(measured: Measured, scenarios: Sequence[str], binary: Sequence[str]) -> str:
+def _binary(measured: MeasuredCampaign, scenarios: Sequence[str], binary: Sequence[str]) -> str:
     """Say what stands for binary reversion."""
     if not is_steady(measured.comparison.problem, scenarios):
         return f"{HYBRID} is held against the placements of binary reversion, none of them moving."
@@ -238,7 +238,7 @@ def _pairs(scenarios: Sequence[str], pairs: Sequence[tuple[str, str]]) -> dict[s
     }
 
 
-def verdict(family: Family, first: str, others: Sequence[str]) -> Outcome:
+def verdict(family: Family, first: str, others: Sequence[str]) -> ChapterOutcome:
     """Say where the first is lower than all others, higher than any, or not told from them.
 
     Parameters
@@ -293,7 +293,7 @@ def verdict(family: Family, first: str, others: Sequence[str]) -> Outcome:
         for scenario, words in mine.items()
         for other in words
     ]
-    return Outcome(answer, text, tuple(evidence))
+    return ChapterOutcome(answer, text, tuple(evidence))
 
 
 def _sized(family: Family, scenario: str, first: str, other: str) -> str:
@@ -328,7 +328,9 @@ def _metric_findings(families: Mapping[str, Family]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _design(measured: Measured, scenarios: Sequence[str], families: Mapping[str, Family]) -> str:
+def _design(
+    measured: MeasuredCampaign, scenarios: Sequence[str], families: Mapping[str, Family]
+) -> str:
     comparisons = families["violation_rate"].comparisons
     repetitions = sorted({item.n for item in comparisons.values()})
     span = f"{repetitions[0]}"
@@ -344,7 +346,9 @@ def _design(measured: Measured, scenarios: Sequence[str], families: Mapping[str,
     )
 
 
-def _main_table(measured: Measured, scenarios: Sequence[str], slug: str, title: str) -> Table:
+def _main_table(
+    measured: MeasuredCampaign, scenarios: Sequence[str], slug: str, title: str
+) -> Table:
     import polars as pl
 
     runs = measured.comparison.runs.filter(pl.col("scenario").is_in(list(scenarios)))

@@ -14,7 +14,7 @@ from dwell.model import FrozenDict
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Answer", "Chapter", "Figure", "FigureKind", "Outcome", "Panel", "Table", "Unit"]
+__all__ = ["Answer", "Chapter", "ChapterOutcome", "Figure", "FigureKind", "Panel", "Table", "Unit"]
 
 Answer: TypeAlias = Literal["yes", "no", "in part", "not shown", "none asked"]
 
@@ -25,7 +25,7 @@ Unit: TypeAlias = Literal["text", "count", "number", "percent", "change", "ms", 
 FigureKind: TypeAlias = Literal["intervals", "lines", "bars", "map", "ecdf", "timeline"]
 
 
-class Outcome(NamedTuple):
+class ChapterOutcome(NamedTuple):
     """What came out of a chapter's question.
 
     Parameters

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import Problem
 from dwell.model.semantics import nearest
-from dwell.study.engine import Progress, StudyResult, play_in_memory
 from dwell.study.intervals import Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
 from dwell.study.player import Example, Player
+from dwell.study.runner import Progress, StudyResult, play_in_memory
 from dwell.study.software import versions
 from dwell.study.study import Contender, Point, Study
 

@@ -15,7 +15,7 @@ from typing import TypeAlias
 from dwell.errors import TraceError
 from dwell.model import Problem
 from dwell.study.comparison import Comparison, compare
-from dwell.study.engine import StudyResult, run_study
+from dwell.study.runner import StudyResult, run_study
 from dwell.study.study import Contender, load_study
 
 __all__ = [

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dwell.errors import SimulationError
 from dwell.study.intervals import CONFIDENCE, median_interval, share_interval
 from dwell.study.over_seeds import interval_of, metric_values
-from dwell.study.paired import (
+from dwell.study.pairs import (
     PairedDifference,
     PairedMedian,
     least_p,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dwell.cellfile.work_folder import Claim, Description, claimed, unwritable
+from dwell.cellfile.work_folder import Description, FolderMark, claimed, unwritable
 from dwell.errors import RunError
 from dwell.files import write_whole
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Parts", "opened"]
 
 FOLDER = "parts"
-STUDY = Claim("study", "study.json", 1, (FOLDER,))
+STUDY = FolderMark("study", "study.json", 1, (FOLDER,))
 
 
 @dataclass(slots=True)

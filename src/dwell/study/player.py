@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.sim import Realisation
 
-__all__ = ["Example", "Played", "Player"]
+__all__ = ["Example", "PlayedItem", "Player"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class Example:
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class PlayedItem:
     """What came of an item.
 
     Parameters
@@ -67,7 +67,7 @@ class Player:
     # Problems as contenders see them, by point and contender: a study asks for each many times.
     _seen: dict[tuple[int, str], Problem] = field(default_factory=dict, repr=False, compare=False)
 
-    def __call__(self, item: Item) -> Played:
+    def __call__(self, item: Item) -> PlayedItem:
         """Do an item.
 
         Raises
@@ -98,7 +98,7 @@ class Player:
                 summaries.append((point, summary))
                 if item.seed in self.kept:
                     examples[point, name] = Example(run.windows, run.decisions)
-        return Played(tuple(summaries), examples)
+        return PlayedItem(tuple(summaries), examples)
 
     def rehearse(self) -> None:
         """Play one window of everything at the first point.

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 __all__ = [
     "PAPER",
     "Answer",
-    "Claim",
     "Judgement",
+    "PaperClaim",
     "Prediction",
     "applies",
     "judge_claim",
@@ -42,14 +42,14 @@ __all__ = [
 ]
 
 Answer: TypeAlias = Literal["agrees", "agrees in part", "differs", "open"]
-Test: TypeAlias = Callable[["Evidence"], bool | None]
+Test: TypeAlias = Callable[["PaperEvidence"], bool | None]
 
 CANDIDATES = ("LOC", "SO", "HYB")
 DTP = "dtp"
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class PaperEvidence:
     """A comparison, seen from one scenario; tests answer None where the runs do not tell."""
 
     comparison: Comparison
@@ -100,7 +100,7 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class PaperClaim:
     """A few words of the paper on a static placement, and the condition they are read as.
 
     Parameters
@@ -126,7 +126,7 @@ class Prediction:
     ----------
     scenario : str
         Its name in a cell file.
-    claims : mapping of str to tuple of Claim
+    claims : mapping of str to tuple of PaperClaim
         By the static placement that they are about.
     dtp : str
         The paper's words on the placement that dominates under DTP.
@@ -137,7 +137,7 @@ class Prediction:
     """
 
     scenario: str
-    claims: Mapping[str, tuple[Claim, ...]]
+    claims: Mapping[str, tuple[PaperClaim, ...]]
     dtp: str
     dominant: tuple[str, ...]
     share: float
@@ -149,12 +149,12 @@ class Prediction:
         return f"{names} leads, with at least {self.share * 100:.0f} % of the windows"
 
 
-def _low(policy: str) -> Claim:
-    return Claim("Low V_D", "V_D under 5 %", lambda e: e.under_aim(policy))
+def _low(policy: str) -> PaperClaim:
+    return PaperClaim("Low V_D", "V_D under 5 %", lambda e: e.under_aim(policy))
 
 
-def _high(policy: str) -> Claim:
-    return Claim("High V_D", "V_D above 5 %", lambda e: _not(e.under_aim(policy)))
+def _high(policy: str) -> PaperClaim:
+    return PaperClaim("High V_D", "V_D above 5 %", lambda e: _not(e.under_aim(policy)))
 
 
 #: The paper's table, row by row.
@@ -164,11 +164,11 @@ PAPER: tuple[Prediction, ...] = (
         {
             "LOC": (
                 _low("LOC"),
-                Claim("high U_r", "U_r above SO's", lambda e: e.more("LOC", "u_robot", "SO")),
+                PaperClaim("high U_r", "U_r above SO's", lambda e: e.more("LOC", "u_robot", "SO")),
             ),
             "SO": (
-                Claim("Low U_r", "U_r below LOC's", lambda e: e.more("LOC", "u_robot", "SO")),
-                Claim(
+                PaperClaim("Low U_r", "U_r below LOC's", lambda e: e.more("LOC", "u_robot", "SO")),
+                PaperClaim(
                     "moderate V_D",
                     "V_D above LOC's",
                     lambda e: e.more("SO", "violation_rate", "LOC"),
@@ -184,15 +184,15 @@ PAPER: tuple[Prediction, ...] = (
         {
             "LOC": (
                 _high("LOC"),
-                Claim("U_r sat.", "U_r at its cap", lambda e: e.saturated("LOC", "u_robot")),
+                PaperClaim("U_r sat.", "U_r at its cap", lambda e: e.saturated("LOC", "u_robot")),
             ),
             "SO": (
-                Claim(
+                PaperClaim(
                     "Mitigated",
                     "V_D below LOC's",
                     lambda e: e.more("LOC", "violation_rate", "SO"),
                 ),
-                Claim(
+                PaperClaim(
                     "higher L95",
                     "L95 above that of LOC without stress",
                     lambda e: e.more("SO", "l95_ms", "LOC", scenario="baseline"),
@@ -207,12 +207,14 @@ PAPER: tuple[Prediction, ...] = (
         "edge-cpu-stress",
         {
             "LOC": (
-                Claim("Stable", "V_D under 5 %", lambda e: e.under_aim("LOC")),
-                Claim("U_r elevated", "U_r above SO's", lambda e: e.more("LOC", "u_robot", "SO")),
+                PaperClaim("Stable", "V_D under 5 %", lambda e: e.under_aim("LOC")),
+                PaperClaim(
+                    "U_r elevated", "U_r above SO's", lambda e: e.more("LOC", "u_robot", "SO")
+                ),
             ),
             "SO": (
                 _high("SO"),
-                Claim("U_e sat.", "U_e at its cap", lambda e: e.saturated("SO", "u_edge")),
+                PaperClaim("U_e sat.", "U_e at its cap", lambda e: e.saturated("SO", "u_edge")),
             ),
         },
         "LOC or HYB",
@@ -223,7 +225,7 @@ PAPER: tuple[Prediction, ...] = (
         "network-impairment",
         {
             "LOC": (
-                Claim(
+                PaperClaim(
                     "Low variance",
                     "distance from the median to the 95th percentile below SO's",
                     lambda e: e.more("SO", "spread_ms", "LOC"),
@@ -231,7 +233,7 @@ PAPER: tuple[Prediction, ...] = (
             ),
             "SO": (
                 _high("SO"),
-                Claim(
+                PaperClaim(
                     "via jitter",
                     "the median latency is within D",
                     lambda e: e.typically_in_time("SO"),
@@ -313,9 +315,9 @@ def judge_placement(comparison: Comparison, prediction: Prediction, policy: str 
     return Judgement(prediction, answer, leader, share, lead)
 
 
-def judge_claim(comparison: Comparison, scenario: str, claim: Claim) -> Answer:
+def judge_claim(comparison: Comparison, scenario: str, claim: PaperClaim) -> Answer:
     """Hold the words on a static placement against its runs."""
-    holds = claim.holds(Evidence(comparison, scenario))
+    holds = claim.holds(PaperEvidence(comparison, scenario))
     return "open" if holds is None else "agrees" if holds else "differs"
 
 

@@ -23,9 +23,9 @@ from dwell.model import Servo
 from dwell.model.instants import NEVER_NS
 
 __all__ = [
-    "Actuations",
     "Age",
-    "Tracking",
+    "EffectiveCommands",
+    "TrackingError",
     "actuations",
     "age_of_information",
     "misses_in",
@@ -39,7 +39,7 @@ Ints: TypeAlias = NDArray[np.int64]
 PERCENT = 95
 
 
-class Actuations(NamedTuple):
+class EffectiveCommands(NamedTuple):
     """Commands that took effect, in that order, which is also that of their cycles.
 
     Parameters
@@ -72,7 +72,7 @@ class Age(NamedTuple):
     mean_peak_ms: float
 
 
-class Tracking(NamedTuple):
+class TrackingError(NamedTuple):
     """Error of the reference loop over a stretch of time; infinite where the loop is unstable.
 
     Parameters
@@ -95,7 +95,7 @@ class Tracking(NamedTuple):
         return self.iae_mm_s / self.seconds
 
 
-def actuations(release_ns: Ints, latency_ns: Ints) -> Actuations:
+def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
     """Find the commands that take effect: those that no newer one precedes.
 
     Parameters
@@ -118,15 +118,15 @@ def actuations(release_ns: Ints, latency_ns: Ints) -> Actuations:
     np.less(at_ns[:-1], newer_ns[1:], out=fresh[:-1])
     if not fresh.all():
         release_ns, at_ns = release_ns[fresh], at_ns[fresh]
-    return Actuations(start_ns, release_ns, at_ns)
+    return EffectiveCommands(start_ns, release_ns, at_ns)
 
 
-def age_of_information(actuated: Actuations, begin_ns: int, end_ns: int) -> Age:
+def age_of_information(actuated: EffectiveCommands, begin_ns: int, end_ns: int) -> Age:
     """Age at the actuator: t less the release of the newest command in effect at t.
 
     Parameters
     ----------
-    actuated : Actuations
+    actuated : EffectiveCommands
     begin_ns, end_ns : int
         The stretch of time; the begin not before the first release, the end after the begin.
 
@@ -204,13 +204,13 @@ def misses_in(missed: NDArray[np.bool_], stretch: int) -> NDArray[np.int32]:
     return total[stretch:] - total[:-stretch] if len(missed) > stretch else total[-1:]
 
 
-def track(servo: Servo, actuated: Actuations, begin_ns: int, end_ns: int) -> Tracking:
+def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int) -> TrackingError:
     """Drive the reference loop by the instants of a run.
 
     Parameters
     ----------
     servo : Servo
-    actuated : Actuations
+    actuated : EffectiveCommands
         A command is made of what is seen at its cycle's release, and held until the next.
     begin_ns, end_ns : int
         The stretch of time whose error counts; the loop runs from the first release.
@@ -218,9 +218,9 @@ def track(servo: Servo, actuated: Actuations, begin_ns: int, end_ns: int) -> Tra
     Returns
     -------
     Tracking
-        See `dwell.kernels.servo` for what is computed and how exactly.
+        See `dwell.kernels.servo_loop` for what is computed and how exactly.
     """
-    from dwell.kernels import servo as kernel
+    from dwell.kernels import servo_loop as kernel
 
     start_ns, target = actuated.start_ns, servo.target
     states = np.empty((len(actuated.at_ns) + 1, kernel.N_STATE))
@@ -240,5 +240,5 @@ def track(servo: Servo, actuated: Actuations, begin_ns: int, end_ns: int) -> Tra
     )
     seconds = (end_ns - begin_ns) / 1e9
     if status == kernel.DIVERGED:
-        return Tracking(np.inf, np.inf, seconds)
-    return Tracking(float(np.sqrt(integrals[0] / seconds)), float(integrals[1]), seconds)
+        return TrackingError(np.inf, np.inf, seconds)
+    return TrackingError(float(np.sqrt(integrals[0] / seconds)), float(integrals[1]), seconds)

@@ -24,8 +24,8 @@ PACKAGES = ("numpy", "numba", "polars")
 #: Parts of this package that make numbers.
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
-    *(f"study/{name}.py" for name in ("clairvoyant", "engine", "hindsight", "judging", "player")),
-    *(f"study/{name}.py" for name in ("quality", "reference", "script", "summary")),
+    *(f"study/{name}.py" for name in ("clairvoyant", "hindsight", "judging", "player")),
+    *(f"study/{name}.py" for name in ("quality", "reference", "runner", "script", "summary")),
 )
 
 

@@ -337,7 +337,7 @@ def _write_samples(
 
 def _document(cell: Path, out: Path) -> dict[str, Any]:
     """Return the cell file as plain values, its traces named from where the new file will be."""
-    from dwell.cellfile.faults import Faults
+    from dwell.cellfile.document_faults import Faults
     from dwell.cellfile.yaml_text import read_yaml
 
     text = read_yaml(str(cell), Faults(str(cell)))

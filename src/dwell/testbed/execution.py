@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from dwell.cellfile.work_folder import Claim, claimed, unwritable
+from dwell.cellfile.work_folder import FolderMark, claimed, unwritable
 from dwell.errors import DwellError, LiveError, RunError
 from dwell.files import write_whole
 from dwell.model import Problem
@@ -38,7 +38,7 @@ __all__ = [
 RUNS, FAILED, WORK = "runs", "failed", ".work"
 #: Beside the tables of a run: when it was made, and how the machine was.
 ATTEMPT = "attempt.json"
-CAMPAIGN = Claim("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
+CAMPAIGN = FolderMark("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
 #: How often a run that failed is repeated.
 REPEATS = 2
 #: So many attempts that end with an error before any does not: nothing works.

@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from dwell.live.transport.memory import Network
-from dwell.live.transport.protocol import Lane, Sample, Transport
+from dwell.live.transport.memory_transport import Network
+from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
-from dwell.live.wiring import SESSIONS, Entry, Locator, Role
+from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -53,10 +53,10 @@ class Inbox:
     """Everything a subscription was handed, in order."""
 
     def __init__(self, notify: Callable[[], None]) -> None:
-        self.samples: list[Sample] = []
+        self.samples: list[Arrival] = []
         self._notify = notify
 
-    def __call__(self, sample: Sample) -> None:
+    def __call__(self, sample: Arrival) -> None:
         self.samples.append(sample)
         self._notify()
 
@@ -106,7 +106,7 @@ class ZenohMesh:
         self._open: list[ZenohTransport] = []
         self._children: list[subprocess.Popen[bytes]] = []
 
-    def entry(self, who: str) -> Entry:
+    def entry(self, who: str) -> WiringEntry:
         return full_entry(self.names, who, self.first_port)
 
     def open(self, who: str) -> Transport:
@@ -149,7 +149,7 @@ class ZenohMesh:
             transport.close()
 
 
-def full_entry(names: Sequence[str], who: str, first_port: int) -> Entry:
+def full_entry(names: Sequence[str], who: str, first_port: int) -> WiringEntry:
     """What a process opens that hears all others in every session."""
 
     def endpoint(name: str, session: int) -> Locator:
@@ -161,7 +161,7 @@ def full_entry(names: Sequence[str], who: str, first_port: int) -> Entry:
     connect = {
         name: tuple(endpoint(other, i) for other in earlier) for i, name in enumerate(SESSIONS)
     }
-    return Entry(Role(who, node, "worker"), listen, connect if earlier else {})
+    return WiringEntry(Role(who, node, "worker"), listen, connect if earlier else {})
 
 
 def free_ports(count: int) -> int:

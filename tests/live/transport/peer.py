@@ -10,12 +10,12 @@ import json
 import signal
 import sys
 
-from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.transport.transport import Arrival, Lane
 from dwell.live.transport.zenoh import ZenohTransport
 from tests.live.transport.meshes import full_entry
 
 
-def digest(sample: Sample) -> bytes:
+def digest(sample: Arrival) -> bytes:
     """Short for everything that arrived."""
     parts = (sample.key.encode(), sample.payload, sample.header)
     return hashlib.sha256(b"|".join(hashlib.sha256(part).digest() for part in parts)).digest()
@@ -26,7 +26,7 @@ def main() -> None:
     asked = json.loads(sys.argv[1])
     transport = ZenohTransport(full_entry(asked["names"], asked["who"], asked["first_port"]))
 
-    def answer(sample: Sample) -> None:
+    def answer(sample: Arrival) -> None:
         transport.put(f"dwell/t/done/{asked['who']}", sample.payload[:16], digest(sample))
 
     lanes: tuple[Lane, ...] = ("control", "images")

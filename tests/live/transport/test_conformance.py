@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.transport.transport import Arrival, Lane
 from tests.live.transport.meshes import MemoryMesh, Mesh, ZenohMesh, introduce
 
 A, B, FAR = "a@R1", "b@R1", "c@E"
@@ -36,7 +36,7 @@ def test_payloads_and_headers_arrive_as_they_were_sent(mesh: Mesh, target: str) 
             for header in (b"", b"\x00h", b"h" * 16_384):
                 sender.put(key, payload, header, lane=lane)
                 mesh.until(lambda: bool(inbox.samples))
-                assert inbox.samples == [Sample(key, payload, header)]
+                assert inbox.samples == [Arrival(key, payload, header)]
                 inbox.samples.clear()
 
 

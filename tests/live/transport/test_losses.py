@@ -10,7 +10,7 @@ import pytest
 from dwell.errors import LiveError
 from dwell.live.keys import Keys
 from dwell.live.transport.losses import LOSSES, Losses, LossFile, target_of
-from dwell.live.transport.protocol import Lane
+from dwell.live.transport.transport import Lane
 from tests.live.transport.meshes import ZenohMesh, introduce
 
 NODES = "R1", "E", "R2"

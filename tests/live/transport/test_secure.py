@@ -16,11 +16,11 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from dwell.errors import LiveError, TrustError
 from dwell.live.keys import Keys
 from dwell.live.security import INSECURE, KEYS, Security
-from dwell.live.transport.protocol import Sample
+from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.trust.authority import Authority, _general_name, _pem
 from dwell.live.trust.roster import Subject, write_private
-from dwell.live.wiring import Entry, Locator, Role, wire
+from dwell.live.wiring import Locator, Role, WiringEntry, wire
 from dwell.model import Endpoint, Host, Problem
 from tests.live.test_wiring import cell, housed
 from tests.live.transport.meshes import free_ports
@@ -84,7 +84,7 @@ class Victim:
         entry = wire(problem).entry(STAMPER)
         self.port = entry.listen["control"].port
 
-    def _hear(self, sample: Sample) -> None:
+    def _hear(self, sample: Arrival) -> None:
         self.heard.append((sample.key, sample.payload))
 
 
@@ -118,7 +118,7 @@ class Intruder:
 
     def __init__(self, port: int, more: dict[str, object], protocol: str = "tls") -> None:
         end = Locator("127.0.0.1", port, protocol)
-        entry = Entry(Role("intruder", "R2", "visitor"), {}, {"control": (end,)})
+        entry = WiringEntry(Role("intruder", "R2", "visitor"), {}, {"control": (end,)})
         self.transport = ZenohTransport(entry, ZenohSettings(more=more))
 
     def __enter__(self) -> ZenohTransport:
@@ -205,13 +205,13 @@ def test_a_server_of_another_authority_is_not_spoken_to(
     other = issued(problem, tmp_path / "other")
     port = free_ports(3)
     listen = {"control": Locator("127.0.0.1", port, "tls")}
-    entry = Entry(Role(STAMPER, "R1", "stamper"), listen, {})  # type: ignore[arg-type]
+    entry = WiringEntry(Role(STAMPER, "R1", "stamper"), listen, {})  # type: ignore[arg-type]
     more = security(problem, other.folder, STAMPER)._settings(8)
     pretender = ZenohTransport(entry, more)
     try:
         settings = security(problem, authority.folder, "agent@R2")._settings(8)
         end = {"control": (Locator("127.0.0.1", port, "tls"),)}
-        agent = ZenohTransport(Entry(Role("agent@R2", "R2", "agent"), {}, end), settings)  # type: ignore[arg-type]
+        agent = ZenohTransport(WiringEntry(Role("agent@R2", "R2", "agent"), {}, end), settings)  # type: ignore[arg-type]
         try:
             time.sleep(1.0)
             assert agent.peers["control"] == pretender.peers["control"] == 0

@@ -13,7 +13,7 @@ from queue import Queue
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.transport.protocol import Lane, Sample, Transport
+from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import (
     ZenohSettings,
     ZenohTransport,
@@ -80,7 +80,7 @@ class Correspondent:
         answers = self.answers[who]
         self.mesh.until(lambda: number.ljust(16) in answers.payloads)
         answer = answers.samples[answers.payloads.index(number.ljust(16))]
-        assert answer.header == digest(Sample(key_to(who, lane), payload, b"header"))
+        assert answer.header == digest(Arrival(key_to(who, lane), payload, b"header"))
 
 
 @pytest.mark.parametrize("size", [0, 100_000, 1_000_000])
@@ -171,7 +171,7 @@ def test_a_receiver_that_fails_goes_on_hearing(
 ) -> None:
     me, inbox = mesh.open(ME), mesh.inbox()
 
-    def fail(sample: Sample) -> None:
+    def fail(sample: Arrival) -> None:
         inbox(sample)
         raise ValueError("no good")
 
@@ -269,7 +269,7 @@ def test_a_receiver_that_fails_gets_the_next_message_and_its_failure_is_logged_o
         assert isinstance(receiver, ZenohTransport)
         inbox, key = mesh.inbox(), "dwell/t/stamped"
 
-        def receive(sample: Sample) -> None:
+        def receive(sample: Arrival) -> None:
             if sample.payload == b"poison":
                 raise ZeroDivisionError
             inbox(sample)

@@ -15,7 +15,7 @@ import dwell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.permissions import senders, subjects
 from dwell.live.transport.expressions import matcher
-from dwell.live.transport.memory import MemoryTransport
+from dwell.live.transport.memory_transport import MemoryTransport
 from dwell.live.trust.acl import access_control
 from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles

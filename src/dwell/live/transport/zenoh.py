@@ -29,8 +29,8 @@ from dwell.live.failures import described, start_thread
 from dwell.live.transport.expressions import require_expression, require_key
 from dwell.live.transport.losses import Losses
 from dwell.live.transport.no_linger import Connections
-from dwell.live.transport.protocol import Lane, Receive, Sample
-from dwell.live.wiring import Entry, Session, session_of
+from dwell.live.transport.transport import Arrival, Lane, Receive
+from dwell.live.wiring import Session, WiringEntry, session_of
 from dwell.model import FrozenDict
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ class ZenohTransport:
 
     Parameters
     ----------
-    entry : Entry
+    entry : WiringEntry
         Where it listens and to whom it connects, from `Wiring.entry`.
     settings : ZenohSettings
     losses : Losses, optional
@@ -153,7 +153,7 @@ class ZenohTransport:
 
     def __init__(
         self,
-        entry: Entry,
+        entry: WiringEntry,
         settings: ZenohSettings | None = None,
         *,
         losses: Losses | None = None,
@@ -326,7 +326,7 @@ class ZenohTransport:
                     self._misled(key)
                     return
                 header = header[MARKED_BYTES:]
-            message = Sample(key, sample.payload.to_bytes(), header)
+            message = Arrival(key, sample.payload.to_bytes(), header)
             with lock:
                 if not self._closed:
                     receive(message)
@@ -479,7 +479,7 @@ class _Pool:
         return buffer
 
 
-def _configuration(entry: Entry, name: Session, settings: ZenohSettings) -> dict[str, object]:
+def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -> dict[str, object]:
     """Zenoh's settings for one session, by path."""
     listen = entry.listen.get(name)
     first_ms, last_ms = settings.retry_ms

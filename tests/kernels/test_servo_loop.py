@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import integrate, signal
 
-from dwell.kernels.servo import DIVERGED, DONE, N_STATE, follow
+from dwell.kernels.servo_loop import DIVERGED, DONE, N_STATE, follow
 
 # NumPy's own types for what arithmetic makes of float64.
 Floats: TypeAlias = NDArray[np.floating[Any]]
@@ -275,7 +275,7 @@ def test_parts_of_a_stretch_add_up(law: dict[str, Any]) -> None:
 CASES = """
 import json
 import numpy as np
-from dwell.kernels.servo import N_STATE, follow
+from dwell.kernels.servo_loop import N_STATE, follow
 
 rng = np.random.default_rng(3)
 released = np.arange(200) * 0.03

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 
 import dwell
-from dwell.live.intervals import SPAN_NS, Intervals
+from dwell.live.latencies import SPAN_NS, Intervals
 from dwell.live.messages import Beat, Completion, Heard, Stamp
-from dwell.live.tables import columns_of
-from dwell.live.transport.memory import Clock, Conditions
+from dwell.live.run_rows import columns_of
+from dwell.live.transport.memory_transport import Clock, NetworkConditions
 from dwell.model import Problem
 from tests.live.small_world import World
-from tests.live.test_cell import EXEC_MS, cell_of, columns
+from tests.live.test_controlled_cell import EXEC_MS, cell_of, columns
 
 MS, S = 1_000_000, 1_000_000_000
 CLOCKS = {"R1": Clock(7 * S), "E": Clock(50 * S, 80.0), "R2": Clock(900 * S, -60.0)}
@@ -51,13 +51,13 @@ def test_it_is_the_latency_where_both_ways_are_alike(problem: Problem) -> None:
 
 def test_a_late_completion_is_part_of_it_and_a_longer_way_is_not(problem: Problem) -> None:
     world = World(problem, exec_ms=EXEC_MS, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
-    longer = Conditions(delay_ns=4 * MS)
+    longer = NetworkConditions(delay_ns=4 * MS)
     for source, target in (("R1", "R2"), ("R2", "R1")):
         world.network.impair(longer, source, target, key="dwell/*/beat/**")
         world.network.impair(longer, source, target, key="dwell/*/done/*")
     world.run(4_000)
     before = [own for own, _ in measured(world)[40:] if own is not None]
-    world.network.impair(Conditions(delay_ns=3 * MS), "R2", "R1", key="dwell/*/done/*")
+    world.network.impair(NetworkConditions(delay_ns=3 * MS), "R2", "R1", key="dwell/*/done/*")
     world.run(4_000)
     after = [own for own, _ in measured(world)[-40:] if own is not None]
     assert min(after) - max(before) == pytest.approx(3 * MS, abs=2 * ROUNDING_NS)

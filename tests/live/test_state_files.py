@@ -14,15 +14,17 @@ from hypothesis import strategies as st
 
 from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.errors import LiveError
-from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
-from dwell.live.stamper import Entry
+from dwell.live.stamper import StamperState
+from dwell.live.state_files import BookFile, HighestFile, InFlight, make_folder
 
 
 def test_a_book_is_read_as_it_was_written(tmp_path: Path) -> None:
     book = BookFile(tmp_path / "stamper.book")
     assert book.read() is None
     for term in range(1, 4):
-        entry = Entry(run=7, reserved=1024 * term, term=term, placement="SO", on_fallback=term == 2)
+        entry = StamperState(
+            run=7, reserved=1024 * term, term=term, placement="SO", on_fallback=term == 2
+        )
         book.write(entry)
         assert BookFile(tmp_path / "stamper.book").read() == entry
 
@@ -41,7 +43,7 @@ def test_the_highest_cycle_outlives_its_process(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from dwell.live.files import HighestFile\n"
+        "from dwell.live.state_files import HighestFile\n"
         "kept = HighestFile(Path(sys.argv[1]))\n"
         "for cycle in range(1, 1000): kept.store(5, cycle)\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
@@ -100,7 +102,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 def test_a_book_that_is_spoilt_is_that_of_the_time_before(tmp_path: Path) -> None:
     path = tmp_path / "stamper.book"
     book = BookFile(path)
-    entries = [Entry(7, 1024 * term, term, "SO", False) for term in range(1, 4)]
+    entries = [StamperState(7, 1024 * term, term, "SO", False) for term in range(1, 4)]
     for entry in entries:
         book.write(entry)
     content = bytearray(path.read_bytes())
@@ -116,7 +118,7 @@ def test_a_full_disk_keeps_nobody_from_remembering(tmp_path: Path) -> None:
         book, highest = BookFile(folder / "book"), HighestFile(folder / "highest")
         inflight = InFlight(folder / "inflight")
         disk.fill()
-        entry = Entry(7, 1024, 3, "SO", True)
+        entry = StamperState(7, 1024, 3, "SO", True)
         book.write(entry)
         highest.store(7, 12)
         inflight.begin(b"x" * 100_000)

@@ -25,8 +25,8 @@ from dwell.model import (
     Task,
 )
 from dwell.sim import simulate_realisation
-from dwell.sim.guard import back_ns
 from dwell.sim.realisation import LinkSegment, NodeChange
+from dwell.sim.simulated_guard import back_ns
 from tests.generate import MS, make_problem, make_realisation
 from tests.reference_simulator import way_back
 from tests.test_against_reference import Case, Played, Replay, differences

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 
 from dwell.control import ClosedWindow, Controller, final_l95_ms
 from dwell.errors import LiveError
-from dwell.live.cycles import Ledger, LiveCycle
+from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.tables import (
+from dwell.live.run_rows import (
     columns_of,
     cycle_values,
     decision_values,

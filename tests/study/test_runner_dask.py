@@ -12,7 +12,7 @@ import pytest
 from dwell.errors import SimulationError
 from dwell.study import run_study
 from dwell.study.cluster import spread_on_dask
-from tests.study.test_engine_folder import assert_same_files, parts_in
+from tests.study.test_runner_folder import assert_same_files, parts_in
 from tests.study.test_study import make_study
 
 distributed: Any = pytest.importorskip("distributed")

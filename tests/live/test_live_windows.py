@@ -23,10 +23,10 @@ import dwell
 from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.errors import LiveError
 from dwell.estimators import Profile
+from dwell.live.live_windows import LiveWindows, Resume, Rows
 from dwell.live.messages import Completion, Hop, Load, Stamp
 from dwell.live.offsets import Offsets
-from dwell.live.tables import columns_of
-from dwell.live.windows import LiveWindows, Resume, Rows
+from dwell.live.run_rows import columns_of
 from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
 from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant

@@ -26,11 +26,11 @@ from dwell.testbed.execution import Kept, read_campaign
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Measured", "read_measured", "without_excluded"]
+__all__ = ["MeasuredCampaign", "read_measured", "without_excluded"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredCampaign:
     """A campaign, read.
 
     Parameters
@@ -86,7 +86,7 @@ class Measured:
         return int((counts["len"] == pairs).sum())
 
 
-def read_measured(folder: Path) -> Measured:
+def read_measured(folder: Path) -> MeasuredCampaign:
     """Read a campaign, finished or not.
 
     Raises
@@ -143,7 +143,7 @@ def read_measured(folder: Path) -> Measured:
     )
     every = _in_order(pl.concat(jobs, how="diagonal_relaxed"), described) if jobs else None
     links, delays = links_of(every, problem)
-    return Measured(
+    return MeasuredCampaign(
         comparison=comparison,
         estimators={name: one["estimator"] for name, one in described["policies"].items()},
         kinds=frozenset(kinds),

@@ -11,16 +11,16 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.control_group import ControlGroup, own_group
-from dwell.live.files import BookFile, HighestFile, InFlight, make_folder
 from dwell.live.hosting import Hosted, clock_of, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.messages import Header
-from dwell.live.role import Place, Pulse, Role
+from dwell.live.role import Pulse, RoleLogic, RolePlace
 from dwell.live.security import Security
 from dwell.live.sink import Sink
 from dwell.live.stage import Actuator, load_actuator, load_stage
 from dwell.live.stamper import Stamper
-from dwell.live.transport.protocol import Sample
+from dwell.live.state_files import BookFile, HighestFile, InFlight, make_folder
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role as Named
 from dwell.live.wiring import wire
 from dwell.live.worker import Job, Worker
@@ -59,7 +59,7 @@ def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Eve
 
 
 def _run(
-    problem: Problem, role: Named, place: Place, folder: Path, stopped: threading.Event
+    problem: Problem, role: Named, place: RolePlace, folder: Path, stopped: threading.Event
 ) -> None:
     # A stage that computes must not keep a beat waiting for long.
     sys.setswitchinterval(0.0005)
@@ -91,7 +91,7 @@ def _count(role: Stamper | Sink, problem: Problem, node: str) -> None:
         role.group_clock = group.taken_ns
 
 
-def _host(role: Role, place: Place, stopped: threading.Event) -> None:
+def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event) -> None:
     """Run a role in this thread until the process is told to end."""
     clock = clock_of(place.problem, place.node)
     hosted = Hosted(role, place.transport, clock, stopped=stopped, complain=place.complain)
@@ -109,7 +109,7 @@ def _actuator(problem: Problem, task: str) -> Actuator:
 
 
 def _work(
-    problem: Problem, role: Named, place: Place, folder: Path, stopped: threading.Event
+    problem: Problem, role: Named, place: RolePlace, folder: Path, stopped: threading.Event
 ) -> None:
     name = problem.pipeline.tasks[role.task].run
     try:
@@ -156,14 +156,14 @@ def _print(line: str) -> None:
 class _Broken:
     """Stands for a worker whose stage cannot be had, and says so."""
 
-    def __init__(self, place: Place, why: str) -> None:
+    def __init__(self, place: RolePlace, why: str) -> None:
         self._why = why
         self.pulse = Pulse(place, lambda: (False, self._why))
 
     def subscriptions(self) -> tuple[str, ...]:
         return self.pulse.subscriptions()
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:
         self.pulse.receive(sample, now_ns)
 
     def wake(self, now_ns: int) -> int:

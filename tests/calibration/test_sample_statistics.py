@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.calibration.summary import describe, find_doubts
+from dwell.calibration.sample_statistics import describe, find_doubts
 from tests.calibration.samples import QUIET, link, task
 
 SAMPLES = st.lists(st.floats(0.001, 1e6), min_size=1, max_size=60)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dwell.cellfile import from_document, load
-from dwell.cellfile.faults import Faults
+from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.errors import Fault, ProblemError
 from tests.cellfile.test_cell import EXAMPLE, LEAST

@@ -6,14 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias
 
-__all__ = ["Lane", "Receive", "Sample", "Transport"]
+__all__ = ["Arrival", "Lane", "Receive", "Transport"]
 
 #: `control` is for what is small and must not wait; `images` for payloads, newest first.
 Lane: TypeAlias = Literal["control", "images"]
 
 
 @dataclass(frozen=True, slots=True)
-class Sample:
+class Arrival:
     """One message as it arrives.
 
     Parameters
@@ -29,7 +29,7 @@ class Sample:
     header: bytes = b""
 
 
-Receive: TypeAlias = Callable[[Sample], None]
+Receive: TypeAlias = Callable[[Arrival], None]
 
 
 class Transport(Protocol):

@@ -13,13 +13,13 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from dwell.control import Controller
-from dwell.live.cycles import LiveCycle
+from dwell.live.cycle_ledger import LiveCycle
 from dwell.live.offsets import UNBOUNDED_NS
 from dwell.model.instants import NEVER_NS
 from dwell.record import Columns, Feature, Row, Types, Values, column_types, row_of
 
 if TYPE_CHECKING:
-    from dwell.live.windows import LiveWindow
+    from dwell.live.live_windows import LiveWindow
 
 __all__ = [
     "columns_of",

@@ -17,7 +17,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.calibration.link import (
+from dwell.calibration.measure import Settings
+from dwell.calibration.round_trips import (
     CHUNK_BYTES,
     HEADER,
     MAGIC,
@@ -29,7 +30,6 @@ from dwell.calibration.link import (
     rate_mbps,
     time_round_trips,
 )
-from dwell.calibration.measure import Settings
 from dwell.errors import MeasurementError, ProblemError, ProfileError
 
 LOCAL = "127.0.0.1"

@@ -29,7 +29,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from dwell.calibration.conditions import Watch
+from dwell.calibration.machine_conditions import MachineCounters
 from dwell.calibration.measure import Pace, Settings
 from dwell.calibration.profile_file import Measurement, link_name, stamp
 from dwell.errors import MeasurementError, ProfileError
@@ -345,7 +345,7 @@ def measure_link(
         See `time_round_trips`.
     """
     name = link_name(source, target)
-    watch = Watch(os.sched_getaffinity(0))
+    watch = MachineCounters(os.sched_getaffinity(0))
     trips = time_round_trips(
         host,
         port,

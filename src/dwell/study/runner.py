@@ -18,7 +18,7 @@ import numpy as np
 from dwell.errors import SimulationError
 from dwell.study.over_seeds import over_seeds
 from dwell.study.parts import opened
-from dwell.study.player import Example, Played, Player
+from dwell.study.player import Example, PlayedItem, Player
 from dwell.study.software import describe, versions
 from dwell.study.study import Item, Study
 from dwell.study.summary import latency_grid_ms
@@ -31,7 +31,7 @@ __all__ = [
     "PARAMETER",
     "Progress",
     "StudyResult",
-    "Tables",
+    "StudyTables",
     "as_frame",
     "assemble",
     "play",
@@ -49,7 +49,7 @@ LABELS = ("scenario", "policy", "seed")
 
 
 @dataclass(frozen=True, slots=True)
-class Tables:
+class StudyTables:
     """The tables of a study (see `StudyResult`)."""
 
     runs: pl.DataFrame
@@ -161,7 +161,7 @@ def play_in_memory(
     processes: int | None = None,
     dask: str | None = None,
     progress: Progress | None = None,
-) -> tuple[Tables, dict[tuple[Item, int, str], Example]]:
+) -> tuple[StudyTables, dict[tuple[Item, int, str], Example]]:
     """Simulate a study and write nothing.
 
     Parameters
@@ -172,7 +172,7 @@ def play_in_memory(
 
     Returns
     -------
-    tables : Tables
+    tables : StudyTables
     examples : dict of (Item, point, policy) to Example
         The runs of the seeds that the player keeps.
     """
@@ -183,7 +183,7 @@ def play_in_memory(
     frames: dict[Item, pl.DataFrame] = {}
     examples: dict[tuple[Item, int, str], Example] = {}
 
-    def take(item: Item, played: Played) -> None:
+    def take(item: Item, played: PlayedItem) -> None:
         frames[item] = as_frame(played)
         examples.update({(item, *key): one for key, one in played.examples.items()})
         count([item])
@@ -198,14 +198,14 @@ def _play_in_folder(
     processes: int | None,
     dask: str | None,
     progress: Progress | None,
-) -> Tables:
+) -> StudyTables:
     """Do the items whose parts are missing in a folder, and write the tables of all."""
     study = player.study
     items = study.items()
     count = _Count(study, progress)
     with opened(folder, describe(study), [item.name for item in items]) as parts:
 
-        def take(item: Item, played: Played) -> None:
+        def take(item: Item, played: PlayedItem) -> None:
             parts.write(item.name, as_frame(played))
             count([item])
 
@@ -249,7 +249,7 @@ def play(
     *,
     processes: int | None = None,
     dask: str | None = None,
-    take: Callable[[Item, Played], None],
+    take: Callable[[Item, PlayedItem], None],
 ) -> None:
     """Do items, and hand over what came of each.
 
@@ -274,7 +274,7 @@ def play(
         spread_on_dask(player, items, address=dask, take=take)
 
 
-def as_frame(played: Played) -> pl.DataFrame:
+def as_frame(played: PlayedItem) -> pl.DataFrame:
     """Return what came of an item as one row a run.
 
     Returns
@@ -301,7 +301,7 @@ def as_frame(played: Played) -> pl.DataFrame:
     return frame.with_columns(pl.Series("within", within).arr.to_list())
 
 
-def assemble(study: Study, frame: pl.DataFrame) -> Tables:
+def assemble(study: Study, frame: pl.DataFrame) -> StudyTables:
     """Put the tables of a study together.
 
     Parameters
@@ -326,7 +326,7 @@ def assemble(study: Study, frame: pl.DataFrame) -> Tables:
     )
     runs = _with_values(study, ordered.drop("costs", "within"))
     costs = ordered.select("point", *LABELS, "costs").explode("costs").unnest("costs")
-    return Tables(
+    return StudyTables(
         runs=runs,
         costs=_with_values(study, costs).with_columns(pl.selectors.float().fill_nan(None)),
         latencies=_with_values(study, _latencies(study, ordered)),

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
-from dwell.live.transport.memory import Clock, Conditions, MemoryTransport, Network
-from dwell.live.transport.protocol import Lane, Sample
+from dwell.live.transport.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
+from dwell.live.transport.transport import Arrival, Lane
 
 MS = 1_000_000
 
@@ -24,7 +24,7 @@ class Listener:
         self.heard: list[tuple[float, bytes]] = []
         self.end.subscribe(key, self._note)
 
-    def _note(self, sample: Sample) -> None:
+    def _note(self, sample: Arrival) -> None:
         self.heard.append((self.network.now_ns / MS, sample.payload))
 
     @property
@@ -46,8 +46,8 @@ def numbers(count: int) -> list[bytes]:
 def test_a_message_takes_its_delay() -> None:
     network = Network(delay_ns=2 * MS)
     listener, sender = Listener(network, "b@E"), network.transport("a@R1")
-    network.impair(Conditions(delay_ns=3 * MS), "R1", "E")
-    network.impair(Conditions(delay_ns=100 * MS), "E", "R1")
+    network.impair(NetworkConditions(delay_ns=3 * MS), "R1", "E")
+    network.impair(NetworkConditions(delay_ns=100 * MS), "E", "R1")
     sender.put("k", b"x")
     assert listener.heard == []
     network.advance(5 * MS - 1)
@@ -59,13 +59,13 @@ def test_a_message_takes_its_delay() -> None:
 def test_jitter_keeps_the_order_and_reordering_does_not() -> None:
     network = Network(seed=3)
     listener, sender = Listener(network, "b@E"), network.transport("a@R1")
-    jitter = network.impair(Conditions(delay_ns=lambda random: random.randrange(10 * MS)))
+    jitter = network.impair(NetworkConditions(delay_ns=lambda random: random.randrange(10 * MS)))
     send(sender, 200, every_ns=MS)
     network.advance(1_000 * MS)
     assert listener.payloads == numbers(200)
     network.heal(jitter)
     listener.heard.clear()
-    network.impair(Conditions(reordering=0.2, reorder_ns=3 * MS))
+    network.impair(NetworkConditions(reordering=0.2, reorder_ns=3 * MS))
     send(sender, 200, every_ns=MS)
     network.advance(2_000 * MS)
     assert listener.payloads != numbers(200)
@@ -75,7 +75,7 @@ def test_jitter_keeps_the_order_and_reordering_does_not() -> None:
 def test_lanes_do_not_wait_for_each_other() -> None:
     network = Network()
     listener, sender = Listener(network, "b@E"), network.transport("a@R1")
-    network.impair(Conditions(delay_ns=5 * MS), key="image")
+    network.impair(NetworkConditions(delay_ns=5 * MS), key="image")
     sender.put("image", b"large", lane="images")
     sender.put("k", b"small")
     network.advance(10 * MS)
@@ -89,8 +89,8 @@ def test_lanes_do_not_wait_for_each_other() -> None:
 def test_losses_and_doubles_come_as_often_as_asked() -> None:
     network = Network(seed=5)
     listener, sender = Listener(network, "b@E"), network.transport("a@R1")
-    network.impair(Conditions(loss=0.3), "a@R1", "b@E")
-    network.impair(Conditions(duplication=0.25))
+    network.impair(NetworkConditions(loss=0.3), "a@R1", "b@E")
+    network.impair(NetworkConditions(duplication=0.25))
     send(sender, 2_000, every_ns=1)
     network.advance(MS)
     # Four standard deviations around the mean of a binomial.
@@ -187,7 +187,7 @@ class Metronome:
     def subscriptions(self) -> Iterable[str]:
         return ["beat/*"]
 
-    def receive(self, sample: Sample, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:
         self.heard.append(now_ns)
 
     def wake(self, now_ns: int) -> int:
@@ -255,7 +255,7 @@ def test_a_seed_gives_the_same_run_whoever_else_is_there(seed: int) -> None:
         for i in range(others):
             Listener(network, f"x{i}@E").end.put("k", b"other")
         network.impair(
-            Conditions(
+            NetworkConditions(
                 delay_ns=lambda random: random.randrange(MS),
                 loss=0.2,
                 duplication=0.2,
@@ -272,7 +272,7 @@ def test_a_seed_gives_the_same_run_whoever_else_is_there(seed: int) -> None:
 def test_streams_of_two_pairs_differ() -> None:
     network = Network(seed=1)
     listeners = [Listener(network, "b@E"), Listener(network, "c@E")]
-    network.impair(Conditions(delay_ns=lambda random: random.randrange(MS)))
+    network.impair(NetworkConditions(delay_ns=lambda random: random.randrange(MS)))
     send(network.transport("a@R1"), 20, every_ns=MS)
     network.advance(100 * MS)
     assert listeners[0].heard != listeners[1].heard

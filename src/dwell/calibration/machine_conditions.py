@@ -1,4 +1,4 @@
-"""Conditions: what else the machine did while something was measured, as far as Linux says it."""
+"""What else the machine did while something was measured, as far as Linux says it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Conditions", "Watch", "processor"]
+__all__ = ["MachineConditions", "MachineCounters", "processor"]
 
 
 @dataclass(frozen=True, slots=True)
-class Conditions:
+class MachineConditions:
     """How quiet the machine was; None where Linux does not say.
 
     Parameters
@@ -45,7 +45,7 @@ class Conditions:
     cpu_s: float
 
 
-class Watch:
+class MachineCounters:
     """Takes the counters when it is made, and their differences when asked.
 
     Parameters
@@ -62,7 +62,7 @@ class Watch:
         self._cpu_s = time.process_time()
         self._preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw
 
-    def conditions(self) -> Conditions:
+    def conditions(self) -> MachineConditions:
         """Return what was the case since this watch was made."""
         preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw - self._preemptions
         cpu_s = time.process_time() - self._cpu_s
@@ -70,7 +70,7 @@ class Watch:
         steal = None
         if ticks is not None and self._ticks is not None and ticks[1] > self._ticks[1]:
             steal = (ticks[0] - self._ticks[0]) / (ticks[1] - self._ticks[1])
-        return Conditions(
+        return MachineConditions(
             load=self._load,
             cpus=os.cpu_count() or 1,
             governor=_governor(self._cores[0]),

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dwell.errors import LiveError
-from dwell.live.stamper import Entry
+from dwell.live.stamper import StamperState
 
 __all__ = ["BookFile", "HighestFile", "InFlight", "make_folder"]
 
@@ -60,7 +60,7 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
 
 
 class BookFile:
-    """A stamper's `Entry`, in two slots of mapped memory written in turn.
+    """A stamper's `StamperState`, in two slots of mapped memory written in turn.
 
     A disk that is full keeps nobody from writing it, and a process that dies while it writes spoils
     the slot only that was not the last.
@@ -82,7 +82,7 @@ class BookFile:
             raise LiveError(f"{path}: cannot be made ({error.strerror})") from None
         self._number = max((number for number, _ in self._good()), default=0)
 
-    def _good(self) -> Iterator[tuple[int, Entry]]:
+    def _good(self) -> Iterator[tuple[int, StamperState]]:
         """Yield the good slots: how often it had been written then, and what was."""
         for turn in (0, 1):
             begin = turn * _BOOK_BYTES
@@ -91,19 +91,19 @@ class BookFile:
             if not number or zlib.crc32(text, number & 0xFFFFFFFF) != check:
                 continue
             try:
-                entry = Entry(**json.loads(text))
+                entry = StamperState(**json.loads(text))
             except (ValueError, TypeError):
                 continue
             numbers = (entry.run, entry.reserved, entry.term)
             if all(type(n) is int and n >= 0 for n in numbers):
                 yield number, entry
 
-    def read(self) -> Entry | None:
+    def read(self) -> StamperState | None:
         """Return what was written last; None where nothing was, or it cannot be read."""
         found = max(self._good(), key=lambda one: one[0], default=None)
         return None if found is None else found[1]
 
-    def write(self, entry: Entry) -> None:
+    def write(self, entry: StamperState) -> None:
         """Write the slot that was not the last."""
         text = json.dumps(asdict(entry)).encode()
         number = self._number + 1

@@ -18,7 +18,6 @@ from dwell.cellfile import from_document
 from dwell.errors import RunError
 from dwell.model.document import to_document
 from dwell.record import seal_run
-from dwell.study.campaign import Measured, read_measured, without_excluded
 from dwell.study.campaign_questions import (
     fault_scenarios,
     needed_pairs,
@@ -27,7 +26,8 @@ from dwell.study.campaign_questions import (
     verdict,
 )
 from dwell.study.family import Family
-from dwell.study.paired import paired_difference
+from dwell.study.measured_campaign import MeasuredCampaign, read_measured, without_excluded
+from dwell.study.pairs import paired_difference
 from dwell.study.summary import summarise
 from dwell.testbed.campaign import Campaign, entrant
 from dwell.testbed.execution import run_campaign
@@ -59,11 +59,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def measured(folder: Path) -> Measured:
+def measured(folder: Path) -> MeasuredCampaign:
     return read_measured(folder)
 
 
-def test_a_repetition_takes_the_place_of_a_seed(measured: Measured) -> None:
+def test_a_repetition_takes_the_place_of_a_seed(measured: MeasuredCampaign) -> None:
     comparison = measured.comparison
     assert comparison.seeds == (1, 2)
     assert comparison.scenarios == SCENARIOS
@@ -88,7 +88,7 @@ def test_a_campaign_of_before_has_thresholds_where_it_says_atp(
     assert len(comparison.values("baseline", "atp-thresholds", "violation_rate")) == 2
 
 
-def test_excluded_windows_and_failures_are_counted(measured: Measured) -> None:
+def test_excluded_windows_and_failures_are_counted(measured: MeasuredCampaign) -> None:
     # One of six windows of every run is excluded, see SimulatedRuns.
     assert measured.log["excluded"].to_list() == [1] * 30
     assert measured.log["windows"].to_list() == [6] * 30
@@ -119,7 +119,9 @@ def test_excluded_windows_leave_with_their_cycles() -> None:
     assert row["cycles"] == (7 - PROBLEM.warmup_windows) * PROBLEM.window_cycles
 
 
-def test_profiles_are_of_the_baseline_and_links_of_every_scenario(measured: Measured) -> None:
+def test_profiles_are_of_the_baseline_and_links_of_every_scenario(
+    measured: MeasuredCampaign,
+) -> None:
     profiles = measured.profiles
     assert set(zip(profiles["task"], profiles["node"], strict=True)) >= {
         (task, node)
@@ -144,7 +146,7 @@ def test_profiles_are_of_the_baseline_and_links_of_every_scenario(measured: Meas
         assert mine["delay_ms"].is_sorted()
 
 
-def test_latencies_are_shares_of_all_cycles(measured: Measured) -> None:
+def test_latencies_are_shares_of_all_cycles(measured: MeasuredCampaign) -> None:
     runs, latencies = measured.comparison.runs, measured.comparison.latencies
     deadline_ms = PROBLEM.pipeline.deadline_ms
     for (scenario, policy), mine in runs.group_by("scenario", "policy"):
@@ -176,7 +178,7 @@ def test_a_campaign_that_goes_on_can_be_read(tmp_path: Path) -> None:
         assert chapter.answer == "not shown"
 
 
-def test_questions_are_asked_where_they_apply(measured: Measured) -> None:
+def test_questions_are_asked_where_they_apply(measured: MeasuredCampaign) -> None:
     names = tuple(PROBLEM.scenarios)
     assert "robot-cpu-stress" in stress_scenarios(PROBLEM, names)
     assert fault_scenarios(PROBLEM, SCENARIOS) == ("network-impairment",)

@@ -19,15 +19,15 @@ from typing import Protocol, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.transport.expressions import matcher, require_key
-from dwell.live.transport.protocol import Lane, Receive, Sample
+from dwell.live.transport.transport import Arrival, Lane, Receive
 
 __all__ = [
     "STALLED_MESSAGES",
     "Clock",
-    "Conditions",
     "Delivery",
     "MemoryTransport",
     "Network",
+    "NetworkConditions",
     "Participant",
     "Reach",
 ]
@@ -46,7 +46,7 @@ class Participant(Protocol):
         """Key expressions that it wants to hear."""
         ...
 
-    def receive(self, sample: Sample, now_ns: int) -> int | None:
+    def receive(self, sample: Arrival, now_ns: int) -> int | None:
         """Take a message."""
         ...
 
@@ -85,7 +85,7 @@ class Clock:
 
 
 @dataclass(frozen=True, slots=True)
-class Conditions:
+class NetworkConditions:
     """What happens to messages on their way.
 
     Parameters
@@ -126,7 +126,7 @@ class _Rule:
     source: str
     target: str
     applies: Callable[[str], bool]
-    conditions: Conditions
+    conditions: NetworkConditions
 
     def holds(self, source: MemoryTransport, target: MemoryTransport, key: str) -> bool:
         return (
@@ -141,7 +141,7 @@ class _Message:
     source: MemoryTransport
     target: MemoryTransport
     lane: Lane
-    sample: Sample
+    sample: Arrival
 
 
 @dataclass(eq=False, slots=True)
@@ -179,7 +179,7 @@ class MemoryTransport:
         """Send a message; returns at once, whatever the receivers do."""
         require_key(key)
         if not self.closed:
-            self._network.send(self, Sample(key, bytes(payload), bytes(header)), lane)
+            self._network.send(self, Arrival(key, bytes(payload), bytes(header)), lane)
 
     def subscribe(self, key: str, receive: Receive) -> None:
         """Have `receive` called with every message under a key expression (``*``, ``**``)."""
@@ -280,7 +280,7 @@ class Network:
 
     def impair(
         self,
-        conditions: Conditions,
+        conditions: NetworkConditions,
         source: str = "*",
         target: str = "*",
         *,
@@ -290,7 +290,7 @@ class Network:
 
         Parameters
         ----------
-        conditions : Conditions
+        conditions : NetworkConditions
         source, target : str
             Name of a process or of a node, or ``*``; the other direction is not touched.
         key : str
@@ -307,7 +307,7 @@ class Network:
 
     def cut(self, source: str = "*", target: str = "*", *, key: str = "**") -> object:
         """Lose everything from one process or node to another until that is healed."""
-        return self.impair(Conditions(loss=1.0), source, target, key=key)
+        return self.impair(NetworkConditions(loss=1.0), source, target, key=key)
 
     def stall(
         self,
@@ -318,7 +318,9 @@ class Network:
         waiting: int = STALLED_MESSAGES,
     ) -> object:
         """Hold everything back until that is healed, as a link that hangs does."""
-        return self.impair(Conditions(stalled=True, waiting=waiting), source, target, key=key)
+        return self.impair(
+            NetworkConditions(stalled=True, waiting=waiting), source, target, key=key
+        )
 
     def heal(self, rule: object) -> None:
         """Lift what `impair`, `cut` or `stall` put on; what waited for it goes on its way."""
@@ -372,7 +374,7 @@ class Network:
 
     # ----------------------------------------------------------- for the transports
 
-    def send(self, source: MemoryTransport, sample: Sample, lane: Lane) -> None:
+    def send(self, source: MemoryTransport, sample: Arrival, lane: Lane) -> None:
         """Send a message to everybody who subscribed to it, the sender left out."""
         for target in list(self._transports.values()):
             if target is source or not any(hit(sample.key) for hit, _ in target.subscriptions):
@@ -459,7 +461,7 @@ class _Drive:
         #: Instant of the network for which the last wake was arranged; older ones are void.
         self.due_ns: int | None = None
 
-    def receive(self, sample: Sample) -> None:
+    def receive(self, sample: Arrival) -> None:
         """Hand over a message, and see what that makes due."""
         self.participant.receive(sample, self.end.now_ns)
         self._arrange()

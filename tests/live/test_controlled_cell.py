@@ -12,11 +12,11 @@ import pytest
 from msgspec.structs import replace as replaced
 
 import dwell
-from dwell.live.cell import Cell
+from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import Keys
+from dwell.live.live_windows import Rows
 from dwell.live.messages import Answer, Ask, Order, decode, encode
-from dwell.live.transport.protocol import Sample
-from dwell.live.windows import Rows
+from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
@@ -47,8 +47,8 @@ def alternating(problem: Problem) -> World:
     return World(problem, exec_ms=EXEC_MS, policy=Alternating("LOC", "SO"))
 
 
-def cell_of(world: World) -> Cell:
-    return next(role for role in reversed(world.roles.values()) if isinstance(role, Cell))
+def cell_of(world: World) -> ControlledCell:
+    return next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
 
 
 def ask(world: World, what: str, about: str = "") -> str:
@@ -56,7 +56,7 @@ def ask(world: World, what: str, about: str = "") -> str:
     keys, heard = Keys(world.problem.name), list[str]()
     visitor = world.network.transport(f"visitor{world.network.now_ns}", "R1")
     visitor.subscribe(keys.answer("me"), lambda s: heard.append(decode(s.payload, Answer).refused))
-    sample = Sample(keys.ask(), encode(Ask("me", what, about)))
+    sample = Arrival(keys.ask(), encode(Ask("me", what, about)))
     # It has no wire of the cell's: it talks to the controller alone.
     reach, world.network.reach = world.network.reach, None
     cell_of(world).receive(sample, world.network.now_ns)
@@ -68,7 +68,7 @@ def ask(world: World, what: str, about: str = "") -> str:
 
 def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
     """Columns of a table's rows, later rows of a number in the place of earlier ones."""
-    from dwell.live.tables import columns_of
+    from dwell.live.run_rows import columns_of
 
     order = list(columns_of(cell_of(world).controller)[table])
     rows = world.recorder.rows[table]

@@ -1,4 +1,4 @@
-"""Cell: one live cell as its controller sees it: windows in, orders out.
+"""ControlledCell: one live cell as its controller sees it: windows in, orders out.
 
 The decisions are those of `dwell.control.Controller`, the object that the simulator runs.
 """
@@ -15,6 +15,7 @@ from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
 from dwell.live.continuity import Continuity
 from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
+from dwell.live.live_windows import LiveWindow, LiveWindows, Resume, Rows
 from dwell.live.messages import (
     Accepted,
     Answer,
@@ -28,12 +29,11 @@ from dwell.live.messages import (
     decode,
     encode,
 )
-from dwell.live.role import REPEATED_NS, Place, Pulse
-from dwell.live.transport.protocol import Sample
-from dwell.live.windows import LiveWindow, LiveWindows, Resume, Rows
+from dwell.live.role import REPEATED_NS, Pulse, RolePlace
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 
-__all__ = ["Cell", "Recorder"]
+__all__ = ["ControlledCell", "Recorder"]
 
 #: Time between two looks at the stamper, and two sendings of an order that is not answered.
 ASK_NS = 250_000_000
@@ -81,12 +81,12 @@ class _Move:
     anew: bool = False
 
 
-class Cell:
+class ControlledCell:
     """See the module.
 
     Parameters
     ----------
-    place : Place
+    place : RolePlace
     controller : Controller
     recorder : Recorder
     name : str
@@ -94,7 +94,7 @@ class Cell:
     """
 
     def __init__(
-        self, place: Place, controller: Controller, recorder: Recorder, name: str, now_ns: int
+        self, place: RolePlace, controller: Controller, recorder: Recorder, name: str, now_ns: int
     ) -> None:
         self.place, self.controller, self.name = place, controller, name
         self._recorder = recorder
@@ -137,7 +137,7 @@ class Cell:
         yield keys.restored()
         yield from (keys.ask(), keys.look())
 
-    def receive(self, sample: Sample, now_ns: int) -> int | None:
+    def receive(self, sample: Arrival, now_ns: int) -> int | None:
         """Take a message in; returns when a window closes, or an order is sent again."""
         self._take(sample, now_ns)
         windows, move = self.windows, self._move
@@ -149,7 +149,7 @@ class Cell:
         again_ns = move.sent_ns + RESEND_NS
         return again_ns if due_ns is None else min(due_ns, again_ns)
 
-    def _take(self, sample: Sample, now_ns: int) -> None:
+    def _take(self, sample: Arrival, now_ns: int) -> None:
         keys = self._keys
         word = keys.word(sample.key)
         if word == "gathered":

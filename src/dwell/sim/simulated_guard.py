@@ -16,7 +16,7 @@ from dwell.model import Placement, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
-__all__ = ["Watch", "back_ns"]
+__all__ = ["SimulatedGuard", "back_ns"]
 
 
 def back_ns(problem: Problem, placement: Placement) -> int:
@@ -40,7 +40,7 @@ def back_ns(problem: Problem, placement: Placement) -> int:
     return round(max(to_ms.get(node, 0.0) for node in sinks) * 1e6)
 
 
-class Watch:
+class SimulatedGuard:
     """The guard of one cell: `dwell.kernels.advance` says when it fires, this says what then.
 
     Parameters

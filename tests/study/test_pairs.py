@@ -14,7 +14,7 @@ from scipy import stats
 
 from dwell.errors import SimulationError
 from dwell.study.intervals import mean_interval
-from dwell.study.paired import (
+from dwell.study.pairs import (
     EXACT_PAIRS,
     FLIPS,
     PairedDifference,
