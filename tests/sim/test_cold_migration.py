@@ -16,8 +16,8 @@ import dwell
 from dwell.model import Constant, ControllerSettings, Execution, Flow, Link, Node, Problem, Task
 from dwell.sim.realisation import LinkSegment, NodeChange
 from tests.generate import MS, make_problem, make_realisation
-from tests.reference_simulator import attempt_uniform, control
-from tests.test_against_reference import Case, Played, Replay, differences, make_case
+from tests.reference.simulator import attempt_uniform, control
+from tests.reference.test_against import Case, Played, Replay, differences, make_case
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 MOVES = {"LOC": {"B": "R"}, "OFF": {"B": "E"}}

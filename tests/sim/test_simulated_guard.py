@@ -28,10 +28,10 @@ from dwell.sim import simulate_realisation
 from dwell.sim.realisation import LinkSegment, NodeChange
 from dwell.sim.simulated_guard import back_ns
 from tests.generate import MS, make_problem, make_realisation
-from tests.reference_simulator import way_back
-from tests.test_against_reference import Case, Played, Replay, differences
-from tests.test_against_reference import play as play_case
-from tests.test_against_reference import reference as reference_of
+from tests.reference.simulator import way_back
+from tests.reference.test_against import Case, Played, Replay, differences
+from tests.reference.test_against import play as play_case
+from tests.reference.test_against import reference as reference_of
 
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 MOVES = {"LOC": {"act": "R"}, "OFF": {"act": "E"}, "ALT": {"act": "X"}}

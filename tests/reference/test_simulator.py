@@ -20,7 +20,7 @@ from dwell.model import (
 )
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from tests.generate import MS, make_problem, make_realisation
-from tests.reference_simulator import Result, Split, attempt_uniform, simulate, transmission_ns
+from tests.reference.simulator import Result, Split, attempt_uniform, simulate, transmission_ns
 
 R, E = Node("R", "robot"), Node("E", "edge")
 

@@ -50,7 +50,7 @@ from tests.generate import (
     random_problem,
     random_stamps,
 )
-from tests.reference_simulator import (
+from tests.reference.simulator import (
     ITSELF,
     NEAR_NS,
     SHADOW,
