@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 import dwell
-from dwell.live.continuity import COMPANY, RESERVED, Continuity, Retreat
+from dwell.live.continuity import CONFIRMATIONS, RESERVED, Continuity, OvershootDetector
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.failure_detector import FailureDetector
 from dwell.live.keys import Keys
@@ -301,7 +301,7 @@ def test_what_leaps_is_believed_in_company() -> None:
     continuity = Continuity(PERIOD_NS)
     continuity.takes((1, 5), 0)
     taken = [continuity.takes((2, n), n * PERIOD_NS) for n in range(1, 8)]
-    assert taken == [False] * (COMPANY - 1) + [True] * (8 - COMPANY)
+    assert taken == [False] * (CONFIRMATIONS - 1) + [True] * (8 - CONFIRMATIONS)
 
 
 def test_what_leaps_among_what_goes_on_is_never_believed() -> None:
@@ -313,12 +313,14 @@ def test_what_leaps_among_what_goes_on_is_never_believed() -> None:
 
 
 def test_copies_and_late_ones_are_no_company() -> None:
-    retreat = Retreat()
-    assert not any(retreat.behind(7) for _ in range(100))
+    overshoot = OvershootDetector()
+    assert not any(overshoot.behind(7) for _ in range(100))
     for n in range(20):
-        assert not retreat.behind(n)
-        retreat.advanced()
-    assert [retreat.behind(1, n) for n in range(COMPANY)] == [False] * (COMPANY - 1) + [True]
+        assert not overshoot.behind(n)
+        overshoot.advanced()
+    assert [overshoot.behind(1, n) for n in range(CONFIRMATIONS)] == [False] * (
+        CONFIRMATIONS - 1
+    ) + [True]
 
 
 # ------------------------------------------------------------- other numbers that only grow
@@ -367,7 +369,7 @@ def test_a_false_completion_stops_no_intervals() -> None:
     for cycle in (3, HUGE, 4):
         done = Completion(Stamp(1, cycle, 1, "LOC", 0), "arm", 0, "actuated", (), "R2")
         intervals.completed(done, 40 * MS, newest=5, direct=True)
-    assert [cycle for cycle, _ in intervals.news()] == [3, 4]
+    assert [cycle for cycle, _ in intervals.take_unreported()] == [3, 4]
 
 
 def test_one_false_instant_does_not_widen_the_clocks_bounds_for_ever() -> None:

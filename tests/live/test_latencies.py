@@ -103,12 +103,12 @@ def test_a_cycle_ends_with_its_last_sink_and_copies_change_nothing() -> None:
     intervals.hear(beat(100 * S + 10 * MS, 100 * S, 0), 14 * MS)
     intervals.completed(done(5), 40 * MS, newest=5, direct=True)
     intervals.completed(done(5), 60 * MS, newest=5, direct=False)
-    assert intervals.news() == ()
+    assert intervals.take_unreported() == ()
     intervals.completed(done(5, "gripper"), 50 * MS, newest=5, direct=True)
     intervals.completed(done(5, "gripper"), 70 * MS, newest=5, direct=True)
     intervals.completed(done(5, "nobody"), 80 * MS, newest=5, direct=True)
-    assert intervals.news() == ((5, 48 * MS),)
-    assert intervals.news() == ()
+    assert intervals.take_unreported() == ((5, 48 * MS),)
+    assert intervals.take_unreported() == ()
 
 
 def test_cycles_that_never_complete_take_no_memory() -> None:

@@ -85,7 +85,8 @@ class Controller:
         (``cusum+corrected``), or None for the cell file's choice. The caller's object is copied,
         never changed.
     estimator : Estimator, str, or None
-        Likewise.
+        An object with `estimate`, an estimator's name, or None for the cell file's choice. The
+        caller's object is copied, never changed.
 
     Raises
     ------

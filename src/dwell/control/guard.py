@@ -358,9 +358,9 @@ class Probation:
 
     __slots__ = (
         "_count",
-        "_fallen",
         "_first",
         "_health",
+        "_on_fallback",
         "_returned",
         "_silence",
         "health_cycles",
@@ -379,7 +379,7 @@ class Probation:
         self.wanted: str | None = None
         self._silence = _Silence(patience_ns)
         self._count = self._first = self._health = 0
-        self._fallen = self._returned = False
+        self._on_fallback = self._returned = False
 
     @classmethod
     def of(cls, problem: Problem) -> Probation:
@@ -435,17 +435,17 @@ class Probation:
         """Note that the guard has moved the cell to a fallback."""
         if self._returned:
             self.needed = min(2 * self.needed, self.most)
-        self._fallen, self._returned, self._health = True, False, 0
+        self._on_fallback, self._returned, self._health = True, False, 0
         self.want(None)
 
     def left(self) -> None:
         """Note that an order has left the fallback."""
-        self._fallen, self._returned, self._health = False, True, 0
+        self._on_fallback, self._returned, self._health = False, True, 0
         self.want(None)
 
     def healthy(self, cycles: int = 1) -> None:
         """Note cycles that have completed; under a fallback they say nothing."""
-        if self._fallen:
+        if self._on_fallback:
             return
         self._health += cycles
         stretches, self._health = divmod(self._health, self.health_cycles)

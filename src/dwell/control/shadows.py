@@ -29,7 +29,7 @@ def shadow_stamps(
     candidates : int
         Number of candidates.
     fraction : float
-        Of the cycles, for each alternative.
+        Share of the cycles that each alternative gets.
 
     Returns
     -------

@@ -125,7 +125,7 @@ class Corrected:
     half_life_windows : float, optional
         The cell file's where None; see `MEMORY` and `UNSEEN`.
     seed : int
-        Of the profile's sample cycles and of how draws are paired.
+        Seed of the profile's sample cycles and of the pairing of draws.
 
     Attributes
     ----------

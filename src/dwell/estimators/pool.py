@@ -128,7 +128,7 @@ class Pool:
         Parameters
         ----------
         deviation : float
-            Of the factor's logarithm; 0 draws the times as they are.
+            Standard deviation of the factor's logarithm; 0 draws the times as they are.
         """
         if deviation == self._widened:
             return

@@ -60,7 +60,7 @@ class Profile:
     samples : int
         Sample cycles.
     seed : int
-        Of the sample cycles; the same for every run, so that an estimate is a fixed number.
+        Seed of the sample cycles; the same for every run, so that an estimate is a fixed number.
 
     Attributes
     ----------

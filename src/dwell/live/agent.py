@@ -26,7 +26,7 @@ __all__ = ["Agent", "CpuCount", "Gauge"]
 LOOK_NS = 20_000_000
 LOAD_NS = 250_000_000
 #: Time between two looks at the memory of the processes, and at how long their logs are.
-TEND_NS = 1_000_000_000
+HOUSEKEEPING_NS = 1_000_000_000
 #: Age from which what a gauge showed counts no more.
 GAUGE_S = 2.0
 #: Periods between two beats of an agent, and between two of anybody that the controller is told of.
@@ -138,7 +138,7 @@ class Agent:
         # No guard waits for it: it carries nothing that a cycle needs.
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
         self._relays = place.node == place.relay
-        self._look_ns = self._load_ns = self._tend_ns = 0
+        self._look_ns = self._load_ns = self._housekeeping_ns = 0
         self._carried = RelayBatch()
         self._carry_ns = NEVER_NS
         self._gathered = RelayBatch(MOST_MESSAGES // 2)
@@ -180,9 +180,9 @@ class Agent:
         if now_ns >= self._look_ns:
             self.supervisor.step()
             self._look_ns = now_ns + LOOK_NS
-        if now_ns >= self._tend_ns:
+        if now_ns >= self._housekeeping_ns:
             self.supervisor.tend()
-            self._tend_ns = now_ns + TEND_NS
+            self._housekeeping_ns = now_ns + HOUSEKEEPING_NS
         if now_ns >= self._load_ns:
             self._report(now_ns)
             self._load_ns = now_ns + LOAD_NS

@@ -5,23 +5,23 @@ up, would make all that come later old ones.
 
 `Continuity`: a cycle's number may be `RESERVED` ahead, which a stamper leaves out when it starts
 again, and as many more as can have been released since. One that is further ahead, or of a later
-run, leaps: it is believed once `COMPANY` in a row, over some periods, have gone on from one
+run, leaps: it is believed once `CONFIRMATIONS` in a row, over some periods, have gone on from one
 another, and none between them went on from what was believed.
 
-`Retreat`: a life or an instant may be any time ahead, as a computer may have slept. But where
-`COMPANY` in a row grow behind the one that is believed, that one was false.
+`OvershootDetector`: a life or an instant may be any time ahead, as a computer may have slept. But
+where `CONFIRMATIONS` in a row grow behind the one that is believed, that one was false.
 """
 
 from __future__ import annotations
 
 from typing import TypeAlias
 
-__all__ = ["COMPANY", "LATENESS_NS", "RESERVED", "Continuity", "Retreat"]
+__all__ = ["CONFIRMATIONS", "LATENESS_NS", "RESERVED", "Continuity", "OvershootDetector"]
 
 #: Cycle numbers that the stamper reserves at a time; after a restart the rest of them stays unused.
 RESERVED = 1_024
 #: Messages in a row that are believed, though they do not go on from what was believed before.
-COMPANY = 5
+CONFIRMATIONS = 5
 #: How much sooner than the message before it a message may have been heard, for all its delay.
 LATENESS_NS = 2_000_000_000
 #: Cycles that may be released in a period (`release: frames`).
@@ -46,7 +46,15 @@ class Continuity:
         Messages that were not believed.
     """
 
-    __slots__ = ("_company", "_heard_ns", "_leap", "_period_ns", "_since_ns", "leaps", "newest")
+    __slots__ = (
+        "_confirmations",
+        "_heard_ns",
+        "_leap",
+        "_period_ns",
+        "_since_ns",
+        "leaps",
+        "newest",
+    )
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -57,7 +65,7 @@ class Continuity:
 
     def _forget(self) -> None:
         self._leap: tuple[Cycle, int] | None = None
-        self._since_ns = self._company = 0
+        self._since_ns = self._confirmations = 0
 
     def believe(self, cycle: Cycle, now_ns: int) -> None:
         """Go on from a cycle, whatever was believed before."""
@@ -95,12 +103,12 @@ class Continuity:
             return False
         leap = self._leap
         if leap is None or not self._follows(*leap, cycle, now_ns):
-            self._company, self._since_ns = 0, now_ns
+            self._confirmations, self._since_ns = 0, now_ns
         self._leap = cycle, now_ns
-        self._company += 1
+        self._confirmations += 1
         if (
-            self._company < COMPANY
-            or now_ns - self._since_ns < (COMPANY - 1) * self._period_ns // 2
+            self._confirmations < CONFIRMATIONS
+            or now_ns - self._since_ns < (CONFIRMATIONS - 1) * self._period_ns // 2
         ):
             return False
         self.believe(cycle, now_ns)
@@ -111,13 +119,13 @@ class Continuity:
         return cycle[0] == before[0] and 0 < step <= self._ahead(heard_ns, now_ns)
 
 
-class Retreat:
+class OvershootDetector:
     """Notices that an instant that was believed had been too high.
 
     Late messages and copies are behind what is believed, too: but they do not go on.
     """
 
-    __slots__ = ("_behind", "_company")
+    __slots__ = ("_behind", "_confirmations")
 
     def __init__(self) -> None:
         self.advanced()
@@ -125,7 +133,7 @@ class Retreat:
     def advanced(self) -> None:
         """Something went on from what is believed."""
         self._behind: tuple[int, ...] | None = None
-        self._company = 0
+        self._confirmations = 0
 
     def behind(self, *order: int) -> bool:
         """Whether so many in a row go on behind what is believed that this was wrong.
@@ -137,8 +145,8 @@ class Retreat:
         """
         if self._behind is None or order > self._behind:
             self._behind = order
-            self._company += 1
-        if self._company < COMPANY:
+            self._confirmations += 1
+        if self._confirmations < CONFIRMATIONS:
             return False
         self.advanced()
         return True

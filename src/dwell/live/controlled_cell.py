@@ -39,7 +39,7 @@ __all__ = ["ControlledCell", "Recorder"]
 ASK_NS = 250_000_000
 RESEND_NS = 40_000_000
 #: Stamps in a row that say that the cell has been moved, where no answer says so.
-TOLD = 3
+CONFIRMATIONS = 3
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
 
@@ -90,7 +90,7 @@ class ControlledCell:
     controller : Controller
     recorder : Recorder
     name : str
-        Of this controller among others that would like to be in charge.
+        Name of this controller, by which others that would take charge tell it apart.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class ControlledCell:
         self.continuity = Continuity(place.period_ns)
         self._cycle_asked = self._term_asked = 0
         # What a stamp says of a term that nobody has confirmed, and how many in a row.
-        self._rumour: tuple[tuple[int, int, str], int] | None = None
+        self._unconfirmed: tuple[tuple[int, int, str], int] | None = None
         self._doubted_until_ns: int | None = None
         self.refused = ""
         self.pinned = ""
@@ -142,7 +142,7 @@ class ControlledCell:
         self._take(sample, now_ns)
         windows, move = self.windows, self._move
         due_ns = None if windows is None else windows.due_ns(now_ns)
-        if self._rumour is not None:
+        if self._unconfirmed is not None:
             due_ns = self._ask_ns if due_ns is None else min(due_ns, self._ask_ns)
         if move is None:
             return due_ns
@@ -241,7 +241,7 @@ class ControlledCell:
             self.windows.stamped(stamp, now_ns)
             self.windows.measured(stamp.run, stamp.intervals)
         if (stamp.run, stamp.term) <= (held.run, held.term):
-            self._rumour = None
+            self._unconfirmed = None
             return
         move = self._move
         ours = (
@@ -251,21 +251,21 @@ class ControlledCell:
             and stamp.term == move.order.term + 1
             and stamp.placement == move.name
         )
-        rumour = stamp.run, stamp.term, stamp.placement
+        reported = stamp.run, stamp.term, stamp.placement
         if not ours:
-            known, count = self._rumour or (None, 0)
-            count = count + 1 if known == rumour else 1
-            self._rumour = rumour, count
-            if count < TOLD:
+            known, count = self._unconfirmed or (None, 0)
+            count = count + 1 if known == reported else 1
+            self._unconfirmed = reported, count
+            if count < CONFIRMATIONS:
                 if count == 1:
                     # The answer says who has moved the cell, too.
                     self._ask_ns = now_ns
                 return
-        self._now_at(*rumour, by_guard=not ours)
+        self._now_at(*reported, by_guard=not ours)
 
     def _now_at(self, run: int, term: int, placement: str, *, by_guard: bool) -> None:
         """Take note of the placement that holds since a term began."""
-        held, self._rumour = self.held, None
+        held, self._unconfirmed = self.held, None
         self._term_asked = self._number
         before = held.placement if held is not None else placement
         self.held = Accepted(
@@ -326,7 +326,7 @@ class ControlledCell:
             self.controller.on_fallback = False
         self.held = answer
         if self._move is None and answer.proven and answer.proven != held.proven:
-            self._obey(now_ns)
+            self._follow_operators(now_ns)
         if not mine or move is None or move is not self._move:
             return
         self.refused = answer.refused
@@ -347,7 +347,7 @@ class ControlledCell:
             if answer.number <= self._term_asked:
                 return False
             self._take_back(answer)
-        self._rumour = None
+        self._unconfirmed = None
         continuity, windows = self.continuity, self.windows
         newest, upcoming = continuity.newest, (answer.run, answer.cycle)
         ahead = continuity.ahead(now_ns)
@@ -394,10 +394,10 @@ class ControlledCell:
         run, term = (held.run, held.term) if held is not None else (0, 0)
         fraction = self.controller.shadow_fraction
         forks = () if move is None else move.forks
-        want = self._wish(now_ns) if move is None else move.name
+        want = self._desired(now_ns) if move is None else move.name
         return Order(self._next_number(), self.name, run, term, placement, fraction, forks, want)
 
-    def _wish(self, now_ns: int) -> str:
+    def _desired(self, now_ns: int) -> str:
         """Return what the guard's fallback shall be left for: people's choice, else the policy's.
 
         It lasts until the cell is there, whatever windows close and orders are given up meanwhile:
@@ -565,13 +565,13 @@ class ControlledCell:
         probed = (held.probed,) if held is not None and held.probed else ()
         order = (*probed, *problem.controller.fallbacks, *problem.candidates)
         clear: list[str] = [name for name in order if self._clear(name)]
-        return next((name for name in clear if self._staffed(name, now_ns)), clear[0])
+        return next((name for name in clear if self._workers_ready(name, now_ns)), clear[0])
 
     def _clear(self, name: str) -> bool:
         """Whether a candidate needs no node that is drained."""
         return not self.drained.intersection(self.place.problem.candidates[name].values())
 
-    def _staffed(self, name: str, now_ns: int) -> bool:
+    def _workers_ready(self, name: str, now_ns: int) -> bool:
         """Whether all workers of a candidate were heard lately, and ready."""
         detector, silent_ns = self.pulse.detector, silent_after_ns(self.place.problem)
         workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].items()]
@@ -630,10 +630,10 @@ class ControlledCell:
                 self.drained.discard(ask.about)
             case _:
                 return f"unknown question {ask.what!r}"
-        self._obey(now_ns)
+        self._follow_operators(now_ns)
         return ""
 
-    def _obey(self, now_ns: int) -> None:
+    def _follow_operators(self, now_ns: int) -> None:
         """Begin to move where people want the cell; from a fallback, once that is proven."""
         held = self.held
         if held is None:
@@ -693,12 +693,12 @@ class ControlledCell:
 
     def _proving(self, now_ns: int) -> dict[str, Any] | None:
         """Return how far the proof is that the guard's fallback is waiting for."""
-        held, wish = self.held, self._wish(now_ns)
-        if held is None or not wish or self._move is not None:
+        held, desired = self.held, self._desired(now_ns)
+        if held is None or not desired or self._move is not None:
             return None
         needed = held.needed or self.place.problem.controller.probe_cycles
-        done = held.probes if held.probed == wish else 0
-        return {"candidate": wish, "done": done, "needed": needed}
+        done = held.probes if held.probed == desired else 0
+        return {"candidate": desired, "done": done, "needed": needed}
 
     def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:
         """Return what is known of everybody that was ever heard."""

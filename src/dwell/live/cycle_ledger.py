@@ -76,7 +76,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     parts_ns : tuple of int, or None
         Compute, queue, network.
     bound_ns : int
-        Of the error of its latency, by the clocks.
+        Bound of the error of its latency, by the clocks.
     interval_ns : int or None
         From its stamp to its last completion, as both arrived at the controller.
     stamper_interval_ns : int or None
@@ -403,7 +403,7 @@ class Ledger:
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._enter(known, row, cycle, report.hops, self._every)
             if cycle.heard and not (cycle.reports or cycle.replaced or cycle.told):
-                self._blame(known, row, cycle)
+                self._mark_lost(known, row, cycle)
         for found in (known, of_shadows):
             for instants in (found.ready_ns, found.end_ns, found.arrived_ns):
                 instants[instants > close_ns] = UNKNOWN
@@ -447,7 +447,7 @@ class Ledger:
                 if flow is not None:
                     known.arrived_ns[row, flow] = max(arrived_ns + shift_ns, 0)
 
-    def _blame(self, known: Instants, row: int, cycle: LiveCycle) -> None:
+    def _mark_lost(self, known: Instants, row: int, cycle: LiveCycle) -> None:
         """Take the first message to another node that is not known to have arrived as lost."""
         nodes = self._candidates[cycle.placement]
         for flow in self._forward:

@@ -8,21 +8,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from dwell.live.continuity import LATENESS_NS, Retreat
+from dwell.live.continuity import LATENESS_NS, OvershootDetector
 from dwell.live.messages import Beat, Heard
 
 __all__ = ["FailureDetector"]
 
 
 @dataclass(slots=True)
-class _Voice:
+class _HeardProcess:
     """The last that was heard of a process."""
 
     beat: Beat
     at_ns: int
     direct_ns: int | None = None
     direct_beat_ns: int = 0
-    retreat: Retreat = field(default_factory=Retreat)
+    overshoot: OvershootDetector = field(default_factory=OvershootDetector)
 
 
 class FailureDetector:
@@ -39,41 +39,43 @@ class FailureDetector:
     def __init__(self, who: str, patience_ns: int) -> None:
         self.who = who
         self.patience_ns = patience_ns
-        self._voices: dict[str, _Voice] = {}
+        self._processes: dict[str, _HeardProcess] = {}
 
     def hear(self, beat: Beat, now_ns: int, *, direct: bool = True) -> bool:
         """Take a beat in; False if it is no news: an older one, or its second copy."""
         if beat.who == self.who:
             return False
-        voice, order = self._voices.get(beat.who), (beat.life, beat.sent_ns)
-        if voice is None:
-            voice = self._voices[beat.who] = _Voice(beat, now_ns)
+        process, order = self._processes.get(beat.who), (beat.life, beat.sent_ns)
+        if process is None:
+            process = self._processes[beat.who] = _HeardProcess(beat, now_ns)
         else:
-            last = voice.beat.life, voice.beat.sent_ns
-            news = order > ((last[0], voice.direct_beat_ns) if direct else last)
+            last = process.beat.life, process.beat.sent_ns
+            news = order > ((last[0], process.direct_beat_ns) if direct else last)
             if order > last:
-                voice.retreat.advanced()
-                voice.beat, voice.at_ns = beat, now_ns
+                process.overshoot.advanced()
+                process.beat, process.at_ns = beat, now_ns
             elif (
-                direct and order < (last[0], last[1] - LATENESS_NS) and voice.retreat.behind(*order)
+                direct
+                and order < (last[0], last[1] - LATENESS_NS)
+                and process.overshoot.behind(*order)
             ):
                 # A connection keeps the order: what was believed was false.
-                voice.beat, voice.at_ns = beat, now_ns
+                process.beat, process.at_ns = beat, now_ns
             elif not news:
                 return False
         if direct:
-            voice.direct_ns, voice.direct_beat_ns = now_ns, beat.sent_ns
+            process.direct_ns, process.direct_beat_ns = now_ns, beat.sent_ns
         return True
 
     def last(self, who: str) -> Beat | None:
         """Return the last beat of a process, however old."""
-        voice = self._voices.get(who)
-        return voice.beat if voice is not None else None
+        process = self._processes.get(who)
+        return process.beat if process is not None else None
 
     def age_ns(self, who: str, now_ns: int) -> int | None:
         """Time since a process was last heard; None if never."""
-        voice = self._voices.get(who)
-        return now_ns - voice.at_ns if voice is not None else None
+        process = self._processes.get(who)
+        return now_ns - process.at_ns if process is not None else None
 
     def fresh(self, who: str, now_ns: int, patience_ns: int | None = None) -> bool:
         """Whether a process was heard within the patience."""
@@ -84,16 +86,16 @@ class FailureDetector:
     def heard(self) -> tuple[Heard, ...]:
         """Return what the next beat says: the last direct beat of everybody."""
         return tuple(
-            Heard(who, voice.beat.node, voice.direct_beat_ns, voice.direct_ns)
-            for who, voice in self._voices.items()
-            if voice.direct_ns is not None
+            Heard(who, process.beat.node, process.direct_beat_ns, process.direct_ns)
+            for who, process in self._processes.items()
+            if process.direct_ns is not None
         )
 
     def forget(self, now_ns: int, after_ns: int) -> None:
         """Forget who has been silent for longer than `after_ns`."""
-        for who in [who for who, v in self._voices.items() if now_ns - v.at_ns > after_ns]:
-            del self._voices[who]
+        for who in [who for who, v in self._processes.items() if now_ns - v.at_ns > after_ns]:
+            del self._processes[who]
 
     def everybody(self, now_ns: int) -> list[tuple[str, Beat, int]]:
         """Return who was heard: name, last beat, and its age."""
-        return [(who, v.beat, now_ns - v.at_ns) for who, v in self._voices.items()]
+        return [(who, v.beat, now_ns - v.at_ns) for who, v in self._processes.items()]

@@ -22,7 +22,7 @@ __all__ = ["Intervals"]
 SPAN_NS = 60_000_000_000
 #: Cycles that are waited for at a time, and intervals that wait to be told.
 MOST_WAITING = 256
-MOST_TOLD = 16
+MOST_REPORTED = 16
 
 
 @dataclass(slots=True)
@@ -66,7 +66,7 @@ class Intervals:
         self._who, self._sinks = who, frozenset(sinks)
         self._best: dict[str, _Best] = {}
         self._waiting: dict[int, _Waiting] = {}
-        self._news: list[tuple[int, int]] = []
+        self._unreported: list[tuple[int, int]] = []
 
     def hear(self, beat: Beat, now_ns: int) -> None:
         """Learn from a beat that came directly how far its node is."""
@@ -106,10 +106,10 @@ class Intervals:
         else:
             waiting.end_ns = max(waiting.end_ns, now_ns - back_ns)
         if waiting.known and waiting.said == self._sinks:
-            self._news.append((cycle, max(waiting.end_ns - done.stamp.released_ns, 0)))
-            del self._news[:-MOST_TOLD]
+            self._unreported.append((cycle, max(waiting.end_ns - done.stamp.released_ns, 0)))
+            del self._unreported[:-MOST_REPORTED]
 
-    def news(self) -> tuple[tuple[int, int], ...]:
+    def take_unreported(self) -> tuple[tuple[int, int], ...]:
         """Return cycles and their intervals, ns, that have not been returned before."""
-        news, self._news = tuple(self._news), []
-        return news
+        reported, self._unreported = tuple(self._unreported), []
+        return reported

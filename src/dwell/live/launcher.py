@@ -59,7 +59,7 @@ class Launcher:
     Parameters
     ----------
     environment : mapping of str to str, optional
-        Of the processes; this one's own if left out.
+        Environment of the processes; this one's own if left out.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:

@@ -13,7 +13,7 @@ __all__ = ["lint"]
 def lint(problem: Problem) -> Iterator[Fault]:
     """Yield what a live cell does not do as its file says, or not as well as it could.
 
-    Of one that is for the simulator alone, with neither hosts nor stages, nothing.
+    A cell for the simulator alone, with neither hosts nor stages, gets no warning.
 
     Parameters
     ----------

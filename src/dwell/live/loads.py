@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.live.continuity import Retreat
+from dwell.live.continuity import OvershootDetector
 from dwell.live.messages import Load
 
 __all__ = ["NodeLoad", "ProcessLoads"]
@@ -35,16 +35,16 @@ class NodeLoad:
         self._total: deque[Floats] = deque(maxlen=KEPT)
         self._life = -1
         self._read = np.zeros(3)
-        self._retreat = Retreat()
+        self._overshoot = OvershootDetector()
 
     def report(self, load: Load) -> None:
         """Take a report in; copies and late ones change nothing."""
         last_ns = self._at_ns[-1] if self._at_ns else -1
         if (load.life, load.at_ns) <= (self._life, last_ns):
-            if not self._retreat.behind(load.life, load.at_ns):
+            if not self._overshoot.behind(load.life, load.at_ns):
                 return
             self._life = -1
-        self._retreat.advanced()
+        self._overshoot.advanced()
         read = np.array((load.busy_ns, load.own_ns, load.shadow_ns), np.float64)
         total = self._total[-1] if self._total else np.zeros(4)
         if load.life == self._life:

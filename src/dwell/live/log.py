@@ -18,7 +18,7 @@ def printable(text: str, keep: str = "") -> str:
     Parameters
     ----------
     text : str
-        Of a user's code, or from the network.
+        Text of a user's code, or from the network.
     keep : str
         Characters that stay.
     """

@@ -186,7 +186,7 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
         place.
     hops : tuple of Hop
     node : str
-        Of the sink; where a shadow stopped.
+        Node of the sink, or where a shadow stopped.
     group_ns : int
         CPU time that the control group of the sink's node had taken by `done_ns`; -1 where that is
         not known.
@@ -241,7 +241,7 @@ class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
     note : str
         What keeps it from being ready, or the last thing that went wrong.
     version : str
-        Of Dwell.
+        Version of Dwell.
     """
 
     who: Name
@@ -345,7 +345,7 @@ class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
     ----------
     node : str
     life : int
-        Of the agent that counts; another one counts from another beginning.
+        Life of the agent that counts; another life counts from another beginning.
     at_ns : int
         On the node's clock.
     busy_ns, own_ns, shadow_ns : int

@@ -165,7 +165,7 @@ def run_controller(
     policy : str, optional
         Instead of the cells' own.
     name : str, optional
-        Of this controller, among others that would like to be in charge.
+        Name of this controller, by which others that would take charge tell it apart.
     jobs : bool
         Whether the runs keep their jobs, and what each process took of the CPUs.
     environment : mapping of str to str, optional

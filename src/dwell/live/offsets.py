@@ -24,7 +24,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
-from dwell.live.continuity import Retreat
+from dwell.live.continuity import OvershootDetector
 from dwell.live.messages import Beat
 
 __all__ = ["UNBOUNDED_NS", "Instant", "Offsets"]
@@ -68,13 +68,13 @@ class _Pair:
     """What clock b is ahead of clock a, as an interval that moves with a's time."""
 
     __slots__ = (
-        *("_retreat", "anchors", "breaks", "fastest"),
+        *("_overshoot", "anchors", "breaks", "fastest"),
         *("high_ns", "low_ns", "slowest", "t_ns"),
     )
 
     def __init__(self) -> None:
         self.breaks = -1
-        self._retreat = Retreat()
+        self._overshoot = OvershootDetector()
         self._begin(0)
 
     def _begin(self, t_ns: int) -> None:
@@ -111,11 +111,11 @@ class _Pair:
         if not self.known:
             self.t_ns = t_ns
         if t_ns < self.t_ns - MEMORY_NS:
-            if self._retreat.behind(t_ns):
+            if self._overshoot.behind(t_ns):
                 # No message is that late: the instant that was believed was false.
                 self._begin(t_ns)
         else:
-            self._retreat.advanced()
+            self._overshoot.advanced()
         if t_ns >= self.t_ns:
             self._advance(t_ns)
             return value_ns

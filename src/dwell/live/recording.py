@@ -50,7 +50,7 @@ class RunRecorder:
     Attributes
     ----------
     folder : Path or None
-        Of the run that is kept; None where it could not be made yet.
+        Folder of the run that is kept; None until it could be made.
     trouble : str
         What keeps it from being written; empty for nothing.
     waiting, dropped : int

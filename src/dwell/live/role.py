@@ -352,7 +352,7 @@ class Pulse:
         direct = keys.beat("", "").removesuffix("/")
         self._prefix = direct, keys.detour(direct)
         # Beats as they came directly: their copies say nothing new, and need not be read.
-        self._came: dict[str, bytes] = {}
+        self._detoured: dict[str, bytes] = {}
 
     def subscriptions(self) -> tuple[str, ...]:
         """Key expressions of beats."""
@@ -373,7 +373,7 @@ class Pulse:
             self.place.complain(LiveError(told))
             return None
         if differs := self._differs(beat):
-            self._estranged(beat.who, differs, now_ns)
+            self._note_stranger(beat.who, differs, now_ns)
             return None
         self.strangers.pop(beat.who, None)
         direct = sample.key.startswith(self._prefix[0])
@@ -387,10 +387,10 @@ class Pulse:
         if sample.key == self._returned:
             return True
         if sample.key.startswith(detour):
-            return self._came.get(sample.key[len(detour) :]) == sample.payload
+            return self._detoured.get(sample.key[len(detour) :]) == sample.payload
         name = sample.key[len(direct) :]
-        if name in self._came or len(self._came) < MAX_STRANGERS:
-            self._came[name] = sample.payload
+        if name in self._detoured or len(self._detoured) < MAX_STRANGERS:
+            self._detoured[name] = sample.payload
         return False
 
     def _differs(self, beat: Beat) -> str:
@@ -412,7 +412,7 @@ class Pulse:
             return f"{beat.who} on {beat.node} is no process of cell {place.problem.name!r}"
         return ""
 
-    def _estranged(self, who: str, differs: str, now_ns: int) -> None:
+    def _note_stranger(self, who: str, differs: str, now_ns: int) -> None:
         """Remember who is not heard, and say it once."""
         known = self.strangers.get(who)
         if known is None and len(self.strangers) >= MAX_STRANGERS:

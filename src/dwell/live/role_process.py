@@ -132,7 +132,7 @@ def _work(
     if group is not None:
         worker.group_clock = group.counts
     inflight = InFlight(folder / f"{role.who}.inflight")
-    _again(worker, folder / f"{role.who}.again")
+    _retry_suspect(worker, folder / f"{role.who}.again")
 
     def note(job: Job | None) -> None:
         if job is None:
@@ -177,7 +177,7 @@ def _written(job: Job) -> bytes:
     )
 
 
-def _again(worker: Worker, path: Path) -> None:
+def _retry_suspect(worker: Worker, path: Path) -> None:
     """Try first what the process before died of, to see whether it was the message."""
     try:
         shadow, inputs = msgspec.msgpack.decode(

@@ -63,7 +63,7 @@ class Routes:
         task : str
             Who sends; `STAMPER` for the stamp itself.
         stamp : Stamp
-            Of the cycle; its placements are candidates. One of term 0 is a source's own guess.
+            The cycle's stamp; its placements are candidates. Term 0 is a source's own guess.
         shadow : bool
             Whether it is the shadow's output and not the cycle's.
 

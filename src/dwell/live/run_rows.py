@@ -103,7 +103,7 @@ def window_values(
         In the order of the columns of its `used`.
     warmup : bool
     l95_ms : float
-        Of final latencies.
+        L95 of final latencies.
     missed : int
         Cycles.
     seen : sequence of 3 float or None

@@ -270,7 +270,7 @@ class Stamper:
         if order.term != self.term:
             return f"stale term: {order.term}, now {self.term}"
         if not order.placement:
-            return self._misfork(order)
+            return self._fork_refusal(order)
         if order.placement not in self.place.problem.candidates:
             return f"infeasible: {order.placement!r} is no candidate ({', '.join(self._names)})"
         if order.placement == self.placement:
@@ -286,7 +286,7 @@ class Stamper:
             return f"not proven: {done} of {needed} cycles through {order.placement}"
         return ""
 
-    def _misfork(self, order: Order) -> str:
+    def _fork_refusal(self, order: Order) -> str:
         tasks = self.place.problem.pipeline.tasks
         for task, node in order.forks:
             if task not in tasks or node not in tasks[task].on:
@@ -391,7 +391,7 @@ class Stamper:
         self._send(stamp, here=True, elsewhere=early is None)
         # A beat wakes every process, and would take the source's turn.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)
-        told = Stamped(*stamp.fields, self.intervals.news(), group_ns)
+        told = Stamped(*stamp.fields, self.intervals.take_unreported(), group_ns)
         self.place.transport.put(self.place.keys.stamped(), encode(told))
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)

@@ -84,8 +84,8 @@ class BookFile:
 
     def _good(self) -> Iterator[tuple[int, StamperState]]:
         """Yield the good slots: how often it had been written then, and what was."""
-        for turn in (0, 1):
-            begin = turn * _BOOK_BYTES
+        for slot in (0, 1):
+            begin = slot * _BOOK_BYTES
             number, length, check = _PAGE.unpack_from(self._map, begin)
             text = self._map[begin + _PAGE.size : begin + _PAGE.size + length]
             if not number or zlib.crc32(text, number & 0xFFFFFFFF) != check:
@@ -125,22 +125,22 @@ class HighestFile:
 
     def __init__(self, path: Path) -> None:
         self._map = _mapped(path, 2 * _SLOT.size)
-        self._turn = 0
+        self._slot = 0
 
     def load(self) -> tuple[int, int]:
         """Return the highest run and cycle of the good slots; (-1, -1) where none is."""
         found = (-1, -1)
-        for turn in (0, 1):
-            run, cycle, check = _SLOT.unpack_from(self._map, turn * _SLOT.size)
+        for slot in (0, 1):
+            run, cycle, check = _SLOT.unpack_from(self._map, slot * _SLOT.size)
             if check and check == _checksum(run, cycle) and (run, cycle) > found:
-                found, self._turn = (run, cycle), 1 - turn
+                found, self._slot = (run, cycle), 1 - slot
         return found
 
     def store(self, run: int, cycle: int) -> None:
         """Write the slot that holds the lower one."""
-        offset = self._turn * _SLOT.size
+        offset = self._slot * _SLOT.size
         _SLOT.pack_into(self._map, offset, run, cycle, _checksum(run, cycle))
-        self._turn = 1 - self._turn
+        self._slot = 1 - self._slot
 
 
 def _checksum(run: int, cycle: int) -> int:

@@ -173,7 +173,7 @@ class Supervisor:
         again = f"; start {child.starts + 1} in {wait_s:.1f} s" if child.failures > 1 else ""
         self._say(f"{child.note}{again}")
         try:
-            self._blame(child, reason)
+            self._hand_on_suspect(child, reason)
         except OSError as error:
             self._say(f"{child.who}: what it died of cannot be kept ({error.strerror})")
 
@@ -191,7 +191,7 @@ class Supervisor:
             return f"{reason} for want of memory{had}"
         return ""
 
-    def _blame(self, child: SupervisedProcess, reason: str) -> None:
+    def _hand_on_suspect(self, child: SupervisedProcess, reason: str) -> None:
         """Give the message that a worker died of to the next one, but not twice."""
         content = InFlight.read(child.inflight)
         again = child.folder / f"{child.who}.again"

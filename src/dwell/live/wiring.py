@@ -68,9 +68,9 @@ class Role:
     node : str
     kind : str
     task : str
-        Of a worker or sink; empty for the others.
+        Task of a worker or sink; empty for the other kinds.
     index : int
-        Of a standby, from 1; 0 for everybody else.
+        Number of a standby, from 1; 0 for the other kinds.
     """
 
     who: str
@@ -330,7 +330,7 @@ def longest_bytes(declared_bytes: int) -> int:
     Parameters
     ----------
     declared_bytes : int
-        Of a flow, or of a task's state; 0 for a command, of which nothing is declared.
+        Declared size of a flow, or of a task's state; 0 for a command, which declares none.
     """
     return max(SPARE * declared_bytes, MAX_CONTROL_BYTES)
 

@@ -46,7 +46,7 @@ class Job:
     Parameters
     ----------
     header : Header
-        Of any of the inputs; its stamp is the cycle's.
+        Header of any of the inputs; its stamp is the cycle's.
     inputs : dict of str to (Header, bytes, int)
         By source task: header, payload, and when it was handed over.
     shadow : bool

@@ -51,7 +51,7 @@ def to_document(problem: Problem) -> Document:
     Returns
     -------
     dict
-        Of dicts, lists, strings, finite numbers and truth values: ready for JSON or YAML.
+        Dicts, lists, strings, finite numbers and truth values: ready for JSON or YAML.
 
     Raises
     ------

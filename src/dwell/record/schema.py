@@ -89,7 +89,7 @@ class Column:
     sentence : str
         What it says.
     unit : str
-        Of a number; empty where it is a count, a share or a bare number.
+        Unit of a number; empty for a count, a share and a bare number.
     null : str
         When it is null; empty where it never is. NaN is null there, too.
     of : tuple of {"live", "shadows", "support"}

@@ -63,9 +63,9 @@ def simulate(
         ``cusum+corrected``), a candidate's name for the placement that never moves, or None for
         what the cell file says. The caller's object is not changed.
     estimator : Estimator, str, or None
-        Likewise.
+        An object with ``estimate``, an estimator's name, or None for what the cell file says.
     seed : int
-        Of everything random; policies under one seed meet the same realisation.
+        Seed of all random streams; policies under one seed meet the same realisation.
     windows : int
         Number of windows, at least 1.
     jobs : bool

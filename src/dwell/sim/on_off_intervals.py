@@ -85,7 +85,7 @@ def drawn_intervals(
     unit_ns : float
         What their values count.
     rngs : pair of Generator
-        Of the times off, and of those on.
+        Random streams of the times off, and of the times on.
     begin_ns, horizon_ns : int
         Where the first time off begins, and from where on no interval begins any more.
     """

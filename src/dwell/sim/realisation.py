@@ -186,7 +186,7 @@ class Realisation:
     link_segments : sequence of LinkSegment
         Per link ascending in time; kept as `LinkSegments`.
     phases : mapping of str to Phase
-        Of nodes whose quota is noticed at ticks; all 0 where one is left out.
+        Phases of the nodes whose kernel checks quotas at ticks; a node left out has phase 0.
     """
 
     scenario: str

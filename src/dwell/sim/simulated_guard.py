@@ -244,7 +244,7 @@ def _joined(intervals: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:
 
 
 @dataclass(slots=True)
-class _Wish:
+class _ProbeRequest:
     """Cycles from `first` on are also sent through a candidate; through none where it is None."""
 
     first: int
@@ -265,26 +265,31 @@ class _Probes:
             if not problem.pipeline.outputs(name)
         ]
         self.tasks, self.candidates = len(names), len(problem.candidates)
-        self._wishes: list[_Wish] = []
+        self._requests: list[_ProbeRequest] = []
         self._open: list[int] = []
         self._next = 0
 
     def begin(self, code: int | None, first: int) -> None:
         """Send cycles from `first` on through another candidate, or no longer."""
-        self._wishes = [*(wish for wish in self._wishes if wish.first < first), _Wish(first, code)]
+        self._requests = [
+            *(request for request in self._requests if request.first < first),
+            _ProbeRequest(first, code),
+        ]
         self._open, self._next = [], first
 
     def end(self, first: int) -> None:
         """Send none from `first` on."""
-        if self._wishes:
+        if self._requests:
             self.begin(None, first)
 
     def stamp(self, tables: k.Tables, start: int, stop: int) -> None:
         """Stamp the probes among some cycles; the others keep what they have."""
-        for i, wish in enumerate(self._wishes):
-            until = self._wishes[i + 1].first if i + 1 < len(self._wishes) else self.cycles
-            if wish.code is not None:
-                tables.stamps[1, max(start, wish.first) : min(stop, until, self.cycles)] = wish.code
+        for i, request in enumerate(self._requests):
+            until = self._requests[i + 1].first if i + 1 < len(self._requests) else self.cycles
+            if request.code is not None:
+                tables.stamps[1, max(start, request.first) : min(stop, until, self.cycles)] = (
+                    request.code
+                )
 
     def news(self, tables: k.Tables, now: int) -> list[tuple[int, bool, int]]:
         """Return what has happened to probes: when, whether they completed, and which cycle.

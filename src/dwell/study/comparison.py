@@ -61,7 +61,7 @@ class Comparison:
     examples : mapping of (scenario, policy) to Example
         The runs of the first seed; empty where they were not kept.
     versions : mapping of str to str
-        Of the software that made the runs.
+        Versions of the software that made the runs, by package.
     """
 
     problem: Problem
@@ -176,7 +176,7 @@ def compare(
     seeds : sequence of int
         All different; the result is the same for the same seeds, whatever `processes` is.
     windows : int
-        Of every run; more than the problem's warm-up.
+        Length of every run; more than the problem's warm-up.
     processes : int, optional
         Over which the runs are spread; one a CPU where None (see `dwell.study.workers`).
     progress : callable, optional

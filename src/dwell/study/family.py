@@ -191,7 +191,7 @@ def cannot_tell(seeds: int, comparisons: int = 1) -> str:
     seeds : int
         Pairs of every comparison.
     comparisons : int
-        Of the family: the smallest of m p values is multiplied by m.
+        Size of the family: the smallest of m p values is multiplied by m.
     """
     if comparisons * least_p(seeds) <= 1 - CONFIDENCE:
         return ""

@@ -80,7 +80,7 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
     values : sequence of float
         One a seed, finite, at least one.
     seed : int
-        Of the resamples.
+        Seed of the resamples.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def share_difference_interval(
     first, second : sequence of float
         One a seed, in the same order, in [0, 1], at least one.
     seed : int
-        Of the resamples.
+        Seed of the resamples.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def studentised_limits(
     tail : float
         Probability with which each limit may be wrong: 0.025 or 0.05.
     seed : int
-        Of the resamples.
+        Seed of the resamples.
 
     Returns
     -------

@@ -29,7 +29,7 @@ def judged_cost(run: Run, problem: Problem) -> float:
     Parameters
     ----------
     run : Run
-        Of this problem, or of one with another controller and objective.
+        A run of this problem, or of one with another controller and objective.
     problem : Problem
 
     Returns

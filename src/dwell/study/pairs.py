@@ -118,7 +118,7 @@ def paired_difference(
     shares : bool
         Whether they are shares, in [0, 1].
     seed : int
-        Of resamples and of drawn flips: the same samples always give the same numbers.
+        Seed of resamples and of drawn flips: the same samples always give the same numbers.
 
     Returns
     -------

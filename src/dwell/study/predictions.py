@@ -327,7 +327,7 @@ def paper_predictions(comparison: Comparison, policies: Sequence[str] = (DTP,)) 
     Parameters
     ----------
     comparison : Comparison
-        Of the candidates LOC, SO and HYB, in some of the paper's scenarios.
+        Compares the candidates LOC, SO and HYB, in some of the paper's scenarios.
     policies : sequence of str
         Those that the predictions about DTP are held against.
 

@@ -117,7 +117,7 @@ def play_alone(problem: Problem, realisation: Realisation) -> dict[str, Run]:
     ----------
     problem : Problem
     realisation : Realisation
-        Of this problem.
+        Drawn for this problem.
     """
     from dwell.sim import simulate_realisation
 
@@ -140,7 +140,7 @@ def references(
     ----------
     problem : Problem
     realisation : Realisation
-        Of this problem.
+        Drawn for this problem.
     min_dwell : int, optional
         N_min of the sequence with a dwell; the problem's where None.
 
@@ -218,7 +218,7 @@ def kept(run: Run, references: References, problem: Problem, limit: float = 0.05
     Parameters
     ----------
     run : Run
-        Of the same realisation.
+        A run of the same realisation.
     references : References
     problem : Problem
     limit : float

@@ -45,7 +45,7 @@ def resample_windows(lengths: Sequence[int], *, seed: int = RESAMPLING_SEED) -> 
     lengths : sequence of int
         Windows of every run, each at least 1.
     seed : int
-        Of the resamples.
+        Seed of the resamples.
 
     Returns
     -------

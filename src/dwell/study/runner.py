@@ -77,7 +77,7 @@ class StudyResult:
         Distribution of final latencies over all seeds: ``share`` of the cycles that finished
         within ``latency_ms``, by point, scenario and policy.
     versions : mapping of str to str
-        Of the software that made the runs.
+        Versions of the software that made the runs, by package.
     folder : Path or None
         Where the tables are.
     """

@@ -73,7 +73,7 @@ POINTS_ALLOWED = 0.02
 USE_ALLOWED = 0.05
 #: Measured time of a group below which its verdicts say little.
 LEAST_MINUTES = 5.0
-#: Of the simulations of each run.
+#: Number of simulations of each run.
 SEEDS = 20
 #: Simulations below which further processes take longer to begin than they save.
 WORTH_SPREADING = 100
@@ -149,7 +149,7 @@ class Validation:
     groups : tuple of Group
         By scenario in the cell's order, and then by policy.
     seeds : int
-        Of the simulations of each run.
+        Number of simulations of each run.
     table : DataFrame
         One row a group and figure: ``scenario``, ``policy``, ``metric``, and ``measured``,
         ``predicted`` and ``error`` with their ends (``_low``, ``_high``), ``allowed``,
@@ -161,7 +161,7 @@ class Validation:
         ``predicted_p95_ms``), the core time where the runs know it (``core_ms``,
         ``core_p95_ms``), and what the cell says it is (``cell_ms``, ``cell_p95_ms``).
     versions : mapping of str to str
-        Of the software that simulated.
+        Versions of the software that simulated, by package.
     """
 
     problem: Problem

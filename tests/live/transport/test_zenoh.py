@@ -19,8 +19,8 @@ from dwell.live.transport.zenoh import (
     ZenohTransport,
     _mark,
     _Pool,
+    _Route,
     _Sender,
-    _Way,
 )
 from tests.live.transport.meshes import PATIENCE_S, Inbox, ZenohMesh, introduce
 from tests.live.transport.peer import digest
@@ -119,12 +119,12 @@ def test_a_frozen_process_costs_the_others_nothing(mesh: ZenohMesh) -> None:
 def test_of_large_payloads_that_wait_the_newest_are_sent() -> None:
     begun, go_on, sent = threading.Event(), threading.Event(), Queue[bytes]()
 
-    def send(way: _Way, content: bytes, header: bytes) -> None:
+    def send(way: _Route, content: bytes, header: bytes) -> None:
         begun.set()
         assert go_on.wait(PATIENCE_S)
         sent.put(content + header)
 
-    sender = _Sender(_Way(print, None, 0), send)
+    sender = _Sender(_Route(print, None, 0), send)
     sender.send(b"1", b"a")
     assert begun.wait(PATIENCE_S)  # it is on its way, and hangs
     for number in (b"2", b"3", b"4", b"5"):
@@ -296,7 +296,7 @@ def test_what_was_put_under_another_key_is_not_heard() -> None:
         inbox, key = mesh.inbox(), "dwell/t/stamped"
         receiver.subscribe(key, inbox)
         introduce(mesh, sender, key, [inbox])
-        way = sender._ways[key, "control"]
+        way = sender._routes[key, "control"]
         own, way.mark = way.mark, _mark("dwell/t/order")
         sender.put(key, b"misled", b"header")
         # What carries no mark is of others, who may put what they may put.

@@ -231,8 +231,8 @@ class Network:
         self._transports: dict[str, MemoryTransport] = {}
         self._rules: list[_Rule] = []
         self._paths: dict[tuple[str, str, Lane], _Path] = {}
-        self._agenda: list[tuple[int, int, Callable[[], None]]] = []
-        self._turn = count()
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._sequence = count()
 
     # ------------------------------------------------------------------ who is there
 
@@ -247,7 +247,7 @@ class Network:
         node : str, optional
             What follows the ``@`` in its name where None, without what follows a dot there.
         clock : Clock, optional
-            Of the node; the network's where None.
+            The node's clock; the network's where None.
 
         Raises
         ------
@@ -274,7 +274,7 @@ class Network:
 
     def call_at(self, at_ns: int, call: Callable[[], None]) -> None:
         """Have something done at an instant, or at once if that has passed."""
-        heapq.heappush(self._agenda, (max(at_ns, self.now_ns), next(self._turn), call))
+        heapq.heappush(self._events, (max(at_ns, self.now_ns), next(self._sequence), call))
 
     # ------------------------------------------------------------- what goes wrong
 
@@ -354,15 +354,15 @@ class Network:
 
     def advance(self, until_ns: int) -> None:
         """Let everything happen that is due by an instant, which then is the present one."""
-        while self._agenda and self._agenda[0][0] <= until_ns:
+        while self._events and self._events[0][0] <= until_ns:
             self.step()
         self.now_ns = max(self.now_ns, until_ns)
 
     def step(self) -> bool:
         """Let the next thing happen; return whether there was one."""
-        if not self._agenda:
+        if not self._events:
             return False
-        at_ns, _, call = heapq.heappop(self._agenda)
+        at_ns, _, call = heapq.heappop(self._events)
         self.now_ns = max(self.now_ns, at_ns)
         call()
         return True
@@ -370,7 +370,7 @@ class Network:
     @property
     def next_ns(self) -> float:
         """Instant of the next thing to happen; infinite if nothing will."""
-        return self._agenda[0][0] if self._agenda else inf
+        return self._events[0][0] if self._events else inf
 
     # ----------------------------------------------------------- for the transports
 

@@ -174,7 +174,7 @@ class ZenohTransport:
         self.failed = 0
         self._failures: set[str] = set()
         # Read and filled without a lock: a publisher too many does no harm.
-        self._ways: dict[tuple[str, Lane], _Way] = {}
+        self._routes: dict[tuple[str, Lane], _Route] = {}
         self._locks: dict[Lane, threading.RLock] = {
             "control": threading.RLock(),
             "images": threading.RLock(),
@@ -196,17 +196,17 @@ class ZenohTransport:
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
     ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
-        way = self._ways.get((key, lane)) or self._way(key, lane)
-        if way is None or self._closed or (way.lost is not None and way.lost()):
+        route = self._routes.get((key, lane)) or self._route(key, lane)
+        if route is None or self._closed or (route.lost is not None and route.lost()):
             return
         # Zenoh takes no views: whoever has one pays for a copy more.
         data = payload if isinstance(payload, bytes) else bytes(payload)
-        if way.sender is None:
-            content = way.content(data)
+        if route.sender is None:
+            content = route.content(data)
             if content is not data or len(data) <= self.settings.patient_bytes:
-                self._send(way, content, header)
+                self._send(route, content, header)
                 return
-        self._sender(way).send(data, header)
+        self._sender(route).send(data, header)
 
     def subscribe(self, key: str, receive: Receive) -> None:
         """Have `receive` called with every message under a key expression (``*``, ``**``)."""
@@ -219,7 +219,7 @@ class ZenohTransport:
             # is behind makes its senders drop instead of growing a queue here.
             session.declare_subscriber(
                 key,
-                self._zenoh.handlers.Callback(self._told(deliver), indirect=False),
+                self._zenoh.handlers.Callback(self._logging_failures(deliver), indirect=False),
                 allowed_origin=self._zenoh.Locality.REMOTE,
             )
 
@@ -230,9 +230,9 @@ class ZenohTransport:
             self._closed = True
             self._connections.stop()
             sessions, self._sessions = self._sessions, {}
-            ways, self._ways = self._ways, {}
+            routes, self._routes = self._routes, {}
         with self._growing:
-            senders = [way.sender for way in ways.values() if way.sender is not None]
+            senders = [route.sender for route in routes.values() if route.sender is not None]
         for sender in senders:
             sender.stop()
         for session in sessions.values():
@@ -264,7 +264,7 @@ class ZenohTransport:
                 "process or another cell?"
             ) from None
 
-    def _way(self, key: str, lane: Lane) -> _Way | None:
+    def _route(self, key: str, lane: Lane) -> _Route | None:
         """Declare a publisher in the session that a key and a lane belong to."""
         require_key(key)
         name = session_of(self.entry, lane, key)
@@ -290,26 +290,26 @@ class ZenohTransport:
             raise
         pool = self._pool if name == "local" else None
         lost = None if self._losses is None else self._losses.sending(key)
-        way = _Way(publisher.put, pool, self.settings.shared_bytes, lost, mark=_mark(key))
-        while len(self._ways) >= _PUBLISHERS:
-            dropped = self._ways.pop(next(iter(self._ways)), None)
+        route = _Route(publisher.put, pool, self.settings.shared_bytes, lost, mark=_mark(key))
+        while len(self._routes) >= _PUBLISHERS:
+            dropped = self._routes.pop(next(iter(self._routes)), None)
             if dropped is not None and dropped.sender is not None:
                 dropped.sender.stop()
-        self._ways[key, lane] = way
-        return way
+        self._routes[key, lane] = route
+        return route
 
-    def _sender(self, way: _Way) -> _Sender:
+    def _sender(self, route: _Route) -> _Sender:
         """Return the thread that puts for a key; from then on it puts everything for it."""
         with self._growing:
-            if way.sender is None:
-                way.sender = _Sender(way, self._send)
+            if route.sender is None:
+                route.sender = _Sender(route, self._send)
                 if self._closed:
-                    way.sender.stop()
-            return way.sender
+                    route.sender.stop()
+            return route.sender
 
-    def _send(self, way: _Way, content: Any, header: bytes) -> None:
+    def _send(self, route: _Route, content: Any, header: bytes) -> None:
         try:
-            way.put(content, attachment=way.mark + header)
+            route.put(content, attachment=route.mark + header)
         except self._zenoh.ZError:
             if not self._closed:
                 raise
@@ -323,7 +323,7 @@ class ZenohTransport:
             header = b"" if attachment is None else attachment.to_bytes()
             if header.startswith(MARK):
                 if not header.startswith(_mark(key)):
-                    self._misled(key)
+                    self._note_misrouted(key)
                     return
                 header = header[MARKED_BYTES:]
             message = Arrival(key, sample.payload.to_bytes(), header)
@@ -333,11 +333,13 @@ class ZenohTransport:
 
         return deliver
 
-    def _told(self, deliver: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+    def _logging_failures(
+        self, deliver: Callable[[zenoh.Sample], None]
+    ) -> Callable[[zenoh.Sample], None]:
         """Have the log say once of each message that nobody could handle, in Zenoh's thread."""
         who = self.entry.role.who
 
-        def tell(sample: zenoh.Sample) -> None:
+        def guarded(sample: zenoh.Sample) -> None:
             try:
                 deliver(sample)
             except Exception as error:
@@ -347,9 +349,9 @@ class ZenohTransport:
                     self._failures.add(what)
                     _LOG.exception("%s: a receiver of %s failed", who, sample.key_expr)
 
-        return tell
+        return guarded
 
-    def _misled(self, key: str) -> None:
+    def _note_misrouted(self, key: str) -> None:
         self.misled += 1
         if self.misled == 1:
             _LOG.warning("%s: heard under %s what was put elsewhere", self.entry.role.who, key)
@@ -386,7 +388,7 @@ def _keep_thread_state() -> None:
 
 
 @dataclass(slots=True)
-class _Way:
+class _Route:
     """How messages of a key and lane go out."""
 
     put: _Put
@@ -407,8 +409,8 @@ class _Way:
 class _Sender:
     """Puts the newest messages of one key in a thread of its own, which may have to wait."""
 
-    def __init__(self, way: _Way, send: Callable[[_Way, Any, bytes], None]) -> None:
-        self._way = way
+    def __init__(self, route: _Route, send: Callable[[_Route, Any, bytes], None]) -> None:
+        self._route = route
         self._send = send
         self._changed = threading.Condition()
         self._waiting: deque[tuple[bytes, bytes]] = deque(maxlen=_WAITING)
@@ -436,7 +438,7 @@ class _Sender:
                     return
                 data, header = self._waiting.popleft()
             try:
-                self._send(self._way, self._way.content(data), header)
+                self._send(self._route, self._route.content(data), header)
             except Exception:
                 _LOG.exception("a payload of %d bytes could not be sent", len(data))
 

@@ -44,7 +44,7 @@ class Subject:
         Counts its certificates from 1: the name in a certificate has it, so that one that was
         revoked is not taken for the one that followed.
     serial : int
-        Of its certificate.
+        Serial number of its certificate.
     public_key : str
         Ed25519, base64.
     expires : str

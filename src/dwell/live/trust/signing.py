@@ -56,7 +56,7 @@ class Seals:
         ----------
         word : str
         name : str
-            Of the subject.
+            Common name of the subject.
         sealed : bytes
         """
         known = word, name, sealed
