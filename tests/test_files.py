@@ -69,3 +69,18 @@ def test_a_process_that_is_killed_leaves_the_older_file(tmp_path: Path) -> None:
     # The next one is not kept from writing by what was left.
     write_whole(file, b"newer")
     assert file.read_bytes() == b"newer"
+
+
+def test_what_lies_at_the_drafts_place_is_neither_followed_nor_kept(tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_bytes(b"somebody's")
+    draft = tmp_path / f".file.{os.getpid()}.draft"
+    draft.symlink_to(elsewhere)
+    write_whole(tmp_path / "file", b"ours", private=True)
+    assert elsewhere.read_bytes() == b"somebody's"
+    assert (tmp_path / "file").read_bytes() == b"ours"
+    assert not (tmp_path / "file").is_symlink()
+    draft.touch(0o666)
+    draft.chmod(0o666)
+    write_whole(tmp_path / "file", b"ours", private=True)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o600

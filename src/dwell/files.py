@@ -37,8 +37,10 @@ def write_whole(
         If that fails.
     """
     draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
+    # What a killed process of this number left would keep its own mode.
+    draft.unlink(missing_ok=True)
     try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
         handle = os.open(draft, flags, 0o600 if private else 0o666)
         with os.fdopen(handle, "wb") as file:
             if isinstance(content, str):

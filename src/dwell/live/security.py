@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault, LiveError, TrustError, installing
+from dwell.files import write_whole
 from dwell.live.failures import start_thread
 from dwell.live.transport.transport import Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
@@ -107,7 +108,7 @@ class Security:
                 f"here before ({kept}); take the newest from the authority's folder"
             )
         if number > before:
-            kept.write_text(str(number))
+            write_whole(kept, str(number))
 
     def transport(self, who: str) -> ZenohTransport:
         """Open the sessions of a process of the cell.
