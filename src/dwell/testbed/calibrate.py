@@ -174,7 +174,7 @@ def calibrate(
         "missing": list(missing),
     }
     sidecar = out.with_name(f"{out.stem}.calibration.json")
-    sidecar.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_whole(sidecar, json.dumps(report, indent=2) + "\n")
     for line in _told(report):
         say(line)
     return Calibrated(out, samples, sidecar, written, report, missing)
