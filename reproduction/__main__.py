@@ -13,7 +13,7 @@ import dwell
 from dwell.study import Study, StudyResult, run_study
 from reproduction.cell import paper_cell
 from reproduction.page import Question, page
-from reproduction.questions import QUESTIONS
+from reproduction.questions import QUESTIONS, Run
 from reproduction.scale import FULL, QUICK, TINY, Scale
 
 SCALES = {"full": FULL, "quick": QUICK, "tiny": TINY}
@@ -58,7 +58,7 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def _ask(name: str, scale: Scale, run: object, traces: Path | None, out: Path) -> Question:
+def _ask(name: str, scale: Scale, run: Run, traces: Path | None, out: Path) -> Question:
     """Answer one question and write its tables."""
     module = import_module(f"reproduction.questions.{name}")
     answer = module.answer(traces if name == REAL else paper_cell(), scale, run)

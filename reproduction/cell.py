@@ -14,6 +14,7 @@ __all__ = [
     "EXAMPLES",
     "PAPERS_DTP",
     "RANDOM",
+    "RULES",
     "STEADY",
     "TIMETABLE",
     "believing",
@@ -45,6 +46,8 @@ DYNAMIC = (*TIMETABLE, *RANDOM)
 
 #: DTP as we read the paper's: with the estimator that it calls static profiling.
 PAPERS_DTP = "dtp+profile"
+#: The two rules whose candidates are varied, with the estimator corrected.
+RULES = ("dtp+corrected", "cusum+corrected")
 
 
 def paper_cell() -> Problem:
@@ -85,8 +88,8 @@ def statics(problem: Problem) -> tuple[Contender, ...]:
 
 
 def rules() -> tuple[Contender, ...]:
-    """Return the two rules whose candidates are varied, with the estimator corrected."""
-    return believing("dtp", "corrected"), believing("cusum", "corrected")
+    """Return the contenders of `RULES`."""
+    return tuple(believing(rule.removesuffix("+corrected"), "corrected") for rule in RULES)
 
 
 # -------------------------------------------------------------------------------- variants

@@ -10,11 +10,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
 import polars as pl
 
 from dwell.study import AIM, Family, Interval, Study, under
 
-__all__ = ["Answer", "Pairs", "between", "compare", "counted", "judge", "policies", "under_aim"]
+__all__ = [
+    "Answer",
+    "Pairs",
+    "between",
+    "compare",
+    "counted",
+    "judge",
+    "policies",
+    "under_aim",
+    "values",
+]
 
 #: Groups of runs that are compared, by (scenario, first, second): what is in their columns.
 Pairs: TypeAlias = Mapping[tuple[str, str, str], tuple[Mapping[str, object], Mapping[str, object]]]
@@ -55,6 +66,12 @@ def policies(scenarios: Iterable[str], pairs: Iterable[tuple[str, str]]) -> Pair
         for scenario in scenarios
         for first, second in wanted
     }
+
+
+def values(runs: pl.DataFrame, column: str, **labels: object) -> np.ndarray:
+    """Return a column of the runs with these labels: one number a seed, in the order of seeds."""
+    mine = runs.filter(*(pl.col(name) == label for name, label in labels.items())).sort("seed")
+    return mine[column].cast(pl.Float64).to_numpy()
 
 
 def between(

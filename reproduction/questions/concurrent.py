@@ -19,6 +19,7 @@ from dwell.policies import ATP
 from dwell.study import Contender, Point, Study, over_seeds
 from reproduction.cell import (
     PAPERS_DTP,
+    RULES,
     believing,
     on_and_off,
     rules,
@@ -33,7 +34,6 @@ from reproduction.verdicts import Answer, compare, policies
 
 TITLE = "RQ1: Does placing T2 and T3 together reduce V_D further than moving one stage (ATP)?"
 
-RULES = ("dtp+corrected", "cusum+corrected")
 TUNED, BEST_HERE = "atp-tuned", "atp best here"
 #: Candidates between which one stage alone moves: on a robot in the first, on E in the second.
 STAGES = {"T2": ("LOC", "HYB"), "T3": ("HYB", "SO")}

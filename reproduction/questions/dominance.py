@@ -24,10 +24,10 @@ from dwell.model import (
     Uniform,
 )
 from dwell.study import Point, Study, over_seeds, paired_difference
-from reproduction.cell import STEADY, rules, statics, with_candidate, with_scenarios
+from reproduction.cell import RULES, STEADY, rules, statics, with_candidate, with_scenarios
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
-from reproduction.verdicts import Answer, compare, policies
+from reproduction.verdicts import Answer, compare, policies, values
 
 TITLE = (
     "Which placement wins where, and does the one that the paper leaves out (T2 on R1, T3 on E) "
@@ -45,7 +45,6 @@ PARAMETERS = ("edge.speed", "links.jitter_ms")
 #: Seeds and windows of a point of the map, at most.
 MAP_SEEDS, MAP_WINDOWS = 5, 40
 
-RULES = ("dtp+corrected", "cusum+corrected")
 METRICS = ("violation_rate", "cost")
 #: What the paper predicts for its scenarios: the placements meant by "dominates under DTP". With
 #: jitter on all links its baseline is none, and has another name in the map.
@@ -214,12 +213,10 @@ def winners(runs: pl.DataFrame, metric: str, candidates: Sequence[str]) -> pl.Da
     keys = [*(f"parameter.{name}" for name in PARAMETERS), "scenario"]
     rows = []
     for labels, here in runs.group_by(keys, maintain_order=True):
-        values = {
-            name: here.filter(policy=name).sort("seed")[metric].to_numpy() for name in candidates
-        }
-        first, second, *_ = sorted(candidates, key=lambda name: float(values[name].mean()))
+        found = {name: values(here, metric, policy=name) for name in candidates}
+        first, second, *_ = sorted(candidates, key=lambda name: float(found[name].mean()))
         shares = metric == "violation_rate"
-        margin = paired_difference(values[second], values[first], shares=shares)
+        margin = paired_difference(found[second], found[first], shares=shares)
         rows.append(
             {
                 "metric": metric,

@@ -35,7 +35,7 @@ from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, statics
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale, thinned
 from reproduction.tuning import best, scores
-from reproduction.verdicts import Answer, compare, judge, policies
+from reproduction.verdicts import Answer, compare, judge, policies, values
 
 TITLE = (
     "In dynamic scenarios, is the cost within 10 % of the reference, V_D under 5 % wherever the "
@@ -204,16 +204,15 @@ def fractions_study(cell: Problem, scale: Scale) -> Study:
 # ----------------------------------------------------------------------------------- aims
 
 
-def values(runs: pl.DataFrame, scenario: str, policy: str, column: str) -> np.ndarray:
-    """Return one number a seed, in the order of the seeds."""
-    mine = runs.filter(scenario=scenario, policy=policy).sort("seed")
-    return mine[column].cast(pl.Float64).to_numpy()
-
-
 def reference_rates(runs: pl.DataFrame, scenario: str, candidates: Sequence[str]) -> np.ndarray:
     """V_D of the reference, one a seed: of the cheapest candidate or clairvoyant sequence."""
     costs, rates = (
-        np.stack([values(runs, scenario, name, column) for name in (*candidates, *REFERENCES)])
+        np.stack(
+            [
+                values(runs, column, scenario=scenario, policy=name)
+                for name in (*candidates, *REFERENCES)
+            ]
+        )
         for column in ("cost", "violation_rate")
     )
     found: np.ndarray = rates[costs.argmin(axis=0), np.arange(rates.shape[1])]
@@ -226,18 +225,21 @@ def aims(
     """Hold each tuned and untuned rule against the three parts of the aim."""
     found = []
     for scenario, name in product((*DYNAMIC, *STEADY), TOLD):
-        regret = mean_interval(values(runs, scenario, name, "regret"))
+        regret = mean_interval(values(runs, "regret", scenario=scenario, policy=name))
         word = within(regret, OVER_REFERENCE)
         cost = (f"Cost at most {OVER_REFERENCE:.0%} over the reference", scenario, name, "regret")
         found.append(judge(*cost, regret, word, *studies))
-        rates = values(runs, scenario, name, "violation_rate")
+        rates = values(runs, "violation_rate", scenario=scenario, policy=name)
         asked = under(reference_rates(runs, scenario, candidates), AIM) == "under"
         word = under(rates, AIM) if asked else "not asked"
         rate = ("V_D under 5 % where the reference's is", scenario, name, "violation_rate")
         found.append(judge(*rate, share_interval(rates), word, *studies))
         for other in (PAPERS_DTP, DTP):
             if other != name:
-                moves = (values(runs, scenario, who, "migrations") for who in (name, other))
+                moves = (
+                    values(runs, "migrations", scenario=scenario, policy=who)
+                    for who in (name, other)
+                )
                 more = mean_interval(np.subtract(*moves))
                 claim = (f"No more migrations than {other}", scenario, name, "migrations")
                 found.append(judge(*claim, more, within(more, 0.0), *studies))
@@ -253,8 +255,10 @@ def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
     """Part regret into what rule and lag make of it, and what the estimate adds, seed by seed."""
     rows = []
     for scenario, (name, told) in product((*DYNAMIC, *STEADY), TOLD.items()):
-        mine, rule = (values(runs, scenario, who, "regret") for who in (name, told))
-        static = np.min([values(runs, scenario, one, "regret") for one in candidates], axis=0)
+        mine, rule = (values(runs, "regret", scenario=scenario, policy=who) for who in (name, told))
+        static = np.min(
+            [values(runs, "regret", scenario=scenario, policy=one) for one in candidates], axis=0
+        )
         row: dict[str, object] = {"scenario": scenario, "policy": name}
         shown = {
             "regret": mine,

@@ -31,7 +31,7 @@ from dwell.study import Contender, Point, Study, median_interval
 from reproduction.cell import believing, rules, statics
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, Pairs, between, compare, judge
+from reproduction.verdicts import Answer, Pairs, between, compare, judge, values
 
 TITLE = "Does the jitter of the links decide where the stages should run?"
 
@@ -190,9 +190,7 @@ def turning(
     offloaded, local = (
         np.stack(
             [
-                runs.filter(pl.col(AT) == width, scenario=scenario, policy=policy)
-                .sort("seed")["cost"]
-                .to_numpy()
+                values(runs, "cost", scenario=scenario, policy=policy, **{AT: width})
                 for width in widths
             ]
         )

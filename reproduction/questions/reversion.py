@@ -16,14 +16,13 @@ import polars as pl
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Normal, Problem, Scenario
 from dwell.study import Contender, Point, Study, over_seeds
-from reproduction.cell import on_and_off, rules, statics, with_candidates, with_scenarios
+from reproduction.cell import RULES, on_and_off, rules, statics, with_candidates, with_scenarios
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
 from reproduction.verdicts import Answer, compare, policies
 
 TITLE = "RQ2: Does routing T3 to R2 during network faults outperform binary R1/E reversion?"
 
-RULES = ("dtp+corrected", "cusum+corrected")
 METRICS = ("violation_rate", "cost")
 #: What having HYB changes about them, seed by seed.
 CHANGES = ("change_of_violation_rate", "change_of_cost")

@@ -66,13 +66,9 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
     ProblemError
         With every fault found in the file, each with its line and field path.
     """
-    from dwell.cellfile.assembly import Assembly
-    from dwell.cellfile.structure import CELL, read_structure
-
     source = fspath(path)
     faults = Faults(source)
-    entry = read_structure(_read_text(source, faults), faults, CELL)
-    return Assembly(entry, None, faults).problem(Path(source).stem or "cell")
+    return _without_traces(_read_text(source, faults), faults, Path(source).stem or "cell")
 
 
 def _read_text(source: str, faults: Faults) -> object:
@@ -147,12 +143,18 @@ def from_record(document: Mapping[str, object]) -> Problem:
     ProblemError
         With every fault found.
     """
+    return _without_traces(document, Faults(), "cell", anchored=True, judged=False)
+
+
+def _without_traces(
+    document: object, faults: Faults, name: str, *, anchored: bool = False, judged: bool = True
+) -> Problem:
+    """Read a document into a Problem whose traces are named only; see `Assembly`."""
     from dwell.cellfile.assembly import Assembly
     from dwell.cellfile.structure import CELL, read_structure
 
-    faults = Faults()
     entry = read_structure(document, faults, CELL)
-    return Assembly(entry, None, faults, anchored=True, judged=False).problem("cell")
+    return Assembly(entry, None, faults, anchored=anchored, judged=judged).problem(name)
 
 
 def read_problem(

@@ -240,9 +240,10 @@ def _floats(column: FileColumn) -> Floats:
 
 def _labels(column: FileColumn) -> list[object]:
     """Return the values of a group; one that is missing is equal to another."""
-    missing = (isinstance(value, float) and math.isnan(value) for value in column.values.tolist())
-    pairs = zip(column.values.tolist(), missing, strict=True)
-    return [None if absent else value for value, absent in pairs]
+    return [
+        None if isinstance(value, float) and math.isnan(value) else value
+        for value in column.values.tolist()
+    ]
 
 
 def _label(value: object) -> str:

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from dwell.errors import ProblemError, RunError
-from dwell.model.entry_points import class_at, installed, loaded
+from dwell.model.entry_points import class_named, names_with
 from dwell.model.semantics import nearest_of
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ REGISTRY: Mapping[str, EstimatorEntry] = MappingProxyType(
 
 def names() -> tuple[str, ...]:
     """Return the names of all estimators: ours, then those of installed packages by name."""
-    return (*REGISTRY, *sorted(installed(GROUP, REGISTRY)))
+    return names_with(REGISTRY, GROUP)
 
 
 def shadowing() -> frozenset[str]:
@@ -103,12 +103,12 @@ def by_name(name: str, problem: Problem) -> Estimator:
         If there is none of that name (the message lists the known ones), or the package that
         declares it cannot be imported.
     """
-    if name in REGISTRY:
-        return cast("Estimator", class_at(REGISTRY[name].path)(problem))
-    others = installed(GROUP, REGISTRY)
-    if name in others:
-        return _made(loaded(others[name], "estimator", ProblemError), problem)
-    raise ProblemError(f"unknown estimator {name!r}; {nearest_of(name, names(), 'estimators')}")
+    path = REGISTRY[name].path if name in REGISTRY else None
+    kind = class_named(name, path, GROUP, "estimator", ProblemError)
+    if kind is None:
+        raise ProblemError(f"unknown estimator {name!r}; {nearest_of(name, names(), 'estimators')}")
+    make = getattr(kind, "from_problem", None)
+    return cast("Estimator", kind(problem) if make is None else make(problem))
 
 
 def name_in_run(meta: Mapping[str, Any]) -> str:
@@ -130,9 +130,3 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     if name not in REGISTRY:
         raise RunError(f"estimator {told!r} is not known (here: {', '.join(REGISTRY)})")
     return name
-
-
-def _made(kind: Any, problem: Problem) -> Estimator:
-    """Make an estimator by its class's ``from_problem``, else of the problem."""
-    make = getattr(kind, "from_problem", None)
-    return cast("Estimator", kind(problem) if make is None else make(problem))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+import sys
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from dwell.errors import DwellError
 
-__all__ = ["class_at", "installed", "loaded"]
+__all__ = ["class_at", "class_named", "names_with"]
 
 
 def class_at(path: str) -> Any:
@@ -24,26 +26,41 @@ def class_at(path: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def installed(group: str, ours: Container[str]) -> dict[str, EntryPoint]:
-    """Return what other packages declare in a group, by name; none takes a name of ours."""
-    return {one.name: one for one in entry_points(group=group) if one.name not in ours}
+def names_with(ours: Iterable[str], group: str) -> tuple[str, ...]:
+    """Return our names, then those that other packages declare in a group, by name."""
+    mine = tuple(ours)
+    return (*mine, *sorted(_declared(group).keys() - set(mine)))
 
 
-def loaded(entry: EntryPoint, what: str, error: type[DwellError]) -> Any:
-    """Import what an entry point names.
+def class_named(name: str, path: str | None, group: str, what: str, error: type[DwellError]) -> Any:
+    """Import the class of a name: ours, or else another package's.
 
     Parameters
     ----------
-    entry : EntryPoint
+    name : str
+    path : str, optional
+        Of ours, as `class_at` takes it; None where the name is none of ours.
+    group : str
+        Of the entry points of other packages.
     what : str
         What it is, for the message: ``policy``.
     error : type of DwellError
 
+    Returns
+    -------
+    type or None
+        None where there is none of that name.
+
     Raises
     ------
     DwellError
-        Of type `error`, if it cannot be imported; the message names the package.
+        Of type `error`, if another package's cannot be imported; the message names the package.
     """
+    if path is not None:
+        return class_at(path)
+    entry = _declared(group).get(name)
+    if entry is None:
+        return None
     try:
         return entry.load()
     except Exception as fault:
@@ -52,3 +69,13 @@ def loaded(entry: EntryPoint, what: str, error: type[DwellError]) -> Any:
             f"{what} {entry.name!r} of the package {package} ({entry.value}) cannot be imported: "
             f"{type(fault).__name__}: {fault}"
         ) from fault
+
+
+def _declared(group: str) -> Mapping[str, EntryPoint]:
+    return _found(group, tuple(sys.path))
+
+
+@lru_cache(maxsize=8)
+def _found(group: str, path: tuple[str, ...]) -> Mapping[str, EntryPoint]:
+    """Look for entry points: milliseconds, in which all that is on the path is looked through."""
+    return {one.name: one for one in entry_points(group=group)}

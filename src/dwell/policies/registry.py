@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from dwell.errors import PolicyError
-from dwell.model.entry_points import class_at, installed, loaded
+from dwell.model.entry_points import class_at, class_named, names_with
 from dwell.model.semantics import nearest_of
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ FAMILIES: Mapping[str, PolicyEntry] = MappingProxyType(
 
 def names() -> tuple[str, ...]:
     """Return the names of all policies: ours, then those of installed packages by name."""
-    return (*REGISTRY, *sorted(installed(GROUP, REGISTRY)))
+    return names_with(REGISTRY, GROUP)
 
 
 def by_name(name: str, problem: Problem) -> Policy:
@@ -141,19 +141,19 @@ def by_name(name: str, problem: Problem) -> Policy:
     """
     if name in REGISTRY and name in problem.candidates:
         raise PolicyError(f"{name!r} is a policy's name and a candidate's; rename the candidate")
-    if name in REGISTRY:
-        return _made(class_at(REGISTRY[name].path), problem)
     if name in problem.candidates:
         static = class_at("dwell.policies.static:Static")
         return cast(
             "Policy",
             static(candidates=problem.candidates, initial=name, objective=problem.objective),
         )
-    others = installed(GROUP, REGISTRY)
-    if name in others:
-        return _made(loaded(others[name], "policy", PolicyError), problem)
-    known = [*names(), *problem.candidates]
-    raise PolicyError(f"unknown policy {name!r}; {nearest_of(name, known, 'policies')}")
+    path = REGISTRY[name].path if name in REGISTRY else None
+    kind = class_named(name, path, GROUP, "policy", PolicyError)
+    if kind is None:
+        known = [*names(), *problem.candidates]
+        raise PolicyError(f"unknown policy {name!r}; {nearest_of(name, known, 'policies')}")
+    make = getattr(kind, "from_problem", None)
+    return cast("Policy", kind() if make is None else make(problem))
 
 
 def estimates(name: str) -> bool:
@@ -167,9 +167,3 @@ def name_of_class(kind: str) -> str | None:
         if entry.path.partition(":")[2] == kind:
             return name
     return None
-
-
-def _made(kind: Any, problem: Problem) -> Policy:
-    """Make a policy by its class's ``from_problem``, else without arguments."""
-    make = getattr(kind, "from_problem", None)
-    return cast("Policy", kind() if make is None else make(problem))

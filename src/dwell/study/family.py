@@ -136,14 +136,11 @@ class Family:
             (
                 *(self.question, self.metric, name),
                 *_numbers(item),
-                *(adjusted[name], self._least(item.n), verdicts[name]),
+                *(adjusted[name], _least_adjusted(item.n, len(self.comparisons)), verdicts[name]),
             )
             for name, item in self.comparisons.items()
         ]
         return pl.DataFrame(rows, schema=_schema(), orient="row").fill_nan(None)
-
-    def _least(self, pairs: int) -> float:
-        return min(1.0, len(self.comparisons) * least_p(pairs))
 
 
 def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
@@ -193,9 +190,14 @@ def cannot_tell(seeds: int, comparisons: int = 1) -> str:
     comparisons : int
         Size of the family: the smallest of m p values is multiplied by m.
     """
-    if comparisons * least_p(seeds) <= 1 - CONFIDENCE:
+    if _least_adjusted(seeds, comparisons) <= 1 - CONFIDENCE:
         return ""
     return f"cannot tell with {seeds} {'seed' if seeds == 1 else 'seeds'}"
+
+
+def _least_adjusted(pairs: int, comparisons: int) -> float:
+    """Return the smallest p value of any of so many comparisons, adjusted."""
+    return min(1.0, comparisons * least_p(pairs))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -105,7 +105,7 @@ def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
 
     Returns
     -------
-    Actuations
+    EffectiveCommands
         Of several at one instant, the newest alone.
     """
     start_ns = int(release_ns[0])
@@ -217,7 +217,7 @@ def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int)
 
     Returns
     -------
-    Tracking
+    TrackingError
         See `dwell.kernels.servo_loop` for what is computed and how exactly.
     """
     from dwell.kernels import servo_loop as kernel
