@@ -20,7 +20,6 @@ import yaml
 import dwell
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
-from dwell.live.parent_death import OWNER
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 
@@ -104,15 +103,15 @@ class RealCell:
         self.environment: dict[str, str] = dict(os.environ)
 
     def start(self, name: str, *arguments: str | Path) -> subprocess.Popen[bytes]:
-        """Start a command; what it prints goes to a file."""
+        """Start an agent or a controller; what it prints goes to a file."""
         with (self.folder / f"{name}.log").open("ab") as log:
             made = subprocess.Popen(
-                [self.python, "-m", "dwell", *map(str, arguments)],
+                [self.python, "-m", "dwell", *map(str, arguments), "--owner", str(os.getpid())],
                 cwd=self.folder,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env={**os.environ, OWNER: str(os.getpid()), **self._sources()},
+                env={**os.environ, **self._sources()},
             )
         self.processes[name] = made
         return made

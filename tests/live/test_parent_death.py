@@ -11,7 +11,7 @@ import threading
 
 import pytest
 
-from dwell.live.parent_death import OWNER, end_with_owner
+from dwell.live.parent_death import end_with_owner
 from dwell.live.transport.orphans import SHARED_MEMORY
 
 PATIENCE_S = 60.0
@@ -23,13 +23,12 @@ code = '''
 import sys, threading
 from dwell.live.parent_death import end_with_owner
 stopped = threading.Event()
-end_with_owner(stopped)
+end_with_owner(stopped, int(sys.argv[1]))
 print("waits", flush=True)
 stopped.wait()
 print("ends", flush=True)
 '''
-environment = {**os.environ, "DWELL_OWNER": str(os.getpid())}
-child = subprocess.Popen([sys.executable, "-c", code], env=environment, process_group=0)
+child = subprocess.Popen([sys.executable, "-c", code, str(os.getpid())], process_group=0)
 time.sleep(3600)
 """
 
@@ -46,12 +45,11 @@ def test_a_process_ends_when_its_owner_is_killed() -> None:
         assert told.read() == ""
 
 
-def test_an_owner_that_has_gone_already_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_owner_that_has_gone_already_is_noticed() -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    monkeypatch.setenv(OWNER, str(gone.pid))
     stopped = threading.Event()
-    end_with_owner(stopped)
+    end_with_owner(stopped, gone.pid)
     assert stopped.is_set()
 
 
@@ -64,14 +62,14 @@ import fcntl, os, sys, threading, time
 from dwell.live.parent_death import end_with_owner
 fcntl.flock(os.open(sys.argv[1], os.O_RDWR), fcntl.LOCK_SH)
 stopped = threading.Event()
-end_with_owner(stopped)
+end_with_owner(stopped, int(sys.argv[3]))
 print("waits", flush=True)
 stopped.wait()
 time.sleep(0.5)
 print(os.path.exists(sys.argv[1]), flush=True)
 '''
-environment = {**os.environ, "DWELL_OWNER": str(os.getpid())}
-child = subprocess.Popen([sys.executable, "-c", code, sys.argv[1]], env=environment)
+words = [sys.argv[1], "--owner", str(os.getpid())]
+child = subprocess.Popen([sys.executable, "-c", code, *words])
 sweeper = start_sweeper()
 print(sweeper.pid, flush=True)
 time.sleep(3600)
@@ -102,15 +100,8 @@ def test_shared_memory_goes_when_the_last_of_an_owner_has_ended() -> None:
         segment.unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("text", [None, "", "nobody", "this process"])
-def test_without_an_owner_that_ends_nothing_happens(
-    text: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if text is None:
-        monkeypatch.delenv(OWNER, raising=False)
-    else:
-        own = text == "this process"
-        monkeypatch.setenv(OWNER, str(os.getpid()) if own else text)
+@pytest.mark.parametrize("owner", [None, os.getpid()], ids=["no owner", "this process"])
+def test_without_an_owner_that_ends_nothing_happens(owner: int | None) -> None:
     stopped = threading.Event()
-    end_with_owner(stopped)
+    end_with_owner(stopped, owner)
     assert not stopped.is_set()

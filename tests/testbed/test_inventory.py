@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -17,11 +16,10 @@ import pytest
 import yaml
 
 from dwell.errors import LiveError, ProblemError
-from dwell.live.parent_death import OWNER
 from dwell.model import LinkDisturbance, NodeDisturbance, Normal
 from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inventory
 from dwell.testbed.real_hosts import RealHosts, require_commands
-from dwell.testbed.remote import local_words, script_of
+from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.timeline import Change, changes_of
 from tests.study.cell import make_problem
 
@@ -126,15 +124,15 @@ def test_a_command_ends_when_it_is_told_to(tmp_path: Path) -> None:
 
 
 def test_a_command_has_its_variables_and_its_code(tmp_path: Path) -> None:
-    code = f"import os, sys; print(os.environ['DWELL_X'], os.environ['{OWNER}'], os.getcwd())"
+    code = "import os, sys; print(os.environ['DWELL_X'], sys.argv[1], os.getppid(), os.getcwd())"
     script = script_of(
-        [sys.executable, "-c", f"{code}; sys.exit(3)"], str(tmp_path), {"DWELL_X": "it's"}
+        [sys.executable, "-c", f"{code}; sys.exit(3)", SHELL_ID], str(tmp_path), {"DWELL_X": "it's"}
     )
     done = subprocess.run(local_words(SHELL, script), capture_output=True, text=True, check=False)
     assert done.returncode == 3
-    value, owner, folder = done.stdout.split()
+    value, owner, shell, folder = done.stdout.split()
     assert value == "it's"
-    assert int(owner) != os.getpid()
+    assert owner == shell
     assert Path(folder) == tmp_path
 
 

@@ -2,32 +2,50 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
+import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
 import dwell
 from dwell.cellfile import from_document
 from dwell.errors import LiveError, TrustError
-from dwell.live.parent_death import OWNER
 from dwell.live.security import INSECURE, Security
 from dwell.live.trust import KEYS
 from dwell.live.wiring import Role
 from dwell.model import Problem
 from dwell.testbed.processes import Processes, expected, without_keys
-from tests.testbed.light_cell import document
+from tests.testbed.light_cell import document, write_cell
 
-# Notes its words and its owner, and stays; it takes SIGTERM as it comes.
+# Notes its words and a variable, and stays; it takes SIGTERM as it comes.
 STAYS = (
     "import json, os, sys, time; "
-    "print(json.dumps([sys.argv[1:], os.environ['{owner}'], os.environ['MINE']]), flush=True); "
+    "print(json.dumps([sys.argv[1:], os.environ['MINE']]), flush=True); "
     "time.sleep(60)"
-).replace("{owner}", OWNER)
+)
+
+# Starts a node's agent, tells its process id, and waits to be killed.
+OWNER = """
+import sys, time
+from pathlib import Path
+import dwell
+from dwell.demo.loopback import on_this_machine
+from dwell.testbed.processes import Processes
+
+processes = Processes([on_this_machine(dwell.load(sys.argv[1]))], Path(sys.argv[2]))
+processes.write()
+processes.start_agent("R1")
+print(processes.running["agent@R1"].pid, flush=True)
+time.sleep(3600)
+"""
 
 
 @pytest.fixture
@@ -38,6 +56,14 @@ def problem() -> Problem:
 def stays(node: str, words: Sequence[str]) -> Sequence[str]:
     """Run something else with the words."""
     return [sys.executable, "-c", STAYS, node, *words]
+
+
+def until(holds: Callable[[], bool]) -> None:
+    """Wait for something that other processes do."""
+    limit_s = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < limit_s
+        time.sleep(0.02)
 
 
 def logged(file: Path) -> str:
@@ -58,13 +84,27 @@ def test_each_runs_where_it_belongs_with_what_it_needs(problem: Problem, tmp_pat
         assert processes.running.keys() == {"agent@R1", "controller@E"}
         agent = logged(tmp_path / "agent@R1.log")
         assert f'["R1", "{sys.executable}", "-m", "dwell", "agent", "--node", "R1"' in agent
-        assert f'"--cell", "{tmp_path}/cell.yaml"], "{os.getpid()}", "yes"]' in agent
+        assert f'"--owner", "{os.getpid()}", "--cell", "{tmp_path}/cell.yaml"], "yes"]' in agent
         assert '"--policy", "LOC"' in logged(tmp_path / "controller@E.log")
         started = list(processes.running.values())
     finally:
         processes.stop()
     assert processes.running == {}
     assert all(one.poll() is not None for one in started)
+
+
+def test_none_is_left_when_the_process_that_started_them_is_killed(tmp_path: Path) -> None:
+    cell, out = write_cell(tmp_path), tmp_path / "out"
+    words = [sys.executable, "-c", OWNER, str(cell), str(out)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, process_group=0) as owner:
+        assert owner.stdout is not None
+        agent = int(owner.stdout.readline())
+        marks = [out / "R1" / f"{who}.pid" for who in ("stamper@R1", "sensing@R1")]
+        until(lambda: all(mark.exists() for mark in marks))
+        pids = [agent, *(json.loads(mark.read_text())["pid"] for mark in marks)]
+        assert all(psutil.pid_exists(pid) for pid in pids)
+        owner.send_signal(signal.SIGKILL)
+    until(lambda: not any(psutil.pid_exists(pid) for pid in pids))
 
 
 def test_the_keys_of_another_cell_are_not_theirs(

@@ -34,6 +34,11 @@ Cpus = Annotated[
     typer.Option(metavar="LIST", help="CPUs to use, as 0,2-3; those of this process if not given."),
 ]
 
+Owner = Annotated[
+    int | None,
+    typer.Option(metavar="PID", hidden=True, help="Process that this one ends with."),
+]
+
 live = typer.Typer(
     no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
 )
@@ -71,6 +76,7 @@ def agent(
     ] = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    owner: Owner = None,
 ) -> None:
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     from dwell.cellfile import load_without_traces
@@ -94,9 +100,9 @@ def agent(
         problem,
         node,
         folder,
-        server(cell.resolve()),
+        server(cell.resolve(), owner),
         lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
-        _until_told(),
+        _until_told(owner),
         cpus=wanted,
         accelerator=read,
         environment=environment(keys, insecure=insecure),
@@ -125,6 +131,7 @@ def controller(
     cpus: Cpus = None,
     keys: Keys = None,
     insecure: Insecure = False,
+    owner: Owner = None,
 ) -> None:
     """Decide where the stages of live cells run."""
     import dwell
@@ -135,7 +142,7 @@ def controller(
         os.sched_setaffinity(0, wanted)
     problems = [dwell.load(file) for file in cell]
     folders = run_controller(
-        *(problems, out, _until_told()),
+        *(problems, out, _until_told(owner)),
         policy=policy,
         name=name,
         jobs=jobs,
@@ -416,12 +423,12 @@ def _state_folder() -> Path:
     return (Path(home) if home else Path.home() / ".local" / "state") / "dwell"
 
 
-def _until_told() -> threading.Event:
+def _until_told(owner: int | None) -> threading.Event:
     """Return an event that is set when this process is told to end, or its owner has ended."""
     from dwell.live.parent_death import end_with_owner
 
     stopped = threading.Event()
-    end_with_owner(stopped)
+    end_with_owner(stopped, owner)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     return stopped

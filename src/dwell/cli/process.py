@@ -19,15 +19,18 @@ from dwell.errors import DwellError, missing_package
 __all__ = ["main", "server", "words"]
 
 
-def server(cell: Path) -> list[str]:
+def server(cell: Path, owner: int | None = None) -> list[str]:
     """Return the command of the process that those of a cell are forked from.
 
     Parameters
     ----------
     cell : Path
         File that it reads once, so that all that reading takes is imported.
+    owner : int, optional
+        Process that all of them end with.
     """
-    return [sys.executable, "-m", "dwell.cli.process", "--cell", str(cell), "--serve"]
+    ends_with = [] if owner is None else ["--owner", str(owner)]
+    return [sys.executable, "-m", "dwell.cli.process", "--cell", str(cell), "--serve", *ends_with]
 
 
 def words(
@@ -67,10 +70,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--state", type=Path, default=Path())
     parser.add_argument("--cpus", default="")
     parser.add_argument("--realtime", type=int, default=0)
+    parser.add_argument("--owner", type=int)
     asked = parser.parse_args(arguments)
     try:
         if asked.serve:
-            return _serve(asked.cell)
+            return _serve(asked.cell, asked.owner)
         _run(asked)
     except DwellError as error:
         print(error, file=sys.stderr)
@@ -84,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _serve(cell: Path) -> int:
+def _serve(cell: Path, owner: int | None) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
     from dwell.calibration import memory  # noqa: F401
     from dwell.cellfile import load_without_traces
@@ -92,12 +96,12 @@ def _serve(cell: Path) -> int:
     from dwell.live.launcher import serve
 
     load_without_traces(cell)
-    asked = serve()
-    if asked is None:
+    words = serve()
+    if words is None:
         return 0
     # Stages may look who they are.
-    sys.argv[1:] = asked
-    return main(asked)
+    sys.argv[1:] = words
+    return main(words if owner is None else [*words, "--owner", str(owner)])
 
 
 def _run(asked: argparse.Namespace) -> None:
@@ -118,7 +122,7 @@ def _run(asked: argparse.Namespace) -> None:
     # What a user's code prints, and its exceptions, are shown on terminals.
     escape_output()
     keep_memory()
-    end_with_owner(stopped)
+    end_with_owner(stopped, asked.owner)
     run_process(load_without_traces(asked.cell), asked.who, asked.state, stopped)
 
 

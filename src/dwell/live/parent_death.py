@@ -1,8 +1,8 @@
 """Ends this process when its owner ends, however many processes stand between the two.
 
 The processes of a cell outlive their agent, so that it can be started again. Where a whole cell
-belongs to one process (the demo, a test), its variable `OWNER` says so to all of them, and none of
-them is left when that process has ended, even if it was killed.
+belongs to one process (a testbed, a test), all of them have its process id on their command lines
+(`OPTION`), and none of them is left when that process has ended, even if it was killed.
 
 Nor is their shared memory. Zenoh removes a segment with the last process that lets go of it, but
 where two do so at the same instant each finds it held by the other, and it stays until a Zenoh
@@ -24,32 +24,37 @@ from pathlib import Path
 from dwell.live.failures import start_thread
 from dwell.live.transport.orphans import remove_orphans
 
-__all__ = ["OWNER", "end_with_owner", "start_sweeper"]
+__all__ = ["OPTION", "end_with_owner", "start_sweeper"]
 
-#: Environment variable: id of the process that all others of a cell end with.
-OWNER = "DWELL_OWNER"
+#: Option of agent, controller and processes: id of the process that they end with.
+OPTION = "--owner"
 #: What does not end by itself within this time after its owner is ended.
 PATIENCE_S = 8.0
 #: How long the sweeper waits for those that end with its owner.
 SWEEP_S = 60.0
 
 
-def end_with_owner(stopped: threading.Event) -> None:
+def end_with_owner(stopped: threading.Event, owner: int | None) -> None:
     """Set an event when the owner has ended; nothing happens where there is none.
 
     Whoever hangs, and does not look at the event, ends some seconds later.
+
+    Parameters
+    ----------
+    stopped : Event
+    owner : int, optional
+        Its process id.
     """
-    text = os.environ.get(OWNER, "")
-    if not text.isdecimal():
+    if owner is None:
         return
     try:
-        owner = os.pidfd_open(int(text))
+        descriptor = os.pidfd_open(owner)
     except ProcessLookupError:
         stopped.set()
         return
     except OSError:
         return  # a kernel without them
-    start_thread("parent-death", _wait, owner, stopped)
+    start_thread("parent-death", _wait, descriptor, stopped)
 
 
 def _wait(owner: int, stopped: threading.Event) -> None:
@@ -89,12 +94,12 @@ def _sweep(owner: int) -> None:
 
 def _those_of(owner: int) -> list[int]:
     """Return a descriptor of every process that ends with an owner."""
-    mark = f"{OWNER}={owner}".encode()
+    words = b"\0%b\0%d\0" % (OPTION.encode(), owner)
     found = []
-    for file in Path("/proc").glob("[0-9]*/environ"):
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
         # Some have just ended, and some are other users'.
         with suppress(OSError):
-            if mark in file.read_bytes().split(b"\0"):
+            if words in file.read_bytes():
                 found.append(os.pidfd_open(int(file.parent.name)))
     return found
 

@@ -1,6 +1,6 @@
 """The processes of a cell that somebody has to start: an agent on every node, and the controller.
 
-All others are started by the agents. They end with the process that made this (`OWNER`), whatever
+All others are started by the agents. They end with the process that made this, whatever
 becomes of those in between, and leave no shared memory.
 """
 
@@ -18,7 +18,7 @@ from typing import TypeAlias
 import yaml
 
 from dwell.errors import LiveError
-from dwell.live.parent_death import OWNER, start_sweeper
+from dwell.live.parent_death import OPTION, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.trust import KEYS
 from dwell.live.wiring import roles
@@ -73,6 +73,8 @@ class Processes:
         Further arguments of the controllers.
     traces : Path, optional
         Folder where the names of trace files begin; this process's own if left out.
+    owner : str, optional
+        Process id, where they run, of the one that they end with; this process's own if left out.
 
     Attributes
     ----------
@@ -90,13 +92,15 @@ class Processes:
         cpus: Mapping[str, int] | None = None,
         more: Sequence[str] = (),
         traces: Path | None = None,
+        owner: str | None = None,
     ) -> None:
         names = [problem.name for problem in problems]
         if len(set(names)) < len(names):
             raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
         self.problems, self.folder = tuple(problems), folder
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self.environment = {OWNER: str(os.getpid()), **(environment or {})}
+        self.environment = dict(environment or {})
+        self._owner = str(os.getpid()) if owner is None else owner
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
         self._traces = Path() if traces is None else traces
         self._sweeper: subprocess.Popen[bytes] | None = None
@@ -162,7 +166,7 @@ class Processes:
     ) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
-        command = [sys.executable, "-m", "dwell", *words]
+        command = [sys.executable, "-m", "dwell", *words, OPTION, self._owner]
         for problem in problems:
             command += ["--cell", str(self.file_of(problem))]
         with (self.folder / f"{who}.log").open("ab") as log:

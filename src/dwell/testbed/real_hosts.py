@@ -24,7 +24,6 @@ from typing import Any
 
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
-from dwell.live.parent_death import OWNER
 from dwell.model import Host, LinkDisturbance, NodeDisturbance, Normal, Problem
 from dwell.model.document import disturbance_document
 from dwell.policies.registry import by_name
@@ -32,7 +31,7 @@ from dwell.record import open_run, seal_run
 from dwell.testbed.inventory import Inventory
 from dwell.testbed.playing import come_up, longest_run, make_folder, play, undisturbed
 from dwell.testbed.processes import Processes, expected
-from dwell.testbed.remote import local_words, script_of
+from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.timeline import Change, changes_of
 
 __all__ = ["RealHosts", "require_commands", "run_on_hosts"]
@@ -83,7 +82,9 @@ class RealHosts:
         self.stress: dict[int, subprocess.Popen[bytes]] = {}
         self._on: dict[int, LinkDisturbance] = {}
         self._stack = ExitStack()
-        self.processes = Processes([self.problem], self.folder, inside=self.inside, more=more)
+        self.processes = Processes(
+            [self.problem], self.folder, inside=self.inside, more=more, owner=SHELL_ID
+        )
 
     def __enter__(self) -> RealHosts:
         """Put the cell file everywhere, and start the agents."""
@@ -124,9 +125,7 @@ class RealHosts:
     def _words(self, node: str, words: Sequence[str], *, whole: bool = False) -> list[str]:
         host = self.inventory.hosts[node]
         environment = {
-            name: value
-            for name, value in os.environ.items()
-            if name.startswith("DWELL_") and name != OWNER
+            name: value for name, value in os.environ.items() if name.startswith("DWELL_")
         }
         if "--cpus" not in words and host.cpus and "dwell" in words:
             words = [*words, "--cpus", host.cpus]
@@ -230,9 +229,7 @@ class RealHosts:
                 line = self.inventory.hosts[item.node].stress.format(threads=item.stress_threads)
                 words = self._words(item.node, ["sh", "-c", line], whole=True)
                 self.stress[change.index] = subprocess.Popen(  # noqa: S603 - the inventory's
-                    words,
-                    env={**os.environ, OWNER: str(os.getpid())},
-                    process_group=0,
+                    words, process_group=0
                 )
         elif change.begins:
             self.shell(item.source, self.inventory.links[item.link].begin.format(**_filled(item)))

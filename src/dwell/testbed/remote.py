@@ -6,7 +6,7 @@ itself, however it does. Then it tells its command to end, and this process ends
 once that has.
 
 Run as ``python -m dwell.testbed.remote SETTINGS``, JSON: ``run`` (words before a command line, as
-``ssh host``) and ``script`` (that line).
+``ssh host``), ``script`` (that line) and ``owner`` (id of the process that this one ends with).
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ import threading
 from collections.abc import Mapping, Sequence
 from types import FrameType
 
-from dwell.live.parent_death import OWNER, end_with_owner
+from dwell.live.parent_death import end_with_owner
 
-__all__ = ["local_words", "script_of"]
+__all__ = ["SHELL_ID", "local_words", "script_of"]
 
+#: Word of a command that stands for the process id of the shell on the other side.
+SHELL_ID = "$$"
 #: 3 is the other side's standard input; a command in the background has none.
 SCRIPT = """exec 3<&0
 cd {folder} || exit 1
-export {environment}
+{environment}
 {command} </dev/null 3<&- &
 command=$!
 {{ cat <&3; kill -TERM {whole}$command; }} >/dev/null 2>&1 &
@@ -47,27 +49,28 @@ def script_of(
     Parameters
     ----------
     words : sequence of str
-        The command.
+        The command; `SHELL_ID` among them becomes the shell's process id.
     folder : str
         Where it runs.
     environment : mapping of str to str
-        Variables that it gets; the owner of all its processes is that shell.
+        Variables that it gets.
     whole : bool
         Whether those that it starts are told to end, too.
     """
     pairs = [f"{name}={shlex.quote(value)}" for name, value in environment.items()]
-    command = shlex.join(["setsid", *words] if whole else words)
+    given = ["setsid", *words] if whole else words
+    command = " ".join(word if word == SHELL_ID else shlex.quote(word) for word in given)
     return SCRIPT.format(
         folder=shlex.quote(folder),
-        environment=" ".join([f"{OWNER}=$$", *pairs]),
+        environment=" ".join(["export", *pairs]) if pairs else ":",
         command=command,
         whole="-" if whole else "",
     )
 
 
 def local_words(run: Sequence[str], script: str) -> list[str]:
-    """Return the command that stands for it on this computer."""
-    settings = json.dumps({"run": list(run), "script": script})
+    """Return the command that stands for it on this computer, and ends with this process."""
+    settings = json.dumps({"run": list(run), "script": script, "owner": os.getpid()})
     return [sys.executable, "-P", "-m", "dwell.testbed.remote", settings]
 
 
@@ -84,7 +87,7 @@ def main() -> int:
         ended.set()
 
     signal.signal(signal.SIGTERM, end)
-    end_with_owner(ended)
+    end_with_owner(ended, settings["owner"])
 
     def close() -> None:
         ended.wait()
