@@ -10,7 +10,8 @@ from importlib import import_module
 from pathlib import Path
 
 import dwell
-from dwell.study import Study, StudyResult, run_study
+from dwell.report import study_html
+from dwell.study import Study, StudyResult, open_study, run_study
 from reproduction.cell import paper_cell
 from reproduction.page import Question, page
 from reproduction.questions import QUESTIONS, Run
@@ -32,16 +33,21 @@ def main(words: list[str]) -> int:
     if asked.seeds is not None:
         scale = replace(scale, seeds=asked.seeds)
     out: Path = asked.out or Path("studies", f"paper-{asked.scale}")
+    drawn: list[str] = []
 
     def run(study: Study) -> StudyResult:
         print(f"{study.name}: {study.runs} runs", file=sys.stderr, flush=True)
         folder = out / "runs" / study.name
-        return run_study(study, folder=folder, processes=asked.processes, dask=asked.dask)
+        result = run_study(study, folder=folder, processes=asked.processes, dask=asked.dask)
+        if asked.pictures:
+            (folder / "report.html").write_text(study_html(open_study(folder)), encoding="utf-8")
+            drawn.append(study.name)
+        return result
 
     names = asked.only or [name for name in QUESTIONS if name != REAL or asked.real]
     try:
         done = [_ask(name, scale, run, asked.real, out) for name in names]
-        text = page(done, scale=asked.scale, version=dwell.__version__)
+        text = page(done, scale=asked.scale, version=dwell.__version__, pictures=drawn)
         (out / "report.html").write_text(text, encoding="utf-8")
     except (dwell.DwellError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -95,6 +101,9 @@ def _parser() -> argparse.ArgumentParser:
         "--dask", metavar="ADDRESS", help="scheduler of a cluster that does the work"
     )
     parser.add_argument("--real", type=Path, metavar="FOLDER", help="recorded traces, for `real`")
+    parser.add_argument(
+        "--pictures", action="store_true", help="also a page of figures for every study"
+    )
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="studies/paper-SCALE if not given"
     )

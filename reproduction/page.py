@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,7 +46,9 @@ class _Table(NamedTuple):
     rows: list[list[str]]
 
 
-def page(questions: list[Question], *, scale: str, version: str) -> str:
+def page(
+    questions: list[Question], *, scale: str, version: str, pictures: Sequence[str] = ()
+) -> str:
     """Return the page.
 
     Parameters
@@ -56,6 +58,8 @@ def page(questions: list[Question], *, scale: str, version: str) -> str:
         Name of the scale, ``full`` or ``quick``.
     version : str
         Of Dwell.
+    pictures : sequence of str
+        Studies that have a page of figures, ``runs/STUDY/report.html``.
     """
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -73,7 +77,7 @@ def page(questions: list[Question], *, scale: str, version: str) -> str:
         for one in questions
     ]
     template = environment.get_template("page.html")
-    return template.render(questions=shown, scale=scale, version=version)
+    return template.render(questions=shown, scale=scale, version=version, pictures=pictures)
 
 
 def _table(title: str, frame: pl.DataFrame) -> _Table:

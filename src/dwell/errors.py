@@ -31,12 +31,13 @@ DISTRIBUTION = "dwell-placement"
 OPTIONAL = {
     "cryptography": ("cryptography", "live"),
     "distributed": ("distributed", "dask"),
-    "matplotlib": ("Matplotlib", "report"),
+    "jinja2": ("Jinja2", "report"),
     "msgspec": ("msgspec", "live"),
     "numba": ("Numba", "sim"),
     "polars": ("Polars", "sim"),
     "psutil": ("psutil", "live"),
     "scipy": ("SciPy", "sim"),
+    "vl_convert": ("vl-convert", "report"),
     "zenoh": ("Zenoh", "live"),
 }
 #: By module: a package that no extra brings.

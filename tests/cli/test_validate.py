@@ -29,7 +29,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_page_table_and_text(folder: Path) -> None:
     result = call("validate", "LOC", "OFF", "--cell", CALIBRATED, "--seeds", "2", "--out", "out")
     assert result.exit_code == 0, result.output
-    assert "small: 2 runs, each simulated 2 times" in result.output
+    assert "2 runs, 0.3 minutes that count, each run simulated 2 times" in result.output
     assert "report: out/report.html" in result.output
     assert (folder / "out" / "report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE")
     told = json.loads((folder / "out" / "validation.json").read_text(encoding="utf-8"))

@@ -7,10 +7,13 @@ from functools import cache
 from html.parser import HTMLParser
 
 from dwell import Run, simulate
+from dwell.report.page import Fact
+from dwell.report.page import Page as Shown
+from dwell.report.table import Table
 from dwell.study import Comparison, compare
 from tests.study.cell import make_problem
 
-__all__ = ["Page", "small_comparison", "small_run"]
+__all__ = ["Page", "facts_of", "small_comparison", "small_run", "table_of"]
 
 VOID = {"meta", "br", "img", "link", "use", "input", "hr", "col"}
 
@@ -55,7 +58,7 @@ class Page(HTMLParser):
             assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] == "style":
+        if self.open and self.open[-1] in ("style", "script"):
             return
         if self.open and self.open[-1] in ("h1", "h2", "h3"):
             self.headings.append(data)
@@ -79,3 +82,13 @@ def small_comparison() -> Comparison:
 def small_run(policy: str = "dtp", scenario: str = "robot-cpu-stress") -> Run:
     """Return a short run with its jobs."""
     return simulate(make_problem(), scenario=scenario, policy=policy, seed=1, windows=12, jobs=True)
+
+
+def facts_of(page: Shown) -> dict[str, Fact]:
+    """Return the numbers at the top of a page by their names."""
+    return {fact.name: fact for fact in page.facts}
+
+
+def table_of(page: Shown, slug: str) -> Table:
+    """Return one of a page's tables."""
+    return next(table for table in page.tables if table.slug == slug)

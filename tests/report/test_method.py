@@ -1,6 +1,9 @@
-"""Scenarios in words."""
+"""What a cell's scenarios are, as a table."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,58 +22,58 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from dwell.report.method import describe_scenario
+from dwell.report.method import cell_definitions, placements_table, scenarios_table
+from tests.study.cell import make_problem
 
 EPISODES = Episodes("edge", every_s=Exponential(30.0), for_s=Uniform(2.0, 10.0))
 TABLE = TraceTable(file="delays.csv", columns={"delay_ms": np.array([1.0, 3.0])})
 
 
+def row_of(item: Disturbance) -> dict[str, object]:
+    problem = replace(make_problem(), scenarios={"one": (item,)})
+    (row,) = scenarios_table(problem, ["one"]).rows
+    return dict(row)
+
+
 @pytest.mark.parametrize(
-    ("scenario", "text"),
+    ("item", "where", "what"),
     [
-        ((), "nothing"),
-        ((NodeDisturbance("R1", stress_threads=4),), "4 threads of foreign work on R1"),
-        (
-            (LinkDisturbance("R1", "E", loss=0.005), LinkDisturbance("E", "R1", loss=0.005)),
-            "0.5 % of the messages lost on R1→E and E→R1",
-        ),
-        (
-            (NodeDisturbance("E", at_s=20, for_s=10, down=True),),
-            "an outage from 20 s for 10 s on E",
-        ),
-        (
-            (LinkDisturbance("R1", "E", rate_mbps=10.0, at_s=5),),
-            "a rate of 10 Mbit/s from 5 s on R1→E",
-        ),
-        (
-            (NodeDisturbance("E", stress_threads=16, episodes=EPISODES),),
-            "16 threads of foreign work, in episodes (off 30 s, on 6 s in the mean) on E",
-        ),
-        (
-            (NodeDisturbance("E", at_s=20, for_s=380, ramp_s=190, stress_threads=16),),
-            "16 threads of foreign work from 20 s for 380 s, growing for 190 s and falling "
-            "likewise on E",
-        ),
-        (
-            (LinkDisturbance("R1", "E", loss=0.02, ramp_s=60),),
-            "2.0 % of the messages lost, growing for 60 s on R1→E",
-        ),
+        (NodeDisturbance("R1", stress_threads=4), "R1", "4 busy threads"),
+        (LinkDisturbance("R1", "E", loss=0.005), "R1→E", "loss 0.5 %"),
+        (NodeDisturbance("E", at_s=20, for_s=10, down=True), "E", "down"),
+        (LinkDisturbance("R1", "E", rate_mbps=10.0, at_s=5), "R1→E", "10 Mbit/s"),
     ],
 )
-def test_scenarios(scenario: tuple[Disturbance, ...], text: str) -> None:
-    assert describe_scenario(scenario) == text
+def test_disturbances(item: Disturbance, where: str, what: str) -> None:
+    row = row_of(item)
+    assert (row["where"], row["what"]) == (where, what)
+    assert row["at_s"] == item.at_s
+    assert row["for_s"] == item.for_s or math.isinf(item.for_s)
+
+
+def test_episodes_and_ramps_are_columns() -> None:
+    row = row_of(NodeDisturbance("E", stress_threads=16, episodes=EPISODES))
+    assert (row["off_s"], row["on_s"]) == (30.0, 6.0)
+    assert row_of(NodeDisturbance("E", for_s=380, ramp_s=190, stress_threads=16))["ramp_s"] == 190
 
 
 @pytest.mark.parametrize(
     ("delay", "text"),
     [
-        (Constant(2.0), "2 ms"),
-        (Normal(25.0, 5.0), "25 ± 5 ms (normal)"),
-        (Uniform(1.0, 5.2), "1 to 5.2 ms"),
-        (LogNormal(0.7, 0.3), "0.7 ms (lognormal, cv 0.3)"),
-        (Trace(TABLE, "delay_ms"), "2 ms (replayed from delays.csv)"),
+        (Constant(2.0), "constant (value 2) ms"),
+        (Normal(25.0, 5.0), "normal (mean 25, std 5"),
+        (Uniform(1.0, 5.2), "uniform (low 1, high 5.2) ms"),
+        (LogNormal(0.7, 0.3), "lognormal (mean 0.7, cv 0.3"),
+        (Trace(TABLE, "delay_ms"), "2 ms in the mean, replayed from delays.csv"),
     ],
 )
 def test_delays(delay: Process, text: str) -> None:
-    scenario = (LinkDisturbance("R1", "E", add_delay_ms=delay),)
-    assert describe_scenario(scenario) == f"{text} more delay a message on R1→E"
+    what = row_of(LinkDisturbance("R1", "E", add_delay_ms=delay))["what"]
+    assert str(what).startswith(f"delay {text}")
+
+
+def test_placements_are_those_of_the_tasks_that_can_move() -> None:
+    rows = {row["placement"]: row for row in placements_table(make_problem()).rows}
+    assert rows["SO"]["perception"] == "E"
+    assert "control" not in rows["SO"] or rows["SO"]["control"]
+    assert cell_definitions(make_problem())["cost"].startswith("J = ")

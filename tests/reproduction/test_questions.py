@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,16 @@ def test_a_question_is_answered(
     assert not set(verdicts.filter(pl.col("p").is_not_null())["word"]) & {"lower", "higher"}
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f'<h2 id="{name}">' in page
+
+
+def test_studies_have_pictures_that_the_page_leads_to(tmp_path: Path) -> None:
+    words = ["--scale", "tiny", "--only", "table", "--out", str(tmp_path), "--processes", "1"]
+    assert main([*words, "--pictures"]) == 0
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    links = re.findall(r'href="(runs/[^"]*)"', page)
+    assert links
+    for link in links:
+        assert "<svg" in (tmp_path / link).read_text(encoding="utf-8")
 
 
 def test_traces_that_are_missing_are_named(

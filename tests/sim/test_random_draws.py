@@ -30,6 +30,7 @@ from dwell.model import (
 )
 from dwell.model.scenario import MAX_LAYERS, RAMP_STEPS
 from dwell.sim import draw
+from dwell.sim.random_draws import drawn_scenario
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from tests.dynamic import dynamic_problem
 from tests.generate import MS, make_problem
@@ -274,3 +275,18 @@ def test_episodes_take_their_share_of_the_time() -> None:
     expected = on_s / (off_s + on_s) * (1 - tau / total_s * (1 - math.exp(-total_s / tau)))
     error = float(np.std(shares)) / math.sqrt(len(shares))
     assert np.mean(shares) == pytest.approx(expected, abs=4 * error)
+
+
+@pytest.mark.parametrize("name", ["bursts", "mixture", "step"])
+def test_a_drawn_scenario_without_episodes_is_the_same_realisation(name: str) -> None:
+    problem = dynamic_problem()
+    asked = {"seed": 3, "windows": 120}
+    episodes = draw(problem, scenario=name, **asked)
+    plain = drawn_scenario(problem, scenario=name, **asked)
+    assert all(item.episodes is None for item in plain)
+    told = replace(problem, scenarios={**problem.scenarios, "plain": plain})
+    again = draw(told, scenario="plain", **asked)
+    # Delays are drawn by the disturbance's number, which is another one; not when they are on.
+    assert (again.node_changes.table == episodes.node_changes.table).all()  # type: ignore[attr-defined]
+    down = [[part.at_ns for part in one.link_segments] for one in (episodes, again)]
+    assert down[0] == down[1]

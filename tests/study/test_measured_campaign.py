@@ -19,15 +19,13 @@ from dwell.errors import RunError
 from dwell.model.document import to_document
 from dwell.record import seal_run
 from dwell.study.campaign_questions import (
+    answer_of,
+    compared,
     fault_scenarios,
-    needed_pairs,
     questions,
     stress_scenarios,
-    verdict,
 )
-from dwell.study.family import Family
 from dwell.study.measured_campaign import MeasuredCampaign, read_measured, without_excluded
-from dwell.study.pairs import paired_difference
 from dwell.study.summary import summarise
 from dwell.testbed.campaign import Campaign, entrant
 from dwell.testbed.execution import run_campaign
@@ -186,60 +184,42 @@ def test_questions_are_asked_where_they_apply(measured: MeasuredCampaign) -> Non
     assert one.title.startswith("RQ1")
     assert two.title.startswith("RQ2")
     assert one.answer == two.answer == "not shown"
-    for chapter in (one, two):
-        assert "With 2 repetitions nothing can be shown" in chapter.verdict
-        assert all(not table.frame.is_empty() for table in chapter.tables)
+    for asked in (one, two):
+        assert set(asked.table["word"]) == {"cannot tell with 2 seeds"}
+        assert (asked.table["p_least"] > 0.05).all()
+        assert set(asked.table["metric"]) == {"violation_rate", "l95_ms", "u_robot", "cost"}
     comparison = replace(measured.comparison, policies=("LOC", "dtp"))
     assert questions(replace(measured, comparison=comparison)) == ()
-
-
-def test_so_many_pairs_it_takes() -> None:
-    def shown(pairs: int, comparisons: int) -> bool:
-        item = paired_difference(np.arange(1.0, pairs + 1), np.zeros(pairs))
-        family = Family("?", "x", {str(i): item for i in range(comparisons)})
-        return set(family.verdicts.values()) == {"higher"}
-
-    for comparisons in (1, 2, 4, 8, 9):
-        needed = needed_pairs(comparisons)
-        assert shown(needed, comparisons)
-        assert not shown(needed - 1, comparisons)
 
 
 @pytest.mark.parametrize(
     ("by_other", "answer"),
     [
-        ({"LOC": -0.1, "SO": -0.2}, "yes"),
-        ({"LOC": 0.1, "SO": -0.2}, "no"),
-        ({"LOC": 0.0, "SO": -0.2}, "not shown"),
+        ({"LOC": "lower", "SO": "lower"}, "yes"),
+        ({"LOC": "higher", "SO": "lower"}, "no"),
+        ({"LOC": "no difference shown", "SO": "lower"}, "not shown"),
     ],
 )
-def test_a_verdict_asks_for_all_others(by_other: dict[str, float], answer: str) -> None:
+def test_an_answer_asks_for_all_others(by_other: dict[str, str], answer: str) -> None:
+    rows = [("violation_rate", "net", "HYB", other, word) for other, word in by_other.items()]
+    rows.append(("violation_rate", "net", "dtp", "LOC", "higher"))
+    names = ["metric", "scenario", "first", "second", "word"]
+    table = pl.DataFrame(rows, schema=names, orient="row")
+    assert answer_of(table, "HYB", ("LOC", "SO")) == answer
+
+
+def test_a_run_that_is_missing_leaves_its_pair_out_alone() -> None:
     ramp = np.linspace(1.0, 1.1, 9)
-    family = Family(
-        "?",
-        "violation_rate",
-        {
-            f"net: HYB, {other}": paired_difference(0.5 + size * ramp, np.full(9, 0.5))
-            for other, size in by_other.items()
-        },
+    runs = pl.concat(
+        pl.DataFrame({"policy": [name] * 9, "seed": range(9), "violation_rate": size * ramp})
+        for name, size in (("HYB", 0.3), ("LOC", 0.5))
     )
-    outcome = verdict(family, "HYB", ("LOC", "SO"))
-    assert outcome.answer == answer
-    assert "nothing can be shown" not in outcome.verdict
-    assert len(outcome.evidence) == 2
-
-
-def test_a_run_that_is_missing_does_not_undo_what_the_others_show() -> None:
-    ramp = np.linspace(1.0, 1.1, 9)
-    lower = paired_difference(0.3 * ramp, 0.5 * ramp)
-    short = paired_difference(0.3 * ramp[:8], 0.5 * ramp[:8])
-    others = {f"net: {name}, LOC": short for name in "ABCDEFG"}
-    family = Family("?", "violation_rate", {"net: HYB, LOC": lower, **others})
-    outcome = verdict(family, "HYB", ("LOC",))
-    assert outcome.answer == "yes"
-    assert "nothing can be shown" not in outcome.verdict
-    fewer = Family("?", "violation_rate", {"net: HYB, LOC": short, **others})
-    assert "With 8 repetitions nothing can be shown" in verdict(fewer, "HYB", ("LOC",)).verdict
+    pairs = {"both": ({"policy": "HYB"}, {"policy": "LOC"})}
+    short = runs.filter(~((pl.col("policy") == "LOC") & (pl.col("seed") == 3)))
+    assert compared(runs, "?", "violation_rate", pairs).comparisons["both"].n == 9
+    assert compared(short, "?", "violation_rate", pairs).comparisons["both"].n == 8
+    none = short.filter(pl.col("policy") == "HYB")
+    assert compared(none, "?", "violation_rate", pairs).comparisons == {}
 
 
 def test_jobs_are_not_needed(folder: Path, tmp_path: Path) -> None:

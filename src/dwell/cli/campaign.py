@@ -12,10 +12,9 @@ from typing import Any
 import typer
 
 import dwell
-from dwell.cli.output import print_json, working, write_file
+from dwell.cli.output import print_json, working, write_report
 from dwell.model import Problem
-from dwell.report.campaign_page import campaign_html
-from dwell.report.campaign_text import campaign_text
+from dwell.report.campaign_page import campaign_page, campaign_text
 from dwell.study.measured_campaign import MeasuredCampaign, read_measured
 from dwell.testbed.campaign import (
     Campaign,
@@ -152,22 +151,40 @@ def _run(campaign: Campaign, folder: Path, play: Play, request: CampaignRequest)
         raise typer.Exit(INTERRUPTED) from None
 
 
-def report_campaign(folder: Path, page: Path, *, as_json: bool) -> None:
+def report_campaign(
+    folder: Path,
+    page: Path,
+    *,
+    figures: Path | None = None,
+    static: bool = False,
+    as_json: bool,
+) -> None:
     """Write the report of a campaign, finished or not, and print what it comes to.
+
+    Parameters
+    ----------
+    folder, page : Path
+    figures : Path, optional
+        Folder for its figures and tables as files.
+    static : bool
+        Whether the page is without scripts.
+    as_json : bool
 
     Raises
     ------
     RunError
         If the folder is no campaign, or none of its runs is done.
     """
-    measured = _write_page(folder, page)
+    measured = _write_page(folder, page, figures=figures, static=static)
     _print(measured, folder, page, None, as_json=as_json)
 
 
-def _write_page(folder: Path, page: Path) -> MeasuredCampaign:
+def _write_page(
+    folder: Path, page: Path, *, figures: Path | None = None, static: bool = False
+) -> MeasuredCampaign:
     with working("writing the report"):
         measured = read_measured(folder)
-        write_file(page, campaign_html(measured))
+        write_report(campaign_page(measured), page, figures=figures, static=static)
     return measured
 
 
@@ -203,7 +220,12 @@ def _told(
         "failed_attempts": measured.failed.height,
         "given_up": [] if state is None else list(state.given_up),
         "questions": [
-            {"question": one.title, "answer": one.answer, "verdict": one.verdict}
+            {
+                "question": one.title,
+                "answer": one.answer,
+                "verdict": one.answer,
+                "comparisons": one.table.to_dicts(),
+            }
             for one in questions(measured)
         ],
         "table": measured.comparison.table().to_dicts(),

@@ -240,11 +240,12 @@ def study(
 @app.command()
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Folder of a saved run, or of a campaign.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Of a saved run, of a study, or of a campaign."),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Page to write [default: RUN/report.html]."),
+        typer.Option(metavar="FILE", help="Page to write [default: FOLDER/report.html]."),
     ] = None,
     trace: Annotated[
         Path | None,
@@ -253,12 +254,24 @@ def report(
             help="Also write every job as a trace for Perfetto; the run must have kept its jobs.",
         ),
     ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV.",
+        ),
+    ] = None,
+    static: Annotated[
+        bool, typer.Option("--static", help="A page without scripts: nothing to hover or choose.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the report of a run, or of a campaign: one HTML file that needs nothing else."""
-    from dwell.cli.report import report_run
+    """Write the report of a run, a study or a campaign: one HTML file that needs nothing else."""
+    from dwell.cli.report import ReportRequest, report_folder
 
-    report_run(folder, out or folder / "report.html", trace, as_json=as_json)
+    page = out or folder / "report.html"
+    request = ReportRequest(folder, page, trace, figures, static)
+    report_folder(request, as_json=as_json)
 
 
 @app.command()

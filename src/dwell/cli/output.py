@@ -8,11 +8,14 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from dwell.files import write_whole
+
+if TYPE_CHECKING:
+    from dwell.report.page import Page
 
 __all__ = [
     "Progress",
@@ -22,6 +25,7 @@ __all__ = [
     "progress",
     "working",
     "write_file",
+    "write_report",
 ]
 
 #: Takes how many are done, and of how many.
@@ -65,6 +69,28 @@ def write_file(path: Path, text: str) -> None:
     if path.is_dir():
         raise IsADirectoryError(None, "is a folder; name a file", str(path))
     write_whole(path, text, durable=False)
+
+
+def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) -> None:
+    """Write a page, and its figures and tables as files where a folder is named for them.
+
+    Parameters
+    ----------
+    page : Page
+    path : Path
+    figures : Path, optional
+        Made where there is none; files of the same names are replaced.
+    static : bool
+        Whether the page is without scripts.
+    """
+    from dwell.report.figure_files import figure_files
+    from dwell.report.page import page_html
+
+    write_file(path, page_html(page, static=static))
+    if figures is not None:
+        figures.mkdir(parents=True, exist_ok=True)
+        for name, data in figure_files(page):
+            write_whole(figures / name, data, durable=False)
 
 
 @contextmanager

@@ -14,8 +14,7 @@ import dwell
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
 from dwell.record import Run, open_run
-from dwell.report.validation_page import validation_html
-from dwell.report.validation_text import validation_text
+from dwell.report.validation_page import validation_html, validation_text
 from dwell.study.validation import GOALS, Validation, validate
 from dwell.testbed.speeds import Usual
 

@@ -2,277 +2,286 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
 
-from dwell.report import campaign_figures as shown
-from dwell.report import chapter_tables, figures
-from dwell.report.answers import answers, beginning
-from dwell.report.contenders import describe_contenders, palette_of
-from dwell.report.drawing import draw
-from dwell.report.formatting import listed, percent, shown_contender, shown_scenario, write_number
-from dwell.report.method import describe_cell, describe_scenario
-from dwell.report.page import (
-    definitions,
-    document,
-    figure,
-    items,
-    paragraph,
-    section,
-)
-from dwell.report.style import PageStyle
-from dwell.report.svg import inline
-from dwell.study.campaign_questions import is_steady, main_table, needed_pairs, questions
-from dwell.study.chapter import Chapter, Figure
+import numpy as np
+
+from dwell.report.charts import cumulative
+from dwell.report.figure import Figure
+from dwell.report.formatting import Measure, percent, shown_contender, write_number
+from dwell.report.method import method_blocks
+from dwell.report.page import Block, Definitions, Fact, Page, Section, page_html
+from dwell.report.palette import ramp_styles
+from dwell.report.policy_blocks import RATE, PolicyBlocks, named
+from dwell.report.table import Columns, Table, Text, table_text
+from dwell.study.campaign_questions import CampaignQuestion, questions
 from dwell.study.measured_campaign import MeasuredCampaign
 
-__all__ = ["campaign_html", "counted_windows", "limits_of"]
+if TYPE_CHECKING:
+    pass
 
-TITLE = "A campaign of measurements"
-#: Runs that were simulated in the place of measured ones.
-SIMULATED = "Some of these runs, or all, were simulated in place of measurements."
+__all__ = ["campaign_html", "campaign_page", "campaign_text"]
+
+#: Points of a distribution over windows.
+POINTS = 80
+#: An axis of latencies ends after so many deadlines.
+DEADLINES = 4
+SHOWN = {
+    "violation_rate": RATE,
+    "l95_ms": Measure("l95_ms", "L95", "ms"),
+    "u_robot": Measure("u_robot", "U_r", "%", 100.0),
+    "u_edge": Measure("u_edge", "U_e", "%", 100.0),
+}
+WHERE = {"testbed": "the testbed"}
 
 
-def campaign_html(measured: MeasuredCampaign) -> str:
-    """Return a self-contained page about a campaign, finished or not.
+def campaign_html(measured: MeasuredCampaign, *, static: bool = False) -> str:
+    """Return a page about a campaign, finished or not; see `dwell.report.page.page_html`.
 
     Parameters
     ----------
     measured : MeasuredCampaign
+    static : bool
+        Whether scripts are left out.
+    """
+    return page_html(campaign_page(measured), static=static)
 
-    Returns
-    -------
-    str
-        HTML without scripts, and without anything that is loaded from elsewhere.
+
+def campaign_page(measured: MeasuredCampaign) -> Page:
+    """Return what there is to show of a campaign; see `campaign_html`."""
+    comparison = measured.comparison
+    blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies)
+    return Page(
+        title=f"Campaign on {comparison.problem.name}",
+        subtitle=f"{len(comparison.scenarios)} scenarios, {len(comparison.policies)} policies, "
+        f"runs of {write_number(measured.seconds, 0)} s on "
+        f"{WHERE.get(measured.where, 'real hosts')}; a repetition takes the place of a seed",
+        facts=list(_facts(measured)),
+        sections=list(_sections(measured, blocks)),
+        policies={name: style.colour for name, style in blocks.styles.items()},
+        seeds=comparison.seeds,
+    )
+
+
+def _facts(measured: MeasuredCampaign) -> Iterator[Fact]:
+    log = measured.log
+    yield Fact("runs", write_number(log.height, 0), f"of {measured.planned}")
+    yield Fact("complete repetitions", write_number(measured.repetitions, 0))
+    windows, excluded = (int(log[name].sum()) for name in ("windows", "excluded"))
+    share = percent(excluded / windows, 1) if windows else "–"
+    yield Fact("windows excluded", write_number(excluded, 0), f"of {windows}, {share}")
+    yield Fact("attempts that failed", write_number(measured.failed.height, 0))
+    simulated = measured.kinds != {"live"}
+    yield Fact("made of", "simulated runs" if simulated else "measured runs")
+
+
+def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Section]:
+    comparison = measured.comparison
+    yield Section("", [blocks.rate(), blocks.counts()])
+    for place, asked in enumerate(questions(measured)):
+        yield Section(asked.title, [_question_table(asked, blocks, place)])
+    yield Section("Results", [blocks.results()])
+    figures: list[Block] = [blocks.tail()]
+    figures += [
+        blocks.measure(SHOWN[name], title=f"{SHOWN[name].name}, utilisation of the busiest node")
+        for name in ("u_robot", "u_edge")
+    ]
+    yield Section("Figures", [*figures, blocks.distribution(), *blocks.placed(), blocks.split()])
+    yield Section(
+        "Windows",
+        [_windows(measured, blocks, name) for name in SHOWN],
+        note="Share of the windows at or below a value, all repetitions together; windows of a "
+        "run are not independent.",
+        folded=True,
+    )
+    yield Section("More numbers", [blocks.more()], folded=True)
+    if not measured.profiles.is_empty():
+        yield Section("What jobs took", [_profiles(measured)])
+    if not measured.links.is_empty():
+        yield Section("What messages took", [_delays(measured), _links(measured)])
+    yield Section("What was run when", [_log(measured), *_failed(measured)])
+    method = method_blocks(comparison.problem, comparison.scenarios, comparison.policies)
+    about = {
+        "estimators": ", ".join(
+            f"{shown_contender(name)}: {estimator}"
+            for name, estimator in measured.estimators.items()
+            if name not in comparison.problem.candidates
+        ),
+        "order": "each repetition is a complete random order of all policies in all scenarios; "
+        "those of a scenario and repetition follow each other",
+        "intervals": "95 %, two-sided, over repetitions, by the studentised bootstrap from 4 on, "
+        "by Student’s t below",
+        "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
+    }
+    yield Section("How it was measured", [*method, Definitions(about)])
+
+
+def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -> Table:
+    metrics = {name: (measure.heading, measure.factor) for name, measure in SHOWN.items()}
+    metrics["cost"] = ("J", 1.0)
+    rows = []
+    for row in asked.table.iter_rows(named=True):
+        heading, factor = metrics[row["metric"]]
+        ends = {f"effect{end}": row[column] for end, column in (("_low", "low"), ("_high", "high"))}
+        numbers = {"effect": row["effect"], **ends}
+        scaled = {key: None if one is None else factor * one for key, one in numbers.items()}
+        rows.append({**row, **scaled, "metric": heading})
+    return Table(
+        f"question-{place}",
+        f"Answer: {asked.answer}",
+        [
+            Text("metric", "metric"),
+            Text("first", "policy", "policy"),
+            Text("second", "less", "policy"),
+            Measure("effect", "difference", decimals=2, signed=True),
+            Measure("n", "repetitions", decimals=0),
+            Measure("p", "p (Holm)", decimals=3),
+            Measure("p_least", "least p", decimals=3),
+            Text("word", "is", "word"),
+        ],
+        rows,
+        Text("scenario", "", "scenario"),
+        "Paired by repetition; sign-flip tests, Holm over all comparisons of a metric. Least p: "
+        "the smallest that so few repetitions and so many comparisons allow.",
+        blocks.palette,
+    )
+
+
+def _windows(measured: MeasuredCampaign, blocks: PolicyBlocks, name: str) -> Figure:
+    """Draw the distributions of a measure over windows."""
+    import polars as pl
+
+    measure, deadline_ms = SHOWN[name], measured.comparison.problem.pipeline.deadline_ms
+    latency = name == "l95_ms"
+    every = measured.windows[name].to_numpy() * measure.factor
+    high = float(every.max())
+    high = min(high, DEADLINES * deadline_ms) if latency else high
+    across = np.linspace(0.0, high or 1.0, POINTS)
+    parts = []
+    for labels, mine in measured.windows.group_by("scenario", "policy", maintain_order=True):
+        values = np.sort(mine[name].to_numpy() * measure.factor)
+        share = np.searchsorted(values, across + 1e-9, side="right") / len(values)
+        scenario, policy = (pl.lit(str(label)) for label in labels)
+        line = pl.DataFrame({"value": across, "share": share})
+        parts.append(line.with_columns(scenario=scenario, policy=policy))
+    return cumulative(
+        f"windows-{name}",
+        named(pl.concat(parts)),
+        blocks.styles,
+        (f"{measure.name} of a window ({measure.unit})", "windows at or below"),
+        limit=deadline_ms if latency else float("inf"),
+        limit_name="deadline",
+        title=f"Windows by their {measure.name}",
+    )
+
+
+def _profiles(measured: MeasuredCampaign) -> Table:
+    times = ("cpu", "wall") if measured.profiles["cpu_ms"].is_not_null().any() else ("wall",)
+    called = {"cpu": "core time", "wall": "start to end"}
+    columns: Columns = [
+        Text("task", "task"),
+        Text("node", "node"),
+        Measure("jobs", "jobs", decimals=0),
+        Measure("runs", "runs", decimals=0),
+    ]
+    for kind in times:
+        columns += [
+            Measure(f"{kind}_ms", f"{called[kind]}, mean", "ms", decimals=2),
+            Measure(f"{kind}_ms_p50", "median", "ms", decimals=2),
+            Measure(f"{kind}_ms_p95", "95 %", "ms", decimals=2),
+        ]
+    columns.append(Measure("told_ms", "the cell says", "ms", decimals=2))
+    return Table(
+        "profiles",
+        "Compute profiles",
+        columns,
+        measured.profiles.to_dicts(),
+        caption="Jobs of the baseline after the warm-up, those of shadows left out. Means over "
+        "runs with 95 % intervals; percentiles of all jobs together.",
+    )
+
+
+def _delays(measured: MeasuredCampaign) -> Figure:
+    frame = measured.delays.select("scenario", "share", policy="link", value="delay_ms")
+    links = [str(name) for name in frame["policy"].unique(maintain_order=True)]
+    return cumulative(
+        "delays",
+        named(frame, ("scenario",)),
+        ramp_styles(links),
+        ("what a message took (ms)", "messages within"),
+        title="Link delays by scenario",
+    )
+
+
+def _links(measured: MeasuredCampaign) -> Table:
+    columns: Columns = [
+        Text("link", "link"),
+        Text("flow", "flow"),
+        Measure("messages", "messages", decimals=0),
+        Measure("mean_ms", "mean", "ms", decimals=2),
+        Measure("std_ms", "std", "ms", decimals=2),
+        Measure("p50_ms", "median", "ms", decimals=2),
+        Measure("p95_ms", "95 %", "ms", decimals=2),
+    ]
+    return Table(
+        "links",
+        "Link delays",
+        columns,
+        measured.links.to_dicts(),
+        Text("scenario", "", "scenario"),
+        "From the end of the job that sent a message until it was there, by the clocks of both "
+        "nodes. Messages that were lost are not in it.",
+    )
+
+
+def _log(measured: MeasuredCampaign) -> Table:
+    rows = [
+        {
+            **row,
+            "begun": datetime.fromtimestamp(row["began_unix_s"], UTC).strftime("%Y-%m-%d %H:%M:%S"),
+            "idle": "yes" if row["idle"] else "no",
+        }
+        for row in measured.log.iter_rows(named=True)
+    ]
+    columns: Columns = [
+        Text("place", "run"),
+        Text("begun", "begun (UTC)"),
+        Measure("repetition", "repetition", decimals=0),
+        Text("scenario", "scenario", "scenario"),
+        Text("policy", "policy", "policy"),
+        Measure("attempt", "attempt", decimals=0),
+        Text("idle", "machine idle before"),
+        Measure("waited_s", "waited for that", "s"),
+        Measure("windows", "windows", decimals=0),
+        Measure("excluded", "excluded", decimals=0),
+    ]
+    return Table("log", "Runs", columns, rows)
+
+
+def _failed(measured: MeasuredCampaign) -> Iterator[Table]:
+    if measured.failed.height:
+        names = ("scenario", "policy", "repetition", "attempt", "outcome", "reason")
+        columns: Columns = [Text(name, name) for name in names]
+        yield Table("failed", "Attempts that failed", columns, measured.failed.to_dicts())
+
+
+def campaign_text(measured: MeasuredCampaign, *, width: int | None = None) -> str:
+    """Return the results of a campaign as text for a terminal, the answers last.
+
+    Parameters
+    ----------
+    measured : MeasuredCampaign
+    width : int, optional
+        Columns of the terminal; as wide as it takes where None.
     """
     comparison = measured.comparison
-    chapters = questions(measured)
-    look = PageStyle(
-        palette_of(comparison.problem, comparison.policies), frozenset(comparison.scenarios)
-    )
-    body = [f"<h1>{TITLE}</h1>", paragraph(_subtitle(measured), "subtitle")]
-    if measured.kinds != {"live"}:
-        body.append(paragraph(SIMULATED, "bad"))
-    body += answers(chapters, look)
-    body.append(items(_told(measured, chapters)))
-    body.append(section("Results", *_results(measured, look)))
-    body.append(section("Distributions", *_distributions(measured, look)))
-    for chapter in chapters:
-        body.append(_chapter(chapter, look))
-    body.append(section("What jobs and messages took", *_parts(measured, look)))
-    body.append(section("What was run when", *_record(measured, look)))
-    body.append(section("How it was measured", *_method(measured)))
-    body.append(section("What it does not say", items(limits_of(measured))))
-    return document(TITLE, body)
-
-
-def _subtitle(measured: MeasuredCampaign) -> str:
-    comparison = measured.comparison
-    where = "on the testbed" if measured.where == "testbed" else "on real hosts"
-    return (
-        f"Cell “{comparison.problem.name}” {where}: {len(comparison.scenarios)} scenarios × "
-        f"{len(comparison.policies)} policies, {measured.log.height} of {measured.planned} runs of "
-        f"{write_number(measured.seconds, 0)} s, {measured.repetitions} complete "
-        f"{'repetition' if measured.repetitions == 1 else 'repetitions'}"
-    )
-
-
-def _told(measured: MeasuredCampaign, chapters: Sequence[Chapter]) -> Iterator[str]:
-    yield _power(measured, chapters)
-    yield counted_windows(measured)
-
-
-def _power(measured: MeasuredCampaign, chapters: Sequence[Chapter]) -> str:
-    """Say what can be shown with so few repetitions."""
-    count = len(measured.comparison.seeds)
-    text = (
-        f"The unit is the repetition, of which there {'is' if count == 1 else 'are'} {count}: "
-        f"a single difference takes {needed_pairs(1)} before a sign-flip test can show it at 5 %"
-    )
-    families = sorted({len(_comparisons(one)) for one in chapters})
-    if families:
-        needed = [f"a family of {size} takes {needed_pairs(size)}" for size in families]
-        text += f"; {listed(needed)}"
-    rest = "What is not shown is not excluded either: the intervals say what is left open."
-    if count == 1:
-        rest = "One repetition has no interval, and nothing is tested."
-    return f"{text}. {rest}"
-
-
-def _comparisons(chapter: Chapter) -> Sequence[object]:
-    return chapter.tables[-1].frame.rows()
-
-
-def counted_windows(measured: MeasuredCampaign) -> str:
-    """Say how many windows were excluded, and how many attempts failed."""
-    windows, excluded = (int(measured.log[name].sum()) for name in ("windows", "excluded"))
-    touched = int((measured.log["excluded"] > 0).sum())
-    text = (
-        f"{excluded} of {windows} windows after the warm-up were measured under pressure and are "
-        f"excluded ({percent(excluded / windows, 1)})"
-    )
-    text += f", in {touched} of {measured.log.height} runs. " if excluded else ". "
-    if measured.failed.height:
-        outcomes = dict(measured.failed["outcome"].value_counts().sort("outcome").rows())
-        words = {"error": "ended with an error", "failed": "were under pressure for too long"}
-        each = [f"{count} {words.get(name, name)}" for name, count in outcomes.items()]
-        text += f"Attempts that failed, and count nowhere: {listed(each)}."
-    else:
-        text += "No attempt failed."
-    return text
-
-
-# ----------------------------------------------------------------------------------- parts
-
-
-def _results(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
-    comparison = measured.comparison
-    yield definitions(describe_contenders(comparison.problem, comparison.policies))
-    yield paragraph(
-        "V_D is the share of cycles that finished after the deadline or not at all; L95 the 95th "
-        "percentile of a window's latencies, averaged over the windows; U_r and U_e the "
-        "utilisation of the busiest robot and edge node; J the cost that weighs all of these."
-    )
-    main = main_table(comparison.runs, "main", "Every policy in every scenario")
-    yield chapter_tables.html(main, look, main=True)
-    for measure in shown.MEASURES:
-        yield _drawn(shown.measures_figure(measured, measure), look, _caption(measure))
-    moving = [name for name in comparison.policies if name not in comparison.statics]
-    if moving and _is_complete(measured):
-        yield figure(
-            figures.placement_shares(comparison, look.palette, moving),
-            "Where the policies that move spent their windows.",
-        )
-
-
-def _is_complete(measured: MeasuredCampaign) -> bool:
-    """Whether every policy has a run in every scenario."""
-    comparison = measured.comparison
-    pairs = comparison.runs.select("scenario", "policy").unique().height
-    return pairs == len(comparison.scenarios) * len(comparison.policies)
-
-
-def _caption(measure: str) -> str:
-    text = {
-        "violation_rate": "V_D, the share of missed deadlines",
-        "l95_ms": "Tail latency as the controller sees it",
-        "u_robot": "Utilisation of the busiest robot",
-        "u_edge": "Utilisation of the busiest edge node",
-    }[measure]
-    return f"{text}: mean over repetitions, with its 95 % interval as a bar where there is one."
-
-
-def _distributions(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
-    yield _drawn(
-        figures.latency_figure(measured.comparison),
-        look,
-        "Latency of all cycles after the warm-up, all repetitions together: one less the empirical "
-        "distribution function, on a logarithmic scale. Where a curve crosses the dashed line one "
-        "reads V_D. A curve that ends on a plateau lost that share of its cycles.",
-    )
-    yield paragraph(
-        "The same of windows: of what share of them the measure is at or below a value. All "
-        "repetitions together; windows of a run are not independent."
-    )
-    for one in shown.window_figures(measured):
-        yield _drawn(one, look, f"{one.title}.")
-
-
-def _chapter(chapter: Chapter, look: PageStyle) -> str:
-    parts = [
-        beginning(chapter, look),
-        paragraph(look.prose(chapter.verdict), "question"),
-        items(map(look.prose, chapter.evidence), "evidence"),
-        paragraph(look.prose(chapter.design), "note"),
+    blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies)
+    parts = [blocks.results(compact=True), blocks.counts()]
+    parts += [
+        _question_table(asked, blocks, place) for place, asked in enumerate(questions(measured))
     ]
-    parts += [_drawn(one, look, chapter_tables.noted(one, look)) for one in chapter.figures]
-    for item in chapter.tables:
-        parts.append(chapter_tables.html(item, look, main=item.slug == chapter.slug))
-    parts += ["<h3>What else came out</h3>", items(map(look.prose, chapter.findings))]
-    return "\n".join([*parts, "</section>"])
-
-
-def _parts(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
-    if measured.profiles.is_empty() and measured.links.is_empty():
-        yield paragraph("The runs kept no jobs: there is nothing to take profiles from.")
-        return
-    if not measured.profiles.is_empty():
-        one = shown.profiles_figure(measured)
-        yield _drawn(one, look, one.note)
-        yield chapter_tables.html(shown.profiles_table(measured), look)
-    if not measured.links.is_empty():
-        one = shown.delays_figure(measured)
-        yield _drawn(one, look, one.note)
-        yield chapter_tables.html(shown.links_table(measured), look)
-
-
-def _record(measured: MeasuredCampaign, look: PageStyle) -> Iterator[str]:
-    busy = measured.log.height - int(measured.log["idle"].sum())
-    yield paragraph(
-        "Each repetition is a complete random order of all policies in all scenarios. Before a run "
-        "begins the machine has to be idle for some seconds; "
-        + (
-            f"{busy} of {measured.log.height} runs began although it was not, patience being over."
-            if busy
-            else "it was before every run."
-        )
-    )
-    yield chapter_tables.html(shown.log_table(measured), look)
-    if measured.failed.height:
-        yield chapter_tables.html(shown.failed_table(measured), look)
-
-
-def _method(measured: MeasuredCampaign) -> Iterator[str]:
-    comparison = measured.comparison
-    problem = comparison.problem
-    yield paragraph(
-        "Real processes run the pipeline on hosts of their own; disturbances are played on their "
-        "links and CPUs. All policies of a scenario and repetition have the same seed and follow "
-        "each other in random order, so that differences are taken repetition by repetition."
-    )
-    beliefs = [
-        f"{shown_contender(name)}: `{estimator}`"
-        for name, estimator in measured.estimators.items()
-        if name not in problem.candidates
-    ]
-    yield definitions(
-        {
-            **describe_cell(problem),
-            "estimators": listed(beliefs) or "none",
-            "run": f"{write_number(measured.seconds, 0)} s, of which the first "
-            f"{problem.warmup_windows} windows are warm-up and count nowhere",
-            "intervals": "95 %, two-sided, over repetitions, by the studentised bootstrap from 4 "
-            "on, by Student's t below; none is taken over windows or cycles, which are not "
-            "independent",
-            "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
-        }
-    )
-    yield paragraph("What the scenarios add to the cell:")
-    yield items(
-        f"{shown_scenario(name)}: {describe_scenario(problem.scenario(name))}."
-        for name in comparison.scenarios
-    )
-
-
-def limits_of(measured: MeasuredCampaign) -> Iterator[str]:
-    """Yield what the numbers do not say."""
-    yield (
-        "One machine, or one set of hosts, at one time: intervals are over repetitions there, and "
-        "say nothing of other hardware."
-    )
-    if measured.where == "testbed":
-        yield (
-            "Hosts are namespaces with quotas of one machine's cores: they share its caches, its "
-            "memory and its kernel."
-        )
-    comparison = measured.comparison
-    if is_steady(comparison.problem, comparison.scenarios):
-        yield (
-            "Scenarios are steady from the first cycle to the last: how fast a policy reacts to a "
-            "change shows in the warm-up only, which does not count."
-        )
-    if any(name.partition("+")[0] == "atp" for name in comparison.policies):
-        yield ("ATP is our reconstruction: its authors' may do better or worse.")
-
-
-def _drawn(item: Figure, look: PageStyle, caption: str) -> str:
-    return figure(inline(draw(item, look), item.slug, item.title), caption)
+    facts = [f"{one.name}: {one.value} {one.error}".strip() for one in _facts(measured)]
+    texts = [table_text(one, width=width) for one in parts]
+    return "\n".join([*texts, *facts])

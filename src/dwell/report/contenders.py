@@ -8,7 +8,6 @@ from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
 from dwell.policies.registry import FAMILIES
 from dwell.report.formatting import OURS, shown_contender
-from dwell.report.method import placements
 from dwell.report.palette import Palette, contended
 
 __all__ = ["POLICIES", "describe_contenders", "palette_of"]
@@ -73,8 +72,7 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
     found: dict[str, str] = {}
     statics = [name for name in problem.candidates if name in names]
     if statics:
-        text = f"{placements(problem, statics)} As policies these never move."
-        found[", ".join(statics)] = text
+        found[", ".join(statics)] = "Placements; as policies these never move."
     known = [one for one in map(contended, names) if one is not None]
     for family, text in POLICIES.items():
         if any(one.family == family for one in known):

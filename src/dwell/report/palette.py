@@ -3,7 +3,8 @@
 The hues are those of Okabe and Ito (2008). Candidates take them from the front, in the order of
 the cell file; a policy that moves has a colour of its own, DTP that of the text, and a marker and
 dashes that say what it believes, so that no two lines differ by their colour alone. Colours of
-text, rules and paper are names that the page gives a value to, light or dark.
+text, rules and paper are CSS variables that the page gives a value to, light or dark, and paper
+another.
 """
 
 from __future__ import annotations
@@ -17,14 +18,17 @@ from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.policies import registry
 
 __all__ = [
+    "BAD",
     "BELIEFS",
     "FAMILIES",
     "INK",
     "MUTED",
     "PAPER",
     "PARTS",
+    "PRINTED",
     "RAMP",
     "RULE",
+    "SHADE",
     "VARIANTS",
     "Contended",
     "Palette",
@@ -33,26 +37,36 @@ __all__ = [
     "ramp_styles",
 ]
 
-Dashes: TypeAlias = "str | tuple[float, tuple[float, ...]]"
+#: Lengths of strokes and gaps in turn, pixels.
+Dashes: TypeAlias = tuple[int, ...]
 
 HUES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#b8a800")
 
-# Placeholders that `svg.inline` replaces; no other colour of a figure may equal one of them.
-INK = "#1a1a1b"
-MUTED = "#6b6b6c"
-RULE = "#d9d9da"
-PAPER = "#fefeff"
+INK, MUTED, RULE = "var(--ink)", "var(--muted)", "var(--rule)"
+PAPER, SHADE, BAD = "var(--paper)", "var(--shade)", "var(--bad)"
 #: Of values that have an order and are neither placements nor policies, the first to the last.
-RAMP = ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862")
+RAMP = tuple(f"var(--ramp-{place})" for place in range(6))
+#: Where the time of a cycle goes: no placement's colours.
+PARTS = {part: f"var(--{part})" for part in ("compute", "queue", "network")}
+PURPLES = ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862")
+#: What a paper's figures have for the variables of a page.
+PRINTED = {
+    INK: "#000000",
+    MUTED: "#444444",
+    RULE: "#dddddd",
+    PAPER: "#ffffff",
+    SHADE: "#eeeeee",
+    BAD: "#b04a00",
+    **dict(
+        zip(RAMP, ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862"), strict=True)
+    ),
+    **dict(zip(PARTS.values(), ("#4d4d4e", "#9a9a9b", "#cfcfd0"), strict=True)),
+}
 
-#: Where the time of a cycle goes: no placement's colours. A page gives them others in the dark.
-PARTS = {"compute": "#4d4d4e", "queue": "#9a9a9b", "network": "#cfcfd0"}
-
-MARKERS = ("D", "s", "^", "v", "P", "X", "o", "<", ">")
-SOLID = "solid"
-DASHED = (0, (5, 2))
-DOTTED = (0, (1.2, 1.6))
-DASHES: tuple[Dashes, ...] = (SOLID, DASHED, DOTTED, (0, (5, 1.5, 1.2, 1.5)), (0, (8, 2, 2, 2)))
+MARKERS = ("diamond", "square", "triangle-up", "triangle-down", "cross", "triangle-right", "circle")
+CIRCLE = "circle"
+SOLID: Dashes = ()
+DASHES: tuple[Dashes, ...] = (SOLID, (7, 3), (2, 2), (7, 2, 2, 2), (11, 3, 3, 3))
 
 #: Hues of the policies that move, from the back of the placements'.
 FAMILIES = {
@@ -161,7 +175,7 @@ class Palette:
             styles[name] = _style(colour, place + shift, strong=known.family == "dtp")
         for name in policies:
             if name in placements:
-                styles[name] = Style(placements[name], "o", SOLID, 1.3)
+                styles[name] = Style(placements[name], CIRCLE, SOLID, 1.3)
         return cls(placements, styles)
 
 

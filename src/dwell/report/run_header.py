@@ -10,6 +10,7 @@ from dwell.errors import RunError
 from dwell.record import Run
 from dwell.report.phases import Disturbed, disturbed
 from dwell.report.tracking import Tracking
+from dwell.study.drawn_disturbances import disturbances_of
 
 __all__ = ["RunHeader"]
 
@@ -65,7 +66,7 @@ class RunHeader(NamedTuple):
         """
         meta = run.meta
         try:
-            problem, disturbances = run.problem, run.disturbances
+            problem, disturbances = run.problem, disturbances_of(run)
         except RunError as error:
             raise RunError(
                 f"this run cannot be reported: its record of the problem is incomplete ({error})"

@@ -4,37 +4,37 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from html import escape
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
-from dwell.report import live_facts, run_figures
-from dwell.report.drawing import draw
-from dwell.report.formatting import OURS, listed, percent, shown_scenario, write_number
-from dwell.report.page import (
-    Cell,
-    definitions,
-    document,
-    figure,
-    items,
-    marked,
-    paragraph,
-    section,
-    swatch,
-    table,
+from dwell.report.charts import (
+    PART_COLOURS,
+    PARTS_SHOWN,
+    distributions,
+    limit_rule,
+    name_of,
+    quantity,
+    stacked,
+    thinned,
 )
-from dwell.report.palette import Palette
-from dwell.report.phase_rows import PhaseRow, phase_rows
-from dwell.report.phases import Disturbed
+from dwell.report.figure import Figure, Spec
+from dwell.report.formatting import (
+    Measure,
+    percent,
+    shown_policy,
+    shown_scenario,
+    write_number,
+)
+from dwell.report.page import Definitions, Fact, Page, Section, page_html
+from dwell.report.palette import BAD, Palette
+from dwell.report.phase_rows import phase_rows
 from dwell.report.run_header import RunHeader
-from dwell.report.style import PageStyle
-from dwell.report.svg import inline
-from dwell.report.timeline import run_timeline
-from dwell.study import AIM
+from dwell.report.table import Columns, Table, Text
+from dwell.report.timeline import begins_by_number, run_timeline
 from dwell.study.summary import Counted, count_in, latency_ms, longest_streak, order_statistic
 
 if TYPE_CHECKING:
@@ -42,26 +42,23 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["run_html"]
+__all__ = ["run_html", "run_page"]
 
-MOST_ROWS = 40
+MOST_ROWS = 200
 WORST = 10
-# Shares of a node's cores below this are not told.
-LEAST_SHOWN = 5e-4
+#: Share of a deadline that clocks may be off by, where a window's latencies are proven.
+PROVEN_SHARE = 0.2
 
 
-def run_html(run: Run) -> str:
-    """Return a self-contained page about a run.
+def run_html(run: Run, *, static: bool = False) -> str:
+    """Return a page about a run; see `dwell.report.page.page_html`.
 
     Parameters
     ----------
     run : Run
         Simulated or live, just made or opened from its folder.
-
-    Returns
-    -------
-    str
-        HTML without scripts, and without anything that is loaded from elsewhere.
+    static : bool
+        Whether scripts are left out.
 
     Raises
     ------
@@ -70,135 +67,466 @@ def run_html(run: Run) -> str:
     SimulationError
         If the run has no window after its warm-up.
     """
-    facts = RunHeader.of(run)
-    counted = count_in(run, facts.window_cycles)
-    palette = Palette.of(facts.candidates)
-    title = f"A run of {_policy(facts, counted)} on {facts.cell}"
-    return document(title, _body(run, facts, counted, palette, title))
+    return page_html(run_page(run), static=static)
 
 
-def _body(
-    run: Run, facts: RunHeader, counted: Counted, palette: Palette, title: str
-) -> Iterator[str]:
-    seconds = counted.cycles.height * facts.period_ms / 1e3
-    yield f"<h1>{escape(title)}</h1>"
-    yield paragraph(
-        f"{_what(facts)}: "
-        f"{counted.windows.height} windows of {facts.window_cycles} cycles after the warm-up, "
-        f"{write_number(seconds / 60)} minutes",
-        "subtitle",
-    )
-    yield paragraph(
-        "Did the cell meet its deadline, and what did the policy do for it?", "question"
-    )
-    yield items(_verdict(facts, counted))
-    begins = _begins(run, facts)
-    yield section("Through time", *_in_time(run, facts, palette, begins))
-    yield section("Latency", *_latency(facts, counted, palette))
-    yield section("Decisions", *_decisions(run, counted, facts, palette, begins))
-    yield section(
-        "Worst windows", _worst_windows(facts, counted, palette, _by_window(run.windows, begins))
-    )
-    if facts.live:
-        yield section("How well this is known", items(live_facts.known(run, facts)))
-    yield section("What this is", *_about(facts))
+def run_page(run: Run) -> Page:
+    """Return what there is to show of a run; see `run_html`."""
+    header = RunHeader.of(run)
+    counted = count_in(run, header.window_cycles)
+    return _RunPage(run, header, counted).page()
 
 
-def _what(facts: RunHeader) -> str:
-    if not facts.live:
-        return f"Scenario “{shown_scenario(facts.scenario)}”, {facts.kind}, seed {facts.seed}"
-    # A cell in earnest has no scenario but what happens to it.
-    played = facts.scenario not in ("live", "–")
-    return f"Live{f', scenario “{shown_scenario(facts.scenario)}”' if played else ''}"
+class _RunPage:
+    """What the parts of a run's page are made from."""
 
+    def __init__(self, run: Run, header: RunHeader, counted: Counted) -> None:
+        self.run = run
+        self.header = header
+        self.counted = counted
+        self.palette = Palette.of(header.candidates)
+        self.begin_s = _begins(run, header)
+        numbers = run.windows["window"].to_list()
+        self.begin_of = dict(zip(numbers, self.begin_s.tolist(), strict=True))
+        self.worst = counted.windows.sort(
+            "violation_rate", "seen_l95_ms", descending=True, nulls_last=True, maintain_order=True
+        ).head(WORST)
 
-def _begins(run: Run, facts: RunHeader) -> NDArray[np.float64]:
-    """When every window began, seconds; a live run's cycles do not come by their numbers."""
-    first = run.windows["first_cycle"].to_numpy()
-    if not facts.live:
-        nominal: NDArray[np.float64] = first * (facts.period_ms / 1e3)
-        return nominal
-    released = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
-    return np.array([released[cycle] / 1e9 for cycle in first.tolist()], np.float64)
-
-
-def _policy(facts: RunHeader, counted: Counted) -> str:
-    """Return the policy's name; a placement's where it never moves."""
-    if facts.policy_name == "Static":
-        return f"{counted.windows['placement'][0]}, which never moves,"
-    return facts.policy_name
-
-
-# ----------------------------------------------------------------------------------- verdict
-
-
-def _verdict(facts: RunHeader, counted: Counted) -> Iterator[str]:
-    cycles, windows, decisions = counted.cycles, counted.windows, counted.decisions
-    missed = cycles["missed"].to_numpy()
-    rate = float(missed.mean())
-    place = "under" if rate < AIM else "above"
-    final_ms = latency_ms(cycles)
-    yield (
-        f"{percent(rate, 1)} of {write_number(cycles.height, 0)} cycles missed the deadline of "
-        f"{write_number(facts.deadline_ms)} ms, which is {place} the aim of {percent(AIM)}. The "
-        f"95th percentile of their latencies is {write_number(order_statistic(final_ms, 95))} ms; "
-        f"at worst {longest_streak(missed)} cycles in a row missed."
-    )
-    yield _lost(cycles)
-    shares = windows["placement"].cast(str).value_counts(sort=True)
-    where = listed(f"{percent(count / windows.height)} on {name}" for name, count in shares.rows())
-    moved_at_all = decisions.filter(decisions["migrated"])
-    by_guard = moved_at_all["reason"].cast(str) == "guard"
-    moves, guards = moved_at_all.filter(~by_guard), moved_at_all.filter(by_guard)
-    moved = f"with {_count(moves.height, 'migration')}" if len(moves) else "and never migrated"
-    text = f"Of its windows it spent {where}, {moved}"
-    undone = _undone(moves)
-    text += f", {undone} of which undid the one before" if undone else ""
-    yield f"{text}."
-    if len(guards):
-        yield (
-            f"Beside these, the robot's guard moved it {_count(guards.height, 'time')}: nothing "
-            "had come through for longer than it waits."
+    def page(self) -> Page:
+        header, counted = self.header, self.counted
+        minutes = counted.cycles.height * header.period_ms / 60e3
+        return Page(
+            title=f"{self._policy()} on {header.cell}",
+            subtitle=" · ".join(
+                (
+                    header.kind if header.live else f"{header.kind}, seed {header.seed}",
+                    f"scenario {shown_scenario(header.scenario)}",
+                    f"{counted.windows.height} windows of {header.window_cycles} cycles after the "
+                    "warm-up",
+                    f"{write_number(minutes)} minutes",
+                )
+            ),
+            facts=list(self._facts()),
+            sections=list(self._sections()),
         )
-    yield from _shadows(facts, counted.windows)
-    yield (
-        "One run is one sample: it says what happened, not what to expect. For intervals, compare "
-        "runs over seeds."
-    )
+
+    def _policy(self) -> str:
+        """Return the policy's name; a placement's where it never moves."""
+        if self.header.policy_name == "Static":
+            return str(self.counted.windows["placement"][0])
+        return shown_policy(self.header.policy_name)
+
+    def _facts(self) -> Iterator[Fact]:
+        cycles, decisions = self.counted.cycles, self.counted.decisions
+        missed = cycles["missed"].to_numpy()
+        l95_ms = order_statistic(latency_ms(cycles), 95)
+        deadline = f"deadline {write_number(self.header.deadline_ms)} ms"
+        yield Fact("V_D, deadlines missed", percent(float(missed.mean()), 1), "aim: under 5 %")
+        yield Fact("L95 of all cycles", f"{write_number(l95_ms)} ms", deadline)
+        yield Fact("misses in a row", write_number(longest_streak(missed), 0), "at most")
+        cost = self.counted.windows["cost"].mean()
+        yield Fact("J", write_number(_number(cost), 2), "mean")
+        moves = decisions.filter(decisions["migrated"])
+        by_guard = moves["reason"].cast(str) == "guard"
+        own = moves.filter(~by_guard)
+        undone = f"{_undone(own)} undone"
+        yield Fact("migrations", write_number(own.height, 0), undone)
+        if by_guard.any():
+            yield Fact("moves of the guard", write_number(int(by_guard.sum()), 0))
+        yield Fact("cycles", write_number(cycles.height, 0))
+
+    def _sections(self) -> Iterator[Section]:
+        yield Section("", [self._timeline(), *self._phases()])
+        yield Section("Worst windows", [self._worst_table()])
+        for window in self.worst.iter_rows(named=True):
+            number = window["window"]
+            yield Section(
+                f"Cycles of window {number}",
+                [self._cycles(window)],
+                anchor=f"window-{number}",
+                folded=True,
+            )
+        yield Section("Latency", self._latencies())
+        yield Section("Cycles and placements", [self._outcomes(), self._shares()])
+        yield Section("Decisions", list(self._decisions()))
+        if self.header.live:
+            yield Section("How well this is known", [self._known()])
+        yield Section("What this is", [self._about()])
+
+    # ------------------------------------------------------------------------------ in time
+
+    def _timeline(self) -> Figure:
+        links = {number: f"#window-{number}" for number in self.worst["window"].to_list()}
+        return run_timeline(
+            self.run.windows,
+            self.run.decisions,
+            self.begin_s,
+            slug="time",
+            palette=self.palette,
+            nodes=self.header.nodes,
+            deadline_ms=self.header.deadline_ms,
+            disturbed=self.header.disturbed,
+            tracking=self.header.tracking,
+            links=links,
+            caption=(
+                "A mark is a window, in the colour of the placement that was active. Thin lines: "
+                "J of the other placements as the policy estimated it. Dashed: the aim of 5 %, and "
+                "the deadline. Upright lines: migrations; in colour, the guard's. Shaded: warm-up "
+                "and disturbances. U: all of a node's load, foreign work included. Marks of the "
+                "worst windows lead to their cycles."
+            ),
+        )
+
+    def _phases(self) -> Iterator[Table]:
+        rows = phase_rows(self.run, self.header)
+        if len(rows) < 2:
+            return
+        names = tuple(self.palette.placements)
+        columns: Columns = [
+            Text("name", "phase"),
+            Measure("begin_s", "from", "s", decimals=0),
+            Measure("end_s", "to", "s", decimals=0),
+            Measure("violation_rate", "V_D", "%", 100.0),
+            Measure("l95_ms", "L95", "ms"),
+            Measure("lost", "lost", decimals=0),
+            *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
+            Measure("migrations", "migrations", decimals=0),
+            Measure("guard_moves", "by the guard", decimals=0),
+        ]
+        if self.header.tracking is not None:
+            columns += [
+                Measure("rms_mm", "error", "mm", decimals=2),
+                Measure("rms_px", "error", "px"),
+            ]
+        shown = [
+            {**row._asdict(), **{f"share {name}": row.shares.get(name, 0.0) for name in names}}
+            for row in rows
+        ]
+        yield Table(
+            "phases",
+            "By phase",
+            columns,
+            shown,
+            caption=(
+                "All cycles by when they were released, the warm-up included. Lost: cycles that "
+                "never finished."
+            ),
+        )
+
+    # -------------------------------------------------------------------------- worst windows
+
+    def _worst_table(self) -> Table:
+        rows = [
+            {**window, "begin_s": self.begin_of[window["window"]]}
+            for window in self.worst.iter_rows(named=True)
+        ]
+        columns: Columns = [
+            Text("window", "window", link="#window-{window}"),
+            Measure("begin_s", "at", "s"),
+            Text("placement", "placement", "placement"),
+            Measure("violation_rate", "V_D", "%", 100.0),
+            Measure("l95_ms", "L95", "ms"),
+            Measure("cost", "J", decimals=2),
+            *(Measure(f"u_{node}", node, "%", 100.0, 0) for node in self.header.nodes),
+        ]
+        caption = "The windows with the most misses; L95 is ∞ where more than 5 % never finished."
+        return Table("worst", "", columns, rows, caption=caption, palette=self.palette)
+
+    def _cycles(self, window: Mapping[str, object]) -> Figure:
+        """Draw where the time of every cycle of a window went."""
+        import polars as pl
+
+        first = int(str(window["first_cycle"]))
+        cycles = self.run.cycles.filter(
+            pl.col("cycle").is_between(first, first + self.header.window_cycles - 1)
+        )
+        frame = cycles.select(
+            "cycle",
+            pl.col("outcome").cast(pl.String),
+            *((pl.col(f"{part}_ns") / 1e6).alias(name) for part, name in PARTS_SHOWN.items()),
+            latency_ms=pl.col("latency_ns") / 1e6,
+        )
+        parts = frame.unpivot(
+            list(PARTS_SHOWN.values()),
+            index=["cycle", "outcome", "latency_ms"],
+            variable_name="part",
+            value_name="time_ms",
+        )
+        lost = frame.filter(pl.col("latency_ms").is_null()).select("cycle", "outcome")
+        deadline_ms = self.header.deadline_ms
+        names = list(PART_COLOURS)
+
+        def draw(width: float) -> Spec:
+            across = {"field": "cycle", "type": "ordinal", "title": "cycle"}
+            across["axis"] = {"labelOverlap": True, "labelAngle": 0}  # type: ignore[assignment]
+            bars: Spec = {
+                "data": {"name": "parts"},
+                "transform": [{"calculate": f"indexof({names!r}, datum.part)", "as": "place"}],
+                "mark": {"type": "bar"},
+                "encoding": {
+                    "x": across,
+                    "y": quantity("time_ms", "latency (ms)", axis={"tickCount": 4}),
+                    "order": {"field": "place", "type": "quantitative"},
+                    "color": name_of(
+                        "part", scale={"domain": names, "range": list(PART_COLOURS.values())}
+                    ),
+                    "tooltip": [
+                        quantity("cycle", "cycle"),
+                        name_of("part", title="part"),
+                        quantity("time_ms", "ms"),
+                        quantity("latency_ms", "in all (ms)"),
+                        name_of("outcome", title="outcome"),
+                    ],
+                },
+            }
+            crosses: Spec = {
+                "data": {"name": "lost"},
+                "mark": {"type": "point", "shape": "triangle-down", "filled": True, "color": BAD},
+                "encoding": {
+                    "x": across,
+                    "y": {"value": 6},
+                    "tooltip": [quantity("cycle", "cycle"), name_of("outcome", title="outcome")],
+                },
+            }
+            layers = [bars, *limit_rule("y", deadline_ms, "deadline"), crosses]
+            return {"width": width - 90, "height": 110, "layer": layers}
+
+        return Figure(
+            f"cycles-{window['window']}",
+            "",
+            {"parts": parts, "lost": lost},
+            draw,
+            "Time along the critical path of every cycle that finished; dashed: deadline. A mark "
+            "at the top: a cycle that was lost.",
+        )
+
+    # ------------------------------------------------------------------------------- latency
+
+    def _latencies(self) -> list[Figure]:
+        import polars as pl
+
+        cycles = self.counted.cycles.with_columns(policy=pl.col("placement").cast(pl.String))
+        used = [name for name in self.palette.placements if (cycles["policy"] == name).any()]
+        lines, parts = [], []
+        for name in used:
+            mine = cycles.filter(pl.col("policy") == name)
+            final_ms = np.sort(latency_ms(mine))
+            finite = final_ms[np.isfinite(final_ms)]
+            keep = thinned(len(finite))
+            longer = 1 - (keep + 1) / len(final_ms)
+            lines.append(pl.DataFrame({"latency_ms": finite[keep], "longer": longer}))
+            lines[-1] = lines[-1].with_columns(policy=pl.lit(name))
+            for part, shown in PARTS_SHOWN.items():
+                mean = mine[f"{part}_ns"].cast(float).mean()
+                parts.append((name, shown, _number(mean) / 1e6))
+        tail = pl.concat(lines).filter(pl.col("longer") > 0).with_columns(scenario=pl.lit(""))
+        split = pl.DataFrame(parts, schema=["policy", "part", "value"], orient="row")
+        styles = Palette.of(self.palette.placements, used).policies
+        deadline_ms = self.header.deadline_ms
+        return [
+            distributions(
+                "latencies",
+                tail,
+                styles,
+                deadline_ms,
+                title="Cycles that took longer than a latency, by placement",
+                caption=(
+                    "Of the cycles that were released under each placement, on a logarithmic "
+                    "scale. Dashed: deadline; dotted: 5 %. A line that ends on a plateau lost that "
+                    "share of its cycles."
+                ),
+            ),
+            stacked(
+                "split",
+                split.with_columns(scenario=pl.lit("")),
+                used,
+                PART_COLOURS,
+                "mean latency of finished cycles (ms)",
+                limit=deadline_ms,
+                limit_name="deadline",
+                title="Where the time goes along the critical path",
+                caption="Dashed: deadline.",
+            ),
+        ]
+
+    # ------------------------------------------------------------------ outcomes and placements
+
+    def _outcomes(self) -> Table:
+        counts = dict(self.counted.cycles["outcome"].cast(str).value_counts().rows())
+        total = self.counted.cycles.height
+        rows = [
+            {"outcome": name, "why": why, "cycles": counts.get(name, 0)}
+            for name, why in OUTCOME_SENTENCES.items()
+        ]
+        rows = [{**row, "share": int(str(row["cycles"])) / total} for row in rows]
+        columns: Columns = [
+            Text("outcome", "outcome"),
+            Text("why", "meaning"),
+            Measure("cycles", "cycles", decimals=0),
+            Measure("share", "share", "%", 100.0, 2),
+        ]
+        return Table("outcomes", "What became of the cycles", columns, rows)
+
+    def _shares(self) -> Table:
+        windows = self.counted.windows
+        shares = dict(windows["placement"].cast(str).value_counts().rows())
+        rows = [
+            {"placement": name, "windows": shares.get(name, 0), "where": _moving(self.header, name)}
+            for name in self.palette.placements
+        ]
+        rows = [{**row, "share": int(str(row["windows"])) / windows.height} for row in rows]
+        columns: Columns = [
+            Text("placement", "placement", "placement"),
+            Text("where", "tasks that not all have on one node"),
+            Measure("windows", "windows", decimals=0),
+            Measure("share", "share", "%", 100.0, 0),
+        ]
+        return Table("placements", "Where it was", columns, rows, palette=self.palette)
+
+    # ----------------------------------------------------------------------------- decisions
+
+    def _decisions(self) -> Iterator[Table]:
+        decisions = self.counted.decisions
+        counts = dict(decisions["reason"].cast(str).value_counts().rows())
+        rows = [
+            {"reason": name, "meaning": text, "times": counts[name]}
+            for name, text in REASON_SENTENCES.items()
+            if counts.get(name)
+        ]
+        columns: Columns = [
+            Text("reason", "reason"),
+            Text("meaning", "meaning"),
+            Measure("times", "times", decimals=0),
+        ]
+        yield Table("reasons", "Why it was decided so", columns, rows)
+        if "shadow_cycles" in self.counted.windows.columns:
+            yield self._shadows()
+        moves = decisions.filter(decisions["migrated"])
+        if not moves.is_empty():
+            yield self._migrations(moves)
+
+    def _shadows(self) -> Table:
+        windows = self.counted.windows
+        cycles = windows.height * self.header.window_cycles
+        seconds = cycles * self.header.period_ms / 1e3
+        sent = float(windows["shadow_bytes"].sum())
+        used = {f"shadow_{node}": windows[f"shadow_{node}"].mean() for node in self.header.nodes}
+        row = {
+            "cycles": float(windows["shadow_cycles"].sum()) / cycles,
+            "rate_mbps": sent * 8e-6 / seconds,
+            **used,
+        }
+        columns: Columns = [
+            Measure("cycles", "cycles shadowed", "%", 100.0),
+            Measure("rate_mbps", "sent more", "Mbit/s", decimals=2),
+            *(Measure(name, f"of {name.removeprefix('shadow_')}", "%", 100.0, 2) for name in used),
+        ]
+        caption = "Cycles that went through another placement as well, for the estimator."
+        return Table("shadows", "What shadow jobs cost", columns, [row], caption=caption)
+
+    def _migrations(self, moves: pl.DataFrame) -> Table:
+        cost = dict(self.run.windows.select("window", "cost").rows())
+        length_s = self.header.window_cycles * self.header.period_ms / 1e3
+        rows = []
+        for move in moves.head(MOST_ROWS).iter_rows(named=True):
+            window, target, reason = move["window"], move["placement"], str(move["reason"])
+            guard = reason == "guard"
+            # A move of the guard is noted under the window that follows it.
+            before, after = (window - 1, window) if guard else (window, window + 1)
+            begin_s = self.begin_of.get(before, math.nan)
+            at_s = begin_s + length_s
+            if guard or before not in self.begin_of:
+                at_s = self.begin_of.get(window, math.nan)
+            rows.append(
+                {
+                    "window": before,
+                    "at_s": at_s,
+                    "from": str(move["incumbent"]),
+                    "to": str(target),
+                    "reason": reason,
+                    "before": cost.get(before),
+                    "estimated": move[f"j_{target}"],
+                    "after": cost.get(after),
+                }
+            )
+        columns: Columns = [
+            Text("window", "after window"),
+            Measure("at_s", "at", "s"),
+            Text("from", "from", "placement"),
+            Text("to", "to", "placement"),
+            Text("reason", "reason"),
+            Measure("before", "J before", decimals=2),
+            Measure("estimated", "J estimated", decimals=2),
+            Measure("after", "J after", decimals=2),
+        ]
+        return Table(
+            "migrations",
+            f"Migrations ({len(rows)} of {moves.height})",
+            columns,
+            rows,
+            caption=(
+                "J as measured in the window before the move, as estimated for the target, and as "
+                "measured in the first window on it."
+            ),
+            palette=self.palette,
+        )
+
+    # ------------------------------------------------------------------------------- record
+
+    def _known(self) -> Table:
+        """Return what of a live run was not heard, not proven or not kept."""
+        windows, cycles = self.run.windows, self.run.cycles
+        recovered = self.header.recovered
+        bound_ms = _number(windows["bound_ms"].max())
+        done = int((cycles["outcome"].cast(str) == "done").sum())
+        rows: list[tuple[str, object]] = [
+            (
+                "largest error of the clocks (ms)",
+                write_number(bound_ms, 2),
+            ),
+            (
+                "allowed in a proven window (ms)",
+                write_number(PROVEN_SHARE * self.header.deadline_ms),
+            ),
+            ("windows unproven", int(windows["unproven"].sum())),
+            ("cycles of which nothing was heard (counted as lost)", int((~cycles["heard"]).sum())),
+            (
+                "commands that arrived and were not applied: too old, or behind a later one",
+                max(done - int(cycles["actuated"].sum()), 0),
+            ),
+            ("cycles in no window, before the first of a placement", int(cycles["lead"].sum())),
+            ("starts of the controller", recovered.get("opened", 1)),
+            ("bytes torn off the journal’s end by a kill", recovered.get("torn_bytes", 0)),
+            ("bytes damaged within the journal", recovered.get("damaged_bytes", 0)),
+            ("windows missing from the run", recovered.get("missing_windows", 0)),
+            ("closed", "yes" if recovered.get("sealed", True) else "no"),
+        ]
+        shown = [{"what": what, "value": str(value)} for what, value in rows]
+        columns: Columns = [Text("what", ""), Measure("value", "")]
+        return Table("known", "", columns, shown)
+
+    def _about(self) -> Definitions:
+        header = self.header
+        return Definitions(
+            {
+                "cell": header.cell,
+                "scenario": header.scenario,
+                "record": f"{header.kind}, seed {header.seed}",
+                "policy": header.policy,
+                "estimator": header.estimator,
+                "window": f"{header.window_cycles} cycles of {write_number(header.period_ms)} ms, "
+                f"deadline {write_number(header.deadline_ms)} ms",
+                "versions": ", ".join(f"{name} {text}" for name, text in header.versions.items()),
+            }
+        )
 
 
-def _shadows(facts: RunHeader, windows: pl.DataFrame) -> Iterator[str]:
-    """Say what shadow jobs cost, where there were any."""
-    if "shadow_cycles" not in windows.columns or not windows["shadow_cycles"].sum():
-        return
-    cycles = windows.height * facts.window_cycles
-    share = float(windows["shadow_cycles"].sum()) / cycles
-    rate_mbps = float(windows["shadow_bytes"].sum()) * 8e-3 / (cycles * facts.period_ms)
-    used = {node: windows[f"shadow_{node}"].mean() for node in facts.nodes}
-    taken = listed(
-        f"{percent(mean, 1)} of {node}"
-        for node, mean in used.items()
-        if isinstance(mean, float) and mean >= LEAST_SHOWN
-    )
-    yield (
-        f"{percent(share, 1)} of the cycles went through another placement as well, for the "
-        f"estimator: these shadow jobs took {taken or 'next to no compute time'}, and sent "
-        f"{write_number(rate_mbps, 2)} Mbit/s more over the links."
-    )
-
-
-def _lost(cycles: pl.DataFrame) -> str:
-    outcomes = dict(cycles["outcome"].cast(str).value_counts().rows())
-    found = [
-        f"{_count(outcomes[name], 'cycle')} because {why}"
-        if name != "in_flight"
-        else f"{_count(outcomes[name], 'cycle')} {why}"
-        for name, why in OUTCOME_SENTENCES.items()
-        if name != "done" and outcomes.get(name)
-    ]
-    if not found:
-        return "Every cycle finished."
-    return f"Not finished: {listed(found)}."
+def _begins(run: Run, header: RunHeader) -> NDArray[np.float64]:
+    """When every window began, seconds; a live run's cycles do not come by their numbers."""
+    if not header.live:
+        return begins_by_number(run.windows, header.period_ms)
+    released = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
+    return np.array([released[cycle] / 1e9 for cycle in run.windows["first_cycle"]], np.float64)
 
 
 def _undone(moves: pl.DataFrame) -> int:
@@ -206,247 +534,15 @@ def _undone(moves: pl.DataFrame) -> int:
     return sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
 
 
-def _count(number: int, what: str) -> str:
-    return f"{write_number(number, 0)} {what}{'' if number == 1 else 's'}"
-
-
-# ----------------------------------------------------------------------------------- figures
-
-
-def _in_time(
-    run: Run, facts: RunHeader, palette: Palette, begin_s: NDArray[np.float64]
-) -> Iterator[str]:
-    shown = run_timeline(
-        run.windows,
-        run.decisions,
-        candidates=tuple(facts.candidates),
-        period_ms=facts.period_ms,
-        deadline_ms=facts.deadline_ms,
-        slug="time",
-        begin_s=begin_s,
-        disturbed=facts.disturbed,
-        tracking=facts.tracking,
-    )
-    error = " The tracking error is its root mean square." if facts.tracking is not None else ""
-    yield figure(
-        inline(draw(shown, PageStyle(palette, frozenset())), shown.slug, shown.title),
-        "Each mark is a window and has the colour of the placement that was active. In the panel "
-        "of J the lines without marks are what the other placements were estimated to cost."
-        + error,
-    )
-    rows = phase_rows(run, facts)
-    if len(rows) > 1:
-        yield _by_phase(facts, palette, rows)
-    yield figure(
-        run_figures.node_use_in_time(run.windows, facts.nodes, begin_s),
-        "Utilisation of each node as its operating system shows it: foreign work included.",
+def _moving(header: RunHeader, name: str) -> str:
+    """Return where a candidate puts the tasks that are not on one node in all of them."""
+    first = next(iter(header.candidates.values()))
+    return ", ".join(
+        f"{task} on {node}"
+        for task, node in header.candidates[name].items()
+        if any(other.get(task) != first.get(task) for other in header.candidates.values())
     )
 
 
-def _by_phase(facts: RunHeader, palette: Palette, phases: Sequence[PhaseRow]) -> str:
-    """Say what every phase showed."""
-    guarded = any(row.guard_moves for row in phases)
-    tracked = facts.tracking is not None
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for row in phases:
-        placed = "<br>".join(
-            f'<span class="nowrap">{_placed(palette, name)} {percent(share)}</span>'
-            for name, share in row.shares.items()
-        )
-        cells = [
-            Cell(escape(row.name)),
-            Cell(f"{row.begin_s:.0f} to {row.end_s:.0f}", "num"),
-            Cell(placed),
-            Cell(write_number(100 * row.violation_rate), "num"),
-            Cell(write_number(row.l95_ms), "num"),
-            Cell(str(row.lost), "num"),
-            Cell(str(row.migrations), "num"),
-        ]
-        cells += [Cell(str(row.guard_moves), "num")] if guarded else []
-        if tracked:
-            cells += [
-                Cell(write_number(row.rms_mm, 2), "num"),
-                Cell(write_number(row.rms_px), "num"),
-            ]
-        rows.append(("", cells))
-    head = [
-        Cell("phase"),
-        Cell("time (s)", "num"),
-        Cell("placed"),
-        Cell(marked("V_D (%)"), "num"),
-        Cell("L95 (ms)", "num"),
-        Cell("lost", "num"),
-        Cell("migrations", "num"),
-    ]
-    head += [Cell("by the guard", "num")] if guarded else []
-    head += [Cell("error (mm)", "num"), Cell("error (px)", "num")] if tracked else []
-    done = listed(f"{one.kind} ({one.what})" for one in _once(facts))
-    caption = (
-        f"All cycles by when they were released, the warm-up included. Played: {done}. Lost: "
-        "cycles that never finished."
-    )
-    if tracked:
-        caption += (
-            " Error: root mean square, over time, of how far the hand is from where it ought to "
-            "be, and the tag from the middle of the picture."
-        )
-    return table(head, rows, caption)
-
-
-def _once(facts: RunHeader) -> list[Disturbed]:
-    """Return what was done, each thing once."""
-    return list({(one.kind, one.what): one for one in facts.disturbed}.values())
-
-
-def _latency(facts: RunHeader, counted: Counted, palette: Palette) -> Iterator[str]:
-    yield figure(
-        run_figures.latencies_by_placement(
-            counted.cycles, PageStyle(palette, frozenset()), facts.deadline_ms
-        ),
-        "Latency of the cycles that were released under each placement: one less the empirical "
-        "distribution function, on a logarithmic scale. Dotted: 5 %.",
-    )
-    yield figure(
-        run_figures.split_by_placement(counted.cycles, palette.placements, facts.deadline_ms),
-        "Where the time goes along the critical path of the cycles that finished.",
-    )
-
-
-# ------------------------------------------------------------------------------------ tables
-
-
-def _decisions(
-    run: Run, counted: Counted, facts: RunHeader, palette: Palette, begins: NDArray[np.float64]
-) -> Iterator[str]:
-    decisions = counted.decisions
-    counts = dict(decisions["reason"].cast(str).value_counts().rows())
-    yield items(
-        f"`{name}`, {_count(counts[name], 'time')}: {text}"
-        for name, text in REASON_SENTENCES.items()
-        if counts.get(name)
-    )
-    moves = decisions.filter(decisions["migrated"])
-    if not moves.is_empty():
-        yield _migrations(run, facts, palette, moves, begins)
-
-
-def _migrations(
-    run: Run, facts: RunHeader, palette: Palette, moves: pl.DataFrame, begins: NDArray[np.float64]
-) -> str:
-    cost = dict(run.windows.select("window", "cost").rows())
-    begin_s = _by_window(run.windows, begins)
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for move in moves.head(MOST_ROWS).iter_rows(named=True):
-        window, target = move["window"], move["placement"]
-        by_guard = move["reason"] == "guard"
-        # A move of the guard is noted under the window that follows it.
-        before, after = (window - 1, window) if by_guard else (window, window + 1)
-        if by_guard or before not in begin_s:
-            at_s = begin_s.get(window, math.nan)
-        else:
-            at_s = begin_s[before] + facts.window_cycles * facts.period_ms / 1e3
-        numbers = (cost.get(before), move[f"j_{target}"], cost.get(after))
-        cells = [
-            Cell(str(before)),
-            Cell(write_number(at_s), "num"),
-            Cell(f"{_placed(palette, move['incumbent'])} → {_placed(palette, target)}"),
-            Cell("by the guard" if by_guard else escape(str(move["reason"]))),
-            *(Cell(write_number(_number(value), 2), "num") for value in numbers),
-        ]
-        rows.append(("", cells))
-    head = [
-        Cell("after window"),
-        Cell("at (s)", "num"),
-        Cell("migration"),
-        Cell("reason"),
-        Cell("J before", "num"),
-        Cell("J estimated", "num"),
-        Cell("J after", "num"),
-    ]
-    more = moves.height - MOST_ROWS
-    caption = (
-        "Every move: measured J of the window before it, J that was estimated for the "
-        "target, and measured J of the first window on it."
-    )
-    return table(head, rows, f"{caption} {more} more are left out." if more > 0 else caption)
-
-
-def _by_window(windows: pl.DataFrame, begins: NDArray[np.float64]) -> Mapping[int, float]:
-    return dict(zip(windows["window"].to_list(), begins.tolist(), strict=True))
-
-
-def _worst_windows(
-    facts: RunHeader, counted: Counted, palette: Palette, all_begins: Mapping[int, float]
-) -> str:
-    worst = counted.windows.sort(
-        "violation_rate", "seen_l95_ms", descending=True, nulls_last=True, maintain_order=True
-    ).head(WORST)
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for window in worst.iter_rows(named=True):
-        begin_s = all_begins[window["window"]]
-        used = [_number(window[f"u_{node}"]) for node in facts.nodes]
-        cells = [
-            Cell(str(window["window"])),
-            Cell(f"{begin_s:.1f}", "num"),
-            Cell(_placed(palette, window["placement"])),
-            Cell(write_number(100 * window["violation_rate"]), "num"),
-            Cell(write_number(_number(window["l95_ms"])), "num"),
-            Cell(write_number(_number(window["cost"]), 2), "num"),
-            *(Cell(write_number(100 * value, 0), "num") for value in used),
-        ]
-        rows.append(("", cells))
-    head = [
-        Cell("window"),
-        Cell("at (s)", "num"),
-        Cell("placement"),
-        Cell(marked("V_D (%)"), "num"),
-        Cell("L95 (ms)", "num"),
-        Cell("J", "num"),
-        *(Cell(f"{escape(node)} (%)", "num") for node in facts.nodes),
-    ]
-    return table(
-        head,
-        rows,
-        f"The {len(rows)} windows with the most misses. L95 of final latencies: ∞ where more than "
-        "5 % of the cycles never finished. The last columns are the utilisation of the nodes.",
-    )
-
-
-def _about(facts: RunHeader) -> Iterator[str]:
-    yield definitions(
-        {
-            "cell": facts.cell,
-            "scenario": facts.scenario,
-            "record": f"{facts.kind}, seed {facts.seed}",
-            "policy": facts.policy,
-            "estimator": facts.estimator,
-            "window": f"{facts.window_cycles} cycles of {write_number(facts.period_ms)} ms, "
-            f"deadline {write_number(facts.deadline_ms)} ms",
-            "placements": _placements(facts),
-            "versions": ", ".join(f"{name} {text}" for name, text in facts.versions.items()),
-        }
-    )
-    if facts.policy_name in ("ATP", "ATPThresholds"):
-        yield paragraph(OURS)
-
-
-def _placements(facts: RunHeader) -> str:
-    """Say where each candidate puts the tasks that are not on the same node in all of them."""
-    first = next(iter(facts.candidates.values()))
-    parts = []
-    for name, placed in facts.candidates.items():
-        moving = [
-            f"{task} on {node}"
-            for task, node in placed.items()
-            if any(other.get(task) != first.get(task) for other in facts.candidates.values())
-        ]
-        parts.append(f"{name}: {listed(moving)}" if moving else name)
-    return "; ".join(parts)
-
-
-def _placed(palette: Palette, name: str) -> str:
-    return f'<span class="nowrap">{swatch(palette.placements[name])}{escape(name)}</span>'
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+def _number(value: object) -> float:
+    return math.nan if value is None else float(str(value))

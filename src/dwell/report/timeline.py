@@ -1,15 +1,17 @@
-"""A run through time: where it was placed, what that showed, and what the policy believed."""
+"""A run through time: what it showed window by window, where it was placed, what was disturbed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.report.charts import is_wide, limit_rule, name_of, quantity
+from dwell.report.figure import Figure, Spec
+from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
-from dwell.study.chapter import Figure, Panel
 
 if TYPE_CHECKING:
     import polars as pl
@@ -18,25 +20,40 @@ if TYPE_CHECKING:
     from dwell.report.phases import Disturbed
     from dwell.report.tracking import Tracking
 
-__all__ = ["GUARD", "MIGRATIONS", "run_timeline"]
+__all__ = ["begins_by_number", "run_timeline"]
 
-MIGRATIONS = "migrations"
-GUARD = "moves of the guard"
+#: Marks of a panel at most; of longer runs several windows are one mark.
+MOST_MARKS = 600
+PANEL_PX, USE_PX = 86, 56
+DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
+#: Scales that every panel has for itself.
+OWN = ("color", "strokeDash")
+L95 = "L95 (ms)"
+WARMUP, UNPROVEN = "warm-up", "clocks unproven"
+
+
+def begins_by_number(windows: pl.DataFrame, period_ms: float) -> NDArray[np.float64]:
+    """Return when every window began, seconds, by the number of its first cycle."""
+    begins: NDArray[np.float64] = windows["first_cycle"].to_numpy() * (period_ms / 1e3)
+    return begins
 
 
 def run_timeline(
     windows: pl.DataFrame,
     decisions: pl.DataFrame,
+    begin_s: NDArray[np.float64],
     *,
-    candidates: Sequence[str],
-    period_ms: float,
-    deadline_ms: float,
     slug: str,
-    begin_s: NDArray[np.float64] | None = None,
+    palette: Palette,
+    nodes: Sequence[str],
+    deadline_ms: float,
     disturbed: Iterable[Disturbed] = (),
     tracking: Tracking | None = None,
+    links: Mapping[int, str] | None = None,
+    title: str = "",
+    caption: str = "",
 ) -> Figure:
-    """Return placement, violation rate, L95 and J of a run, window by window.
+    """Draw violation rate, L95, J, utilisation and, where it is known, the tracking error.
 
     J of the placement that is active is the measured one; of the others, what the policy estimated
     at the window's close.
@@ -45,125 +62,304 @@ def run_timeline(
     ----------
     windows, decisions : DataFrame
         Of the run.
-    candidates : sequence of str
-    period_ms, deadline_ms : float
+    begin_s : float64 array, shape (windows,)
+        When each window began, seconds.
     slug : str
-        Of the figure.
-    begin_s : float64 array, shape (windows,), optional
-        When each window began; by its first cycle's number where left out.
+    palette : Palette
+        Of the candidates.
+    nodes : sequence of str
+    deadline_ms : float
     disturbed : iterable of Disturbed
         What happened meanwhile. What went on beyond the run is cut.
     tracking : Tracking, optional
+    links : mapping of int to str, optional
+        Where windows lead to, by their numbers.
+    title, caption : str
     """
     import polars as pl
 
-    if begin_s is None:
-        begin_s = windows["first_cycle"].to_numpy() * (period_ms / 1e3)
     length_s = float(np.median(np.diff(begin_s))) if len(begin_s) > 1 else 1.0
-    lines = [
-        ("V_D", "V_D", _floats(windows["violation_rate"])),
-        ("L95", "L95", _floats(windows["seen_l95_ms"])),
-        *(("J", name, _cost(windows, decisions, name)) for name in candidates),
-    ]
-    panels = {
-        "V_D": Panel("V_D", "percent", AIM, "5 %"),
-        "L95": Panel("L95", "ms", deadline_ms, "deadline"),
-        "J": Panel("J", "cost"),
-    }
+    end_s = float(begin_s[-1]) + length_s
+    candidates = tuple(palette.placements)
+    frame = pl.DataFrame(
+        {
+            "window": windows["window"],
+            "time": begin_s + length_s / 2,
+            "placement": windows["placement"].cast(pl.String),
+            "v_d": windows["violation_rate"] * 100,
+            "l95": windows["seen_l95_ms"],
+            "j": windows["cost"],
+            "link": [(links or {}).get(number) for number in windows["window"].to_list()],
+            **{f"u {node}": windows[f"u_{node}"].cast(pl.Float64) * 100 for node in nodes},
+        },
+        strict=False,
+    ).with_columns(link=pl.col("link").cast(pl.String))
     if tracking is not None:
         errors = [tracking.rms(begin, begin + length_s)[0] for begin in begin_s.tolist()]
-        lines.append(("error", "error", np.array(errors)))
-        panels["error"] = Panel("tracking error (mm)", "number")
-    frame = pl.concat(
-        pl.DataFrame(
-            {
-                "time": begin_s + length_s / 2,
-                "panel": [panel] * len(values),
-                "series": [series] * len(values),
-                "y": values,
-                "placement": windows["placement"].cast(pl.String),
-            }
-        )
-        for panel, series, values in lines
+        frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
+    frames = {
+        "windows": _binned(frame),
+        "estimates": _estimates(windows, decisions, begin_s + length_s, candidates),
+        "moves": _moves(windows, decisions, begin_s, length_s),
+        "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
+    }
+    long = frames["windows"].unpivot(
+        [f"u {node}" for node in nodes],
+        index=["time", "window"],
+        variable_name="node",
+        value_name="used",
     )
-    end_s = float(begin_s[-1]) + length_s
-    spans = [
-        *_warmup(windows, begin_s, length_s),
-        *((one.begin_s, min(one.end_s, end_s), one.kind) for one in disturbed),
-        *_unproven(windows, begin_s, length_s),
-        *_moves(windows, decisions, begin_s, length_s),
-    ]
-    return Figure(
-        slug=slug,
-        title="Placement, violation rate, L95 and cost over time",
-        kind="timeline",
-        frame=frame,
-        x="time",
-        y="y",
-        series="series",
-        facet="panel",
-        x_label="time (s)",
-        panels=panels,
-        spans=pl.DataFrame(
-            [span for span in spans if span[0] < end_s],
-            schema={"begin": pl.Float64, "end": pl.Float64, "label": pl.String},
-            orient="row",
+    frames["nodes"] = long.with_columns(node=pl.col("node").str.slice(2))
+    frames["windows"] = frames["windows"].drop([f"u {node}" for node in nodes])
+    shown = [name for name in candidates if name in set(frame["placement"])]
+    wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
+    aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
+    rows: list[tuple[int, Callable[[Spec], list[Spec]]]] = [
+        (PANEL_PX, lambda time: [*aim, _marks(time, "v_d", "V_D (%)", palette, shown)]),
+        (PANEL_PX, lambda time: [*due, _marks(time, "l95", L95, palette, shown, log=wide)]),
+        (
+            PANEL_PX,
+            lambda time: [_others(time, palette), _marks(time, "j", "J", palette, shown)],
         ),
+        (USE_PX, lambda time: [_use(time, nodes)]),
+    ]
+    if tracking is not None:
+        error = "tracking error (mm)"
+        rows.append((PANEL_PX, lambda time: [_marks(time, "error", error, palette, shown)]))
+
+    def draw(width: float) -> Spec:
+        panels = []
+        for place, (height, marks) in enumerate(rows):
+            time = _time(end_s, shown=place == len(rows) - 1)
+            layers = [_shade(time), *marks(time), _migrations(time)]
+            panels.append({"width": width - 90, "height": height, "layer": layers})
+        return {
+            "vconcat": [_named_spans(width - 90, _time(end_s)), *panels],
+            "spacing": 8,
+            "resolve": {"scale": {"x": "shared", **dict.fromkeys(OWN, "independent")}},
+        }
+
+    return Figure(slug, title, frames, draw, caption)
+
+
+# -------------------------------------------------------------------------------------- data
+
+
+def _binned(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return one row a mark: of several windows the worst, where there are too many."""
+    import polars as pl
+
+    each = math.ceil(frame.height / MOST_MARKS)
+    if each <= 1:
+        return frame
+    numbers = [name for name, kind in frame.schema.items() if kind.is_float() and name != "time"]
+    rows = frame.with_row_index("row").with_columns(bin=pl.col("row") // each)
+    return (
+        rows.group_by("bin", maintain_order=True)
+        .agg(
+            pl.col("window").first(),
+            pl.col("time").mean(),
+            pl.col("placement").mode().first(),
+            *(pl.col(name).max() for name in numbers),
+            pl.col("link").drop_nulls().first(),
+        )
+        .drop("bin")
+        .select(frame.columns)
     )
 
 
-def _warmup(
-    windows: pl.DataFrame, begin_s: NDArray[np.float64], length_s: float
-) -> Iterable[tuple[float, float, str]]:
-    count = int(windows["warmup"].sum())
-    if count:
-        yield 0.0, float(begin_s[count - 1]) + length_s, "warm-up"
+def _estimates(
+    windows: pl.DataFrame,
+    decisions: pl.DataFrame,
+    close_s: NDArray[np.float64],
+    candidates: Sequence[str],
+) -> pl.DataFrame:
+    """Return J of the candidates that were not active, as estimated at the close of windows."""
+    import polars as pl
 
-
-def _unproven(
-    windows: pl.DataFrame, begin_s: NDArray[np.float64], length_s: float
-) -> Iterable[tuple[float, float, str]]:
-    """Yield the windows whose latencies the clocks do not prove."""
-    if "unproven" not in windows.columns:
-        return
-    for begin, unproven in zip(begin_s.tolist(), windows["unproven"], strict=True):
-        if unproven:
-            yield begin, begin + length_s, "clocks unproven"
+    closes = pl.DataFrame({"window": windows["window"], "time": close_s})
+    priced = decisions.filter(pl.col("reason").cast(pl.String) != "guard").join(
+        closes, on="window", how="inner"
+    )
+    each = math.ceil(priced.height / MOST_MARKS) or 1
+    parts = [
+        priced.gather_every(each).select(
+            "time",
+            pl.lit(name).alias("placement"),
+            pl.when(pl.col("incumbent").cast(pl.String) != name)
+            .then(pl.col(f"j_{name}"))
+            .alias("j"),
+        )
+        for name in candidates
+        if f"j_{name}" in priced.columns
+    ]
+    schema = {"time": pl.Float64, "placement": pl.String, "j": pl.Float64}
+    return pl.concat(parts) if parts else pl.DataFrame(schema=schema)
 
 
 def _moves(
+    windows: pl.DataFrame, decisions: pl.DataFrame, begin_s: NDArray[np.float64], length_s: float
+) -> pl.DataFrame:
+    """Return when moves were decided; those of the guard stand under the window that follows."""
+    import polars as pl
+
+    began = dict(zip(windows["window"].to_list(), begin_s.tolist(), strict=True))
+    rows = []
+    for move in decisions.filter(decisions["migrated"]).iter_rows(named=True):
+        guard = str(move["reason"]) == "guard"
+        at_s = began.get(move["window"])
+        if at_s is not None:
+            name = f"{move['incumbent']} → {move['placement']}"
+            rows.append((at_s if guard else at_s + length_s, name, str(move["reason"])))
+    schema = {"time": pl.Float64, "move": pl.String, "reason": pl.String}
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def _spans(
     windows: pl.DataFrame,
-    decisions: pl.DataFrame,
+    disturbed: Iterable[Disturbed],
     begin_s: NDArray[np.float64],
     length_s: float,
-) -> Iterable[tuple[float, float, str]]:
-    """Yield every move as a span without length.
+    end_s: float,
+) -> pl.DataFrame:
+    """Return what went on: warm-up, unproven clocks, disturbances as far as the run reaches."""
+    import polars as pl
 
-    A migration comes at its window's close. A move of the guard is noted under the window that
-    follows it, and comes before that window begins.
-    """
-    begin_of = dict(zip(windows["window"], begin_s.tolist(), strict=True))
-    last_s = float(begin_s[-1]) + length_s
-    moves = decisions.filter(decisions["migrated"])
-    for window, reason in zip(moves["window"], moves["reason"].cast(str), strict=True):
-        if reason == "guard":
-            at_s, label = begin_of.get(window, last_s), GUARD
-        else:
-            at_s, label = begin_of.get(window, last_s - length_s) + length_s, MIGRATIONS
-        yield at_s, at_s, label
-
-
-def _cost(windows: pl.DataFrame, decisions: pl.DataFrame, name: str) -> NDArray[np.float64]:
-    """J of a candidate: measured while it is active, estimated while it is not."""
-    measured = _floats(windows["cost"])
-    active = windows["placement"].cast(str).to_numpy() == name
-    at = decisions["window"].to_numpy() - int(windows["window"][0])
-    known = (at >= 0) & (at < len(measured))
-    estimated = np.full(len(measured), math.nan)
-    estimated[at[known]] = _floats(decisions[f"j_{name}"])[known]
-    return np.where(active, measured, estimated)
+    rows = []
+    warm = windows["warmup"].to_numpy()
+    if warm.any():
+        rows.append((WARMUP, 0.0, float(begin_s[warm][-1]) + length_s))
+    if "unproven" in windows.columns:
+        unproven = windows["unproven"].fill_null(value=False).to_numpy()
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], unproven, [False])).astype(int)))
+        ends = np.append(begin_s, end_s)
+        rows += [(UNPROVEN, ends[low], ends[high]) for low, high in edges.reshape(-1, 2)]
+    for item in disturbed:
+        low, high = max(item.begin_s, 0.0), min(item.end_s, end_s)
+        if low < high:
+            rows.append((item.what, low, high))
+    schema = {"what": pl.String, "begin": pl.Float64, "end": pl.Float64}
+    return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-def _floats(values: pl.Series) -> NDArray[np.float64]:
-    found: NDArray[np.float64] = values.cast(float).fill_null(math.nan).to_numpy()
-    return found
+# ---------------------------------------------------------------------------------- drawings
+
+
+def _time(end_s: float, *, shown: bool = False) -> Spec:
+    axis = {"title": "time (s)", "grid": False, "tickCount": 10} if shown else None
+    return {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}, "axis": axis}
+
+
+def _named_spans(width: float, time: Spec) -> Spec:
+    """Return a row for everything that went on, with its name."""
+    return {
+        "data": {"name": "spans"},
+        "width": width,
+        "height": {"step": 15},
+        "mark": {"type": "bar", "height": 4, "color": MUTED, "cornerRadius": 2},
+        "encoding": {
+            "x": {**time, "field": "begin"},
+            "x2": {"field": "end"},
+            "y": name_of("what", sort=None, axis={"domain": False, "ticks": False}),
+            "tooltip": [
+                name_of("what", title="what"),
+                quantity("begin", "from (s)", format=".1f"),
+                quantity("end", "to (s)", format=".1f"),
+            ],
+        },
+    }
+
+
+def _shade(time: Spec) -> Spec:
+    return {
+        "data": {"name": "spans"},
+        "mark": {"type": "rect", "color": SHADE},
+        "encoding": {
+            "x": {**time, "field": "begin"},
+            "x2": {"field": "end"},
+            "opacity": {
+                "condition": {"test": f"datum.what === '{WARMUP}'", "value": 0.5},
+                "value": 1,
+            },
+        },
+    }
+
+
+def _migrations(time: Spec) -> Spec:
+    return {
+        "data": {"name": "moves"},
+        "mark": {"type": "rule", "strokeWidth": 0.7},
+        "encoding": {
+            "x": {**time, "field": "time"},
+            "color": {
+                "condition": {"test": "datum.reason === 'guard'", "value": BAD},
+                "value": INK,
+            },
+            "opacity": {"value": 0.35},
+            "tooltip": [
+                name_of("move", title="moved"),
+                name_of("reason", title="reason"),
+                quantity("time", "at (s)", format=".1f"),
+            ],
+        },
+    }
+
+
+def _marks(
+    time: Spec, field: str, title: str, palette: Palette, shown: Sequence[str], *, log: bool = False
+) -> Spec:
+    scale: Spec = {"type": "log", "nice": False} if log else {"zero": field == "v_d"}
+    return {
+        "data": {"name": "windows"},
+        "mark": {"type": "point", "filled": True, "size": 18, "opacity": 0.9},
+        "encoding": {
+            "x": {**time, "field": "time"},
+            "y": quantity(field, title, scale=scale, axis={"tickCount": 4}),
+            "color": name_of(
+                "placement",
+                scale={"domain": list(shown), "range": [palette.placements[one] for one in shown]},
+                legend={"symbolSize": 60} if field == "v_d" else None,
+            ),
+            "href": {"field": "link", "type": "nominal"},
+            "tooltip": [
+                quantity("window", "window"),
+                quantity("time", "at (s)", format=".1f"),
+                name_of("placement", title="placement"),
+                quantity(field, title),
+            ],
+        },
+    }
+
+
+def _others(time: Spec, palette: Palette) -> Spec:
+    names = list(palette.placements)
+    return {
+        "data": {"name": "estimates"},
+        "mark": {"type": "line", "strokeWidth": 1, "opacity": 0.75},
+        "encoding": {
+            "x": {**time, "field": "time"},
+            "y": quantity("j", "J", scale={"zero": False}, axis={"tickCount": 4}),
+            "color": name_of(
+                "placement",
+                scale={"domain": names, "range": list(palette.placements.values())},
+                legend=None,
+            ),
+        },
+    }
+
+
+def _use(time: Spec, nodes: Sequence[str]) -> Spec:
+    shades = [INK if place % 2 == 0 else MUTED for place in range(len(nodes))]
+    dashes = [DASHES[place % len(DASHES)] for place in range(len(nodes))]
+    return {
+        "data": {"name": "nodes"},
+        "mark": {"type": "line", "strokeWidth": 1.1},
+        "encoding": {
+            "x": {**time, "field": "time"},
+            "y": quantity(
+                "used", "U (%)", scale={"domain": [0, 104]}, axis={"values": [0, 50, 100]}
+            ),
+            "color": name_of("node", scale={"domain": list(nodes), "range": shades}),
+            "strokeDash": name_of("node", scale={"domain": list(nodes), "range": dashes}),
+        },
+    }

@@ -4,38 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from html import escape
 from typing import TYPE_CHECKING
 
-from dwell.report import validation_figures as figures
-from dwell.report.formatting import (
-    OURS,
-    Measure,
-    percent,
-    shown_contender,
-    shown_scenario,
-    write_interval,
-    write_number,
-)
-from dwell.report.method import describe_cell
-from dwell.report.page import (
-    Cell,
-    definitions,
-    document,
-    figure,
-    items,
-    marked,
-    named,
-    paragraph,
-    section,
-    table,
-)
-from dwell.report.palette import Palette
-from dwell.report.validation_findings import GOAL_NAMES, remarks, totals, worst_use
-from dwell.study.intervals import Interval
-from dwell.study.judged_prediction import Outcome
+import numpy as np
+
+from dwell.report.charts import PART_COLOURS, PARTS_SHOWN, cumulative, name_of, quantity, stacked
+from dwell.report.figure import Figure, Spec
+from dwell.report.formatting import Measure, percent, shown_contender, shown_scenario, write_number
+from dwell.report.method import cell_definitions
+from dwell.report.page import Definitions, Page, Section, page_html
+from dwell.report.palette import DASHES, INK, MUTED, SHADE, Palette, Style
+from dwell.report.table import Columns, Row, Table, Text, interval_row, table_text
+from dwell.study.judged_prediction import ORDER, Judged
 from dwell.study.resampling import DRAWS
 from dwell.study.validation import (
+    GOALS,
     L95_ALLOWED,
     LEAST_MINUTES,
     POINTS_ALLOWED,
@@ -45,374 +28,112 @@ from dwell.study.validation import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    import polars as pl
 
-__all__ = ["validation_html"]
+__all__ = ["validation_html", "validation_page", "validation_text"]
 
-TAGS: Mapping[Outcome, str] = {
-    "met": "good",
-    "explained": "good",
-    "open": "open",
-    "missed": "bad",
-    "": "open",
+GOAL_NAMES = {
+    "l95_ms": "L95 within 10 %",
+    "violation_rate": "V_D within 2 percentage points, or explained",
+    "utilisation": "U of every node within 5 percentage points",
+    "dominant": "the same dominant placement",
+    "sum_of_means": "better than the sum of means",
 }
-L95 = Measure("l95_ms", "L95", "ms")
-RATE = Measure("violation_rate", "V_D", "%", 100.0)
-USE = Measure("utilisation", "U", "%", 100.0)
+#: Points of a distribution, and where its axis ends.
+POINTS, DEADLINES = 120, 3.0
+MEASURED, PREDICTED = "measured", "predicted"
+BOTH = {
+    MEASURED: Style(INK, "circle", DASHES[0], 1.5),
+    PREDICTED: Style(MUTED, "diamond", DASHES[1], 1.5),
+}
+#: Columns of verdicts that a terminal has room for.
+SHORT = {
+    *("l95", "l95_predicted", "l95_word", "rate", "rate_predicted", "rate_word"),
+    *("use_word", "placed_word", "sum_word"),
+}
+SCENARIO = Text("scenario", "", "scenario")
+POLICY = Text("policy", "policy", "policy")
 
 
-def validation_html(validation: Validation) -> str:
-    """Return a self-contained page about a validation.
+def validation_html(validation: Validation, *, static: bool = False) -> str:
+    """Return a page about a validation; see `dwell.report.page.page_html`.
 
     Parameters
     ----------
     validation : Validation
-
-    Returns
-    -------
-    str
-        HTML without scripts, and without anything that is loaded from elsewhere.
+    static : bool
+        Whether scripts are left out.
     """
-    title = f"Predicted beside measured: {validation.problem.name}"
-    return document(title, _body(validation, title))
+    return page_html(validation_page(validation), static=static)
 
 
-def _body(validation: Validation, title: str) -> Iterator[str]:
-    palette = _palette(validation)
+def validation_page(validation: Validation) -> Page:
+    """Return what there is to show of a validation; see `validation_html`."""
     runs = sum(len(group.runs) for group in validation.groups)
     minutes = sum(group.minutes for group in validation.groups)
-    yield f"<h1>{escape(title)}</h1>"
-    yield paragraph(
-        f"Groups of a scenario and a policy: {len(validation.groups)}; runs: {runs}, "
+    return Page(
+        title=f"Predicted beside measured: {validation.problem.name}",
+        subtitle=f"{len(validation.groups)} groups of a scenario and a policy, {runs} runs, "
         f"{write_number(minutes)} minutes that count, each run simulated {validation.seeds} times",
-        "subtitle",
+        sections=list(_sections(validation)),
     )
-    yield paragraph(
-        "Does the simulator predict what this cell shows when it really runs?", "question"
-    )
-    yield _totals(validation)
-    told = list(remarks(validation))
-    if told:
-        yield items(told, "evidence")
-    yield section("Verdicts", _verdicts(validation, palette))
-    yield section("Predicted over measured", _over(validation, palette))
-    yield section("Latencies", *_latencies(validation, palette))
-    yield section("Where the time goes", *_parts(validation, palette))
+
+
+def validation_text(validation: Validation, *, width: int | None = None) -> str:
+    """Return the tables of a validation as text for a terminal, the verdicts on goals last.
+
+    Parameters
+    ----------
+    validation : Validation
+    width : int, optional
+        Columns of the terminal; as wide as it takes where None.
+    """
+    page = validation_page(validation)
+    tables = [_verdicts(validation, compact=True), _goals(validation)]
+    texts = [table_text(one, width=width) for one in tables]
+    return "\n".join([page.title, f"{page.subtitle}\n", *texts])
+
+
+def _sections(validation: Validation) -> Iterator[Section]:
+    yield Section("", [_goals(validation), _over(validation)])
+    yield Section("Verdicts", [_verdicts(validation)])
+    yield Section("Latencies", [_latencies(validation), _rates(validation)])
+    yield Section("Where the time goes", [_split(validation), _parts(validation)])
     if not validation.jobs.is_empty():
-        yield section("Jobs", _jobs(validation, palette))
-    yield section("More figures", *_more(validation, palette))
-    yield section("How it was judged", items(_method(validation)))
-    yield section("What it does not say", items(_limits()))
-    yield section("What this is", definitions(_about(validation)))
+        yield Section("Jobs", [_jobs(validation)], folded=True)
+    nodes = [f"u_{node}" for node in validation.problem.fabric.nodes]
+    others = [
+        _compared(validation, "windows", ["window_l95_ms", "migrations"], "Windows and migrations"),
+        _compared(validation, "use", nodes, "Utilisation of the nodes"),
+        _compared(validation, "shares", _shares(validation), "Windows under each placement"),
+    ]
+    yield Section("More figures", [one for one in others if one.rows])
+    names = [name for group in validation.groups for name in group.runs]
+    allowed = f"{percent(L95_ALLOWED)} of L95, {100 * POINTS_ALLOWED:g} points of V_D, "
+    about = {
+        "met, missed": "the whole interval of the error is within what is allowed, or beyond it; "
+        "else open",
+        "allowed": f"{allowed}{100 * USE_ALLOWED:g} points of U",
+        "explained": "V_D is not met, L95 is, and the measured V_D lies between those of the "
+        "predicted latencies times 0.9 and times 1.1",
+        "intervals": f"95 %, of {DRAWS} resamples: of runs, and of blocks of windows within them; "
+        "of simulations; of errors, both",
+        "enough": f"{LEAST_MINUTES:g} minutes measured",
+        "sum of means": "mean time of every task and message along the longest path",
+        "runs": ", ".join(names),
+        "versions": ", ".join(f"{name} {one}" for name, one in validation.versions.items()),
+    }
+    yield Section("What this is", [Definitions({**cell_definitions(validation.problem), **about})])
 
 
 def _palette(validation: Validation) -> Palette:
     """Return the colours of placements and policies; runs may have had candidates of their own."""
-    groups = validation.groups
-    theirs = [
-        name.removeprefix("share_")
-        for group in groups
-        for name in group.figures
-        if name.startswith("share_")
-    ]
-    names = dict.fromkeys([*validation.problem.candidates, *theirs])
-    return Palette.of(names, [group.policy for group in groups])
+    names = dict.fromkeys([*validation.problem.candidates, *map(_share, _shares(validation))])
+    return Palette.of(names, [group.policy for group in validation.groups])
 
 
-def _tag(verdict: Outcome) -> str:
-    return f'<span class="{TAGS[verdict]} nowrap">{verdict or "–"}</span>'
-
-
-def _totals(validation: Validation) -> str:
-    rows: list[tuple[str, Sequence[Cell]]] = [
-        (
-            "",
-            [Cell(marked(GOAL_NAMES[goal])), Cell(_tag(verdict)), Cell(escape(counts))],
-        )
-        for goal, verdict, counts in totals(validation)
-    ]
-    head = [Cell("goal"), Cell("in the worst group"), Cell("groups")]
-    return table(head, rows, kind="prose")
-
-
-def _named(palette: Palette, policy: str) -> str:
-    colour = palette.policies[policy].colour
-    return named(shown_contender(policy), colour, ring=policy not in palette.placements)
-
-
-def _pair(interval: Interval, measure: Measure, kind: str = "num") -> list[Cell]:
-    written = write_interval(interval, measure)
-    return [Cell(written.value, kind), Cell(written.error, "err")]
-
-
-def _value(interval: Interval, measure: Measure) -> Cell:
-    return Cell(write_interval(interval, measure).value, "num")
-
-
-def _by_scenario(
-    validation: Validation, columns: int
-) -> Iterator[tuple[str, Sequence[Cell]] | Group]:
-    """Yield a row with each scenario's name, and then its groups."""
-    shown = None
-    for group in validation.groups:
-        if group.scenario != shown:
-            shown = group.scenario
-            yield "group", [Cell(escape(shown_scenario(shown)), columns=columns)]
-        yield group
-
-
-# ------------------------------------------------------------------------------------- verdicts
-
-
-def _verdicts(validation: Validation, palette: Palette) -> str:
-    head = [
-        Cell("policy"),
-        Cell("min", "num"),
-        Cell("measured", "pair", 2),
-        Cell("predicted", "num"),
-        Cell(""),
-        Cell("measured", "pair", 2),
-        Cell("predicted", "num"),
-        Cell(""),
-        Cell("points off", "num"),
-        Cell(""),
-        Cell("placed"),
-        Cell("sum of means", "num"),
-        Cell("beaten"),
-    ]
-    above = [
-        Cell("", "", 2),
-        Cell("L95 (ms)", "over", 4),
-        Cell(marked("V_D (%)"), "over", 4),
-        Cell("U, worst node", "over", 2),
-        Cell("", "", 3),
-    ]
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for item in _by_scenario(validation, 15):
-        if not isinstance(item, Group):
-            rows.append(item)
-            continue
-        l95, rate = item.figures["l95_ms"], item.figures["violation_rate"]
-        node, use = worst_use(item)
-        error = write_number(100 * use.error.value, signed=True)
-        placed = item.verdict("dominant")
-        was, said = item.dominant
-        where = "" if was == said else f" <small>({escape(said)})</small>"
-        minutes = write_number(item.minutes)
-        rows.append(
-            (
-                "",
-                [
-                    Cell(_named(palette, item.policy)),
-                    Cell(f'<span class="bad">{minutes}</span>' if item.short else minutes, "num"),
-                    *_pair(l95.measured, L95),
-                    _value(l95.predicted, L95),
-                    Cell(_tag(l95.verdict)),
-                    *_pair(rate.measured, RATE),
-                    _value(rate.predicted, RATE),
-                    Cell(_tag(rate.verdict)),
-                    Cell(f"{escape(node)} {error}", "num"),
-                    Cell(_tag(item.verdict("utilisation"))),
-                    Cell(f"{escape(was)}{where} {_tag(placed)}", "nowrap"),
-                    _value(Interval(l95.baseline, math.nan, math.nan), L95),
-                    Cell(_tag(item.verdict("sum_of_means"))),
-                ],
-            )
-        )
-    atp = f" {OURS}" if any(one.policy.startswith("atp") for one in validation.groups) else ""
-    return table(
-        head,
-        rows,
-        "Measured figures with their 95 % intervals. L95 is that of all cycles together: where "
-        "more than 5 % are lost it is ∞. “Placed” is the dominant placement, measured, with the "
-        "predicted one in brackets where it is another. “Sum of means” is the "
-        f"L95 of that predictor. Minutes in colour: fewer than {LEAST_MINUTES:g}.{atp}",
-        above=above,
-        kind="wide small of-chapter",
-    )
-
-
-def _over(validation: Validation, palette: Palette) -> str:
-    return figure(
-        figures.predicted_over_measured(validation, palette),
-        f"Each mark is a group, the bar through it the interval of what was measured. Shaded: "
-        f"what is allowed, {percent(L95_ALLOWED)} of L95, {100 * POINTS_ALLOWED:g} points of V_D, "
-        f"{100 * USE_ALLOWED:g} points of U. A short dash is what the sum of means predicts for "
-        "the group of the same L95 or V_D.",
-    )
-
-
-# ------------------------------------------------------------------------------------ latencies
-
-
-def _latencies(validation: Validation, palette: Palette) -> Iterator[str]:
-    yield figure(
-        figures.distributions(validation, palette),
-        "Empirical distributions of the latencies of all cycles. A curve that stays below 100 % "
-        "shows that cycles were lost. 95 % is where L95 is read.",
-    )
-    head = [
-        Cell("policy"),
-        Cell("measured", "num begin"),
-        Cell("predicted", "num"),
-        Cell("measured", "num begin"),
-        Cell("predicted", "num"),
-        Cell("10 % shorter", "num begin"),
-        Cell("10 % longer", "num"),
-        Cell("factor", "num begin"),
-    ]
-    above = [
-        Cell(""),
-        Cell("within 10 % of D (%)", "over", 2),
-        Cell(marked("V_D (%)"), "over", 2),
-        Cell(marked("V_D if latencies were"), "over", 2),
-        Cell(""),
-    ]
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for item in _by_scenario(validation, 8):
-        if not isinstance(item, Group):
-            rows.append(item)
-            continue
-        rate = item.figures["violation_rate"]
-        numbers = [
-            item.measured.share_near(L95_ALLOWED),
-            item.predicted.share_near(L95_ALLOWED),
-            rate.measured.value,
-            rate.predicted.value,
-            *item.allowed_rates,
-        ]
-        rows.append(
-            (
-                "",
-                [
-                    Cell(_named(palette, item.policy)),
-                    *(Cell(write_number(100 * value), "num") for value in numbers),
-                    Cell(write_number(item.factor, 2), "num"),
-                ],
-            )
-        )
-    yield paragraph(
-        "Where the mass of the latency lies at the deadline D, and what V_D would be if every "
-        "predicted latency were as much shorter or longer as L95 may be off. The factor is what "
-        "the predicted latencies would have to be multiplied by to give the measured V_D; there "
-        "is none where no cycle missed.",
-        "note",
-    )
-    yield table(head, rows, above=above)
-
-
-def _parts(validation: Validation, palette: Palette) -> Iterator[str]:
-    yield figure(
-        figures.time_split(validation),
-        "Time along the critical path of the cycles that finished: in each pair the thick bar was "
-        "measured, the thin one is predicted. What differs here is where to look for a cause.",
-    )
-    names = {"compute": "computing", "queue": "waiting", "network": "network"}
-    head = [Cell("policy")]
-    above = [Cell("")]
-    for name in names.values():
-        above.append(Cell(f"{name} (ms)", "over", 3))
-        head += [Cell("measured", "num begin"), Cell("predicted", "num"), Cell("off", "num")]
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    for item in _by_scenario(validation, 10):
-        if not isinstance(item, Group):
-            rows.append(item)
-            continue
-        cells = [Cell(_named(palette, item.policy))]
-        for part in names:
-            was, said = item.measured.parts_ms[part], item.predicted.parts_ms[part]
-            cells += [
-                Cell(write_number(was, 2), "num begin"),
-                Cell(write_number(said, 2), "num"),
-                Cell(write_number(said - was, 2, signed=True), "num"),
-            ]
-        rows.append(("", cells))
-    yield table(head, rows, above=above)
-
-
-def _jobs(validation: Validation, palette: Palette) -> str:
-    with_core = validation.jobs["core_ms"].is_not_null().any()
-    head = [
-        Cell("policy"),
-        Cell("task"),
-        Cell("node"),
-        Cell("jobs", "num"),
-        *(Cell(name, "num") for name in ("measured", "P95", "predicted", "P95")),
-    ]
-    above = [Cell("", "", 4), Cell("start to end (ms)", "over", 4)]
-    if with_core:
-        head += [Cell(name, "num") for name in ("measured", "P95", "cell", "P95")]
-        above.append(Cell("core time (ms)", "over", 4))
-    columns = ["measured", "predicted", *(["core", "cell"] if with_core else [])]
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    shown: tuple[str, str] | None = None
-    for row in validation.jobs.iter_rows(named=True):
-        mine = row["scenario"], row["policy"]
-        if shown is None or shown[0] != mine[0]:
-            title = escape(shown_scenario(mine[0]))
-            rows.append(("group", [Cell(title, columns=len(head))]))
-        first = _named(palette, mine[1]) if mine != shown else ""
-        shown = mine
-        numbers = [row[f"{name}{tail}"] for name in columns for tail in ("_ms", "_p95_ms")]
-        rows.append(
-            (
-                "",
-                [
-                    Cell(first),
-                    Cell(escape(row["task"])),
-                    Cell(escape(row["node"])),
-                    Cell(write_number(row["jobs"], 0), "num"),
-                    *(
-                        Cell(write_number(math.nan if one is None else one, 2), "num")
-                        for one in numbers
-                    ),
-                ],
-            )
-        )
-    core = (
-        " Core time is what the job's own thread used, beside the execution time that the cell "
-        "file has for it."
-        if with_core
-        else " These runs do not know the core time of their jobs."
-    )
-    return (
-        "<details><summary>By task and node</summary>"
-        + table(
-            head,
-            rows,
-            "Of the runs that kept their jobs: time from a job's start to its end, with whatever "
-            f"else ran on the node and what its quota withheld.{core} Jobs of shadows are among "
-            "them.",
-            above=above,
-            kind="small",
-        )
-        + "</details>"
-    )
-
-
-# ----------------------------------------------------------------------------------------- more
-
-
-def _more(validation: Validation, palette: Palette) -> Iterator[str]:
-    nodes = list(validation.problem.fabric.nodes)
-    yield _compared(
-        validation,
-        palette,
-        "Windows and migrations",
-        [Measure("window_l95_ms", "L95 of windows", "ms"), Measure("migrations", "migrations")],
-        "L95 of windows is the mean over windows of what the controller saw, in which a cycle "
-        "that has not finished counts with its age. Migrations are those of one run, without "
-        "the guard's.",
-    )
-    yield _compared(
-        validation,
-        palette,
-        "Utilisation",
-        [Measure(f"u_{node}", f"U of {node}", "%", 100.0) for node in nodes],
-        "Utilisation of every node, foreign work included.",
-        judged=True,
-    )
-    shares = list(
+def _shares(validation: Validation) -> list[str]:
+    return list(
         dict.fromkeys(
             name
             for group in validation.groups
@@ -420,109 +141,372 @@ def _more(validation: Validation, palette: Palette) -> Iterator[str]:
             if name.startswith("share_")
         )
     )
-    yield _compared(
-        validation,
-        palette,
-        "Placements",
-        [Measure(name, name.removeprefix("share_"), "%", 100.0, 0) for name in shares],
-        "Share of the windows that began under each placement.",
-        moving=True,
-    )
 
 
-def _compared(
+def _share(name: str) -> str:
+    return name.removeprefix("share_")
+
+
+def _table(
     validation: Validation,
-    palette: Palette,
+    slug: str,
     title: str,
-    measures: Sequence[Measure],
-    caption: str,
-    *,
-    judged: bool = False,
-    moving: bool = False,
-) -> str:
-    """Return a table of figures, measured and predicted; of `moving` policies only."""
-    each = 4 if judged else 3
-    head, above = [Cell("policy")], [Cell("")]
-    for measure in measures:
-        above.append(Cell(marked(measure.heading), "over", each))
-        head += [Cell("measured", "pair begin", 2), Cell("predicted", "num")]
-        head += [Cell("")] if judged else []
-    rows: list[tuple[str, Sequence[Cell]]] = []
-    pending: tuple[str, Sequence[Cell]] | None = None
-    for item in _by_scenario(validation, 1 + each * len(measures)):
-        if not isinstance(item, Group):
-            pending = item
-            continue
-        if moving and f"share_{item.policy}" in item.figures:
-            continue
-        if pending is not None:
-            rows.append(pending)
-            pending = None
-        cells = [Cell(_named(palette, item.policy))]
-        for measure in measures:
-            found = item.figures.get(measure.column)
-            if found is None:
-                cells += [Cell("–", "num"), Cell(""), Cell("–", "num")]
-                continue
-            cells += _pair(found.measured, measure, "num begin")
-            cells.append(_value(found.predicted, measure))
-            cells += [Cell(_tag(found.verdict))] if judged else []
-        rows.append(("", cells))
-    if not rows:
-        return ""
-    return f"<h3>{title}</h3>\n" + paragraph(caption, "note") + table(head, rows, above=above)
+    columns: Sequence[Text | Measure],
+    rows: Sequence[Row],
+    caption: str = "",
+) -> Table:
+    palette = _palette(validation)
+    return Table(slug, title, [POLICY, *columns], rows, SCENARIO, caption, palette)
 
 
-def _method(validation: Validation) -> Iterator[str]:
-    yield (
-        "For every run the same cell, scenario and policy was simulated "
-        f"{validation.seeds} times, with as many windows, the same warm-up, the disturbances at "
-        "the times at which they were played, and without the windows that the run leaves out."
+def _named(group: Group) -> dict[str, object]:
+    return {"scenario": group.scenario, "policy": group.policy}
+
+
+# -------------------------------------------------------------------------------------- goals
+
+
+def _goals(validation: Validation) -> Table:
+    rows = []
+    for goal in GOALS:
+        found = [group.verdict(goal) for group in validation.groups]
+        counts: dict[str, object] = {word: found.count(word) for word in ORDER if word}
+        rows.append({**counts, "goal": GOAL_NAMES[goal], "word": validation.verdict(goal)})
+    columns: Columns = [
+        Text("goal", "goal"),
+        Text("word", "in the worst group", "word"),
+        *(Measure(word, word, decimals=0) for word in ORDER if word),
+    ]
+    return Table("goals", "Does the simulator predict what this cell shows?", columns, rows)
+
+
+def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
+    rows = []
+    for group in validation.groups:
+        l95, rate = group.figures["l95_ms"], group.figures["violation_rate"]
+        node, use = worst_use(group)
+        was, said = group.dominant
+        rows.append(
+            {
+                **_named(group),
+                "minutes": group.minutes,
+                "enough": "no" if group.short else "yes",
+                "excluded": group.excluded,
+                **interval_row({"l95": l95.measured, "rate": rate.measured}),
+                "l95_predicted": l95.predicted.value,
+                **interval_row({"l95_off": l95.error}),
+                "l95_word": l95.verdict,
+                "rate_predicted": rate.predicted.value,
+                "rate_word": rate.verdict,
+                "node": node,
+                "use_off": use.error.value,
+                "use_word": group.verdict("utilisation"),
+                "was": was,
+                "said": said,
+                "placed_word": group.verdict("dominant"),
+                "sum": l95.baseline,
+                "sum_word": group.verdict("sum_of_means"),
+            }
+        )
+    columns: Columns = [
+        Measure("minutes", "min"),
+        Text("enough", "enough"),
+        Measure("excluded", "windows excluded", decimals=0),
+        Measure("l95", "L95 measured", "ms"),
+        Measure("l95_predicted", "predicted", "ms"),
+        Measure("l95_off", "off", "%", 100.0, signed=True),
+        Text("l95_word", "L95", "word"),
+        Measure("rate", "V_D measured", "%", 100.0),
+        Measure("rate_predicted", "predicted", "%", 100.0),
+        Text("rate_word", "V_D", "word"),
+        Text("node", "worst node"),
+        Measure("use_off", "U off", "points", 100.0, signed=True),
+        Text("use_word", "U", "word"),
+        Text("was", "placed", "placement"),
+        Text("said", "predicted", "placement"),
+        Text("placed_word", "placed", "word"),
+        Measure("sum", "sum of means", "ms"),
+        Text("sum_word", "beaten", "word"),
+    ]
+    if compact:
+        columns = [one for one in columns if one[0] in SHORT]
+    caption = (
+        "L95: of all cycles together, ∞ where more than 5 % are lost. Placed: the dominant "
+        "placement. ATP is our reconstruction."
     )
-    yield (
-        f"Intervals of what was measured come from {DRAWS} resamples: runs with replacement, and "
-        "within each of them blocks of consecutive windows. Those of predictions come from "
-        "resampled simulations, and those of errors from both."
-    )
-    yield (
-        "A goal is met where the whole interval of the error lies within what is allowed, missed "
-        "where the whole of it lies beyond, and open elsewhere."
-    )
-    yield (
-        "V_D is explained where it is not met, L95 is, and the whole interval of the measured V_D "
-        "lies between the V_D of the predicted latencies times 0.9 and times 1.1. That is so "
-        "where much of the mass of the latency lies at the deadline."
-    )
-    yield (
-        "Where no measured cycle missed, the upper limit of V_D is the rule of three over the "
-        "windows, as if each were independent."
-    )
-    yield (
-        "The sum of means adds up the mean time of every task on its node, slowed down by quota "
-        "and foreign threads in the mean, and the mean delay and sending time of every message "
-        "along the longest path; L95 is that sum, and V_D 0 or 1. It is told where the cycles "
-        "ran. It is beaten where the error of L95 is smaller, and that of V_D not larger or both "
-        f"within {100 * POINTS_ALLOWED:g} points."
+    return _table(validation, "verdicts", "Every group", columns, rows, caption)
+
+
+def worst_use(group: Group) -> tuple[str, Judged]:
+    """Return the node whose utilisation is predicted worst, and what was found there."""
+    uses = group.uses
+
+    def rank(name: str) -> tuple[int, float]:
+        error = abs(uses[name].error.value)
+        return ORDER.index(uses[name].verdict), error if math.isfinite(error) else -1.0
+
+    node = max(uses, key=rank)
+    return node, uses[node]
+
+
+# ----------------------------------------------------------------------------------- figures
+
+
+def _over(validation: Validation) -> Figure:
+    """Draw predicted over measured: L95, V_D and U, with what is allowed as a band."""
+    import polars as pl
+
+    rows = []
+    for group in validation.groups:
+        name = shown_contender(group.policy)
+        figures = [("l95_ms", 1.0, group.figures["l95_ms"])]
+        figures.append(("violation_rate", 100.0, group.figures["violation_rate"]))
+        figures += [("use", 100.0, one) for one in group.uses.values()]
+        for goal, factor, one in figures:
+            numbers = (one.measured.value, one.measured.low, one.measured.high, one.predicted.value)
+            shown = [factor * number if math.isfinite(number) else None for number in numbers]
+            rows.append((goal, shown_scenario(group.scenario), name, one.metric, *shown))
+    texts = dict.fromkeys(("goal", "scenario", "policy", "metric"), pl.String)
+    numbers_of = dict.fromkeys(("measured", "low", "high", "predicted"), pl.Float64)
+    frame = pl.DataFrame(rows, schema={**texts, **numbers_of}, orient="row")
+    palette = _palette(validation)
+    policies = {
+        shown_contender(group.policy): palette.policies[group.policy].colour
+        for group in validation.groups
+    }
+    titles = {"l95_ms": "L95 (ms)", "violation_rate": "V_D (%)", "use": "U of every node (%)"}
+    return Figure(
+        "over",
+        "Predicted over measured",
+        {"rows": frame},
+        lambda width: {
+            "hconcat": [
+                _scatter(frame, goal, title, policies, (width - 180) / 3)
+                for goal, title in titles.items()
+            ],
+            "resolve": {"legend": {"color": "shared", "shape": "shared"}},
+        },
+        "A mark is a group, the bar through it the interval of what was measured. Shaded: what is "
+        "allowed.",
     )
 
 
-def _limits() -> Iterator[str]:
-    yield (
-        "Intervals know what these runs knew: what the machine does in another week is not in "
-        "them, and a disturbance that no run met is not either."
-    )
-    yield (
-        "With few runs what differs from run to run is known badly; the blocks within runs make "
-        "up for some of it."
-    )
-    yield "Each verdict stands on its own; intervals are not widened for being many."
+def _scatter(
+    frame: pl.DataFrame, goal: str, title: str, policies: dict[str, str], size: float
+) -> Spec:
+    import polars as pl
+
+    mine = frame.filter(pl.col("goal") == goal)
+    numbers = [*mine["measured"].drop_nulls(), *mine["predicted"].drop_nulls()]
+    high = 1.05 * max(numbers, default=1.0) or 1.0
+    share = L95_ALLOWED if goal == "l95_ms" else 0.0
+    points = {"l95_ms": 0.0, "violation_rate": 100 * POINTS_ALLOWED, "use": 100 * USE_ALLOWED}[goal]
+    band = [
+        {"at": at, "low": at * (1 - share) - points, "high": at * (1 + share) + points}
+        for at in (0.0, high)
+    ]
+    domain = {"domain": [0, high], "nice": False}
+    across = quantity("measured", f"{title}, measured", scale=domain, axis={"tickCount": 4})
+    up = quantity("predicted", "predicted", scale=domain, axis={"tickCount": 4})
+    colour = name_of("policy", scale={"domain": list(policies), "range": list(policies.values())})
+    shape = name_of("scenario")
+    return {
+        "width": size,
+        "height": size,
+        "layer": [
+            {
+                "data": {"values": band},
+                "mark": {"type": "area", "color": SHADE, "clip": True},
+                "encoding": {
+                    "x": {**across, "field": "at"},
+                    "y": {**up, "field": "low"},
+                    "y2": {"field": "high"},
+                },
+            },
+            {
+                "data": {"name": "rows"},
+                "transform": [{"filter": f"datum.goal === '{goal}'"}],
+                "mark": {"type": "rule", "opacity": 0.6},
+                "encoding": {
+                    "x": {**across, "field": "low"},
+                    "x2": {"field": "high"},
+                    "y": up,
+                    "color": colour,
+                },
+            },
+            {
+                "data": {"name": "rows"},
+                "transform": [{"filter": f"datum.goal === '{goal}'"}],
+                "mark": {"type": "point", "size": 45, "strokeWidth": 1.6},
+                "encoding": {
+                    "x": across,
+                    "y": up,
+                    "color": colour,
+                    "shape": shape,
+                    "tooltip": [
+                        name_of("policy", title="policy"),
+                        name_of("scenario", title="scenario"),
+                        name_of("metric", title="metric"),
+                        quantity("measured", "measured"),
+                        quantity("predicted", "predicted"),
+                    ],
+                },
+            },
+        ],
+    }
 
 
-def _about(validation: Validation) -> dict[str, str]:
-    told = describe_cell(validation.problem)
-    names = [name for group in validation.groups for name in group.runs]
-    told["runs"] = ", ".join(names[:12]) + (
-        f" and {len(names) - 12} more" if len(names) > 12 else ""
+def _panel(group: Group) -> str:
+    return f"{shown_contender(group.policy)}, {shown_scenario(group.scenario)}"
+
+
+def _latencies(validation: Validation) -> Figure:
+    import polars as pl
+
+    deadline_ms = validation.problem.pipeline.deadline_ms
+    across = np.linspace(0.0, DEADLINES * deadline_ms, POINTS)
+    parts = []
+    for group in validation.groups:
+        for name, sample in ((MEASURED, group.measured), (PREDICTED, group.predicted)):
+            line = pl.DataFrame({"value": across, "share": sample.share_within(across)})
+            scenario, policy = pl.lit(_panel(group)), pl.lit(name)
+            parts.append(line.with_columns(scenario=scenario, policy=policy))
+    return cumulative(
+        "latencies",
+        pl.concat(parts),
+        BOTH,
+        ("latency (ms)", "cycles within"),
+        limit=deadline_ms,
+        limit_name="deadline",
+        title="Latencies of all cycles",
+        caption="A line that stays below 100 % shows that cycles were lost. Dashed: deadline.",
     )
-    told["software"] = ", ".join(f"{name} {one}" for name, one in validation.versions.items())
-    return told
+
+
+def _split(validation: Validation) -> Figure:
+    import polars as pl
+
+    rows = [
+        (_panel(group), name, shown, sample.parts_ms[part])
+        for group in validation.groups
+        for name, sample in ((MEASURED, group.measured), (PREDICTED, group.predicted))
+        for part, shown in PARTS_SHOWN.items()
+    ]
+    frame = pl.DataFrame(rows, schema=["scenario", "policy", "part", "value"], orient="row")
+    return stacked(
+        "split",
+        frame,
+        [MEASURED, PREDICTED],
+        PART_COLOURS,
+        "mean (ms)",
+        limit=validation.problem.pipeline.deadline_ms,
+        limit_name="deadline",
+        title="Time along the critical path of the cycles that finished",
+        caption="Dashed: deadline.",
+    )
+
+
+# ------------------------------------------------------------------------------------ tables
+
+
+def _rates(validation: Validation) -> Table:
+    rows = []
+    for group in validation.groups:
+        rate = group.figures["violation_rate"]
+        shorter, longer = group.allowed_rates
+        rows.append(
+            {
+                **_named(group),
+                "near": group.measured.share_near(L95_ALLOWED),
+                "near_predicted": group.predicted.share_near(L95_ALLOWED),
+                "rate": rate.measured.value,
+                "rate_predicted": rate.predicted.value,
+                "shorter": shorter,
+                "longer": longer,
+                "factor": group.factor,
+            }
+        )
+    columns: Columns = [
+        Measure("near", "within 10 % of D, measured", "%", 100.0),
+        Measure("near_predicted", "predicted", "%", 100.0),
+        Measure("rate", "V_D measured", "%", 100.0),
+        Measure("rate_predicted", "predicted", "%", 100.0),
+        Measure("shorter", "if 10 % shorter", "%", 100.0),
+        Measure("longer", "if 10 % longer", "%", 100.0),
+        Measure("factor", "factor", decimals=2),
+    ]
+    caption = (
+        "V_D if every predicted latency were as much shorter or longer as L95 may be off; and the "
+        "factor by which the predicted latencies would give the measured V_D."
+    )
+    return _table(validation, "rates", "How much lies at the deadline", columns, rows, caption)
+
+
+def _parts(validation: Validation) -> Table:
+    rows = []
+    for group in validation.groups:
+        row = _named(group)
+        for part in PARTS_SHOWN:
+            was, said = group.measured.parts_ms[part], group.predicted.parts_ms[part]
+            row |= {part: was, f"{part}_predicted": said, f"{part}_off": said - was}
+        rows.append(row)
+    columns: Columns = [
+        column
+        for part, shown in PARTS_SHOWN.items()
+        for column in (
+            Measure(part, f"{shown}, measured", "ms", decimals=2),
+            Measure(f"{part}_predicted", "predicted", "ms", decimals=2),
+            Measure(f"{part}_off", "off", "ms", decimals=2, signed=True),
+        )
+    ]
+    return _table(validation, "parts", "", columns, rows)
+
+
+def _jobs(validation: Validation) -> Table:
+    columns: Columns = [
+        Text("task", "task"),
+        Text("node", "node"),
+        Measure("jobs", "jobs", decimals=0),
+        Measure("measured_ms", "measured", "ms", decimals=2),
+        Measure("measured_p95_ms", "P95", "ms", decimals=2),
+        Measure("predicted_ms", "predicted", "ms", decimals=2),
+        Measure("predicted_p95_ms", "P95", "ms", decimals=2),
+    ]
+    if validation.jobs["core_ms"].is_not_null().any():
+        columns += [
+            Measure("core_ms", "core time", "ms", decimals=2),
+            Measure("core_p95_ms", "P95", "ms", decimals=2),
+            Measure("cell_ms", "the cell says", "ms", decimals=2),
+            Measure("cell_p95_ms", "P95", "ms", decimals=2),
+        ]
+    return _table(
+        validation,
+        "jobs",
+        "By task and node",
+        columns,
+        validation.jobs.to_dicts(),
+        "Of the runs that kept their jobs: from a job’s start to its end. Core time: what the "
+        "job’s own thread used. Jobs of shadows are among them.",
+    )
+
+
+def _compared(validation: Validation, slug: str, names: Sequence[str], title: str) -> Table:
+    """Return figures, measured and predicted."""
+    share = {name: not name.startswith(("window_", "migr")) for name in names}
+    rows = []
+    for group in validation.groups:
+        row = _named(group)
+        for name in names:
+            found = group.figures.get(name)
+            if found is not None:
+                row |= interval_row({name: found.measured})
+                row |= {f"{name}_predicted": found.predicted.value}
+        rows.append(row)
+    called = {"window_l95_ms": ("L95 of windows", "ms"), "migrations": ("migrations", "")}
+    columns = []
+    for name in names:
+        shown, unit = called.get(name, (name.partition("_")[2], "%"))
+        factor = 100.0 if share[name] else 1.0
+        columns.append(Measure(name, shown, unit, factor))
+        columns.append(Measure(f"{name}_predicted", "predicted", unit, factor))
+    return _table(validation, slug, title, columns, rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ from dwell.model.scenario import RAMP_STEPS
 from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 
-__all__ = ["draw", "draw_shadows", "stream"]
+__all__ = ["draw", "draw_shadows", "drawn_scenario", "stream"]
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -91,6 +92,26 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
     if cycles >= 1 << 32:
         raise SimulationError(f"windows is {windows}; {cycles} cycles are more than 2^32")
     return _Draw(problem, scenario, disturbances, seed, windows).realisation()
+
+
+def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) -> Scenario:
+    """Return a scenario as a realisation has it: a disturbance for each of the episodes drawn.
+
+    Parameters
+    ----------
+    problem, scenario, seed, windows
+        See `draw`.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario.
+    TraceError
+        If the times of episodes are a trace that is too short or is not there.
+    """
+    disturbances = problem.scenario(scenario)
+    drawing = _Draw(problem, scenario, disturbances, seed, windows)
+    return tuple(one for item in disturbances for one in drawing.episodes_of(item))
 
 
 def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
@@ -312,6 +333,16 @@ class _Draw:
         rngs = self._rng(f"episodes/{name}/every"), self._rng(f"episodes/{name}/for")
         drawn = drawn_intervals(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
         return drawn.until(end_ns)
+
+    def episodes_of(self, item: Disturbance) -> Iterator[Disturbance]:
+        """Yield a disturbance for each time that one is on; itself where it has no episodes."""
+        if item.episodes is None:
+            yield item
+            return
+        on = self._intervals(item)
+        for begin_ns, end_ns in zip(on.begin.tolist(), on.end.tolist(), strict=True):
+            length_s = (end_ns - begin_ns) / NS_PER_S
+            yield replace(item, at_s=begin_ns / NS_PER_S, for_s=length_s, episodes=None)
 
     def _node_changes(self) -> NodeChanges:
         """Fold stress, bursts and outages of each node into the states it goes through."""

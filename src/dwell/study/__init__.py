@@ -9,6 +9,7 @@ from dwell.study.over_seeds import over_seeds
 from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
 from dwell.study.predictions import paper_predictions
 from dwell.study.runner import StudyResult, run_study
+from dwell.study.saved import SavedStudy, open_study
 from dwell.study.study import Contender, Point, Study, load_study
 from dwell.study.validation import Validation, validate
 
@@ -23,6 +24,7 @@ __all__ = [
     "PairedDifference",
     "PairedMedian",
     "Point",
+    "SavedStudy",
     "Study",
     "StudyResult",
     "Validation",
@@ -32,6 +34,7 @@ __all__ = [
     "longest_run",
     "mean_interval",
     "median_interval",
+    "open_study",
     "over_seeds",
     "paired_difference",
     "paired_median",

@@ -236,6 +236,13 @@ class QosSample:
         at = here[len(here) - wanted]
         return self.deadline_ms / float(at) if 0 < at < math.inf else math.nan
 
+    def share_within(self, limits_ms: Floats) -> Floats:
+        """Share of the cycles that took no longer than each of several limits."""
+        found: Floats = np.searchsorted(self.latency_ms, limits_ms, side="right") / len(
+            self.latency_ms
+        )
+        return found
+
     def share_near(self, allowed: float) -> float:
         """Share of the cycles whose latency lies within `allowed` of the deadline."""
         low, high = self.deadline_ms * (1 - allowed), self.deadline_ms * (1 + allowed)

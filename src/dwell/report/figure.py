@@ -1,0 +1,205 @@
+"""A figure: data and a Vega-Lite drawing of it, as SVG of a page, and as files for a paper.
+
+Colours in drawings are names that a page gives a value to, light or dark; files for a paper have
+them resolved. Drawings are made for a width, so that text keeps its size in both.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from dwell.report.palette import PRINTED
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["COLUMN_PT", "PAGE_PX", "Figure", "Spec", "javascript", "pdf", "printed_svg", "svg"]
+
+Spec: TypeAlias = "dict[str, Any]"
+
+#: Width of a figure in a page, pixels, and in a paper's column, points.
+PAGE_PX, COLUMN_PT = 940, 252
+#: Size of letters in a page, pixels, and on paper, points.
+LETTERS_PX, LETTERS_PT = 12, 7
+FONT = "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, Arial, sans-serif"
+PRINTED_FONT = "Liberation Sans, Arial, Helvetica, sans-serif"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure.
+
+    Parameters
+    ----------
+    slug : str
+        Its name in files and links; different for every figure of a page.
+    title : str
+        What it shows.
+    frames : mapping of str to DataFrame
+        Data by the names that the drawing has for them.
+    draw : callable
+        Takes a width in pixels and returns a Vega-Lite drawing about as wide, without data.
+    caption : str
+        Plain text.
+    """
+
+    slug: str
+    title: str
+    frames: Mapping[str, pl.DataFrame]
+    draw: Callable[[float], Spec]
+    caption: str = ""
+
+    def spec(self, width: float = PAGE_PX, *, letters: float = LETTERS_PX) -> Spec:
+        """Return the drawing with its data and style; lengths and letters in pixels."""
+        return {
+            **self.draw(width),
+            "datasets": {name: _rows(frame) for name, frame in self.frames.items()},
+            "config": _style(letters),
+            "background": "transparent",
+            "padding": {"left": 12, "right": 6, "top": 2, "bottom": 2},
+        }
+
+
+def _rows(frame: pl.DataFrame) -> list[dict[str, Any]]:
+    """Return rows; numbers that JSON does not have are null, and digits that nobody sees go."""
+    return [
+        {name: _plain(value) for name, value in row.items()} for row in frame.iter_rows(named=True)
+    ]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value
+
+
+def svg(figure: Figure) -> str:
+    """Return the SVG element of a figure for a page."""
+    import vl_convert
+
+    text = vl_convert.vegalite_to_svg(figure.spec())
+    # Sizes are the page's; what a page has many of must not be huge.
+    text = re.sub(r"(?<=\d\.\d\d)\d+", "", text)
+    text = re.sub(r' (?:role|aria-\w+)="[^"]*"', "", text)
+    # Names within a drawing go on from the one drawn before it: every figure has its own.
+    names = list(dict.fromkeys(re.findall(r'id="(\w+)"', text)))
+    for place, name in enumerate(names):
+        text = re.sub(rf"\b{name}\b", f"{figure.slug}-{place}", text)
+    label = escape(figure.title)
+    width = re.search(r'width="([\d.]+)"', text)
+    most = "" if width is None else f' style="max-width:{float(width[1]):.0f}px"'
+    return re.sub(
+        r'<svg ([^>]*?)width="[^"]*" height="[^"]*"',
+        rf'<svg role="img" aria-label="{label}"{most} \1',
+        text,
+        count=1,
+    )
+
+
+def printed_svg(figure: Figure, width_pt: float = COLUMN_PT) -> str:
+    """Return a figure as an SVG document of a paper's column: black on white, text at 7 pt."""
+    import vl_convert
+
+    text = str(vl_convert.vegalite_to_svg(_printed(figure, width_pt)))
+    # Drawn in points, a unit each.
+    return re.sub(
+        r'width="([\d.]+)" height="([\d.]+)"', r'width="\1pt" height="\2pt"', text, count=1
+    )
+
+
+def pdf(figure: Figure, width_pt: float = COLUMN_PT) -> bytes:
+    """Return a figure as PDF of a paper's column: black on white, text at 7 pt."""
+    import vl_convert
+
+    return bytes(vl_convert.vegalite_to_pdf(_printed(figure, width_pt)))
+
+
+def _printed(figure: Figure, width_pt: float) -> Spec:
+    """Return the drawing that is as wide as it shall be: axes take what they take."""
+    import vl_convert
+
+    asked = width_pt
+    spec: Spec = {}
+    for _ in range(4):
+        drawn = figure.spec(asked, letters=LETTERS_PT)
+        spec = _resolved({**drawn, "background": "white"})
+        found = re.search(r'width="([\d.]+)"', vl_convert.vegalite_to_svg(spec))
+        off = width_pt - (width_pt if found is None else float(found[1]))
+        if 0 <= off < 1:
+            break
+        asked += off - 0.5
+    return spec
+
+
+def _resolved(value: Any) -> Any:
+    """Return a drawing with the colours of paper."""
+    if isinstance(value, dict):
+        return {key: _resolved(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_resolved(item) for item in value]
+    if value == FONT:
+        return PRINTED_FONT
+    return PRINTED.get(value, value) if isinstance(value, str) else value
+
+
+@cache
+def javascript() -> str:
+    """Return Vega, Vega-Lite, their embedding and its interpreter as one script."""
+    import vl_convert
+
+    # Without a snippet it is the whole bundle; the types of the package ask for one.
+    return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]
+
+
+def _style(letters: float) -> Spec:
+    ink, muted, rule = "var(--ink)", "var(--muted)", "var(--rule)"
+    text = {"labelFontSize": letters, "titleFontSize": letters, "labelFont": FONT}
+    text |= {"titleFont": FONT, "titleFontWeight": "normal"}
+    return {
+        # Every mark would say what it is, twice its own length.
+        "aria": False,
+        "font": FONT,
+        "view": {"stroke": None, "fill": None},
+        "axis": {
+            **text,
+            "labelColor": muted,
+            "titleColor": muted,
+            "gridColor": rule,
+            "gridWidth": 0.6,
+            "domainColor": muted,
+            "domainWidth": 0.6,
+            "tickColor": muted,
+            "tickWidth": 0.6,
+            "tickSize": 3,
+            "titlePadding": 5,
+            "labelLimit": 240,
+        },
+        "axisY": {"domain": False, "ticks": False, "minExtent": 30},
+        "header": {
+            **text,
+            "titleColor": muted,
+            "labelColor": ink,
+            "labelFontWeight": 600,
+            "labelAnchor": "start",
+            "labelLimit": 320,
+        },
+        "legend": {
+            **text,
+            "labelColor": ink,
+            "titleColor": muted,
+            "orient": "top",
+            "symbolStrokeWidth": 1.5,
+            "labelLimit": 260,
+            "columns": 0,
+        },
+        "title": {"color": ink, "font": FONT, "fontSize": letters, "anchor": "start"},
+        "text": {"color": muted, "font": FONT, "fontSize": letters},
+        "rule": {"color": ink},
+        "concat": {"spacing": 10},
+    }

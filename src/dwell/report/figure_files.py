@@ -1,0 +1,141 @@
+"""Figures and tables of a page as files for a paper: PDF, SVG, LaTeX, and CSV of what they show."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import TYPE_CHECKING
+
+from dwell.report.figure import COLUMN_PT, Figure, pdf, printed_svg
+from dwell.report.formatting import SYMBOL
+from dwell.report.page import TEMPLATES, Page
+from dwell.report.table import Table, Text
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+__all__ = ["figure_files", "table_tex"]
+
+#: Width of both columns of a paper, points, and columns of a table above which it has that.
+BOTH_PT, MOST_COLUMNS = 516, 6
+#: What LaTeX writes otherwise.
+ESCAPES = {
+    "\\": r"\textbackslash{}",
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\u2212": "$-$",
+    "\u2009": r"\,",
+    "\u00b1": r"$\pm$",
+    "\u221e": r"$\infty$",
+    "\u2013": "--",
+    "\u2192": r"$\to$",
+    "\u0394": r"$\Delta$",
+    "\u2019": "'",
+    "<": "$<$",
+    ">": "$>$",
+}
+
+
+def figure_files(page: Page) -> Iterator[tuple[str, bytes | str]]:
+    """Yield every figure and table of a page as files.
+
+    Parameters
+    ----------
+    page : Page
+
+    Yields
+    ------
+    (str, bytes or str)
+        A file's name and what it holds: of a figure ``SLUG.pdf``, ``SLUG.svg`` and a CSV for each
+        of its tables of data; of a table ``SLUG.csv`` and ``SLUG.tex``.
+    """
+    yield from _figures(page.figures)
+    yield from _tables(page.tables)
+
+
+def _figures(figures: Iterator[Figure]) -> Iterator[tuple[str, bytes | str]]:
+    for one in figures:
+        slug = _file_name(one.slug)
+        yield f"{slug}.pdf", pdf(one)
+        yield f"{slug}.svg", printed_svg(one)
+        for name, frame in one.frames.items():
+            end = "" if len(one.frames) == 1 else f"-{name}"
+            yield f"{slug}{end}.csv", frame.write_csv()
+
+
+def _tables(tables: Iterator[Table]) -> Iterator[tuple[str, bytes | str]]:
+    import polars as pl
+
+    for one in tables:
+        if not one.rows:
+            continue
+        slug = _file_name(one.slug)
+        names = [one.group.column] if one.group is not None else []
+        names += [column.column for column in one.columns]
+        ends = [f"{name}{end}" for name in names for end in ("", "_low", "_high")]
+        known = {key for row in one.rows for key in row}
+        columns = [name for name in dict.fromkeys(ends) if name in known]
+        rows = [[row.get(name) for name in columns] for row in one.rows]
+        frame = pl.DataFrame(
+            rows, schema=columns, orient="row", infer_schema_length=None, strict=False
+        )
+        yield f"{slug}.csv", frame.write_csv()
+        yield f"{slug}.tex", table_tex(one)
+
+
+def _file_name(slug: str) -> str:
+    return re.sub(r"[^\w.-]+", "-", slug)
+
+
+def table_tex(table: Table) -> str:
+    """Return a table as LaTeX, 7-point text: one column of a paper wide, or both where it is wide.
+
+    It needs the packages booktabs and xcolor.
+    """
+    wide = len(table.columns) > MOST_COLUMNS
+    align = "".join("l" if isinstance(column, Text) else "r" for column in table.columns)
+    template = _environment().get_template("table.tex")
+    return template.render(
+        table=table, groups=list(table.groups()), align=align, width=BOTH_PT if wide else COLUMN_PT
+    )
+
+
+@cache
+def _environment() -> Environment:
+    import jinja2
+
+    found = jinja2.Environment(  # noqa: S701
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        variable_start_string="<<",
+        variable_end_string=">>",
+        block_start_string="<%",
+        block_end_string="%>",
+        comment_start_string="<#",
+        comment_end_string="#>",
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    found.filters["tex"] = _tex
+    return found
+
+
+def _tex(text: str) -> str:
+    """Return a text as LaTeX writes it; symbols with an index are set in mathematics."""
+    parts = SYMBOL.split(text)
+    found = []
+    # What stands between symbols, and each symbol's letter and index, in turn.
+    for plain, letter, index in _in_threes(parts):
+        found.append("".join(ESCAPES.get(sign, sign) for sign in plain))
+        if letter:
+            found.append(f"${ESCAPES.get(letter, letter).strip('$')}_{{\\mathrm{{{index}}}}}$")
+    return "".join(found)
+
+
+def _in_threes(parts: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+    padded = [*parts, "", ""]
+    for place in range(0, len(parts), 3):
+        yield padded[place], padded[place + 1], padded[place + 2]

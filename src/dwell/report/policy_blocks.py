@@ -1,0 +1,373 @@
+"""Figures and tables of runs by scenario and policy: of comparisons, studies and campaigns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dwell.model import Problem
+from dwell.report.charts import PART_COLOURS, PARTS_SHOWN, distributions, intervals, stacked
+from dwell.report.contenders import palette_of
+from dwell.report.figure import Figure
+from dwell.report.formatting import Measure, shown_contender, shown_scenario
+from dwell.report.palette import Palette, Style
+from dwell.report.table import Columns, Table, Text
+from dwell.study import AIM, over_seeds, under
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["COST", "L95", "MEASURES", "RATE", "PolicyBlocks", "named", "scaled"]
+
+RATE = Measure("violation_rate", "V_D", "%", 100.0)
+L95 = Measure("l95_ms", "L95", "ms")
+COST = Measure("cost", "J", decimals=2)
+MEASURES = (
+    RATE,
+    L95,
+    COST,
+    Measure("u_robot", "U_r", "%", 100.0),
+    Measure("u_edge", "U_e", "%", 100.0),
+    Measure("migrations", "migrations"),
+)
+MORE = (
+    Measure("p95_ms", "P95 of all cycles", "ms", ends=True),
+    Measure("lost", "lost cycles"),
+    Measure("compute_ms", "computing", "ms"),
+    Measure("queue_ms", "waiting", "ms"),
+    Measure("network_ms", "network", "ms"),
+    Measure("longest_misses", "misses in a row"),
+    Measure("misses_in_20", "most misses in 20"),
+    Measure("over_5_in_100", "100 with more than 5", "%", 100.0),
+    Measure("aoi_mean_ms", "mean age", "ms"),
+    Measure("aoi_p95_ms", "age, 95 % of the time", "ms"),
+    Measure("aoi_peak_ms", "largest age", "ms"),
+    Measure("tracking_rms_mm", "tracking error", "mm"),
+)
+#: Lines of a distribution have so many points at most.
+POINTS = 60
+LEAST_SHARE = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyBlocks:
+    """Runs by scenario and policy, and how they are shown.
+
+    Parameters
+    ----------
+    problem : Problem
+    runs : DataFrame
+        One row a run: ``scenario``, ``policy``, ``seed`` and numbers.
+    latencies : DataFrame
+        ``scenario``, ``policy``, ``latency_ms``, ``share`` of the cycles within it.
+    prefix : str
+        Of the names of figures and tables, where a page has several of these.
+    """
+
+    problem: Problem
+    runs: pl.DataFrame
+    latencies: pl.DataFrame
+    prefix: str = ""
+
+    @property
+    def scenarios(self) -> list[str]:
+        """Names, in the order of the runs."""
+        return [str(name) for name in self.runs["scenario"].unique(maintain_order=True)]
+
+    @property
+    def policies(self) -> list[str]:
+        """Names, in the order of the runs."""
+        return [str(name) for name in self.runs["policy"].unique(maintain_order=True)]
+
+    @property
+    def palette(self) -> Palette:
+        """Colours of the candidates, and styles of the policies by their names."""
+        return palette_of(self.problem, self.policies)
+
+    @property
+    def styles(self) -> dict[str, Style]:
+        """Styles of the policies, as they are called in figures."""
+        found = self.palette.policies
+        return {shown_contender(name): found[name] for name in self.policies}
+
+    # ------------------------------------------------------------------------------- figures
+
+    def measure(
+        self,
+        measure: Measure,
+        *,
+        limit: float = math.inf,
+        limit_name: str = "",
+        title: str = "",
+        caption: str = "",
+    ) -> Figure:
+        """Draw a measure: means with intervals, and every seed.
+
+        Parameters
+        ----------
+        measure : Measure
+        limit : float
+            In the column's unit.
+        limit_name, title, caption : str
+        """
+        import polars as pl
+
+        columns = ("scenario", "policy")
+        means = over_seeds(self.runs, columns, [measure.column])
+        keys = [pl.col(name).cast(pl.String) for name in columns]
+        seeds = self.runs.select(*keys, "seed", pl.col(measure.column).alias("value"))
+        found = means.select(
+            *keys,
+            pl.col(measure.column).alias("mean"),
+            pl.col(f"{measure.column}_low").alias("low"),
+            pl.col(f"{measure.column}_high").alias("high"),
+        )
+        numbers = ["mean", "low", "high", "value"]
+        rows = pl.concat([found, seeds], how="diagonal_relaxed").with_columns(
+            pl.col(name).cast(pl.Float64) * measure.factor for name in numbers
+        )
+        return intervals(
+            f"{self.prefix}{measure.column}",
+            named(rows),
+            measure,
+            self.styles,
+            limit=limit * measure.factor,
+            limit_name=limit_name,
+            title=title,
+            caption=caption,
+        )
+
+    def rate(self) -> Figure:
+        """Draw V_D beside the aim."""
+        return self.measure(
+            RATE,
+            limit=AIM,
+            limit_name="the aim, 5 %",
+            title="V_D, the share of missed deadlines",
+            caption=(
+                "Marks: means over seeds; bars: their 95 % intervals; ticks: single seeds. "
+                "Dashed: the aim of 5 %."
+            ),
+        )
+
+    def tail(self) -> Figure:
+        """Draw L95 beside the deadline."""
+        return self.measure(
+            L95,
+            limit=self.problem.pipeline.deadline_ms,
+            limit_name="deadline",
+            title="L95, the 95th percentile of a window’s latencies, mean over windows",
+            caption=(
+                "As the controller sees it: a cycle that has not finished counts with its age. "
+                "Dashed: deadline."
+            ),
+        )
+
+    def distribution(self) -> Figure:
+        """Draw the distributions of latency."""
+        import polars as pl
+
+        parts = []
+        for labels, mine in self.latencies.group_by("scenario", "policy", maintain_order=True):
+            longer = 1 - mine["share"].to_numpy()
+            bins = np.round(np.log10(np.maximum(longer, LEAST_SHARE)) * POINTS / 4)
+            keep = np.flatnonzero(np.diff(bins, prepend=math.inf))
+            scenario, policy = map(str, labels)
+            line = mine[keep].select("latency_ms", longer=1 - pl.col("share"))
+            labelled = line.select(
+                pl.lit(scenario).alias("scenario"), pl.lit(policy).alias("policy"), pl.all()
+            )
+            parts.append(labelled.filter(pl.col("longer") > 0))
+        return distributions(
+            f"{self.prefix}latencies",
+            named(pl.concat(parts)),
+            self.styles,
+            self.problem.pipeline.deadline_ms,
+            title="Cycles that took longer than a latency",
+            caption=(
+                "All cycles after the warm-up, all seeds together, on a logarithmic scale. Dashed: "
+                "deadline, where one reads V_D; dotted: 5 %. A line that ends on a plateau lost "
+                "that share of its cycles."
+            ),
+        )
+
+    def placed(self) -> list[Figure]:
+        """Draw where the policies that move spent their windows; nothing where none moves."""
+        candidates = self.problem.candidates
+        moving = [name for name in self.policies if name not in candidates]
+        columns = {f"share_{name}": name for name in candidates}
+        if not moving or not set(columns) <= set(self.runs.columns):
+            return []
+        figure = stacked(
+            f"{self.prefix}shares",
+            self._parts({name: (shown, 100.0) for name, shown in columns.items()}, moving),
+            [shown_contender(name) for name in moving],
+            self.palette.placements,
+            "share of the windows (%)",
+            title="Where the policies that move spent their windows",
+        )
+        return [figure]
+
+    def split(self) -> Figure:
+        """Draw where the time of finished cycles goes."""
+        columns = {f"{part}_ms": (shown, 1.0) for part, shown in PARTS_SHOWN.items()}
+        return stacked(
+            f"{self.prefix}split",
+            self._parts(columns, self.policies),
+            [shown_contender(name) for name in self.policies],
+            PART_COLOURS,
+            "mean latency of finished cycles (ms)",
+            limit=self.problem.pipeline.deadline_ms,
+            limit_name="deadline",
+            title="Where the time goes along the critical path",
+            caption="Lost cycles are not in it. Dashed: deadline.",
+        )
+
+    def _parts(
+        self, columns: Mapping[str, tuple[str, float]], policies: Sequence[str]
+    ) -> pl.DataFrame:
+        """Return means over seeds as ``scenario``, ``policy``, ``part`` and ``value``."""
+        import polars as pl
+
+        means = (
+            self.runs.filter(pl.col("policy").is_in(list(policies)))
+            .group_by("scenario", "policy", maintain_order=True)
+            .agg(
+                (pl.col(name).cast(pl.Float64).mean() * factor).alias(shown)
+                for name, (shown, factor) in columns.items()
+            )
+        )
+        shown = [shown for shown, _ in columns.values()]
+        return named(
+            means.unpivot(
+                shown, index=["scenario", "policy"], variable_name="part", value_name="value"
+            )
+        )
+
+    # -------------------------------------------------------------------------------- tables
+
+    def standing(self, scenario: str, policy: str) -> str:
+        """Return whether V_D is shown to be under 5 %: a word of docs/background/statistics.md."""
+        mine = self.runs.filter(scenario=scenario, policy=policy)
+        return under(mine["violation_rate"].to_list(), AIM) if mine.height else ""
+
+    def counts(self) -> Table:
+        """Return in how many scenarios V_D of each policy is under the aim, or over it."""
+        rows = []
+        for policy in self.policies:
+            words = [self.standing(scenario, policy) for scenario in self.scenarios]
+            counts = {word: words.count(word) for word in ("under", "over", "not shown")}
+            rows.append({"policy": policy, **counts})
+        columns: Columns = [
+            Text("policy", "policy", "policy"),
+            *(Measure(word, word, decimals=0) for word in ("under", "over", "not shown")),
+        ]
+        return Table(
+            f"{self.prefix}counts",
+            "V_D and the aim of 5 %, number of scenarios",
+            columns,
+            rows,
+            caption="By one-sided 95 % limits over seeds.",
+            palette=self.palette,
+        )
+
+    def results(self, *, compact: bool = False) -> Table:
+        """Return what every policy shows in every scenario.
+
+        Parameters
+        ----------
+        compact : bool
+            Whether for a terminal: utilisations without intervals, others with the larger half.
+        """
+        shares = [
+            Measure(f"share_{name}", name, "%", 100.0, 0)
+            for name in self.problem.candidates
+            if f"share_{name}" in self.runs.columns
+        ]
+        table = self._table([*MEASURES, *shares])
+        rows = [
+            {**row, "is": self.standing(row["scenario"], row["policy"])} for row in table.to_dicts()
+        ]
+        # Of shares of windows there is no room for intervals.
+        bare = [*shares, *(MEASURES[3:5] if compact else ())]
+        for row in rows:
+            for measure in bare:
+                row.pop(f"{measure.column}_low")
+        first, *others = MEASURES
+        columns: Columns = [
+            Text("policy", "policy", "policy"),
+            first,
+            Text("is", "5 %", "word"),
+            *others,
+            *shares,
+        ]
+        return Table(
+            f"{self.prefix}results",
+            "Every policy in every scenario",
+            columns,
+            rows,
+            Text("scenario", "", "scenario"),
+            f"Means over {len(set(self.runs['seed']))} seeds with their 95 % intervals"
+            f"{' (±: their larger half)' if compact else ''}. L95: 95th "
+            "percentile of a window’s latencies, mean over windows. U_r, U_e: busiest robot and "
+            "edge node. Last columns: share of the windows under each placement. ATP is our "
+            "reconstruction.",
+            self.palette,
+            compact,
+        )
+
+    def more(self) -> Table:
+        """Return further numbers of every policy in every scenario."""
+        nodes = [
+            Measure(f"node_{node}", f"U of {node}", "%", 100.0)
+            for node in self.problem.fabric.nodes
+        ]
+        measures = [one for one in (*MORE, *nodes) if one.column in self.runs.columns]
+        return Table(
+            f"{self.prefix}more",
+            "More numbers",
+            [Text("policy", "policy", "policy"), *measures],
+            self._table(measures).to_dicts(),
+            Text("scenario", "", "scenario"),
+            "P95 counts lost cycles as infinite: median over seeds. Computing, waiting, network: "
+            "means over finished cycles. Misses in any 20 and any 100 cycles that follow each "
+            "other. Age: of the newest command in effect, from its cycle’s release.",
+            self.palette,
+        )
+
+    def _table(self, measures: Sequence[Measure]) -> pl.DataFrame:
+        names = [one.column for one in measures if one.column in self.runs.columns]
+        return over_seeds(self.runs, ("scenario", "policy"), names)
+
+
+def named(frame: pl.DataFrame, columns: Sequence[str] = ("scenario", "policy")) -> pl.DataFrame:
+    """Return rows in which scenarios and policies have the names that figures show."""
+    import polars as pl
+
+    shown = {"scenario": shown_scenario, "policy": shown_contender}
+    return frame.with_columns(
+        pl.col(name).cast(pl.String).map_elements(shown[name], return_dtype=pl.String)
+        for name in columns
+    )
+
+
+def scaled(frame: pl.DataFrame, measure: Measure) -> pl.DataFrame:
+    """Return ``mean``, ``low`` and ``high`` of a measure in its shown unit, beside the other keys.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        Of `dwell.study.over_seeds`.
+    measure : Measure
+    """
+    import polars as pl
+
+    names = {"mean": "", "low": "_low", "high": "_high"}
+    return frame.with_columns(
+        (pl.col(f"{measure.column}{end}").cast(pl.Float64) * measure.factor).alias(name)
+        for name, end in names.items()
+    )

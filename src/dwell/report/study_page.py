@@ -1,0 +1,164 @@
+"""The report of a study: a measure over any of its parameters, by scenario and policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from dwell.report.charts import curves
+from dwell.report.figure import Figure
+from dwell.report.formatting import Measure
+from dwell.report.method import method_blocks, ranges
+from dwell.report.page import Definitions, Page, Section, page_html
+from dwell.report.policy_blocks import COST, L95, RATE, PolicyBlocks, named, scaled
+from dwell.report.table import Table, Text
+from dwell.study import AIM, SavedStudy, over_seeds
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["study_html", "study_page"]
+
+REGRET = Measure("regret", "regret", "%", 100.0)
+MIGRATIONS = Measure("migrations", "migrations")
+
+
+def study_html(study: SavedStudy, *, static: bool = False) -> str:
+    """Return a page about a study; see `dwell.report.page.page_html`.
+
+    Parameters
+    ----------
+    study : SavedStudy
+        Of `dwell.study.open_study`.
+    static : bool
+        Whether scripts are left out.
+    """
+    return page_html(study_page(study), static=static)
+
+
+def study_page(study: SavedStudy) -> Page:
+    """Return what there is to show of a study; see `study_html`."""
+    blocks = PolicyBlocks(study.problem, study.runs, study.latencies)
+    points = study.runs.select(study.parameters).unique().height if study.parameters else 1
+    return Page(
+        title=f"Study {study.name}",
+        subtitle=f"{study.runs.height} runs: {len(study.scenarios)} scenarios, "
+        f"{len(study.policies)} policies, {points} points, seeds {ranges(study.seeds)}, "
+        f"{study.windows} windows",
+        sections=list(_sections(study, blocks)),
+        policies={name: style.colour for name, style in blocks.styles.items()},
+        seeds=() if study.parameters else study.seeds,
+    )
+
+
+def _sections(study: SavedStudy, blocks: PolicyBlocks) -> Iterator[Section]:
+    if study.parameters:
+        for place, parameter in enumerate(study.parameters):
+            shown = parameter.partition(".")[2]
+            measures = [RATE, L95, COST, MIGRATIONS, *_regret(study)]
+            figures = [_curve(study, blocks, parameter, one, place) for one in measures]
+            tables = [_pivot(study, blocks, parameter, one, place) for one in measures]
+            yield Section(
+                f"By {shown}",
+                [figures[0], tables[0]],
+                note="Means over the other parameters and seeds; intervals are over seeds, of "
+                "their means.",
+            )
+            yield Section(f"More by {shown}", [*figures[1:], *tables[1:]], folded=True)
+        yield Section("Every point", [_points(study, blocks)], folded=True)
+    else:
+        yield Section("", [blocks.rate(), blocks.counts()])
+        yield Section("Results", [blocks.results()])
+        figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
+        figures += [blocks.measure(one, title="Regret") for one in _regret(study)]
+        yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
+        yield Section("More numbers", [blocks.more()])
+    about = {
+        "runs": f"{study.windows} windows, seeds {ranges(study.seeds)}",
+        "intervals": "95 %, two-sided, over seeds, by the studentised bootstrap, each on its own",
+        "versions": ", ".join(f"{name} {text}" for name, text in study.versions.items()),
+    }
+    method = method_blocks(study.problem, study.scenarios, study.policies)
+    yield Section("How it was made", [*method, Definitions(about)])
+
+
+def _regret(study: SavedStudy) -> list[Measure]:
+    return [REGRET] if "regret" in study.runs.columns else []
+
+
+def _means(study: SavedStudy, parameter: str, measure: Measure) -> pl.DataFrame:
+    """Return a measure by a parameter's values: means over the others, a run a seed."""
+    import polars as pl
+
+    keys = ("scenario", "policy", parameter)
+    runs = study.runs.group_by(*keys, "seed", maintain_order=True).agg(
+        pl.col(measure.column).cast(pl.Float64).mean()
+    )
+    return over_seeds(runs, keys, [measure.column])
+
+
+def _curve(
+    study: SavedStudy, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
+) -> Figure:
+    import polars as pl
+
+    limits = {"violation_rate": (100 * AIM, "the aim, 5 %")}
+    limits["l95_ms"] = (study.problem.pipeline.deadline_ms, "deadline")
+    limit, name = limits.get(measure.column, (math.inf, ""))
+    table = scaled(_means(study, parameter, measure), measure)
+    at = table[parameter]
+    frame = table.with_columns(at=at if at.dtype.is_numeric() else at.cast(pl.String))
+    rows = frame.select("scenario", "policy", "at", "mean", "low", "high")
+    return curves(
+        f"{measure.column}-{place}",
+        named(rows.sort("at", maintain_order=True) if at.dtype.is_numeric() else rows),
+        measure,
+        blocks.styles,
+        parameter.partition(".")[2],
+        limit=limit,
+        limit_name=name,
+        title=f"{measure.name} by {parameter.partition('.')[2]}",
+    )
+
+
+def _pivot(
+    study: SavedStudy, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
+) -> Table:
+    """Return a measure, a row a policy and scenario and a column a value of the parameter."""
+    table = _means(study, parameter, measure)
+    values = [str(value) for value in table[parameter].unique(maintain_order=True)]
+    rows: dict[tuple[str, str], dict[str, object]] = {}
+    for row in table.iter_rows(named=True):
+        key = row["scenario"], row["policy"]
+        mine = rows.setdefault(key, {"scenario": key[0], "policy": key[1]})
+        for end in ("", "_low", "_high"):
+            mine[f"{row[parameter]}{end}"] = row[f"{measure.column}{end}"]
+    columns = [measure._replace(column=value, name=value, unit="") for value in values]
+    return Table(
+        f"pivot-{measure.column}-{place}",
+        f"{measure.heading} by {parameter.partition('.')[2]}",
+        [Text("policy", "policy", "policy"), *columns],
+        list(rows.values()),
+        Text("scenario", "", "scenario"),
+        palette=blocks.palette,
+    )
+
+
+def _points(study: SavedStudy, blocks: PolicyBlocks) -> Table:
+    """Return every point, scenario and policy."""
+    measures = [RATE, L95, COST, MIGRATIONS, *_regret(study)]
+    keys = (*study.parameters, "scenario", "policy")
+    table = over_seeds(study.runs, keys, [one.column for one in measures])
+    return Table(
+        "points",
+        "Every point",
+        [
+            Text("policy", "policy", "policy"),
+            *(Text(name, name.partition(".")[2]) for name in study.parameters),
+            *measures,
+        ],
+        table.to_dicts(),
+        Text("scenario", "", "scenario"),
+        palette=blocks.palette,
+    )

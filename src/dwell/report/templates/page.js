@@ -1,0 +1,110 @@
+"use strict";
+// Draws the page's figures again, with what can be chosen and seen; sorts its tables.
+(() => {
+  const views = [];
+  const narrow = 600;
+
+  // A drawing was made for the page's width: parts that are wider than a small screen are fitted.
+  function fit(spec, room) {
+    if (room >= narrow) return spec;
+    const lone = (part) => {
+      if (typeof part !== "object" || part === null) return;
+      if ("columns" in part && ("facet" in part || "concat" in part)) part.columns = 1;
+      if (typeof part.width === "number") part.width = Math.max(140, room - 110);
+      for (const inner of ["spec", "layer", "concat", "vconcat", "hconcat"]) {
+        const parts = part[inner];
+        (Array.isArray(parts) ? parts : [parts]).forEach(lone);
+      }
+    };
+    if (spec.hconcat) { spec.vconcat = spec.hconcat; delete spec.hconcat; }
+    lone(spec);
+    return spec;
+  }
+
+  function draw(figure, spec) {
+    const place = document.createElement("div");
+    const options = { ast: true, actions: false, renderer: "svg", hover: true };
+    return vegaEmbed(place, fit(spec, figure.clientWidth), options).then((result) => {
+      figure.replaceChildren(place);
+      figure.classList.add("live");
+      views.push(result.view);
+    });
+  }
+
+  // One after the other, so that the page stays at hand; what is folded, when it is opened.
+  async function drawAll(part) {
+    for (const figure of part.querySelectorAll("[data-figure]:not(.live)")) {
+      if (figure.closest("details:not([open])")) continue;
+      const spec = document.querySelector(`script[data-spec="${figure.dataset.figure}"]`);
+      await draw(figure, JSON.parse(spec.textContent));
+    }
+    choose();
+  }
+
+  const form = document.querySelector("form.choice");
+
+  function choose() {
+    if (!form) return;
+    const boxes = [...form.querySelectorAll("[name=policy]")];
+    const shown = boxes.filter((box) => box.checked).map((box) => box.value);
+    const select = form.querySelector("[name=seed]");
+    const seed = select && select.value !== "" ? Number(select.value) : null;
+    for (const view of views) {
+      const signals = Object.keys(view.getState().signals);
+      if (boxes.length && signals.includes("policies")) view.signal("policies", shown);
+      if (signals.includes("seed")) view.signal("seed", seed);
+      view.runAsync();
+    }
+    for (const row of document.querySelectorAll("tr[data-policy]")) {
+      const box = boxes.find((one) => one.value === row.dataset.policy);
+      row.hidden = box !== undefined && !box.checked;
+    }
+  }
+
+  if (form) {
+    form.hidden = false;
+    form.addEventListener("change", choose);
+  }
+
+  function compare(a, b) {
+    const [x, y] = [Number(a), Number(b)];
+    if (a === "" || b === "") return (a === "") - (b === "");
+    return Number.isNaN(x) || Number.isNaN(y) ? a.localeCompare(b) : x - y;
+  }
+
+  for (const table of document.querySelectorAll("table")) {
+    const heads = [...table.tHead.rows[0].cells];
+    heads.forEach((head, column) => {
+      head.tabIndex = 0;
+      head.setAttribute("role", "button");
+      const sort = () => {
+        const down = head.getAttribute("aria-sort") === "ascending";
+        heads.forEach((other) => other.removeAttribute("aria-sort"));
+        head.setAttribute("aria-sort", down ? "descending" : "ascending");
+        for (const body of table.tBodies) {
+          const rows = [...body.rows].filter((row) => !row.classList.contains("group"));
+          rows.sort((a, b) => {
+            const order = compare(a.cells[column].dataset.sort, b.cells[column].dataset.sort);
+            return down ? -order : order;
+          });
+          body.append(...rows);
+        }
+      };
+      head.addEventListener("click", sort);
+      head.addEventListener("keydown", (event) => { if (event.key === "Enter") sort(); });
+    });
+  }
+
+  // A link to something folded opens it.
+  function unfold() {
+    const target = location.hash && document.getElementById(location.hash.slice(1));
+    const details = target && (target.querySelector("details") || target.closest("details"));
+    if (details) { details.open = true; target.scrollIntoView(); }
+  }
+  addEventListener("hashchange", unfold);
+  unfold();
+  for (const details of document.querySelectorAll("details")) {
+    details.addEventListener("toggle", () => { if (details.open) drawAll(details); });
+  }
+  drawAll(document);
+})();
