@@ -15,11 +15,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
-from dwell.live.transport.transport import Arrival, Lane
+from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import SESSIONS, Locator, Role, Session, WiringEntry
+from dwell.testbed.losses import Losses, LossyTransport
 
 __all__ = ["Specification", "paced"]
 
@@ -51,6 +53,8 @@ class Specification:
     hertz : float
         Messages a second of one flow.
     seconds : float
+    losses : str
+        File of the losses that a sender over Zenoh has; without any where empty.
     """
 
     side: Literal["send", "receive"]
@@ -61,6 +65,7 @@ class Specification:
     flows: int
     hertz: float
     seconds: float
+    losses: str = ""
 
     @property
     def count(self) -> int:
@@ -207,7 +212,14 @@ def _zenoh_sender(asked: Specification, stack: ExitStack) -> Callable[[int, byte
         stack.callback(way.close)
     while any(way.peers[asked.lane] == 0 for way in ways):
         time.sleep(0.01)
-    return lambda flow, message: ways[flow].put(_key(flow), message, lane=asked.lane)
+    senders: list[Transport] = [*ways]
+    if asked.losses:
+        path = Path(asked.losses)
+        senders = [
+            LossyTransport(way, Losses(path, way.entry.role.who, way.entry.role.node))
+            for way in ways
+        ]
+    return lambda flow, message: senders[flow].put(_key(flow), message, lane=asked.lane)
 
 
 def _zenoh_receiver(asked: Specification, receive: Receive, stack: ExitStack) -> None:

@@ -22,10 +22,10 @@ import numpy as np
 
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.link_end import Specification
-from dwell.live.transport.losses import LOSSES, LossFile
 from dwell.model import Constant, Normal
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.link import Passed, TunLink
+from dwell.testbed.losses import LossFile
 
 __all__ = ["measure"]
 
@@ -153,7 +153,8 @@ class _Bench:
         """Return the ages of messages on arrival, ms, and what has passed the link."""
         address = self._hosts.address("B")
         receive = kind.asked("receive", address, seconds).words()
-        send = kind.asked("send", address, seconds).words()
+        asked = kind.asked("send", address, seconds)
+        send = replace(asked, losses=str(self._losses.path)).words()
         with self._process("B", receive) as receiver:
             assert receiver.stdout is not None
             assert receiver.stdin is not None
@@ -175,7 +176,6 @@ class _Bench:
         return subprocess.Popen(
             self._hosts.inside(node, words),
             cwd=ROOT,
-            env={**os.environ, LOSSES: str(self._losses.path)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -20,7 +20,7 @@ from dwell.chaos.faults import Fault, Means, bound_of, faults_of
 from dwell.chaos.harness import STARVING_THREADS, Harness, environment_of
 from dwell.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.chaos.observer import Observer
-from dwell.chaos.stage import OnHosts, OnLoopback, Stage
+from dwell.chaos.stage import CLOCK_FILE, OnHosts, OnLoopback, Stage
 from dwell.chaos.stages import APPLY
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond, strike
@@ -81,6 +81,7 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
             seed=seed,
             beside=beside,
             environment=environment,
+            clocks=folder / CLOCK_FILE,
         )
         return OnHosts(testbed), home
 

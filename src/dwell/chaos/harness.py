@@ -16,18 +16,18 @@ import psutil
 from dwell.chaos.actuations import Actuations
 from dwell.chaos.disk import DiskHog, SmallDisk, limit_file_size
 from dwell.chaos.faults import Fault
-from dwell.chaos.stage import Stage
+from dwell.chaos.stage import CLOCK_FILE, Stage
 from dwell.chaos.stages import APPLY, TOLD
 from dwell.errors import LiveError
-from dwell.live.clocks import CLOCKS, ClockFile
 from dwell.live.hosting import clock_of
 from dwell.model import Problem
 from dwell.testbed.burner import Burner
+from dwell.testbed.clocks import ClockFile
 from dwell.testbed.processes import expected
 
 __all__ = ["Harness", "environment_of", "pid_of"]
 
-OBSERVED, CLOCK_FILE = "observed", "clocks"
+OBSERVED = "observed"
 #: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
 HEALTH_S = 5.0
 #: Busy threads beside the processes of a node that starves.
@@ -35,10 +35,10 @@ STARVING_THREADS = 32
 
 
 def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) -> dict[str, str]:
-    """Return the variables that stages, actuator and clocks of a cell in a folder need."""
+    """Return the variables that stages and actuator of a cell in a folder need."""
     folder = folder.resolve()
     told = {"observed": str(folder / OBSERVED), "exec_ms": exec_ms, **more}
-    return {TOLD: json.dumps(told), CLOCKS: str(folder / CLOCK_FILE)}
+    return {TOLD: json.dumps(told)}
 
 
 def pid_of(mark: Path) -> int | None:

@@ -14,7 +14,10 @@ from dwell.model import Problem
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.processes import without_keys
 
-__all__ = ["OnHosts", "OnLoopback", "Stage"]
+__all__ = ["CLOCK_FILE", "OnHosts", "OnLoopback", "Stage"]
+
+#: What is wrong with the clocks of a stage's nodes, in its folder.
+CLOCK_FILE = "clocks"
 
 
 class Stage(Protocol):
@@ -101,7 +104,12 @@ class OnLoopback:
         self, problem: Problem, folder: Path, *, seed: int, environment: Mapping[str, str]
     ) -> None:
         self._problem, self._folder = problem, folder
-        self._play = Loopback(problem, folder, {}, seed=seed, environment=environment)
+        self._play = Loopback(
+            *(problem, folder, {}),
+            seed=seed,
+            environment=environment,
+            clocks=folder.resolve() / CLOCK_FILE,
+        )
         self._visitor: OperatorClient | None = None
 
     @property

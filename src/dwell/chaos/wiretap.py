@@ -125,6 +125,7 @@ def main() -> None:
     from dwell.live.security import INSECURE
     from dwell.live.transport.zenoh import ZenohTransport
     from dwell.live.wiring import wire
+    from dwell.testbed.losses import without_source
 
     parent = Parent()
     try:
@@ -145,9 +146,10 @@ def main() -> None:
             at_ns = time.monotonic_ns()
             payload = b"" if sample.key.startswith(inputs) else sample.payload
             key = sample.key.encode()
-            lengths = len(key), len(payload), len(sample.header)
+            _, header = without_source(sample.header)
+            lengths = len(key), len(payload), len(header)
             with lock:
-                file.write(_HEAD.pack(at_ns, *lengths) + key + payload + sample.header)
+                file.write(_HEAD.pack(at_ns, *lengths) + key + payload + header)
 
         for key in heard(Keys(problem.name)):
             transport.subscribe(key, write)

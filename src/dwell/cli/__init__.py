@@ -8,23 +8,29 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dwell.live.hosting import Platform
 
 __all__ = ["main"]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None, platform: Platform | None = None) -> None:
     """Run a command and exit with its code.
 
     Parameters
     ----------
     arguments : sequence of str, optional
         Those of the process where None.
+    platform : Platform, optional
+        Clock and transport of an agent or a controller; without faults if left out.
     """
     # Pydantic would look for plugins in all that is installed; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
         from dwell.cli.commands import app
 
-        app(arguments, prog_name="dwell")
+        app(arguments, prog_name="dwell", obj=platform)
     except KeyboardInterrupt:
         sys.exit(130)

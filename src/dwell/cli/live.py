@@ -45,6 +45,7 @@ live = typer.Typer(
 
 
 def agent(
+    ctx: typer.Context,
     node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
     cell: CellOption,
     state: Annotated[
@@ -81,6 +82,7 @@ def agent(
     """Run a node of a live cell: its workers, and on the right nodes stamper and sinks."""
     from dwell.cellfile import load_without_traces
     from dwell.cli.process import server, words
+    from dwell.live.hosting import Platform
     from dwell.live.lint import lint
     from dwell.live.node import run_agent
     from dwell.live.stage import load_function
@@ -95,22 +97,25 @@ def agent(
     wanted = _cpus(cpus)
     there = sorted(role.who for role in roles(problem) if role.node == node)
     of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
+    platform = ctx.find_object(Platform) or Platform()
     priorities = _by_process("--realtime", realtime, there, _priority)
     run_agent(
         problem,
         node,
         folder,
-        server(cell.resolve(), owner),
+        server(cell.resolve(), platform.program, owner),
         lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
         _until_told(owner),
         cpus=wanted,
         accelerator=read,
         environment=environment(keys, insecure=insecure),
+        platform=platform,
         say=_say,
     )
 
 
 def controller(
+    ctx: typer.Context,
     cell: Annotated[
         list[Path], typer.Option("--cell", metavar="FILE", help="Cell file; may be repeated.")
     ],
@@ -135,6 +140,7 @@ def controller(
 ) -> None:
     """Decide where the stages of live cells run."""
     import dwell
+    from dwell.live.hosting import Platform
     from dwell.live.node import run_controller
 
     wanted = _cpus(cpus)
@@ -147,6 +153,7 @@ def controller(
         name=name,
         jobs=jobs,
         environment=environment(keys, insecure=insecure),
+        platform=ctx.find_object(Platform),
         say=_say,
     )
     for folder in folders:

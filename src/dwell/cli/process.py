@@ -10,27 +10,33 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dwell.errors import DwellError, missing_package
+
+if TYPE_CHECKING:
+    from dwell.live.hosting import Platform
 
 __all__ = ["main", "server", "words"]
 
 
-def server(cell: Path, owner: int | None = None) -> list[str]:
+def server(cell: Path, program: Sequence[str], owner: int | None = None) -> list[str]:
     """Return the command of the process that those of a cell are forked from.
 
     Parameters
     ----------
     cell : Path
         File that it reads once, so that all that reading takes is imported.
+    program : sequence of str
+        Module, and its first arguments, that runs this or what stands for it (`Platform`).
     owner : int, optional
         Process that all of them end with.
     """
     ends_with = [] if owner is None else ["--owner", str(owner)]
-    return [sys.executable, "-m", "dwell.cli.process", "--cell", str(cell), "--serve", *ends_with]
+    return [sys.executable, "-m", *program, "--cell", str(cell), "--serve", *ends_with]
 
 
 def words(
@@ -61,8 +67,16 @@ def words(
     return found
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the process until it is told to end; returns the exit code."""
+def main(arguments: Sequence[str] | None = None, platform: Platform | None = None) -> int:
+    """Run the process until it is told to end; returns the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the process where None.
+    platform : Platform, optional
+        Its clock and transport; without faults if left out.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell", type=Path, required=True)
     parser.add_argument("--serve", action="store_true")
@@ -74,8 +88,8 @@ def main(arguments: list[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     try:
         if asked.serve:
-            return _serve(asked.cell, asked.owner)
-        _run(asked)
+            return _serve(asked.cell, asked.owner, platform)
+        _run(asked, platform)
     except DwellError as error:
         print(error, file=sys.stderr)
         return 2
@@ -88,7 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _serve(cell: Path, owner: int | None) -> int:
+def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
     from dwell.calibration import memory  # noqa: F401
     from dwell.cellfile import load_without_traces
@@ -101,10 +115,10 @@ def _serve(cell: Path, owner: int | None) -> int:
         return 0
     # Stages may look who they are.
     sys.argv[1:] = words
-    return main(words if owner is None else [*words, "--owner", str(owner)])
+    return main(words if owner is None else [*words, "--owner", str(owner)], platform)
 
 
-def _run(asked: argparse.Namespace) -> None:
+def _run(asked: argparse.Namespace, platform: Platform | None) -> None:
     _name(asked.who)
     _schedule(asked.who, asked.cpus, asked.realtime)
     stopped = threading.Event()
@@ -123,7 +137,7 @@ def _run(asked: argparse.Namespace) -> None:
     escape_output()
     keep_memory()
     end_with_owner(stopped, asked.owner)
-    run_process(load_without_traces(asked.cell), asked.who, asked.state, stopped)
+    run_process(load_without_traces(asked.cell), asked.who, asked.state, stopped, platform)
 
 
 def _name(who: str) -> None:

@@ -21,6 +21,7 @@ from dwell.model import Endpoint, Host, NodeDisturbance, Problem
 from dwell.model.scenario import Disturbance
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions
+from dwell.testbed.process import program
 from dwell.testbed.processes import Processes, expected
 from dwell.testbed.timeline import Change, link_changes, link_with, threads_on
 
@@ -88,6 +89,8 @@ class Loopback:
         Of delays and losses.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
+    clocks : Path, optional
+        What is wrong with the nodes' clocks, of a `ClockFile`.
 
     Attributes
     ----------
@@ -103,6 +106,7 @@ class Loopback:
         *,
         seed: int = 0,
         environment: Mapping[str, str] | None = None,
+        clocks: Path | None = None,
     ) -> None:
         self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
         self.world = folder / "world"
@@ -113,6 +117,7 @@ class Loopback:
             folder,
             environment={"DWELL_WORLD": str(self.world), **(environment or {})},
             cpus=cpus,
+            program=program(clocks=clocks),
         )
         self._on: dict[int, Disturbance] = {}
         self._stack = ExitStack()

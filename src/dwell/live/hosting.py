@@ -8,15 +8,23 @@ import time
 from collections.abc import Callable, Sequence
 
 from dwell.errors import LiveError
-from dwell.live.clocks import wrong_clock
 from dwell.live.failures import described, end_process, start_thread
 from dwell.live.role import RoleLogic
+from dwell.live.security import Security
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.worker import Job, Worker
 from dwell.model import Problem
 
-__all__ = ["Clock", "Hosted", "clock_of", "keep_collections_short", "take_turns", "work"]
+__all__ = [
+    "Clock",
+    "Hosted",
+    "Platform",
+    "clock_of",
+    "keep_collections_short",
+    "take_turns",
+    "work",
+]
 
 Clock = Callable[[], int]
 
@@ -24,14 +32,39 @@ Clock = Callable[[], int]
 LONGEST_SLEEP_S = 0.2
 
 
-def clock_of(problem: Problem, node: str = "") -> Clock:
-    """Return what all processes of a live cell, or of one of its nodes, read the time from.
+def clock_of(problem: Problem) -> Clock:
+    """Return what all processes of a live cell read the time from.
 
     Where clocks are kept synchronous by others, that is the time of day; elsewhere a clock that
-    nobody sets. In a trial it may be wrong on a node (see `dwell.live.clocks`).
+    nobody sets.
     """
-    clock = time.time_ns if problem.live.clock == "system" else time.monotonic_ns
-    return wrong_clock(node, clock)
+    return time.time_ns if problem.live.clock == "system" else time.monotonic_ns
+
+
+class Platform:
+    """Clock and transport of the processes of a node; a testbed's has faults around both.
+
+    Attributes
+    ----------
+    program : sequence of str
+        Module, and its first arguments, that runs one process of a cell.
+    """
+
+    program: Sequence[str] = ("dwell.cli.process",)
+
+    def clock(self, problem: Problem, node: str) -> Clock:
+        """Return what the processes of a node read the time from."""
+        return clock_of(problem)
+
+    def transport(self, security: Security, who: str, node: str) -> Transport:
+        """Open the sessions of a process on a node.
+
+        Raises
+        ------
+        LiveError
+            If there is no such process, or a port is taken.
+        """
+        return security.transport(who)
 
 
 def keep_collections_short() -> None:

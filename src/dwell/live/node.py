@@ -16,7 +16,7 @@ from dwell.errors import LiveError
 from dwell.live.agent import Agent, CpuCount, Gauge
 from dwell.live.control_group import own_group
 from dwell.live.controlled_cell import ControlledCell
-from dwell.live.hosting import Hosted, clock_of, keep_collections_short, take_turns
+from dwell.live.hosting import Hosted, Platform, keep_collections_short, take_turns
 from dwell.live.launcher import ForkServer
 from dwell.live.log import Log
 from dwell.live.recording import RunRecorder
@@ -24,7 +24,7 @@ from dwell.live.security import Security
 from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
-from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.transport.transport import Transport
 from dwell.live.wiring import wire
 from dwell.model import Problem
 
@@ -45,6 +45,7 @@ def run_agent(
     cpus: Iterable[int] | None = None,
     accelerator: Callable[[], float] | None = None,
     environment: Mapping[str, str] | None = None,
+    platform: Platform | None = None,
     say: Callable[[str], None] = print,
 ) -> None:
     """Keep a node's processes running until told to stop; then end them.
@@ -67,6 +68,8 @@ def run_agent(
     environment : mapping of str to str, optional
         Of the node's processes, with the variables of `dwell.live.security`; this process's own if
         left out.
+    platform : Platform, optional
+        Clock and transport of the agent; without faults if left out.
     say : callable
         Takes lines for the log.
 
@@ -88,7 +91,8 @@ def run_agent(
     security = Security.of(problem, wiring.entry(who).role, environment)
     security.remember(make_folder(folder))
     security.remind(say, stopped)
-    transport = _listening(security, who, node)
+    platform = platform or Platform()
+    transport = _listening(platform, security, who, node)
     launcher = ForkServer(program, environment)
     supervisor = Supervisor(make_folder(folder), say, launcher=launcher)
     try:
@@ -98,7 +102,7 @@ def run_agent(
         place = security.place(who, node, transport, Log(say))
         gauge = None if accelerator is None else Gauge(accelerator)
         agent = Agent(place, supervisor, _cpu_count(problem, node, say), gauge)
-        clock, complain = clock_of(problem, node), place.complain
+        clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         keep_collections_short()
         hosted.run()
@@ -122,7 +126,7 @@ def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCo
     return CpuCount(group=group)
 
 
-def _listening(security: Security, who: str, node: str) -> ZenohTransport:
+def _listening(platform: Platform, security: Security, who: str, node: str) -> Transport:
     """Open an agent's sessions.
 
     Raises
@@ -131,7 +135,7 @@ def _listening(security: Security, who: str, node: str) -> ZenohTransport:
         If its port is taken: an agent of this node is there already.
     """
     try:
-        return security.transport(who)
+        return platform.transport(security, who, node)
     except LiveError as error:
         raise LiveError(f"{error}\nis there another agent for node {node} here?") from None
 
@@ -152,6 +156,7 @@ def run_controller(
     name: str | None = None,
     jobs: bool = False,
     environment: Mapping[str, str] | None = None,
+    platform: Platform | None = None,
     say: Callable[[str], None] = print,
 ) -> list[Path]:
     """Control cells until told to stop.
@@ -170,6 +175,8 @@ def run_controller(
         Whether the runs keep their jobs, and what each process took of the CPUs.
     environment : mapping of str to str, optional
         With the variables of `dwell.live.security`; this process's own if left out.
+    platform : Platform, optional
+        Clock and transport of the controller; without faults if left out.
     say : callable
         Takes lines for the log.
 
@@ -193,7 +200,7 @@ def run_controller(
     name = name or f"controller-{os.getpid()}"
     # No message waits for long while a window closes.
     sys.setswitchinterval(0.0005)
-    recorders = []
+    recorders, platform = [], platform or Platform()
     with ExitStack() as stack:
         hosted, hurry = [], threading.Event()
         for problem in problems:
@@ -201,12 +208,12 @@ def run_controller(
             role = wire(problem).entry(f"controller@{node}").role
             security = Security.of(problem, role, environment)
             security.remind(say, stopped)
-            transport = security.transport(f"controller@{node}")
+            transport = platform.transport(security, f"controller@{node}", node)
             stack.callback(transport.close)
             place = security.place(f"controller@{node}", node, transport, Log(say))
             controller = Controller(problem, policy)
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs)
-            clock = clock_of(problem, node)
+            clock = platform.clock(problem, node)
             cell = ControlledCell(place, controller, recorder, name, time.time_ns())
             hosted.append(
                 Hosted(

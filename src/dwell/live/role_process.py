@@ -11,7 +11,7 @@ import msgspec
 
 from dwell.errors import LiveError
 from dwell.live.control_group import ControlGroup, own_group
-from dwell.live.hosting import Hosted, clock_of, keep_collections_short, work
+from dwell.live.hosting import Clock, Hosted, Platform, keep_collections_short, work
 from dwell.live.log import Log
 from dwell.live.messages import Header
 from dwell.live.role import Pulse, RoleLogic, RolePlace
@@ -29,7 +29,13 @@ from dwell.model import Problem
 __all__ = ["run_process"]
 
 
-def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Event) -> None:
+def run_process(
+    problem: Problem,
+    who: str,
+    folder: Path,
+    stopped: threading.Event,
+    platform: Platform | None = None,
+) -> None:
     """Run one process of a cell until it is told to end.
 
     Parameters
@@ -40,6 +46,8 @@ def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Eve
     folder : Path
         Where the node's processes keep their files.
     stopped : Event
+    platform : Platform, optional
+        Its clock and transport; without faults if left out.
 
     Raises
     ------
@@ -49,34 +57,37 @@ def run_process(problem: Problem, who: str, folder: Path, stopped: threading.Eve
         If the keys that it has been given are not its.
     """
     entry = wire(problem).entry(who)
+    node, platform = entry.role.node, platform or Platform()
     security = Security.of(problem, entry.role)
-    transport = security.transport(who)
-    place = security.place(who, entry.role.node, transport, Log(_print))
+    clock = platform.clock(problem, node)
+    transport = platform.transport(security, who, node)
+    place = security.place(who, node, transport, Log(_print))
     try:
-        _run(problem, entry.role, place, make_folder(folder), stopped)
+        _run(entry.role, place, make_folder(folder), stopped, clock)
     finally:
         transport.close()
 
 
 def _run(
-    problem: Problem, role: Named, place: RolePlace, folder: Path, stopped: threading.Event
+    role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
 ) -> None:
+    problem = place.problem
     # A stage that computes must not keep a beat waiting for long.
     sys.setswitchinterval(0.0005)
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
-        stamper = Stamper(place, book, time.time_ns(), clock_of(problem, role.node)())
+        stamper = Stamper(place, book, time.time_ns(), clock())
         _count(stamper, problem, role.node)
-        _host(stamper, place, stopped)
+        _host(stamper, place, stopped, clock)
     elif role.kind == "sink":
         actuator = _actuator(problem, role.task)
         highest = HighestFile(folder / f"{role.who}.highest")
         expected = getattr(actuator, "inputs", {}).get(role.task)
         sink = Sink(place, role.task, actuator, highest, expected)
         _count(sink, problem, role.node)
-        _host(sink, place, stopped)
+        _host(sink, place, stopped, clock)
     else:
-        _work(problem, role, place, folder, stopped)
+        _work(role, place, folder, stopped, clock)
 
 
 def _group(problem: Problem, node: str) -> ControlGroup | None:
@@ -91,9 +102,8 @@ def _count(role: Stamper | Sink, problem: Problem, node: str) -> None:
         role.group_clock = group.taken_ns
 
 
-def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event) -> None:
+def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Clock) -> None:
     """Run a role in this thread until the process is told to end."""
-    clock = clock_of(place.problem, place.node)
     hosted = Hosted(role, place.transport, clock, stopped=stopped, complain=place.complain)
     keep_collections_short()
     hosted.run()
@@ -109,8 +119,9 @@ def _actuator(problem: Problem, task: str) -> Actuator:
 
 
 def _work(
-    problem: Problem, role: Named, place: RolePlace, folder: Path, stopped: threading.Event
+    role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
 ) -> None:
+    problem = place.problem
     name = problem.pipeline.tasks[role.task].run
     try:
         if name is None:
@@ -119,7 +130,7 @@ def _work(
     except LiveError as error:
         # It stays, and says in its beats what is wrong: a crash loop would say it less well.
         print(error, file=sys.stderr, flush=True)
-        _host(_Broken(place, f"{role.who}: {error}"), place, stopped)
+        _host(_Broken(place, f"{role.who}: {error}"), place, stopped, clock)
         return
     worker = Worker(
         place,
@@ -132,7 +143,7 @@ def _work(
     if group is not None:
         worker.group_clock = group.counts
     inflight = InFlight(folder / f"{role.who}.inflight")
-    _retry_suspect(worker, folder / f"{role.who}.again")
+    _retry_suspect(worker, folder / f"{role.who}.again", clock)
 
     def note(job: Job | None) -> None:
         if job is None:
@@ -144,7 +155,7 @@ def _work(
         *(worker, place.transport),
         stopped=stopped,
         note=note,
-        clock=clock_of(problem, role.node),
+        clock=clock,
         ready=keep_collections_short,
     )
 
@@ -177,7 +188,7 @@ def _written(job: Job) -> bytes:
     )
 
 
-def _retry_suspect(worker: Worker, path: Path) -> None:
+def _retry_suspect(worker: Worker, path: Path, clock: Clock) -> None:
     """Try first what the process before died of, to see whether it was the message."""
     try:
         shadow, inputs = msgspec.msgpack.decode(
@@ -186,4 +197,4 @@ def _retry_suspect(worker: Worker, path: Path) -> None:
         path.unlink()
     except (OSError, msgspec.MsgspecError):
         return
-    worker.retry(shadow, inputs, clock_of(worker.place.problem, worker.place.node)())
+    worker.retry(shadow, inputs, clock())

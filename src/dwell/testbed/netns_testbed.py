@@ -20,7 +20,6 @@ from typing import Any
 
 from dwell.errors import LiveError
 from dwell.live.security import INSECURE
-from dwell.live.transport.losses import LOSSES, LossFile
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Host, Link, Node, NodeDisturbance, Problem
@@ -31,7 +30,9 @@ from dwell.testbed.groups import PROBES, Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
 from dwell.testbed.link import TunLink
+from dwell.testbed.losses import LossFile
 from dwell.testbed.playing import come_up
+from dwell.testbed.process import program
 from dwell.testbed.processes import Processes, expected
 from dwell.testbed.stress import Stress
 from dwell.testbed.timeline import Change, is_down, link_changes, link_with, threads_on
@@ -138,6 +139,8 @@ class NetnsTestbed:
         Those that nodes may use; all that this process may use if left out.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
+    clocks : Path, optional
+        What is wrong with the nodes' clocks, of a `ClockFile`.
 
     Attributes
     ----------
@@ -164,6 +167,7 @@ class NetnsTestbed:
         more: Sequence[str] = (),
         cpus: Sequence[int] | None = None,
         environment: Mapping[str, str] | None = None,
+        clocks: Path | None = None,
     ) -> None:
         self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
         require_playable(self.problems)
@@ -175,7 +179,7 @@ class NetnsTestbed:
         self.stress: dict[str, Stress] = {}
         self._usual = _links_of(self.problems)
         self._beside, self._more = beside, tuple(more)
-        self._environment = dict(environment or {})
+        self._environment, self._clocks = dict(environment or {}), clocks
         self._on: dict[int, Disturbance] = {}
         self._claim = Claim(name, list(self.nodes))
         self._claimed = False
@@ -232,7 +236,6 @@ class NetnsTestbed:
         self._stack.callback(self._stop_stress)
         environment = {
             "DWELL_WORLD": str(self.folder / "world"),
-            LOSSES: str(self._losses.path),
             # Its hosts' addresses lead nowhere but to each other.
             INSECURE: "1",
             **_modules(self._beside),
@@ -245,6 +248,7 @@ class NetnsTestbed:
             environment=environment,
             more=self._more,
             traces=self._beside,
+            program=program(losses=self._losses.path, clocks=self._clocks),
         )
         self._processes.write()
         self._stack.callback(self._processes.stop)

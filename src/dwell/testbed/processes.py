@@ -73,6 +73,8 @@ class Processes:
         Further arguments of the controllers.
     traces : Path, optional
         Folder where the names of trace files begin; this process's own if left out.
+    program : sequence of str
+        Module, and its first arguments, that runs agents and controllers.
     owner : str, optional
         Process id, where they run, of the one that they end with; this process's own if left out.
 
@@ -92,6 +94,7 @@ class Processes:
         cpus: Mapping[str, int] | None = None,
         more: Sequence[str] = (),
         traces: Path | None = None,
+        program: Sequence[str] = ("dwell",),
         owner: str | None = None,
     ) -> None:
         names = [problem.name for problem in problems]
@@ -100,6 +103,7 @@ class Processes:
         self.problems, self.folder = tuple(problems), folder
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.environment = dict(environment or {})
+        self._program = tuple(program)
         self._owner = str(os.getpid()) if owner is None else owner
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
         self._traces = Path() if traces is None else traces
@@ -166,7 +170,7 @@ class Processes:
     ) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
-        command = [sys.executable, "-m", "dwell", *words, OPTION, self._owner]
+        command = [sys.executable, "-m", *self._program, *words, OPTION, self._owner]
         for problem in problems:
             command += ["--cell", str(self.file_of(problem))]
         with (self.folder / f"{who}.log").open("ab") as log:

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
 from dwell.live.transport.expressions import require_expression, require_key
-from dwell.live.transport.losses import Losses
 from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.transport import Arrival, Lane, Receive
 from dwell.live.wiring import Session, WiringEntry, session_of
@@ -46,7 +45,6 @@ MARK = b"\xc1"
 MARKED_BYTES = 5
 
 _LOG = logging.getLogger(__name__)
-_SENT_BY = "zenoh/bytes;"
 _SHARED_MEMORY = "/dev/shm"  # noqa: S108 - where Linux keeps it
 #: Different failures of receivers that are logged.
 MOST_FAILURES = 100
@@ -142,8 +140,6 @@ class ZenohTransport:
     entry : WiringEntry
         Where it listens and to whom it connects, from `Wiring.entry`.
     settings : ZenohSettings
-    losses : Losses, optional
-        Messages that it leaves out; what the environment asks for if left out.
 
     Raises
     ------
@@ -151,13 +147,7 @@ class ZenohTransport:
         If Zenoh is not installed, or a port is taken.
     """
 
-    def __init__(
-        self,
-        entry: WiringEntry,
-        settings: ZenohSettings | None = None,
-        *,
-        losses: Losses | None = None,
-    ) -> None:
+    def __init__(self, entry: WiringEntry, settings: ZenohSettings | None = None) -> None:
         try:
             import zenoh
         except ImportError:
@@ -165,7 +155,6 @@ class ZenohTransport:
         self.entry = entry
         self.settings = settings or ZenohSettings()
         self._zenoh = zenoh
-        self._losses = losses or Losses.of(entry.role.who, entry.role.node)
         self._closed = False
         self._connections = Connections()
         #: Messages that arrived under another key than they were put under.
@@ -197,7 +186,7 @@ class ZenohTransport:
     ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
         route = self._routes.get((key, lane)) or self._route(key, lane)
-        if route is None or self._closed or (route.lost is not None and route.lost()):
+        if route is None or self._closed:
             return
         # Zenoh takes no views: whoever has one pays for a copy more.
         data = payload if isinstance(payload, bytes) else bytes(payload)
@@ -213,8 +202,6 @@ class ZenohTransport:
         require_expression(key)
         for name, session in list(self._sessions.items()):
             deliver = self._deliver(receive, "control" if name == "control" else "images")
-            if self._losses is not None:
-                deliver = self._unless_lost(deliver, self._losses)
             # Called in the thread that read the message: one hand-over less, and a receiver that
             # is behind makes its senders drop instead of growing a queue here.
             session.declare_subscriber(
@@ -278,7 +265,6 @@ class ZenohTransport:
         try:
             publisher = session.declare_publisher(
                 key,
-                encoding=self._encoding(),
                 congestion_control=self._zenoh.CongestionControl.DROP,
                 priority=priority,
                 express=True,
@@ -289,8 +275,7 @@ class ZenohTransport:
                 return None
             raise
         pool = self._pool if name == "local" else None
-        lost = None if self._losses is None else self._losses.sending(key)
-        route = _Route(publisher.put, pool, self.settings.shared_bytes, lost, mark=_mark(key))
+        route = _Route(publisher.put, pool, self.settings.shared_bytes, mark=_mark(key))
         while len(self._routes) >= _PUBLISHERS:
             dropped = self._routes.pop(next(iter(self._routes)), None)
             if dropped is not None and dropped.sender is not None:
@@ -356,23 +341,6 @@ class ZenohTransport:
         if self.misled == 1:
             _LOG.warning("%s: heard under %s what was put elsewhere", self.entry.role.who, key)
 
-    def _encoding(self) -> zenoh.Encoding | None:
-        """Return what tells receivers the node that sent a message, where some are to be lost."""
-        if self._losses is None:
-            return None
-        return self._zenoh.Encoding(f"{_SENT_BY}{self._losses.node}")
-
-    @staticmethod
-    def _unless_lost(
-        deliver: Callable[[zenoh.Sample], None], losses: Losses
-    ) -> Callable[[zenoh.Sample], None]:
-        def filtered(sample: zenoh.Sample) -> None:
-            source = str(sample.encoding).removeprefix(_SENT_BY)
-            if losses.receives(str(sample.key_expr), source):
-                deliver(sample)
-
-        return filtered
-
 
 _kept = threading.local()
 
@@ -394,7 +362,6 @@ class _Route:
     put: _Put
     pool: _Pool | None
     shared_bytes: int
-    lost: Callable[[], bool] | None = None
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
     mark: bytes = b""

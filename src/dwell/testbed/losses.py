@@ -1,37 +1,36 @@
-"""Messages that a link loses, left out by the transport: for testbeds, whose links carry TCP.
+"""Messages that a link loses, left out before they are on it: a testbed's links carry TCP.
 
 Nobody can take one message out of a TCP connection on its way: a lost packet is sent again, and
-holds up everything behind it. A loss that is meant for messages is therefore drawn here, before a
-message is on any link. Where the variable `DWELL_LOSSES` names no file, nothing of this exists.
+holds up everything behind it. A loss that is meant for messages is therefore drawn by a decorator
+of the transport, before a message is on any link.
 
 A message that is for one node, which its key names (`target_of`), is drawn by who sends it. All
 others go to several nodes by one put; they are drawn by each process that receives them, by the
-node that sent them, which they then carry in their encoding.
+node that sent them, which they carry before their header.
 """
 
 from __future__ import annotations
 
 import json
 import mmap
-import os
 import random
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
 from dwell.errors import LiveError
 from dwell.files import write_whole
+from dwell.live.transport.transport import Arrival, Lane, Receive, Transport
 
-__all__ = ["LOSSES", "LossFile", "Losses", "target_of"]
-
-#: Names the file, for every process of a cell.
-LOSSES = "DWELL_LOSSES"
+__all__ = ["LossFile", "Losses", "LossyTransport", "target_of", "without_source"]
 
 _MAGIC = b"dwelloss"
 # Magic, seed, bytes of the names that follow the probabilities.
 _HEAD = struct.Struct("<8sQQ")
 _VALUE_BYTES = 8
+#: Begins a header that says where its message comes from; MessagePack never uses this byte.
+_SOURCE = b"\xc1"
 #: Keys whose fifth chunk is the one node that a message is for (see `Keys`).
 _FOR_ONE_NODE = frozenset({"in", "state", "snapshot"})
 
@@ -127,21 +126,15 @@ class Losses:
         try:
             content = path.read_bytes()
         except OSError as error:
-            raise LiveError(f"{LOSSES}: {path}: cannot be read ({error.strerror})") from None
+            raise LiveError(f"{path}: cannot be read ({error.strerror})") from None
         self.node = node
         seed, names = _head(path, content)
         if node not in names:
-            raise LiveError(f"{LOSSES}: {path}: no node {node}; it has {', '.join(names)}")
+            raise LiveError(f"{path}: no node {node}; it has {', '.join(names)}")
         values = _values(path, len(names), mmap.ACCESS_READ)
         others = [name for name in names if name != node]
         self._to = {name: _drawer(values, names, node, name, seed, who) for name in others}
         self._from = {name: _drawer(values, names, name, node, seed, who) for name in others}
-
-    @classmethod
-    def of(cls, who: str, node: str, environment: Mapping[str, str] = os.environ) -> Losses | None:
-        """Return what the variable asks of a process; None where there is no such variable."""
-        path = environment.get(LOSSES, "")
-        return cls(Path(path), who, node) if path else None
 
     def sending(self, key: str) -> Callable[[], bool] | None:
         """Return what draws whether the next message under a key is lost; None if none ever is."""
@@ -152,6 +145,54 @@ class Losses:
         """Draw whether a message from a node is received; what its sender draws always is."""
         lost = self._from.get(source)
         return lost is None or target_of(key) is not None or not lost()
+
+
+class LossyTransport:
+    """A transport that leaves messages out; see `Transport`.
+
+    Parameters
+    ----------
+    transport : Transport
+    losses : Losses
+    """
+
+    def __init__(self, transport: Transport, losses: Losses) -> None:
+        self._transport, self._losses = transport, losses
+        node = losses.node.encode()
+        self._source = _SOURCE + bytes([len(node)]) + node
+
+    def put(
+        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
+    ) -> None:
+        """Send a message, unless it is for one node and lost; else say where it comes from."""
+        if target_of(key) is None:
+            self._transport.put(key, payload, self._source + header, lane=lane)
+            return
+        lost = self._losses.sending(key)
+        if lost is None or not lost():
+            self._transport.put(key, payload, header, lane=lane)
+
+    def subscribe(self, key: str, receive: Receive) -> None:
+        """Have `receive` called with every message under a key expression that is not lost."""
+
+        def filtered(sample: Arrival) -> None:
+            source, header = without_source(sample.header)
+            if self._losses.receives(sample.key, source):
+                receive(Arrival(sample.key, sample.payload, header) if source else sample)
+
+        self._transport.subscribe(key, filtered)
+
+    def close(self) -> None:
+        """Send and deliver nothing more; safe to call twice."""
+        self._transport.close()
+
+
+def without_source(header: bytes) -> tuple[str, bytes]:
+    """Return the node that a message comes from and its own header; no node where none is said."""
+    if not header.startswith(_SOURCE):
+        return "", header
+    end = len(_SOURCE) + 1 + header[len(_SOURCE)]
+    return header[len(_SOURCE) + 1 : end].decode(), header[end:]
 
 
 def _drawer(
@@ -187,7 +228,7 @@ def _head(path: Path, content: bytes) -> tuple[int, tuple[str, ...]]:
     except (struct.error, ValueError, TypeError):
         good = False
     if not good:
-        raise LiveError(f"{LOSSES}: {path}: is no file of losses")
+        raise LiveError(f"{path}: is no file of losses")
     return seed, tuple(names)
 
 

@@ -1,27 +1,23 @@
 """Clocks that are wrong on purpose: for trials of what a cell does when they jump or drift.
 
-All nodes of a cell on one computer read one clock, which nobody may set. Where the variable
-`DWELL_CLOCKS` names a file, the processes of a node add to it what the file says of that node, and
-whoever made the file changes that while they run. Without the variable nothing of this exists.
+All nodes of a cell on one computer read one clock, which nobody may set. The processes of a node
+that `dwell.testbed.process` starts add to it what a file says of that node, and whoever made the
+file changes that while they run.
 """
 
 from __future__ import annotations
 
 import json
 import mmap
-import os
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
 from dwell.errors import LiveError
 from dwell.files import write_whole
 
-__all__ = ["CLOCKS", "ClockFile", "wrong_clock"]
-
-#: Names the file, for every process of a cell.
-CLOCKS = "DWELL_CLOCKS"
+__all__ = ["ClockFile", "wrong_clock"]
 
 PPB = 1_000_000_000
 
@@ -107,22 +103,17 @@ class ClockFile:
         self.close()
 
 
-def wrong_clock(
-    node: str, clock: Callable[[], int], environment: Mapping[str, str] = os.environ
-) -> Callable[[], int]:
-    """Return the clock of a node: the one given, unless the variable says that it is wrong.
+def wrong_clock(clock: Callable[[], int], path: Path, node: str) -> Callable[[], int]:
+    """Return a node's clock: the one given, and what a `ClockFile` says that it is ahead by.
 
     Raises
     ------
     LiveError
         If there is no such file, it is another kind of file, or has no such node.
     """
-    path = environment.get(CLOCKS, "")
-    if not path or not node:
-        return clock
-    content, names = _open(Path(path))
+    content, names = _open(path)
     if node not in names:
-        raise LiveError(f"{CLOCKS}: {path}: no node {node}; it has {', '.join(names)}")
+        raise LiveError(f"{path}: no node {node}; it has {', '.join(names)}")
     begin = _HEAD.size + _NODE_BYTES * names.index(node)
 
     def wrong() -> int:
@@ -144,7 +135,7 @@ def _open(path: Path) -> tuple[mmap.mmap, tuple[str, ...]]:
         with path.open("rb") as file:
             content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        raise LiveError(f"{CLOCKS}: {path}: cannot be read ({error})") from None
+        raise LiveError(f"{path}: cannot be read ({error})") from None
     try:
         magic, length = _HEAD.unpack_from(content)
         names = json.loads(content[len(content) - length :])
@@ -153,5 +144,5 @@ def _open(path: Path) -> tuple[mmap.mmap, tuple[str, ...]]:
     except (struct.error, ValueError, TypeError):
         good = False
     if not good:
-        raise LiveError(f"{CLOCKS}: {path}: is no file of clocks")
+        raise LiveError(f"{path}: is no file of clocks")
     return content, tuple(names)

@@ -9,8 +9,8 @@ import pytest
 
 from dwell.errors import LiveError
 from dwell.live.keys import Keys
-from dwell.live.transport.losses import LOSSES, Losses, LossFile, target_of
 from dwell.live.transport.transport import Lane
+from dwell.testbed.losses import Losses, LossFile, LossyTransport, target_of
 from tests.live.transport.meshes import ZenohMesh, introduce
 
 NODES = "R1", "E", "R2"
@@ -143,7 +143,7 @@ def test_a_writer_says_what_is_wrong(file: LossFile, tmp_path: Path) -> None:
 
 
 def test_a_reader_says_what_is_wrong(file: LossFile, tmp_path: Path) -> None:
-    with pytest.raises(LiveError, match=r"DWELL_LOSSES: .*missing: cannot be read"):
+    with pytest.raises(LiveError, match=r"missing: cannot be read"):
         Losses(tmp_path / "missing", "camera@R1", "R1")
     with pytest.raises(LiveError, match="no node X; it has R1, E, R2"):
         Losses(file.path, "camera@X", "X")
@@ -155,12 +155,6 @@ def test_a_reader_says_what_is_wrong(file: LossFile, tmp_path: Path) -> None:
             Losses(other, "camera@R1", "R1")
 
 
-def test_without_the_variable_there_is_nothing(file: LossFile) -> None:
-    assert Losses.of("camera@R1", "R1", {}) is None
-    assert Losses.of("camera@R1", "R1", {LOSSES: ""}) is None
-    assert Losses.of("camera@R1", "R1", {LOSSES: str(file.path)}) is not None
-
-
 # ------------------------------------------------------------------------------ over Zenoh
 
 COUNT = 400
@@ -168,17 +162,20 @@ SENDER, NEAR, FAR = "camera@R1", "stamper@R1", "perception@E"
 
 
 @pytest.fixture
-def mesh(file: LossFile, monkeypatch: pytest.MonkeyPatch) -> Iterator[ZenohMesh]:
-    monkeypatch.setenv(LOSSES, str(file.path))
+def mesh() -> Iterator[ZenohMesh]:
     opened = ZenohMesh([SENDER, NEAR, FAR])
     yield opened
     opened.close()
 
 
+def lossy(mesh: ZenohMesh, file: LossFile, who: str) -> LossyTransport:
+    return LossyTransport(mesh.open(who), Losses(file.path, who, who.partition("@")[2]))
+
+
 @pytest.mark.parametrize("key", [TO_E, KEYS.stamped()], ids=["at the sender", "at the receiver"])
 @pytest.mark.parametrize("lane", ["control", "images"])
 def test_a_share_crosses_the_link(mesh: ZenohMesh, file: LossFile, key: str, lane: Lane) -> None:
-    sender, near, far = (mesh.open(who) for who in (SENDER, NEAR, FAR))
+    sender, near, far = (lossy(mesh, file, who) for who in (SENDER, NEAR, FAR))
     inbox, here = mesh.inbox(), mesh.inbox()
     far.subscribe(key, inbox)
     near.subscribe(KEYS.beat("R1", "*"), here)
@@ -200,7 +197,7 @@ def test_a_share_crosses_the_link(mesh: ZenohMesh, file: LossFile, key: str, lan
 
 
 def test_a_link_may_lose_everything_for_a_while(mesh: ZenohMesh, file: LossFile) -> None:
-    sender, far = mesh.open(SENDER), mesh.open(FAR)
+    sender, far = lossy(mesh, file, SENDER), lossy(mesh, file, FAR)
     inbox = mesh.inbox()
     far.subscribe(TO_E, inbox)
     introduce(mesh, sender, TO_E, [inbox])
