@@ -28,7 +28,7 @@ from dwell.live.trust import KEYS
 from dwell.model import Problem
 from dwell.report.phases import Disturbed, disturbed
 from dwell.testbed.playing import crowded, make_folder
-from dwell.testbed.timeline import Change, changes_of
+from dwell.testbed.timeline import timeline_of
 from tests.report.live_runs import PERIOD_NS, live_run
 
 SECONDS = 116.0
@@ -138,9 +138,9 @@ def test_logs_get_a_line_whenever_something_has_changed(
 
 def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path) -> None:
     folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
-    told = live_demo._Told(problem, "demo", 5)
-    first = changes_of(problem, "demo")[0]
-    told.begun_ns[first.index] = 20 * PERIOD_NS
+    timeline = timeline_of(problem, "demo", seed=5, seconds=100)
+    told = live_demo._Told(problem, "demo", 5, timeline)
+    told.changed(timeline.changes[0], 20 * PERIOD_NS)
     run = told.note(folder, **told.tracking(folder))
     assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
     # Interrupted: it was on until the end.
@@ -170,10 +170,10 @@ def test_a_machine_that_was_full_while_nothing_disturbed_it_is_warned_of(
 
 
 def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:
-    told = live_demo._Told(problem, "demo", 1)
-    changes: list[Change] = changes_of(problem, "demo")
+    timeline = timeline_of(problem, "demo", seed=1, seconds=1_000)
+    told = live_demo._Told(problem, "demo", 1, timeline)
     seen = []
-    for change in changes:
+    for change in timeline.changes:
         told.changed(change)
         seen.append(tuple(one.kind for one in told.on()))
     assert list(dict.fromkeys(seen)) == [

@@ -94,7 +94,9 @@ def test_a_connection_that_is_not_zenohs_passes_too(wire: Wire) -> None:
 
 def test_every_message_takes_its_delay_and_none_overtakes(wire: Wire) -> None:
     a, b = wire.connect()
-    wire.link.set("A", "B", delay_ms=Uniform(10.0, 30.0), add_delay_ms=Constant(5.0))
+    wire.link.set(
+        "A", "B", delay_ms=Uniform(10.0, 30.0), add_delays_ms=(Constant(5.0),), shares=(1.0,)
+    )
     sent_ns = []
     batches = data(40)
     for batch in batches:

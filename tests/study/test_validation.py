@@ -13,7 +13,17 @@ import pytest
 
 from dwell import Run, simulate
 from dwell.errors import RunError
-from dwell.model import Execution, Gamma, LogNormal, NodeDisturbance, Placement, Problem
+from dwell.model import (
+    Constant,
+    Episodes,
+    Execution,
+    Exponential,
+    Gamma,
+    LogNormal,
+    NodeDisturbance,
+    Placement,
+    Problem,
+)
 from dwell.study.measured_run import excluded_windows, read_measured
 from dwell.study.qos_sample import piece_of
 from dwell.study.validation import GOALS, Validation, validate
@@ -212,6 +222,24 @@ class TestWhatCounts:
         assert found.problem.scenario("late") == (
             NodeDisturbance("R1", at_s=6.5, for_s=9.0, stress_threads=4),
             NodeDisturbance("E", at_s=0.0, for_s=math.inf, stress_threads=1),
+        )
+
+    def test_episodes_and_ramps_are_simulated_as_they_were_played(self) -> None:
+        episodes = Episodes("wind", Exponential(3.0), Constant(1.0))
+        windy = NodeDisturbance("R1", stress_threads=4, episodes=episodes)
+        rising = NodeDisturbance("E", at_s=2.0, for_s=9.0, ramp_s=4.0, stress_threads=4)
+        problem = replace(make_problem(), scenarios={"drawn": (windy, rising)})
+        run = simulate(problem, scenario="drawn", policy="LOC", seed=1, windows=WINDOWS)
+        wind, rise = run.meta["problem"]["scenarios"]["drawn"]
+        del wind["episodes"]
+        told = [{**wind, "at_s": at_s, "for_s": 1.0} for at_s in (2.5, 6.0)]
+        told.append({**rise, "at_s": 2.1, "for_s": 7.9, "ramp_s": 3.95})
+        found = read_measured("run", with_meta(run, played=told), problem)
+        plain = NodeDisturbance("R1", for_s=1.0, stress_threads=4)
+        assert found.problem.scenario("drawn") == (
+            replace(plain, at_s=2.5),
+            replace(plain, at_s=6.0),
+            replace(rising, at_s=2.1, for_s=7.9, ramp_s=3.95),
         )
 
     def test_a_placement_that_the_cell_does_not_list_is_predicted_too(self) -> None:

@@ -24,6 +24,7 @@ from dwell.model import (
     Uniform,
 )
 from dwell.testbed.conditions import Conditions, changed, delays_ns, to_json
+from dwell.testbed.draws import Draws
 
 PROCESSES = [
     Constant(3.0),
@@ -40,6 +41,29 @@ PROCESSES = [
 def test_processes_arrive(process: Process) -> None:
     sent = json.dumps(to_json({"delay_ms": process, "rate_mbps": math.inf, "cut": None}))
     assert changed(Conditions(cut="drop"), json.loads(sent)) == Conditions(process)
+
+
+def test_added_delays_arrive_with_their_shares() -> None:
+    added = {"add_delays_ms": (Normal(25.0, 5.0), Constant(4.0)), "shares": (0.5, 1.0)}
+    arrived = changed(Conditions(), json.loads(json.dumps(to_json(added))))
+    assert arrived == Conditions(**added)  # type: ignore[arg-type]
+    for shares in ((1.0,), (1.0, 1.5), (1.0, math.nan)):
+        with pytest.raises(ProblemError, match="shares"):
+            changed(arrived, {"shares": list(shares)})
+
+
+def test_a_stream_goes_on_while_its_share_changes() -> None:
+    process = AR1(20.0, 0.2, 0.9)
+    plain, changing = Draws((1, 0)), Draws((1, 0))
+    for draws in (plain, changing):
+        draws.apply(to_json({"add_delays_ms": (Constant(2.0), process), "shares": (0.0, 1.0)}))
+    whole = [plain.delay_ns() for _ in range(9)]
+    found = []
+    for share in (1.0, 0.0, 0.5):
+        changing.apply(to_json({"shares": (1.0, share)}))
+        found += [(changing.delay_ns() - 2_000_000, share) for _ in range(3)]
+    expected = [delay * share for delay, (_, share) in zip(whole, found, strict=True)]
+    assert [delay for delay, _ in found] == pytest.approx(expected, abs=1)
 
 
 @pytest.mark.parametrize("process", PROCESSES, ids=lambda process: type(process).__name__)

@@ -16,11 +16,12 @@ import pytest
 import yaml
 
 from dwell.errors import LiveError, ProblemError
-from dwell.model import LinkDisturbance, NodeDisturbance, Normal
+from dwell.model import LinkDisturbance, Normal
+from dwell.sim import NodeChange
 from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inventory
 from dwell.testbed.real_hosts import RealHosts, require_commands
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
-from dwell.testbed.timeline import Change, changes_of
+from dwell.testbed.timeline import Change, usual_conditions
 from tests.study.cell import make_problem
 
 PROBLEM = make_problem()
@@ -186,10 +187,16 @@ def test_disturbances_are_played_by_the_inventorys_commands(tmp_path: Path) -> N
         f"echo on {{mean_ms}} {{std_ms}} {{loss_percent}} >> {log}", f"echo off >> {log}"
     )
     cell = RealHosts(PROBLEM, inventory(tmp_path, **{LINK.name: commands}), tmp_path, name="one")
-    item = LinkDisturbance(LINK.source, LINK.target, add_delay_ms=Normal(25.0, 5.0), loss=0.02)
-    cell.apply(Change(0.0, 0, item, begins=True))
-    cell.apply(Change(1.0, 0, item, begins=False))
-    assert log.read_text().splitlines() == ["on 25.0 5.0 2.0", "off"]
+    usual = usual_conditions(LINK)
+    delays = Normal(25.0, 5.0), Normal(100.0, 12.0)
+    for shares, loss in (((1.0, 0.0), 0.02), ((1.0, 1.0), 0.5), ((0.0, 0.5), 0.0), ((0, 0), 0.0)):
+        now = replace(
+            usual, add_delays_ms=delays, shares=shares, loss=1 - (1 - usual.loss) * (1 - loss)
+        )
+        cell.apply(Change(0, LINK.name, now))
+    cell.apply(Change(1, LINK.name, usual))
+    told = ["on 25.0 5.0 2.0", "on 125.0 13.0 50.0", "on 50.0 6.0 0.0", "off"]
+    assert log.read_text().splitlines() == told
 
 
 def test_stress_runs_until_it_ends(tmp_path: Path) -> None:
@@ -202,21 +209,20 @@ def test_stress_runs_until_it_ends(tmp_path: Path) -> None:
     )
     cell = RealHosts(PROBLEM, over_there, tmp_path, name="one")
     Path(cell.there("E")).mkdir(parents=True)
-    item = NodeDisturbance("E", stress_threads=3)
-    cell.apply(Change(0.0, 0, item, begins=True))
+    cell.apply(Change(0, "E", NodeChange(0, "E", 3, False)))
     until(lambda: threads.is_file() and threads.read_text() == "3\n")
     process = next(iter(cell.stress.values()))
-    cell.apply(Change(1.0, 0, item, begins=False))
+    cell.apply(Change(1, "E", NodeChange(1, "E", 0, False)))
     assert process.poll() is not None
 
 
 def test_links_without_commands_are_refused(tmp_path: Path) -> None:
-    changes = changes_of(PROBLEM, "network-impairment")
+    scenario = PROBLEM.scenario("network-impairment")
     with pytest.raises(LiveError, match="no commands that disturb"):
-        require_commands(inventory(tmp_path), changes)
+        require_commands(inventory(tmp_path), scenario)
     links = {
-        change.item.link: LinkCommands("true", "true")
-        for change in changes
-        if isinstance(change.item, LinkDisturbance)
+        item.link: LinkCommands("true", "true")
+        for item in scenario
+        if isinstance(item, LinkDisturbance)
     }
-    require_commands(inventory(tmp_path, **links), changes)
+    require_commands(inventory(tmp_path, **links), scenario)

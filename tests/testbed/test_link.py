@@ -50,7 +50,7 @@ def link(shared: TunLink) -> Iterator[TunLink]:
     shared.read()
     yield shared
     for way in (AB, BA):
-        shared.set(*way, delay_ms=Constant(0.0), add_delay_ms=Constant(0.0), loss=0.0, cut=None)
+        shared.set(*way, delay_ms=Constant(0.0), add_delays_ms=(), shares=(), loss=0.0, cut=None)
         shared.set(*way, rate_mbps=float("inf"))
 
 
@@ -76,7 +76,7 @@ class Probe:
 
 @needs_hosts
 def test_no_message_comes_before_its_delay(hosts: TwoHosts, link: TunLink) -> None:
-    link.set(*AB, delay_ms=Constant(15.0), add_delay_ms=Constant(5.0))
+    link.set(*AB, delay_ms=Constant(15.0), add_delays_ms=(Constant(10.0),), shares=(0.5,))
     probe = Probe(hosts)
     for number in range(5):
         probe.send(str(number))
@@ -84,7 +84,7 @@ def test_no_message_comes_before_its_delay(hosts: TwoHosts, link: TunLink) -> No
         assert name == str(number)
         assert age_ms >= 20.0
     time.sleep(PAUSE_S)
-    link.set(*AB, add_delay_ms=Constant(0.0))
+    link.set(*AB, shares=(0.0,))
     probe.send("x")
     assert probe.next()[1] >= 15.0
     passed = link.read()[AB]

@@ -12,10 +12,11 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.errors import LiveError
-from dwell.model import LinkDisturbance, NodeDisturbance
+from dwell.model import Constant
+from dwell.sim import NodeChange
 from dwell.testbed.hosts import namespace_path
 from dwell.testbed.netns_testbed import NetnsTestbed
-from dwell.testbed.timeline import Change
+from dwell.testbed.timeline import Change, usual_conditions
 from tests.testbed.light_cell import document, write_cell
 from tests.testbed.machine import no_groups, no_hosts, own_name
 
@@ -80,33 +81,46 @@ def test_a_run_begins_anew_with_everybody_there(testbed: NetnsTestbed) -> None:
 
 
 def test_stress_is_in_the_group_of_its_node(testbed: NetnsTestbed) -> None:
-    stress = NodeDisturbance("R2", stress_threads=2)
-    testbed.apply(Change(0.0, 0, stress, begins=True))
+    testbed.apply(Change(0, "R2", NodeChange(0, "R2", 2, False)))
     begun_ns = testbed.used_ns["R2"]()
     # Far less than its quota, far more than its stages take.
     wait_for(lambda: testbed.used_ns["R2"]() - begun_ns > 2_000_000_000, "two seconds of CPU time")
-    testbed.apply(Change(1.0, 0, stress, begins=False))
+    testbed.apply(Change(1, "R2", NodeChange(1, "R2", 0, False)))
 
 
 def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None:
     link = testbed.links[frozenset(("R1", "R2"))]
-    cut = LinkDisturbance("R1", "R2", down=True, loss=0.5)
-    testbed.apply(Change(0.0, 0, cut, begins=True))
+    usual = usual_conditions(testbed.problems[0].fabric.links["R1->R2"])
+    testbed.apply(Change(0, "R1->R2", replace(usual, cut="drop", loss=0.5)))
     wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
-    testbed.apply(Change(1.0, 0, cut, begins=False))
+    testbed.apply(Change(1, "R1->R2", usual))
     link.read()
     wait_for(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
+
+
+def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> None:
+    link = testbed.links[frozenset(("R1", "R2"))]
+    usual = usual_conditions(testbed.problems[0].fabric.links["R1->R2"])
+    own_ms, delays = usual.delay_ms.expectation, (Constant(4.0), Constant(9.0))
+    for shares in ((1.0, 1.0), (1.0, 1 / 3), (0.0, 0.0)):
+        now = replace(usual, add_delays_ms=delays, shares=shares)
+        testbed.apply(Change(0, "R1->R2", now))
+        # What began before has the delay of before.
+        link.read()
+        wait_for(lambda: link.read(reset=False)["R1", "R2"].bursts >= 5, "messages")
+        added_ms = 4.0 * shares[0] + 9.0 * shares[1]
+        assert link.read()["R1", "R2"].delay_mean_ms == pytest.approx(own_ms + added_ms, abs=1e-3)
+    testbed.apply(Change(1, "R1->R2", usual))
 
 
 def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
     (watcher,) = testbed.watchers
     if "controller@E" not in testbed._processes.running:
         testbed.begin(patience_s=PATIENCE_S)
-    outage = NodeDisturbance("R2", down=True)
     there = set(testbed._groups.pids("R2"))
-    testbed.apply(Change(0.0, 0, outage, begins=True))
+    testbed.apply(Change(0, "R2", NodeChange(0, "R2", 0, True)))
     assert testbed._groups.pids("R2") == []
-    testbed.apply(Change(1.0, 0, outage, begins=False))
+    testbed.apply(Change(1, "R2", NodeChange(1, "R2", 0, False)))
 
     def ready() -> bool:
         heard = watcher.status(10.0)["processes"]

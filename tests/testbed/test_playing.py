@@ -13,6 +13,7 @@ import pytest
 from dwell.cellfile import from_document
 from dwell.errors import LiveError
 from dwell.model import Problem
+from dwell.sim import NodeChange
 from dwell.testbed.playing import (
     Played,
     come_up,
@@ -22,7 +23,7 @@ from dwell.testbed.playing import (
     play,
     undisturbed,
 )
-from dwell.testbed.timeline import Change, changes_of
+from dwell.testbed.timeline import Change, timeline_of
 from tests.report.live_runs import PERIOD_NS, live_run
 from tests.testbed.light_cell import document
 
@@ -50,16 +51,16 @@ def test_changes_are_made_at_their_times_with_looks_between(
     problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = Clock(monkeypatch)
-    made: list[tuple[float, str, bool]] = []
+    made: list[tuple[float, str]] = []
     looks: list[float] = []
 
     def apply(change: Change) -> None:
-        made.append((clock.at_s, type(change.item).__name__[:4], change.begins))
+        made.append((clock.at_s, change.place))
 
-    changes = changes_of(problem, "impaired")
+    changes = timeline_of(problem, "impaired", seed=1, seconds=2.75).changes
     play(changes, 2.75, clock.now_s, apply, looks.append)
     # What ends at 3 s is beyond the end.
-    assert made == [(1.0, "Link", True), (1.0, "Link", True), (1.0, "Node", True)]
+    assert made == [(1.0, "E"), (1.0, "R1->E"), (1.0, "E->R1")]
     assert looks == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
     assert clock.at_s == 2.75
 
@@ -69,18 +70,20 @@ def test_a_change_between_two_looks_is_not_late(
 ) -> None:
     clock = Clock(monkeypatch)
     made: list[float] = []
-    item = problem.scenario("impaired")[-1]
-    changes = [Change(0.3, 0, item, begins=True), Change(0.7, 0, item, begins=False)]
+    steps = [NodeChange(round(at_s * 1e9), "E", 1, False) for at_s in (0.3, 0.7)]
+    changes = [Change(step.at_ns, "E", step) for step in steps]
     play(changes, 1.0, clock.now_s, lambda change: made.append(clock.at_s), lambda at_s: None)
     assert made == pytest.approx([0.3, 0.7])
 
 
 def test_the_run_is_told_what_was_played_when(problem: Problem, tmp_path: Path) -> None:
     folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
-    played = Played(problem, "impaired", 7)
-    last = len(problem.scenario("impaired")) - 1
-    played.begun_ns[last] = 20 * PERIOD_NS
-    played.ended_ns[last] = 30 * PERIOD_NS
+    timeline = timeline_of(problem, "impaired", seed=7, seconds=60)
+    played = Played(problem, "impaired", 7, timeline)
+    begin, end = [change for change in timeline.changes if change.place == "E"]
+    played.changed(begin, 20 * PERIOD_NS)
+    assert [item.place for item in played.active()] == ["E"]
+    played.changed(end, 30 * PERIOD_NS)
     assert played.active() == []
     meta = played.note(folder, pressure={"failed": False}).meta
     assert (meta["scenario"], meta["seed"], meta["pressure"]) == ("impaired", 7, {"failed": False})
@@ -91,6 +94,45 @@ def test_the_run_is_told_what_was_played_when(problem: Problem, tmp_path: Path) 
     assert longest_run(tmp_path) == folder
     assert longest_run(tmp_path, "another cell") is None
     assert longest_run(tmp_path / "nothing") is None
+
+
+def test_episodes_and_ramps_are_told_as_they_were_played(tmp_path: Path) -> None:
+    episodes = {"name": "x", "every_s": 2, "for_s": 1}
+    items = [
+        {"node": "E", "stress_threads": 4, "for_s": 6, "episodes": episodes},
+        {"node": "R1", "stress_threads": 31, "at_s": 1, "for_s": 8, "ramp_s": 3},
+        {"node": "R2", "stress_threads": 31, "at_s": 4, "ramp_s": 3},
+    ]
+    problem = from_document(document(scenarios={"some": items}))
+    timeline = timeline_of(problem, "some", seed=1, seconds=20)
+    played = Played(problem, "some", 1, timeline)
+    for change in timeline.changes:
+        if change.at_s < 5:
+            played.changed(change, change.at_ns)
+    folder = live_run(origin_ns=1).save(tmp_path / "run")
+    told = played.note(folder, (0, 5_000_000_000)).meta["played"]
+    times = [(item["node"], item["at_s"], item.get("for_s"), item["ramp_s"]) for item in told]
+    assert times == [("E", 2, 1, 0), ("R1", 1, 8, 3), ("R2", 4, None, 3)]
+    # What has begun, and goes on.
+    assert [item.place for item in played.active()] == ["R1", "R2"]
+    for change in timeline.changes:
+        played.changed(change, change.at_ns)
+    told = played.note(folder, (0, 20_000_000_000)).meta["played"]
+    times = [(item["node"], item["at_s"], item.get("for_s"), item["ramp_s"]) for item in told]
+    assert times == [("E", 2, 1, 0), ("E", 5, 1, 0), ("R1", 1, 8, 3), ("R2", 4, None, 3)]
+
+
+def test_what_began_after_the_last_release_was_on_for_no_time(
+    problem: Problem, tmp_path: Path
+) -> None:
+    folder = live_run(origin_ns=1).save(tmp_path / "run")
+    timeline = timeline_of(problem, "impaired", seed=1, seconds=9)
+    played = Played(problem, "impaired", 1, timeline)
+    for change in timeline.changes[:3]:
+        played.changed(change, change.at_ns)
+    told = played.note(folder, (0, 900_000_000))
+    assert [item["for_s"] for item in told.meta["played"]] == [0.0] * 3
+    assert told.played == ()
 
 
 def test_a_cell_is_up_when_everybody_is_ready(tmp_path: Path) -> None:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+import dwell
 from dwell.cellfile import from_document
 from dwell.errors import LiveError
-from dwell.model import Problem
+from dwell.model import Disturbance, Problem
+from dwell.record import open_run
+from dwell.sim.random_draws import drawn_scenario
 from dwell.testbed.playing import Played
-from dwell.testbed.run import MARK, length_s, run_once, spans_of
+from dwell.testbed.run import MARK, length_s, require_machine, run_once, spans_of
+from dwell.testbed.timeline import Timeline, timeline_of
 from tests.report.live_runs import PERIOD_NS, live_run
-from tests.testbed.light_cell import document
+from tests.testbed.light_cell import document, write_cell
+from tests.testbed.machine import own_name
 
 ORIGIN_NS = 10 * PERIOD_NS
 
@@ -31,7 +38,7 @@ def test_the_last_window_has_time_to_close(problem: Problem) -> None:
 def test_windows_are_in_time_where_their_cycles_were() -> None:
     run = live_run(origin_ns=ORIGIN_NS)
     problem = from_document(run.meta["problem"])
-    spans = spans_of(run, Played(problem, "baseline", 1))
+    spans = spans_of(run, Played(problem, "baseline", 1, Timeline()))
     first = run.windows["first_cycle"].to_list()
     assert [span.number for span in spans] == run.windows["window"].to_list()
     release_ns = run.cycles["release_ns"].to_list()
@@ -48,13 +55,55 @@ def test_a_node_is_stressed_in_windows_that_lie_in_its_stress_as_a_whole() -> No
     cores = written["nodes"][node].get("cores", 1)
     written["scenarios"] = {"some": [{"node": node, "stress_threads": cores}]}
     problem = from_document(written)
-    played = Played(problem, "some", 1)
+    timeline = timeline_of(problem, "some", seed=1, seconds=60)
+    played = Played(problem, "some", 1, timeline)
     calm = spans_of(run, played)
     assert [span.stressed for span in calm] == [{}] * len(calm)
-    played.begun_ns[0] = calm[0].begin_ns + 1
+    played.changed(timeline.changes[0], calm[0].begin_ns + 1)
     found = spans_of(run, played)
     capacity = problem.fabric.nodes[node].capacity
     assert [span.stressed for span in found] == [{}, *[{node: capacity}] * (len(found) - 1)]
+
+
+def test_a_run_meets_what_a_simulation_of_its_seed_meets(tmp_path: Path) -> None:
+    wind = {"name": "wind", "every_s": {"exponential": {"mean": 2}}, "for_s": 1}
+    items = [
+        {"link": "R1->E", "add_delay_ms": 5, "at_s": 1, "episodes": wind},
+        {"link": "R1->E", "add_delay_ms": 6, "at_s": 2, "for_s": 6},
+        {"link": "R1->E", "add_delay_ms": 31, "at_s": 1, "for_s": 7, "ramp_s": 3},
+        {"node": "R2", "stress_threads": 1, "at_s": 3, "for_s": 2},
+    ]
+    cell = dwell.load(write_cell(tmp_path / "cell", scenarios={"some": items}))
+    try:
+        require_machine([cell])
+    except LiveError as error:
+        pytest.skip(str(error))
+    folder = run_once(
+        cell,
+        scenario="some",
+        policy=None,
+        seconds=12,
+        seed=1,
+        out=tmp_path / "out",
+        name=own_name(),
+        beside=tmp_path / "cell",
+    )
+    run = open_run(folder)
+    drawn = drawn_scenario(cell, scenario="some", seed=1, windows=13)
+    expected = [item for item in drawn if item.at_s < 11]
+    assert len(expected) > len(items)
+    played = [item for item in run.played or () if item.at_s < 11]
+    assert [_timeless(item) for item in played] == [_timeless(item) for item in expected]
+    for item, planned in zip(played, expected, strict=True):
+        assert item.at_s == pytest.approx(planned.at_s, abs=0.5)
+    # One way had the delays, the other its own.
+    links = run.meta["links"]
+    assert links["R1->E"]["delay_ms"]["mean"] > 5.0
+    assert links["E->R1"]["delay_ms"] == {"mean": 1.0, "std": 0.0}
+
+
+def _timeless(item: Disturbance) -> Disturbance:
+    return replace(item, at_s=0.0, for_s=math.inf, ramp_s=0.0)
 
 
 def test_faults_come_before_the_folder_is_touched(problem: Problem, tmp_path: Path) -> None:

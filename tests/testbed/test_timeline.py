@@ -1,4 +1,4 @@
-"""What a scenario does when, and what nodes and links are like then."""
+"""What a scenario's realisation does when, and what nodes and links are like then."""
 
 from __future__ import annotations
 
@@ -8,98 +8,179 @@ import pytest
 
 from dwell.cellfile import from_document
 from dwell.errors import LiveError, ProblemError
-from dwell.model import Constant, Disturbance, Problem
-from dwell.testbed.timeline import changes_of, is_down, link_changes, link_with, threads_on
+from dwell.model import Constant, Problem
+from dwell.sim import Realisation, draw
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.playing import play
+from dwell.testbed.timeline import Change, Timeline, differing, timeline_of, usual_conditions
 from tests.testbed.light_cell import document
 
+EPISODES = {
+    "name": "wind",
+    "every_s": {"exponential": {"mean": 2}},
+    "for_s": {"normal": {"mean": 1, "std": 0.2}},
+}
+#: Episodes on a node and a link, ramps on both, and two delays at once.
+MIXED: list[dict[str, Any]] = [
+    {"link": "R1->E", "add_delay_ms": 5, "loss": 0.1, "episodes": EPISODES},
+    {"link": "R1->E", "add_delay_ms": 31, "at_s": 4, "for_s": 20, "ramp_s": 6, "rate_mbps": 10},
+    {"link": "R1->E", "add_delay_ms": 7, "loss": 0.2, "at_s": 2, "for_s": 12},
+    {"link": "E->R1", "down": True, "at_s": 3, "for_s": 2},
+    {"node": "E", "stress_threads": 1, "episodes": EPISODES},
+    {"node": "E", "stress_threads": 4, "at_s": 1, "for_s": 24, "ramp_s": 8},
+    {"node": "R2", "down": True, "at_s": 6, "for_s": 3},
+]
+SECONDS = 30.0
 
-def cell(*items: dict[str, Any]) -> Problem:
-    return from_document(document(scenarios={"some": list(items)}))
+
+def cell(*items: dict[str, Any], **more: Any) -> Problem:
+    return from_document(document(scenarios={"some": list(items)}, **more))
 
 
-def test_changes_come_in_the_order_of_time_ends_before_beginnings() -> None:
-    problem = cell(
-        {"node": "E", "at_s": 5, "stress_threads": 1},
-        {"node": "R1", "at_s": 2, "for_s": 3, "stress_threads": 2},
-    )
-    found = [(change.at_s, change.begins) for change in changes_of(problem, "some")]
-    # What lasts for ever never ends.
-    assert found == [(2, True), (5, False), (5, True)]
+def planned(*items: dict[str, Any], seconds: float = SECONDS) -> Timeline:
+    return timeline_of(cell(*items), "some", seed=1, seconds=seconds, outages=True)
 
 
-def test_equal_items_are_told_apart_by_their_places() -> None:
-    twice = {"node": "E", "at_s": 1, "for_s": 2, "stress_threads": 1}
-    problem = cell(twice, {**twice})
-    on: dict[int, Disturbance] = {}
-    threads = []
-    for change in changes_of(problem, "some"):
-        on = change.made(on)
-        threads.append(threads_on("E", on.values()))
-    assert threads == [1, 2, 1, 0]
+def threads_of(timeline: Timeline, node: str) -> list[tuple[float, int]]:
+    return [
+        (change.at_s, change.state.threads)
+        for change in timeline.changes
+        if change.place == node and not isinstance(change.state, Conditions)
+    ]
+
+
+def conditions_of(timeline: Timeline, link: str) -> list[Conditions]:
+    return [
+        change.state
+        for change in timeline.changes
+        if change.place == link and isinstance(change.state, Conditions)
+    ]
+
+
+class Recording:
+    """A testbed that writes down what it is made to do."""
+
+    def __init__(self) -> None:
+        self.at_s = 0.0
+        self.applied: list[Change] = []
+
+    def sleep(self, seconds: float) -> None:
+        self.at_s += seconds
+
+    def play(self, timeline: Timeline, seconds: float) -> None:
+        play(timeline.changes, seconds, lambda: self.at_s, self.applied.append, lambda at_s: None)
+
+
+def extra_ns(drawn: Realisation, link: str, layers: tuple[int, ...]) -> int:
+    """Extra delay of a link's messages, whose processes are constant, in some of its layers."""
+    if not layers:
+        return 0
+    hop = next(hop for hop, (_, _, name) in enumerate(drawn.hops) if name == link)
+    rows = [drawn.layers.index((hop, layer)) for layer in layers]
+    return int(drawn.extra_ns[rows, 0].sum())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_is_applied_is_what_the_simulator_draws(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = cell(*MIXED)
+    testbed = Recording()
+    monkeypatch.setattr("dwell.testbed.playing.time.sleep", testbed.sleep)
+    timeline = timeline_of(problem, "some", seed=seed, seconds=SECONDS, outages=True)
+    testbed.play(timeline, SECONDS)
+    drawn = draw(problem, scenario="some", seed=seed, windows=40)
+    # It has episodes, and all of a ramp.
+    assert len(testbed.applied) > 60
+    nodes = [change.state for change in testbed.applied if not isinstance(change.state, Conditions)]
+    assert nodes == [change for change in drawn.node_changes if change.at_ns < SECONDS * 1e9]
+    for link in ("R1->E", "E->R1"):
+        segments = [
+            segment
+            for segment in drawn.link_segments
+            if segment.link == link and 0 < segment.at_ns < SECONDS * 1e9
+        ]
+        applied = [change for change in testbed.applied if change.place == link]
+        assert [change.at_ns for change in applied] == [segment.at_ns for segment in segments]
+        for change, segment in zip(applied, segments, strict=True):
+            state = change.state
+            assert isinstance(state, Conditions)
+            assert (state.loss, state.rate_mbps) == (segment.loss, segment.rate_mbps)
+            assert (state.cut == "drop") == segment.down
+            pairs = zip(state.add_delays_ms, state.shares, strict=True)
+            delay_ns = sum(delay.expectation * share for delay, share in pairs) * 1e6
+            assert delay_ns == pytest.approx(extra_ns(drawn, link, segment.layers), abs=5)
+
+
+def test_episodes_are_drawn_by_the_seed() -> None:
+    problem = cell(*MIXED)
+    found = [timeline_of(problem, "some", seed=s, seconds=30, outages=True) for s in (1, 1, 2)]
+    assert found[0] == found[1]
+    assert found[0] != found[2]
+    assert all(item.episodes is None for item in found[0].items)
+
+
+def test_bursts_are_no_part_of_it() -> None:
+    nodes = document()["nodes"]
+    nodes["E"]["bursts"] = {"every_ms": 100, "for_ms": 10, "threads": 1}
+    links = [dict(link) for link in document()["links"]]
+    links[0]["bursts"] = {"every_ms": 100, "for_ms": 10, "add_delay_ms": 5}
+    bursty = cell(*MIXED, nodes=nodes, links=links)
+    found = timeline_of(bursty, "some", seed=1, seconds=SECONDS, outages=True)
+    assert found == planned(*MIXED)
 
 
 def test_threads_of_a_node_add_up() -> None:
-    problem = cell(
-        {"node": "E", "stress_threads": 1},
-        {"node": "E", "stress_threads": 2},
-        {"node": "R1", "stress_threads": 4},
-    )
-    assert threads_on("E", problem.scenario("some")) == 3
-    assert threads_on("R2", problem.scenario("some")) == 0
+    twice = {"node": "E", "at_s": 1, "for_s": 2, "stress_threads": 1}
+    found = planned(twice, {**twice, "at_s": 2}, {"node": "R1", "stress_threads": 4})
+    assert threads_of(found, "E") == [(1, 1), (2, 2), (3, 1), (4, 0)]
+    # What lasts for ever never ends.
+    assert threads_of(found, "R1") == [(0, 4)]
+    assert threads_of(found, "R2") == []
 
 
 def test_a_link_is_what_all_that_is_on_makes_of_it() -> None:
-    problem = cell(
-        {"link": "R1->E", "loss": 0.5, "rate_mbps": 20},
-        {"link": "R1->E", "loss": 0.5, "rate_mbps": 10, "add_delay_ms": 25},
-        {"link": "E->R1", "loss": 0.9},
-    )
-    link = problem.fabric.links["R1->E"]
-    on = problem.scenario("some")
-    found = link_with(link, on)
-    assert found.loss == pytest.approx(0.75)
-    assert found.rate_mbps == 10
-    assert found.add_delay_ms == Constant(25.0)
-    usual = link_with(link, ())
-    assert (usual.loss, usual.rate_mbps, usual.delay_ms) == (0.0, 1000, link.delay_ms)
+    (both,) = conditions_of(
+        planned(
+            {"link": "R1->E", "loss": 0.5, "rate_mbps": 20, "add_delay_ms": 5},
+            {"link": "R1->E", "loss": 0.5, "rate_mbps": 10, "add_delay_ms": 25},
+            {"link": "E->R1", "loss": 0.9},
+        ),
+        "R1->E",
+    )[:1]
+    assert both.loss == pytest.approx(0.75)
+    assert both.rate_mbps == 10
+    assert both.add_delays_ms == (Constant(5.0), Constant(25.0))
+    assert both.shares == (1.0, 1.0)
+
+
+def test_a_link_is_as_it_was_when_all_is_over() -> None:
+    problem = cell({"link": "R1->E", "rate_mbps": 10, "at_s": 1, "for_s": 2, "add_delay_ms": 5})
+    timeline = timeline_of(problem, "some", seed=1, seconds=SECONDS)
+    usual = usual_conditions(problem.fabric.links["R1->E"])
+    begun, ended = conditions_of(timeline, "R1->E")
+    assert differing(usual, begun).keys() == {"rate_mbps", "add_delays_ms", "shares"}
     # A delay that stays is not set anew: it may have a memory.
-    assert link_changes(link, on[:1], on[:2]).keys() == {"add_delay_ms", "rate_mbps", "loss"}
-    assert link_changes(link, on[1:], on) == {"loss": pytest.approx(0.75)}
-    assert link_changes(link, on, on) == {}
+    assert differing(begun, ended) == {"rate_mbps": usual.rate_mbps, "shares": (0.0,)}
+    assert differing(ended, ended) == {}
 
 
 def test_an_outage_is_played_where_it_can_be() -> None:
     problem = cell({"node": "R2", "down": True, "for_s": 3}, {"link": "R1->E", "down": True})
     with pytest.raises(LiveError, match=r"R2 cannot be taken down here; R1->E cannot be taken"):
-        changes_of(problem, "some")
-    changes = changes_of(problem, "some", outages=True)
-    assert len(changes) == 3
-    assert is_down("R2", problem.scenario("some"))
-    assert is_down("R1->E", problem.scenario("some"))
-    assert not is_down("E->R1", problem.scenario("some"))
+        timeline_of(problem, "some", seed=1, seconds=SECONDS)
+    found = timeline_of(problem, "some", seed=1, seconds=SECONDS, outages=True)
+    states = [change.state for change in found.changes if change.place == "R2"]
+    assert [getattr(state, "down", None) for state in states] == [True, False]
+    assert conditions_of(found, "R1->E")[0].cut == "drop"
+    assert conditions_of(found, "E->R1") == []
 
 
-def test_what_cannot_be_played_is_told_all_at_once() -> None:
-    problem = cell(
-        {"node": "E", "stress_threads": 4, "at_s": 0, "for_s": 60, "ramp_s": 10},
-        {"link": "R1->E", "loss": 0.1, "episodes": {"name": "x", "every_s": 10, "for_s": 2}},
-        {"link": "E->R2", "add_delay_ms": 5, "at_s": 0, "for_s": 10},
-        {"link": "E->R2", "add_delay_ms": 5, "at_s": 5},
-    )
-    with pytest.raises(LiveError) as caught:
-        changes_of(problem, "some")
-    for part in ("ramp of 10 s", "episodes", "E->R2 gets two extra delays"):
-        assert part in str(caught.value)
-
-
-def test_delays_one_after_the_other_are_fine() -> None:
-    problem = cell(
-        {"link": "E->R2", "add_delay_ms": 5, "at_s": 0, "for_s": 10},
-        {"link": "E->R2", "add_delay_ms": 9, "at_s": 10},
-    )
-    assert len(changes_of(problem, "some")) == 3
+def test_a_link_that_would_lose_everything_is_refused() -> None:
+    with pytest.raises(ProblemError, match="loss"):
+        planned({"link": "R1->E", "loss": 1.0})
 
 
 def test_an_unknown_scenario_is_an_error() -> None:
     with pytest.raises(ProblemError, match="unknown scenario 'nome'"):
-        changes_of(cell({"node": "E", "stress_threads": 1}), "nome")
+        timeline_of(cell({"node": "E", "stress_threads": 1}), "nome", seed=1, seconds=1)

@@ -24,7 +24,7 @@ from dwell.testbed.campaign import (
 )
 from dwell.testbed.execution import Play, State, run_campaign
 from dwell.testbed.playing import interruptible
-from dwell.testbed.timeline import changes_of
+from dwell.testbed.timeline import require_playable_scenario
 
 __all__ = ["CampaignRequest", "report_campaign", "run_campaign_file"]
 
@@ -116,13 +116,14 @@ def _player(
 ) -> tuple[Play, str]:
     """Return what makes a run, and where; refuse what can be played in no run."""
     outages = request.inventory is None
-    changes = [one for name in scenarios for one in changes_of(problem, name, outages=outages)]
+    for name in scenarios:
+        require_playable_scenario(problem, name, outages=outages)
     if request.inventory is not None:
         from dwell.testbed.inventory import load_inventory
         from dwell.testbed.real_hosts import require_commands, run_on_hosts
 
         inventory = load_inventory(request.inventory, problem)
-        require_commands(inventory, changes)
+        require_commands(inventory, [item for name in scenarios for item in problem.scenario(name)])
         return partial(run_on_hosts, inventory), inventory.digest
     from dwell.testbed.run import require_machine, run_once
 

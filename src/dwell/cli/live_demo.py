@@ -41,7 +41,7 @@ from dwell.testbed.playing import (
 )
 from dwell.testbed.playing import play as play_changes
 from dwell.testbed.processes import without_keys
-from dwell.testbed.timeline import Change, changes_of
+from dwell.testbed.timeline import Change, timeline_of
 
 __all__ = ["play"]
 
@@ -76,14 +76,14 @@ def play(
         problem = dwell.load(file)
     if policy is not None:
         problem = problem.under(policy)
-    changes = changes_of(problem, scenario)
+    timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
     make_folder(out, MARK, "a demo's")
     problem = on_this_machine(problem)
-    told = _Told(problem, scenario, seed)
+    told = _Told(problem, scenario, seed, timeline)
     interrupted = False
     with interruptible(), Loopback(problem, out.resolve(), _cpus(problem), seed=seed) as cell:
         try:
-            _watch_from_start(cell, changes, seconds, told)
+            _watch_from_start(cell, seconds, told)
         except KeyboardInterrupt:
             interrupted = True
             typer.echo("interrupted; ending the cell", err=True)
@@ -110,13 +110,13 @@ class _Told(Played):
 
     def planned(self) -> list[Disturbed]:
         """Return what is to be played, as it is shown."""
-        return disturbed(self.plan(), self.problem.fabric)
+        return disturbed(self.timeline.items, self.problem.fabric)
 
     def on(self) -> list[Disturbed]:
         """Return what is on now, as it is shown."""
         return disturbed(self.active(), self.problem.fabric)
 
-    def tracking(self, folder: Path) -> dict[str, object]:
+    def tracking(self, folder: Path) -> dict[str, Any]:
         """Return what is to be said of the run's tracking error."""
         span = begun(open_run(folder))
         if self.sampler is None or span is None:
@@ -135,9 +135,7 @@ def _cpus(problem: Problem) -> dict[str, int]:
     }
 
 
-def _watch_from_start(
-    cell: Loopback, changes: Sequence[Change], seconds: float, told: _Told
-) -> None:
+def _watch_from_start(cell: Loopback, seconds: float, told: _Told) -> None:
     """Wait until everybody is there, and play the scenario."""
     awaited = [who for node in cell.problem.fabric.nodes for who in cell.expected(node)]
     with OperatorClient(cell.problem, without_keys()) as visitor:
@@ -154,7 +152,7 @@ def _watch_from_start(
         told.sampler = ErrorSampler(world, begin_ns + round(SETTLED_S * 1e9))
         try:
             with live_view(cell.problem, seconds, told.planned()) as view:
-                _watch(ask, cell, changes, begin_ns, seconds, told, view)
+                _watch(ask, cell, begin_ns, seconds, told, view)
         finally:
             told.sampler.sample(time.monotonic_ns())
             world.close()
@@ -163,7 +161,6 @@ def _watch_from_start(
 def _watch(
     ask: Ask,
     cell: Loopback,
-    changes: Sequence[Change],
     begin_ns: int,
     seconds: float,
     told: _Told,
@@ -193,7 +190,7 @@ def _watch(
             error = told.sampler.newest()
         view.show(Look(at_s, status, answered_s, *error, told.on()))
 
-    play_changes(changes, seconds, now_s, apply, look)
+    play_changes(told.timeline.changes, seconds, now_s, apply, look)
 
 
 def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:

@@ -17,13 +17,12 @@ from pathlib import Path
 from dwell.demo.link import Forward, LinkProcess
 from dwell.errors import LiveError
 from dwell.live.wiring import PORTS_PER_ROLE, roles, wire
-from dwell.model import Endpoint, Host, NodeDisturbance, Problem
-from dwell.model.scenario import Disturbance
+from dwell.model import Endpoint, Host, Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.process import program
 from dwell.testbed.processes import Processes, expected
-from dwell.testbed.timeline import Change, link_changes, link_with, threads_on
+from dwell.testbed.timeline import Change, differing, usual_conditions
 
 __all__ = ["Loopback", "on_this_machine"]
 
@@ -119,7 +118,9 @@ class Loopback:
             cpus=cpus,
             program=program(clocks=clocks),
         )
-        self._on: dict[int, Disturbance] = {}
+        links = problem.fabric.links.items()
+        self._conditions = {name: usual_conditions(link) for name, link in links}
+        self._threads: dict[str, int] = {}
         self._stack = ExitStack()
 
     @property
@@ -169,7 +170,7 @@ class Loopback:
     def _usual(self, one: str, other: str) -> dict[tuple[str, str], Conditions]:
         links = self.problem.fabric.links.values()
         return {
-            (link.source, link.target): link_with(link, ())
+            (link.source, link.target): usual_conditions(link)
             for link in links
             if {link.source, link.target} == {one, other}
         }
@@ -187,19 +188,20 @@ class Loopback:
         self._processes.start_controllers()
 
     def apply(self, change: Change) -> None:
-        """Have links and CPUs do what begins or ends."""
-        item, before = change.item, self._on
-        self._on = change.made(before)
-        if isinstance(item, NodeDisturbance):
-            burner = self.burners[item.node]
+        """Have a link, or a node's CPU, be as a change says."""
+        place, state = change.place, change.state
+        if not isinstance(state, Conditions):
+            self._threads[place] = state.threads
+            burner = self.burners[place]
             nodes = [node for node, its in self.burners.items() if its is burner]
-            burner.set(sum(threads_on(node, self._on.values()) for node in nodes))
+            burner.set(sum(self._threads.get(node, 0) for node in nodes))
             return
-        usual = self.problem.fabric.links[item.link]
-        link = self.links[frozenset((item.source, item.target))]
-        link.set(
-            item.source, item.target, **link_changes(usual, before.values(), self._on.values())
-        )
+        link = self.problem.fabric.links[place]
+        changes = differing(self._conditions[place], state)
+        self._conditions[place] = state
+        if changes:
+            way = self.links[frozenset((link.source, link.target))]
+            way.set(link.source, link.target, **changes)
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""

@@ -32,7 +32,7 @@ from dwell.model.scenario import RAMP_STEPS
 from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 
-__all__ = ["draw", "draw_shadows", "drawn_scenario", "stream"]
+__all__ = ["draw", "draw_changes", "draw_shadows", "drawn_scenario", "stream"]
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -114,6 +114,26 @@ def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) 
     return tuple(one for item in disturbances for one in drawing.episodes_of(item))
 
 
+def draw_changes(
+    problem: Problem, *, scenario: str, seed: int, windows: int
+) -> tuple[NodeChanges, LinkSegments]:
+    """Draw what a realisation says of nodes and links, and nothing of its jobs and messages.
+
+    Parameters
+    ----------
+    problem, scenario, seed, windows
+        See `draw`.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario.
+    TraceError
+        If the times of episodes are a trace that is too short or is not there.
+    """
+    return _Draw(problem, scenario, problem.scenario(scenario), seed, windows).changes()
+
+
 def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
     """Draw what shadow jobs meet in a realisation: times, delays and losses of their own.
 
@@ -179,6 +199,9 @@ class _Draw:
             link_segments=self._link_segments(),
             phases=self._phases(),
         )
+
+    def changes(self) -> tuple[NodeChanges, LinkSegments]:
+        return self._node_changes(), self._link_segments()
 
     def _phases(self) -> dict[str, Phase]:
         """Draw where periods and ticks are when the run begins, where a quota is bound to ticks."""

@@ -327,16 +327,19 @@ def _as_played(
         if match is None:
             told = json.dumps(disturbance_document(item))
             raise RunError(f"{told} was played, which scenario {name!r} does not have")
-        left.remove(match)
+        if match[0].episodes is None:
+            left.remove(match)
         # What was on to the end of a run had no end within it.
         for_s = math.inf if item.end_s >= end_s else item.for_s
-        found.append(replace(match[0], at_s=item.at_s, for_s=for_s))
+        own_item = replace(match[0], at_s=item.at_s, for_s=for_s, ramp_s=item.ramp_s)
+        found.append(replace(own_item, episodes=None))
     return tuple(found)
 
 
 def _timeless(item: Disturbance) -> dict[str, Any]:
     document = disturbance_document(item)
-    return {key: value for key, value in document.items() if key not in ("at_s", "for_s")}
+    times = "at_s", "for_s", "episodes", "ramp_s"
+    return {key: value for key, value in document.items() if key not in times}
 
 
 def _end_s(cycles: pl.DataFrame) -> float:

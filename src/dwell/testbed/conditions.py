@@ -44,8 +44,10 @@ class Conditions:
     ----------
     delay_ms : Process
         Propagation delay, one value a message.
-    add_delay_ms : Process
-        What a disturbance adds to it.
+    add_delays_ms : tuple of Process
+        What each disturbance of the link adds to it, whether it is on or not.
+    shares : tuple of float
+        How much of each of them is added now, in [0, 1].
     rate_mbps : float
         Serialisation rate that all connections share, Mbit/s; infinite where nothing queues.
     loss : float
@@ -57,15 +59,18 @@ class Conditions:
     """
 
     delay_ms: Process = field(default_factory=lambda: Constant(0.0))
-    add_delay_ms: Process = field(default_factory=lambda: Constant(0.0))
+    add_delays_ms: tuple[Process, ...] = ()
+    shares: tuple[float, ...] = ()
     rate_mbps: float = math.inf
     loss: float = 0.0
     cut: Cut | None = None
 
     def __post_init__(self) -> None:
-        for name in ("delay_ms", "add_delay_ms"):
-            value = getattr(self, name)
+        named = [("add_delays_ms", process) for process in self.add_delays_ms]
+        for name, value in (("delay_ms", self.delay_ms), *named):
             bounds.require(isinstance(value, Process), name, value, "a random process")
+        good = len(self.shares) == len(self.add_delays_ms) and all(0 <= s <= 1 for s in self.shares)
+        bounds.require(good, "shares", self.shares, "one from 0 to 1 for each of add_delays_ms")
         bounds.RATE_MBPS.check("rate_mbps", self.rate_mbps)
         bounds.LOSS.check("loss", self.loss)
         known = self.cut is None or self.cut in CUTS
@@ -87,10 +92,7 @@ def to_json(changes: Mapping[str, object]) -> dict[str, object]:
     unknown = [name for name in changes if name not in known]
     if unknown:
         raise LiveError(f"a link has no {', '.join(unknown)}; it has {', '.join(known)}")
-    return {
-        name: _process(value) if isinstance(value, Process) else value
-        for name, value in changes.items()
-    }
+    return {name: _written(value) for name, value in changes.items()}
 
 
 def changed(conditions: Conditions, changes: Mapping[str, object]) -> Conditions:
@@ -101,10 +103,14 @@ def changed(conditions: Conditions, changes: Mapping[str, object]) -> Conditions
     ProblemError
         If a value is out of its bounds.
     """
-    values: dict[str, Any] = {
-        name: _read(value) if isinstance(value, dict) else value for name, value in changes.items()
-    }
+    values: dict[str, Any] = {name: _read(value) for name, value in changes.items()}
     return replace(conditions, **values)
+
+
+def _written(value: object) -> object:
+    if isinstance(value, tuple):
+        return [_written(one) for one in value]
+    return _process(value) if isinstance(value, Process) else value
 
 
 def _process(process: Process) -> dict[str, object]:
@@ -118,7 +124,11 @@ def _process(process: Process) -> dict[str, object]:
     return {name: {item.name: getattr(process, item.name) for item in fields(kind)}}
 
 
-def _read(written: Mapping[str, Mapping[str, float]]) -> Process:
+def _read(written: object) -> object:
+    if isinstance(written, list):
+        return tuple(_read(one) for one in written)
+    if not isinstance(written, dict):
+        return written
     ((name, values),) = written.items()
     if name == "trace":
         return Trace(TraceTable("trace", {"delay": np.asarray(values, np.float64)}), "delay")

@@ -14,6 +14,8 @@ __all__ = ["Draws"]
 class Draws:
     """Conditions that may change, and streams of their own for each delay and for losses.
 
+    A stream goes on for as long as its process stays, whether it counts or not.
+
     Parameters
     ----------
     seed : (int, int)
@@ -22,21 +24,20 @@ class Draws:
 
     def __init__(self, seed: tuple[int, int]) -> None:
         self.conditions = Conditions()
-        delays, added, losses = np.random.default_rng(seed).spawn(3)
-        self._rngs = {"delay_ms": delays, "add_delay_ms": added}
-        self._delays = {name: self._drawn(name) for name in self._rngs}
-        self._losses = losses
-
-    def _drawn(self, name: str) -> Iterator[int]:
-        return delays_ns(getattr(self.conditions, name), self._rngs[name])
+        self._delays_rng, self._added_rng, self._losses = np.random.default_rng(seed).spawn(3)
+        self._delays = delays_ns(self.conditions.delay_ms, self._delays_rng)
+        self._added: list[Iterator[int]] = []
 
     def apply(self, changes: dict[str, object]) -> None:
         """Change conditions, as `to_json` has written them."""
-        before = self.conditions
-        self.conditions = changed(before, changes)
-        for name in self._rngs:
-            if getattr(before, name) != getattr(self.conditions, name):
-                self._delays[name] = self._drawn(name)
+        before, now = self.conditions, changed(self.conditions, changes)
+        self.conditions = now
+        if before.delay_ms != now.delay_ms:
+            self._delays = delays_ns(now.delay_ms, self._delays_rng)
+        if before.add_delays_ms != now.add_delays_ms:
+            rngs = self._added_rng.spawn(len(now.add_delays_ms))
+            pairs = zip(now.add_delays_ms, rngs, strict=True)
+            self._added = [delays_ns(process, rng) for process, rng in pairs]
 
     def lose(self) -> bool:
         """Decide whether what comes next is lost."""
@@ -44,4 +45,5 @@ class Draws:
 
     def delay_ns(self) -> int:
         """Draw a delay."""
-        return sum(map(next, self._delays.values()))
+        shares = zip(self._added, self.conditions.shares, strict=True)
+        return next(self._delays) + sum(round(next(added) * share) for added, share in shares)

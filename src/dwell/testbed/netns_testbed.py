@@ -22,8 +22,7 @@ from dwell.errors import LiveError
 from dwell.live.security import INSECURE
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import PORTS_PER_ROLE, roles
-from dwell.model import Host, Link, Node, NodeDisturbance, Problem
-from dwell.model.scenario import Disturbance
+from dwell.model import Host, Link, Node, Problem
 from dwell.testbed.allotment import allot, nodes_of
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.groups import PROBES, Groups, Share
@@ -35,7 +34,7 @@ from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
 from dwell.testbed.processes import Processes, expected
 from dwell.testbed.stress import Stress
-from dwell.testbed.timeline import Change, is_down, link_changes, link_with, threads_on
+from dwell.testbed.timeline import Change, differing, usual_conditions
 from dwell.testbed.watcher import Watcher
 
 __all__ = ["NetnsTestbed", "require_playable"]
@@ -180,7 +179,9 @@ class NetnsTestbed:
         self._usual = _links_of(self.problems)
         self._beside, self._more = beside, tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
-        self._on: dict[int, Disturbance] = {}
+        self._conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
+        self._threads = dict.fromkeys(self.nodes, 0)
+        self._down: set[str] = set()
         self._claim = Claim(name, list(self.nodes))
         self._claimed = False
         # Run of each cell that is no part of any measurement any more.
@@ -279,7 +280,7 @@ class NetnsTestbed:
             if {link.source, link.target} != set(pair):
                 continue
             way = link.source, link.target
-            usual[way] = link_with(link, ())
+            usual[way] = usual_conditions(link)
             if link.retransmit_ms is None:
                 usual[way] = replace(usual[way], loss=0.0)
             else:
@@ -392,22 +393,22 @@ class NetnsTestbed:
     # --------------------------------------------------------------------- disturbances
 
     def apply(self, change: Change) -> None:
-        """Have nodes and links do what begins or ends."""
-        item, before = change.item, list(self._on.values())
-        self._on = change.made(self._on)
-        if isinstance(item, NodeDisturbance):
-            self._apply_to_node(item.node, before)
+        """Have a node or a link be as a change says."""
+        if isinstance(change.state, Conditions):
+            self._apply_to_link(self._usual[change.place], change.state)
         else:
-            self._apply_to_link(self._usual[item.link], before)
+            self._apply_to_node(change.place, change.state.threads, down=change.state.down)
 
-    def _apply_to_node(self, node: str, before: Sequence[Disturbance]) -> None:
-        was, now = is_down(node, before), is_down(node, self._on.values())
-        if now and not was:
+    def _apply_to_node(self, node: str, threads: int, *, down: bool) -> None:
+        self._threads[node] = threads
+        if down and node not in self._down:
+            self._down.add(node)
             self._take_down(node)
-        elif was and not now:
+        elif not down and node in self._down:
+            self._down.remove(node)
             self._bring_up(node)
-        elif not now:
-            self.stress[node].set(threads_on(node, self._on.values()))
+        elif not down:
+            self.stress[node].set(threads)
 
     def _take_down(self, node: str) -> None:
         """Kill everything on a node at once, as a loss of power does."""
@@ -418,20 +419,18 @@ class NetnsTestbed:
 
     def _bring_up(self, node: str) -> None:
         self._start_stress(node)
-        self.stress[node].set(threads_on(node, self._on.values()))
+        self.stress[node].set(self._threads[node])
         self._processes.start_agent(node)
         if any(problem.controller_node == node for problem in self.problems):
             self._processes.start_controller(node)
 
-    def _apply_to_link(self, link: Link, before: Sequence[Disturbance]) -> None:
-        changes = link_changes(link, before, self._on.values())
+    def _apply_to_link(self, link: Link, now: Conditions) -> None:
+        changes = differing(self._conditions[link.name], now)
+        self._conditions[link.name] = now
         if link.retransmit_ms is None and "loss" in changes:
             self._losses.set(link.source, link.target, changes.pop("loss"))
-        way = self.links[frozenset((link.source, link.target))]
-        was, now = is_down(link.name, before), is_down(link.name, self._on.values())
-        if was != now:
-            way.down(link.source, link.target, now)
         if changes:
+            way = self.links[frozenset((link.source, link.target))]
             way.set(link.source, link.target, **changes)
 
     # ---------------------------------------------------------------------------- facts

@@ -8,17 +8,18 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeAlias
 
 from dwell.errors import DwellError, LiveError
 from dwell.live.hosting import clock_of
-from dwell.model import Disturbance, Problem, Scenario
+from dwell.model import Disturbance, Problem
 from dwell.model.document import disturbance_document
 from dwell.record import Run, open_run, seal_run
-from dwell.testbed.timeline import Change
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.timeline import Change, Timeline, first_ns, last_ns, step_ns
 
 __all__ = [
     "LOOK_S",
@@ -55,54 +56,90 @@ class Played:
     problem : Problem
     scenario : str
     seed : int
-    begun_ns, ended_ns : dict of int to int
-        By the index of the disturbance in the scenario.
+    timeline : Timeline
+    made_ns : dict of (str, int) to int
+        When changes were made, by the place and the instant of each.
+    threads : dict of str to list of (int, int)
+        By node: since when it had how many foreign threads.
     """
 
     problem: Problem
     scenario: str
     seed: int
-    begun_ns: dict[int, int] = field(default_factory=dict)
-    ended_ns: dict[int, int] = field(default_factory=dict)
+    timeline: Timeline
+    made_ns: dict[tuple[str, int], int] = field(default_factory=dict)
+    threads: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
-    def changed(self, change: Change) -> None:
-        """Note that a change has been made."""
-        instants = self.begun_ns if change.begins else self.ended_ns
-        instants[change.index] = clock_of(self.problem)()
+    def changed(self, change: Change, at_ns: int | None = None) -> None:
+        """Note that a change has been made, at an instant or now."""
+        at_ns = clock_of(self.problem)() if at_ns is None else at_ns
+        self.made_ns[change.place, change.at_ns] = at_ns
+        if not isinstance(change.state, Conditions):
+            self.threads.setdefault(change.place, []).append((at_ns, change.state.threads))
 
-    def plan(self) -> Scenario:
-        """Return what is to be played."""
-        return self.problem.scenario(self.scenario)
+    def begun_ns(self, item: Disturbance) -> int | None:
+        """Return when a disturbance of the timeline has begun; None where it has not."""
+        made_ns = self.made_ns.get((item.place, first_ns(item)))
+        return None if made_ns is None else made_ns - step_ns(item)
+
+    def ended_ns(self, item: Disturbance) -> int | None:
+        """Return when a disturbance of the timeline has ended; None where it has not."""
+        made_ns = self.made_ns.get((item.place, last_ns(item)))
+        return None if made_ns is None else made_ns + step_ns(item)
 
     def active(self) -> list[Disturbance]:
         """Return what is on now."""
-        on = self.begun_ns.keys() - self.ended_ns.keys()
-        return [item for index, item in enumerate(self.plan()) if index in on]
+        return [
+            item
+            for item in self.timeline.items
+            if self.begun_ns(item) is not None and self.ended_ns(item) is None
+        ]
 
-    def note(self, folder: Path, **more: object) -> Run:
+    def least_threads(self, node: str, begin_ns: int, end_ns: int) -> int:
+        """Return how many foreign threads a node had at least between two instants."""
+        found = 0
+        for at_ns, threads in self.threads.get(node, ()):
+            if at_ns >= end_ns:
+                break
+            found = threads if at_ns <= begin_ns else min(found, threads)
+        return found
+
+    def note(self, folder: Path, span: tuple[int, int] | None = None, **more: Any) -> Run:
         """Tell the run, whose time begins with the first release.
 
         Parameters
         ----------
         folder : Path
+        span : (int, int), optional
+            First and last release; what the run says of them if left out.
         **more
             To be said of it as well.
         """
-        run = open_run(folder)
         notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
-        span = begun(run)
+        span = begun(open_run(folder)) if span is None else span
         if span is not None:
-            origin_ns, end_ns = span
-            notes["played"] = [
-                {
-                    **disturbance_document(item),
-                    "at_s": round((begun_ns - origin_ns) / 1e9, 3),
-                    "for_s": round((self.ended_ns.get(index, end_ns) - begun_ns) / 1e9, 3),
-                }
-                for index, item in enumerate(self.plan())
-                if (begun_ns := self.begun_ns.get(index)) is not None
-            ]
+            items = (self._as_played(item, *span) for item in self.timeline.items)
+            notes["played"] = [item for item in items if item is not None]
         return seal_run(folder, **notes, **more)
+
+    def _as_played(
+        self, item: Disturbance, origin_ns: int, end_ns: int
+    ) -> Mapping[str, object] | None:
+        """Return a disturbance with its times in the run; None where it was not played.
+
+        One that was on at the end is told as on until then; a ramp keeps its slope.
+        """
+        begun_ns, ended_ns = self.begun_ns(item), self.ended_ns(item)
+        if begun_ns is None:
+            return None
+        at_s = round((begun_ns - origin_ns) / 1e9, 3)
+        if item.ramp_s and ended_ns is None:
+            return {**disturbance_document(item), "at_s": at_s}
+        # What has begun after the last release is told as on for no time.
+        end_ns = max(end_ns if ended_ns is None else ended_ns, begun_ns)
+        for_s = round((end_ns - begun_ns) / 1e9, 3)
+        shorter = replace(item, ramp_s=min(item.ramp_s, for_s / 2, item.for_s / 2))
+        return {**disturbance_document(shorter), "at_s": at_s, "for_s": for_s}
 
 
 def begun(run: Run) -> tuple[int, int] | None:

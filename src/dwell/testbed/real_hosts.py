@@ -8,6 +8,7 @@ disturbed. Nothing is known of the hosts' pressure: no window is excluded.
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import shlex
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tarfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -24,15 +25,16 @@ from typing import Any
 
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
-from dwell.model import Host, LinkDisturbance, NodeDisturbance, Normal, Problem
-from dwell.model.document import disturbance_document
+from dwell.model import Host, Link, LinkDisturbance, Normal, Problem
+from dwell.model.scenario import Disturbance
 from dwell.policies.registry import by_name
-from dwell.record import open_run, seal_run
+from dwell.record import open_run
+from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
-from dwell.testbed.playing import come_up, longest_run, make_folder, play, undisturbed
+from dwell.testbed.playing import Played, come_up, longest_run, make_folder, play, undisturbed
 from dwell.testbed.processes import Processes, expected
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
-from dwell.testbed.timeline import Change, changes_of
+from dwell.testbed.timeline import Change, timeline_of, usual_conditions
 
 __all__ = ["RealHosts", "require_commands", "run_on_hosts"]
 
@@ -42,6 +44,8 @@ NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 COMMAND_S = 60.0
 START_S = 120.0
 STOP_S = 10.0
+#: Less than any loss that is asked for, more than roundings.
+LEAST_LOSS = 1e-9
 
 
 class RealHosts:
@@ -79,8 +83,8 @@ class RealHosts:
         hosts = {node: Host(host.address, host.port) for node, host in inventory.hosts.items()}
         self.problem = replace(problem, live=replace(problem.live, hosts=hosts))
         self.inventory, self.folder, self.name = inventory, folder.resolve(), name
-        self.stress: dict[int, subprocess.Popen[bytes]] = {}
-        self._on: dict[int, LinkDisturbance] = {}
+        self.stress: dict[str, subprocess.Popen[bytes]] = {}
+        self._disturbed: set[str] = set()
         self._stack = ExitStack()
         self.processes = Processes(
             [self.problem], self.folder, inside=self.inside, more=more, owner=SHELL_ID
@@ -220,26 +224,30 @@ class RealHosts:
     # --------------------------------------------------------------------- disturbances
 
     def apply(self, change: Change) -> None:
-        """Have a host or a link do what begins or ends."""
-        item = change.item
-        if isinstance(item, NodeDisturbance):
-            if not change.begins:
-                self._end_stress(change.index)
-            elif item.stress_threads:
-                line = self.inventory.hosts[item.node].stress.format(threads=item.stress_threads)
-                words = self._words(item.node, ["sh", "-c", line], whole=True)
-                self.stress[change.index] = subprocess.Popen(  # noqa: S603 - the inventory's
-                    words, process_group=0
-                )
-        elif change.begins:
-            self.shell(item.source, self.inventory.links[item.link].begin.format(**_filled(item)))
-            self._on[change.index] = item
-        else:
-            self._on.pop(change.index, None)
-            self.shell(item.source, self.inventory.links[item.link].end)
+        """Have a host or a link be as a change says."""
+        state = change.state
+        if isinstance(state, Conditions):
+            self._disturb(self.problem.fabric.links[change.place], state)
+            return
+        node = change.place
+        self._end_stress(node)
+        if state.threads:
+            line = self.inventory.hosts[node].stress.format(threads=state.threads)
+            words = self._words(node, ["sh", "-c", line], whole=True)
+            self.stress[node] = subprocess.Popen(words, process_group=0)  # noqa: S603 - as above
 
-    def _end_stress(self, number: int) -> None:
-        process = self.stress.pop(number, None)
+    def _disturb(self, link: Link, now: Conditions) -> None:
+        """Run a link's command for what is on, again where it changes, or for the end of it."""
+        commands = self.inventory.links[link.name]
+        if asked := disturbance_of(link, now):
+            self._disturbed.add(link.name)
+            self.shell(link.source, commands.begin.format(**asked))
+        elif link.name in self._disturbed:
+            self._disturbed.remove(link.name)
+            self.shell(link.source, commands.end)
+
+    def _end_stress(self, node: str) -> None:
+        process = self.stress.pop(node, None)
         if process is None:
             return
         process.terminate()
@@ -250,14 +258,15 @@ class RealHosts:
             process.wait()
 
     def _undisturb(self) -> None:
-        for number in list(self.stress):
-            self._end_stress(number)
-        for item in self._on.values():
-            self.shell(item.source, self.inventory.links[item.link].end)
-        self._on.clear()
+        for node in list(self.stress):
+            self._end_stress(node)
+        for name in sorted(self._disturbed):
+            source = self.problem.fabric.links[name].source
+            self.shell(source, self.inventory.links[name].end)
+        self._disturbed.clear()
 
 
-def require_commands(inventory: Inventory, changes: Sequence[Change]) -> None:
+def require_commands(inventory: Inventory, scenario: Iterable[Disturbance]) -> None:
     """Refuse what an inventory has no commands for.
 
     Raises
@@ -265,8 +274,7 @@ def require_commands(inventory: Inventory, changes: Sequence[Change]) -> None:
     LiveError
         With all of it.
     """
-    items = [change.item for change in changes]
-    links = {item.link for item in items if isinstance(item, LinkDisturbance)}
+    links = {item.link for item in scenario if isinstance(item, LinkDisturbance)}
     missing = sorted(links - set(inventory.links))
     if missing:
         raise LiveError(
@@ -275,13 +283,24 @@ def require_commands(inventory: Inventory, changes: Sequence[Change]) -> None:
         )
 
 
-def _filled(item: LinkDisturbance) -> dict[str, float]:
-    delay = item.add_delay_ms
+def disturbance_of(link: Link, now: Conditions) -> dict[str, float]:
+    """Return what is to be filled into a link's command; nothing where nothing is on.
+
+    Its loss is what makes the link's own the one that is asked for, and its rate the link's where
+    that is the lower one.
+    """
+    usual = usual_conditions(link)
+    added = [pair for pair in zip(now.add_delays_ms, now.shares, strict=True) if pair[1]]
+    variance = sum((share * delay.std) ** 2 for delay, share in added if isinstance(delay, Normal))
+    loss = 1 - (1 - now.loss) / (1 - usual.loss)
+    rate_mbps = now.rate_mbps if now.rate_mbps < usual.rate_mbps else math.inf
+    if not added and loss < LEAST_LOSS and math.isinf(rate_mbps):
+        return {}
     return {
-        "mean_ms": 0.0 if delay is None else round(delay.expectation, 3),
-        "std_ms": delay.std if isinstance(delay, Normal) else 0.0,
-        "loss_percent": 100 * item.loss,
-        "rate_mbps": item.rate_mbps,
+        "mean_ms": round(sum(share * delay.expectation for delay, share in added), 3),
+        "std_ms": round(variance**0.5, 3),
+        "loss_percent": round(100 * max(loss, 0.0), 6),
+        "rate_mbps": rate_mbps,
     }
 
 
@@ -307,7 +326,7 @@ def run_on_hosts(
     seconds : float
         From the first release on, the warm-up included.
     seed : int
-        Noted; nothing is drawn on real hosts.
+        Of the episodes of disturbances; delays and losses are the links'.
     out : Path
         For logs and the run; one of a run before is replaced.
     name : str
@@ -321,11 +340,11 @@ def run_on_hosts(
     """
     by_name(policy, problem)
     problem = problem.under(policy)
-    changes = changes_of(problem, scenario)
+    timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
     hosts = RealHosts(problem, inventory, out, name=name, more=["--jobs"] if jobs else [])
-    require_commands(inventory, changes)
+    require_commands(inventory, timeline.items)
     make_folder(out, MARK, "a testbed's")
-    instants: dict[tuple[int, bool], float] = {}
+    played = Played(problem, scenario, seed, timeline)
     with ExitStack() as stack:
 
         def close() -> None:
@@ -336,42 +355,23 @@ def run_on_hosts(
         hosts.__enter__()
         visitor = stack.enter_context(OperatorClient(hosts.problem))
         hosts.begin(visitor)
-        begun_s = time.monotonic()
+        begun_ns = time.monotonic_ns()
 
         def now_s() -> float:
-            return time.monotonic() - begun_s
+            return (time.monotonic_ns() - begun_ns) / 1e9
 
         def apply(change: Change) -> None:
             hosts.apply(change)
-            instants[change.index, change.begins] = now_s()
+            played.changed(change, time.monotonic_ns())
 
-        play(changes, seconds, now_s, apply, lambda at_s: None)
+        play(timeline.changes, seconds, now_s, apply, lambda at_s: None)
         hosts.processes.stop_controllers()
         hosts.fetch_runs()
     folder = longest_run(out / "runs")
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    _note(folder, problem, scenario, seed, instants)
+    # By this computer's clock, since the run was seen to begin: its stamper's is another one.
+    release_ns = open_run(folder).cycles["release_ns"]
+    played.note(folder, (begun_ns, begun_ns + int(release_ns[-1]) if len(release_ns) else begun_ns))
     shutil.rmtree(out / "starting", ignore_errors=True)
     return folder
-
-
-def _note(
-    folder: Path,
-    problem: Problem,
-    scenario: str,
-    seed: int,
-    instants: Mapping[tuple[int, bool], float],
-) -> None:
-    """Tell the run what was played, by this computer's clock since the run was seen to begin."""
-    release_ns = open_run(folder).cycles["release_ns"]
-    end_s = float(release_ns[-1]) / 1e9 if len(release_ns) else 0.0
-    played = []
-    for index, item in enumerate(problem.scenario(scenario)):
-        begun_s = instants.get((index, True))
-        if begun_s is not None:
-            ended_s = instants.get((index, False), max(end_s, begun_s))
-            for_s = round(ended_s - begun_s, 3)
-            times = {"at_s": round(begun_s, 3), "for_s": for_s}
-            played.append({**disturbance_document(item), **times})
-    seal_run(folder, scenario=scenario, seed=seed, played=played)

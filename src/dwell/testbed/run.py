@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
 from dwell.estimators import registry as estimators
 from dwell.live.hosting import clock_of
-from dwell.model import NodeDisturbance, Problem
+from dwell.model import Problem
 from dwell.policies.registry import by_name
 from dwell.record import Run, open_run
 from dwell.testbed.doctor import examine
@@ -26,7 +26,7 @@ from dwell.testbed.playing import (
 )
 from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
-from dwell.testbed.timeline import Change, changes_of
+from dwell.testbed.timeline import Change, timeline_of
 
 __all__ = ["MARK", "length_s", "require_machine", "run_once", "spans_of"]
 
@@ -86,7 +86,7 @@ def run_once(
     seconds : float
         From the first release on, the warm-up included.
     seed : int
-        Of delays and losses.
+        Of the realisation that is played, and of delays and losses.
     out : Path
         For states, logs and the run; one of a run before is replaced.
     name : str
@@ -115,12 +115,12 @@ def run_once(
         problem = problem.under(policy)
         by_name(problem.controller.policy, problem)
         estimators.by_name(problem.controller.estimator, problem)
-    changes = changes_of(problem, scenario, outages=True)
+    timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
     testbed = NetnsTestbed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
     require_machine([problem])
     rule = rule or Rule()
-    played = Played(problem, scenario, seed)
+    played = Played(problem, scenario, seed, timeline)
     samplers: list[Sampler] = []
     try:
         with interruptible():
@@ -132,7 +132,7 @@ def run_once(
                 tell("starting the cell")
                 testbed.come_up()
                 tell(f"playing {scenario} for {seconds:g} s")
-                _play(testbed, changes, seconds, played, samplers, rule)
+                _play(testbed, seconds, played, samplers, rule)
             finally:
                 with undisturbed():
                     testbed.close()
@@ -153,7 +153,6 @@ def run_once(
 
 def _play(
     testbed: NetnsTestbed,
-    changes: Sequence[Change],
     seconds: float,
     played: Played,
     samplers: list[Sampler],
@@ -171,6 +170,7 @@ def _play(
         testbed.cpus, testbed.used_ns, testbed.switches, links, clock, rule, testbed.probing
     ) as sampler:
         samplers.append(sampler)
+        changes = played.timeline.changes
         play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
     testbed.stop_controllers()
 
@@ -185,7 +185,7 @@ def _seal(
     interrupted: bool,
 ) -> Run:
     """Tell the run what was played, on what, and how the machine was."""
-    more: dict[str, object] = {"testbed": testbed.facts()}
+    more: dict[str, Any] = {"testbed": testbed.facts()}
     if interrupted:
         more["interrupted"] = True
     if samplers:
@@ -213,25 +213,18 @@ def spans_of(run: Run, played: Played) -> list[Span]:
         last = min(row + problem.window_cycles, len(release_ns)) - 1
         begin_ns = origin_ns + release_ns[row]
         end_ns = origin_ns + release_ns[last] + period_ns
-        stressed = dict(_stressed(played, begin_ns, end_ns))
+        stressed = _stressed(played, begin_ns, end_ns)
         found.append(Span(window["window"], begin_ns, end_ns, window["warmup"], stressed))
     return found
 
 
-def _stressed(played: Played, begin_ns: int, end_ns: int) -> Mapping[str, float]:
+def _stressed(played: Played, begin_ns: int, end_ns: int) -> dict[str, float]:
     """Return the capacity of nodes with as many foreign threads as cores all the time."""
-    found: dict[str, float] = {}
-    for index, item in enumerate(played.plan()):
-        if not isinstance(item, NodeDisturbance):
-            continue
-        node = played.problem.fabric.nodes[item.node]
-        begun_ns = played.begun_ns.get(index)
-        ended_ns = played.ended_ns.get(index, end_ns)
-        if item.stress_threads < node.cores or begun_ns is None:
-            continue
-        if begun_ns <= begin_ns and ended_ns >= end_ns:
-            found[item.node] = node.capacity
-    return found
+    return {
+        name: node.capacity
+        for name, node in played.problem.fabric.nodes.items()
+        if played.least_threads(name, begin_ns, end_ns) >= node.cores
+    }
 
 
 def summary(run: Run) -> dict[str, Any]:

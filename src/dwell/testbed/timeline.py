@@ -1,143 +1,201 @@
-"""Timeline: what a scenario does to nodes and links, and when.
+"""Timeline: what a scenario's realisation does to nodes and links, and when.
 
-A change begins or ends one item of the scenario. What a node or link is like follows from all items
-that are on, as in the simulator: threads add up, losses combine as independent, the lowest rate
-counts.
+It is the simulator's: the node changes and link segments that the run's seed draws there, so that
+episodes, ramps and several disturbances at once mean the same on a testbed. Only bursts, which
+belong to nodes and links and not to the scenario, are not played.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from itertools import combinations
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError
-from dwell.model import Constant, Link, LinkDisturbance, NodeDisturbance, Problem
-from dwell.model.scenario import Disturbance
+from dwell.model import Link, LinkDisturbance, Problem, Scenario
+from dwell.model.instants import NEVER_NS
+from dwell.model.scenario import RAMP_STEPS, Disturbance
 from dwell.testbed.conditions import Conditions
 
-__all__ = ["Change", "changes_of", "is_down", "link_changes", "link_with", "threads_on"]
+if TYPE_CHECKING:
+    from dwell.sim import LinkSegment, NodeChange
+
+__all__ = [
+    "Change",
+    "Timeline",
+    "differing",
+    "first_ns",
+    "last_ns",
+    "require_playable_scenario",
+    "step_ns",
+    "timeline_of",
+    "usual_conditions",
+]
+
+NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Something that begins or ends in a scenario.
+    """A node or a link is another one from an instant on.
 
     Parameters
     ----------
-    at_s : float
-    index : int
-        Of the item, in its scenario.
-    item : Disturbance
-    begins : bool
+    at_ns : int
+        Since the first release.
+    place : str
+        Node, or link (``R1->E``).
+    state : NodeChange or Conditions
+        All of what it is like from then on: of a node, or of a link.
     """
 
-    at_s: float
-    index: int
-    item: Disturbance
-    begins: bool
+    at_ns: int
+    place: str
+    state: NodeChange | Conditions
 
-    def made(self, on: Mapping[int, Disturbance]) -> dict[int, Disturbance]:
-        """Return what is on after it, of what was on before; by index."""
-        rest = {index: other for index, other in on.items() if index != self.index}
-        return {**rest, self.index: self.item} if self.begins else rest
+    @property
+    def at_s(self) -> float:
+        """The instant in seconds."""
+        return self.at_ns / 1e9
 
 
-def changes_of(problem: Problem, scenario: str, *, outages: bool = False) -> list[Change]:
-    """Return what a scenario's disturbances do, in the order of time.
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """What is done to the nodes and links that a scenario disturbs.
+
+    Parameters
+    ----------
+    items : Scenario
+        The scenario with a disturbance for each of the episodes drawn.
+    changes : tuple of Change
+        In the order of time.
+    """
+
+    items: Scenario = ()
+    changes: tuple[Change, ...] = ()
+
+
+def timeline_of(
+    problem: Problem, scenario: str, *, seed: int, seconds: float, outages: bool = False
+) -> Timeline:
+    """Return what a scenario's realisation does, for as long as a cell runs.
 
     Parameters
     ----------
     problem : Problem
     scenario : str
+    seed : int
+        At least 0; a simulation of this seed meets the same.
+    seconds : float
+        How long it is played.
     outages : bool
         Whether nodes and links can be made to be down.
 
     Raises
     ------
     ProblemError
-        If there is no such scenario.
+        If there is no such scenario, or a link would lose everything.
     LiveError
         If it has something that real links and CPUs cannot be made to do; all of it at once.
     """
-    items = problem.scenario(scenario)
-    faults = [fault for item in items for fault in _unplayable(item, outages=outages)]
-    faults += _two_delays([item for item in items if isinstance(item, LinkDisturbance)])
-    if faults:
-        raise LiveError(f"scenario {scenario!r} cannot be played: {'; '.join(faults)}")
-    found = []
-    for index, item in enumerate(items):
-        found.append(Change(item.at_s, index, item, begins=True))
-        if item.end_s < math.inf:
-            found.append(Change(item.end_s, index, item, begins=False))
-    # What ends makes room for what begins at the same time.
-    return sorted(found, key=lambda change: (change.at_s, change.begins))
+    require_playable_scenario(problem, scenario, outages=outages)
+    written = problem.scenario(scenario)
+    if not written:
+        return Timeline()
+    from dwell.sim.random_draws import draw_changes, drawn_scenario
+
+    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    asked = {"seed": seed, "windows": math.floor(seconds / window_s) + 1}
+    problem = _without_bursts(problem)
+    items = drawn_scenario(problem, scenario=scenario, **asked)
+    nodes, segments = draw_changes(problem, scenario=scenario, **asked)
+    changes = [Change(one.at_ns, one.node, one) for one in nodes]
+    # A link's first segment is the link as it is, unless something is on from the beginning.
+    at_once = {item.place for item in items if first_ns(item) == 0}
+    changes += [
+        Change(one.at_ns, one.link, _conditions(problem.fabric.links[one.link], one, written))
+        for one in segments
+        if one.at_ns > 0 or one.link in at_once
+    ]
+    return Timeline(items, tuple(sorted(changes, key=lambda change: change.at_ns)))
 
 
-def _unplayable(item: Disturbance, *, outages: bool) -> Iterable[str]:
-    where = item.place
-    if item.down and not outages:
-        yield f"{where} cannot be taken down here"
-    if item.episodes is not None:
-        yield f"{where} is disturbed in `episodes`, which are drawn; use at_s and for_s"
-    if item.ramp_s:
-        yield f"{where} is disturbed along a ramp of {item.ramp_s:g} s; use at_s and for_s"
+def first_ns(item: Disturbance) -> int:
+    """Instant of the change with which a disturbance begins, since the first release."""
+    return round(item.at_s * NS_PER_S) + step_ns(item)
 
 
-def _two_delays(items: Sequence[LinkDisturbance]) -> Iterable[str]:
-    """Faults of links that would get two extra delays at a time: they have one process for them."""
-    delays = [item for item in items if item.add_delay_ms is not None]
-    for one, other in combinations(delays, 2):
-        apart = one.end_s <= other.at_s or other.end_s <= one.at_s
-        if one.link == other.link and not apart:
-            yield f"{one.link} gets two extra delays at the same time; give it their sum"
+def last_ns(item: Disturbance) -> int:
+    """Instant of the change after which a disturbance is over; beyond all of them if it lasts."""
+    if math.isinf(item.for_s):
+        return NEVER_NS
+    end_ns: int = round(round(item.at_s * NS_PER_S) + item.for_s * NS_PER_S)
+    return end_ns - step_ns(item)
 
 
-def threads_on(node: str, on: Iterable[Disturbance]) -> int:
-    """Return how many foreign threads a node has while some disturbances are on."""
-    return sum(
-        item.stress_threads
-        for item in on
-        if isinstance(item, NodeDisturbance) and item.node == node
-    )
+def step_ns(item: Disturbance) -> int:
+    """Time of one step of a disturbance's ramp; 0 where it has none."""
+    step: int = round(round(item.ramp_s * NS_PER_S) / RAMP_STEPS)
+    return step
 
 
-def is_down(where: str, on: Iterable[Disturbance]) -> bool:
-    """Whether a node, or a link (``R1->E``), is down while some disturbances are on."""
-    return any(item.down and item.place == where for item in on)
+def require_playable_scenario(problem: Problem, scenario: str, *, outages: bool) -> None:
+    """Refuse a scenario with something that real links and CPUs cannot be made to do.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario.
+    LiveError
+        With all of it.
+    """
+    down = [item.place for item in problem.scenario(scenario) if item.down]
+    if down and not outages:
+        faults = "; ".join(f"{place} cannot be taken down here" for place in down)
+        raise LiveError(f"scenario {scenario!r} cannot be played: {faults}")
 
 
-def link_with(link: Link, on: Iterable[Disturbance]) -> Conditions:
-    """Return the conditions of a link while some disturbances are on; its outages are not in it."""
-    rate_mbps, kept = link.rate_mbps, 1 - link.loss
-    add_delay_ms = None
-    for item in on:
-        if isinstance(item, LinkDisturbance) and item.link == link.name:
-            rate_mbps = min(rate_mbps, item.rate_mbps)
-            kept *= 1 - item.loss
-            add_delay_ms = item.add_delay_ms if item.add_delay_ms is not None else add_delay_ms
+def _without_bursts(problem: Problem) -> Problem:
+    fabric = problem.fabric
+    nodes = {name: replace(node, bursts=None) for name, node in fabric.nodes.items()}
+    links = {name: replace(link, bursts=None) for name, link in fabric.links.items()}
+    return replace(problem, fabric=replace(fabric, nodes=nodes, links=links))
+
+
+def usual_conditions(link: Link) -> Conditions:
+    """Return the conditions of a link that nothing disturbs."""
+    return Conditions(delay_ms=link.delay_ms, rate_mbps=link.rate_mbps, loss=link.loss)
+
+
+def _conditions(link: Link, segment: LinkSegment, scenario: Scenario) -> Conditions:
+    """Return the conditions of a link in a segment of its realisation."""
+    delays, shares, layer = [], [], 0
+    for item in scenario:
+        if not isinstance(item, LinkDisturbance) or item.link != link.name:
+            continue
+        if item.add_delay_ms is None:
+            continue
+        # Its layers are the digits of its strength.
+        level = sum(1 << (one - layer) for one in segment.layers if 0 <= one - layer < item.layers)
+        delays.append(item.add_delay_ms)
+        shares.append(level / ((1 << item.layers) - 1))
+        layer += item.layers
     return Conditions(
         delay_ms=link.delay_ms,
-        add_delay_ms=Constant(0.0) if add_delay_ms is None else add_delay_ms,
-        rate_mbps=rate_mbps,
-        loss=max(1 - kept, 0.0) if kept < 1 else 0.0,
+        add_delays_ms=tuple(delays),
+        shares=tuple(shares),
+        rate_mbps=segment.rate_mbps,
+        loss=segment.loss,
+        cut="drop" if segment.down else None,
     )
 
 
-def link_changes(
-    link: Link, before: Iterable[Disturbance], on: Iterable[Disturbance]
-) -> dict[str, Any]:
-    """Return what changes of a link's `Conditions` when other disturbances are on than before.
+def differing(before: Conditions, now: Conditions) -> dict[str, Any]:
+    """Return the fields of conditions that are others than before.
 
-    What stays is left out: a delay with a memory that is set anew begins anew.
+    Processes that stay are left out: one with a memory that is set anew begins anew.
     """
-    old, new = link_with(link, before), link_with(link, on)
-    pairs = ((item.name, getattr(old, item.name), getattr(new, item.name)) for item in fields(new))
-    return {name: value for name, was, value in pairs if not _same(was, value)}
-
-
-def _same(one: object, other: object) -> bool:
-    comparable = isinstance(one, float | Constant)
-    return one is other or (comparable and one == other)
+    pairs = (
+        (item.name, getattr(before, item.name), getattr(now, item.name)) for item in fields(now)
+    )
+    return {name: value for name, was, value in pairs if was is not value and was != value}
