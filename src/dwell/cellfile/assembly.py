@@ -92,6 +92,8 @@ class Assembly:
         Whether a candidate may name anchored tasks where they are.
     judged : bool
         Whether policies and estimators must be known here. A record names what its machine had.
+    home : str, optional
+        `Problem.folder`.
     """
 
     entry: CellEntry
@@ -99,6 +101,7 @@ class Assembly:
     faults: Faults
     anchored: bool = False
     judged: bool = True
+    home: str | None = None
 
     def problem(self, name: str) -> Problem:
         """Return the problem.
@@ -182,6 +185,7 @@ class Assembly:
             controller=controller,
             servo=servo,
             live=live,
+            folder=self.home,
             **_given(window_cycles=entry.window_cycles, warmup_windows=entry.warmup_windows),
         )
 

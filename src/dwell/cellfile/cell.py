@@ -46,7 +46,7 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
     faults = Faults(source)
     text = _read_text(source, faults)
     folder = Path(source).parent if traces is None else Path(traces)
-    return read_problem(text, faults, folder, Path(source).stem or "cell")
+    return read_problem(text, faults, folder, Path(source).stem or "cell", home=_home(source))
 
 
 def load_without_traces(path: str | PathLike[str]) -> Problem:
@@ -68,7 +68,13 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
     """
     source = fspath(path)
     faults = Faults(source)
-    return _without_traces(_read_text(source, faults), faults, Path(source).stem or "cell")
+    text = _read_text(source, faults)
+    return _without_traces(text, faults, Path(source).stem or "cell", home=_home(source))
+
+
+def _home(source: str) -> str:
+    """Return the folder in which a cell file's own modules lie."""
+    return str(Path(source).resolve().parent)
 
 
 def _read_text(source: str, faults: Faults) -> object:
@@ -147,14 +153,20 @@ def from_record(document: Mapping[str, object]) -> Problem:
 
 
 def _without_traces(
-    document: object, faults: Faults, name: str, *, anchored: bool = False, judged: bool = True
+    document: object,
+    faults: Faults,
+    name: str,
+    *,
+    anchored: bool = False,
+    judged: bool = True,
+    home: str | None = None,
 ) -> Problem:
     """Read a document into a Problem whose traces are named only; see `Assembly`."""
     from dwell.cellfile.assembly import Assembly
     from dwell.cellfile.structure import CELL, read_structure
 
     entry = read_structure(document, faults, CELL)
-    return Assembly(entry, None, faults, anchored=anchored, judged=judged).problem(name)
+    return Assembly(entry, None, faults, anchored, judged, home).problem(name)
 
 
 def read_problem(
@@ -165,6 +177,7 @@ def read_problem(
     known: dict[object, Tables] | None = None,
     *,
     anchored: bool = False,
+    home: str | None = None,
 ) -> Problem:
     """Read a document into a Problem.
 
@@ -182,6 +195,8 @@ def read_problem(
         Traces that were read for documents like this one; takes those that are read now.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
+    home : str, optional
+        Folder of the modules that it names, for `Problem.folder`.
 
     Raises
     ------
@@ -198,4 +213,4 @@ def read_problem(
     declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
     if declared not in known:
         known[declared] = read_traces(entry, folder, faults)
-    return Assembly(entry, known[declared], faults, anchored=anchored).problem(name)
+    return Assembly(entry, known[declared], faults, anchored=anchored, home=home).problem(name)

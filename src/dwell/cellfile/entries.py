@@ -649,7 +649,8 @@ class ControllerEntry(Entry):
     )
     policy: str | None = Field(
         None,
-        description="A policy (`dtp`, default), or a candidate: the placement that never moves.",
+        description="A policy (`dtp`, default), `package.module:Class` of your own, or a "
+        "candidate: the placement that never moves.",
         examples=list(POLICIES),
     )
     initial: str | None = Field(None, description="Candidate to start with; default: the first.")
@@ -666,7 +667,8 @@ class ControllerEntry(Entry):
     )
     estimator: str | None = Field(
         None,
-        description="How the QoS of candidates is estimated; default `profile`.",
+        description="How the QoS of candidates is estimated; default `profile`; also "
+        "`package.module:Class` of your own.",
         examples=list(ESTIMATORS),
     )
     shadow_fraction: Annotated[float, Number(bounds.SHADOW_FRACTION)] | None = Field(

@@ -23,6 +23,7 @@ from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
 from dwell.model.semantics import LONGEST_NAME, NAME, nearest, nearest_of
+from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names
 
 if TYPE_CHECKING:
@@ -138,8 +139,8 @@ class _Cell:
         document = self.document
         for one in overrides:
             document = put(document, one.steps, one.value)
-        name = self.problem.name
-        problem = read_problem(document, Faults(), self.folder, name, self.traces)
+        name, home = self.problem.name, self.problem.folder
+        problem = read_problem(document, Faults(), self.folder, name, self.traces, home=home)
         return _Cell(document, problem, self.folder, self.traces)
 
 
@@ -214,7 +215,9 @@ class _Reading:
         try:
             if faults.at(""):
                 raise faults.error()
-            problem = read_problem(document, faults, folder, file.stem or "cell", traces)
+            home = str(file.resolve().parent)
+            name = file.stem or "cell"
+            problem = read_problem(document, faults, folder, name, traces, home=home)
         except ProblemError as error:
             for line in str(error).splitlines():
                 self.faults.add("cell", line)
@@ -391,7 +394,7 @@ class _Reading:
         """Check that the names that a policy gives are known."""
         path = f"policies.{policy.name}"
         known = [*policy_names(), *problem.candidates]
-        if policy.policy not in known:
+        if policy.policy not in known and not is_class_path(policy.policy):
             hint = nearest_of(policy.policy, known, "policies")
             self.faults.add(path, f"unknown policy {policy.policy!r}; {hint}")
         elif policy.name in problem.candidates and policy.policy != policy.name:
@@ -400,9 +403,8 @@ class _Reading:
                 f"{policy.name!r} is a candidate's name, for the placement that never moves; give "
                 f"{policy.policy!r} another one",
             )
-        estimators = estimator_names()
-        if policy.estimator is not None and policy.estimator not in estimators:
-            hint = nearest(policy.estimator, estimators)
+        if policy.estimator is not None and not _is_estimator(policy.estimator):
+            hint = nearest(policy.estimator, estimator_names())
             shown = f"unknown estimator {policy.estimator!r}; {hint}"
             self.faults.add(f"{path}.estimator", shown)
 
@@ -417,11 +419,15 @@ class _Reading:
                 for key, found in steps.items()
                 if found is not None
             ]
-            if policy.estimator in estimator_names():
+            if policy.estimator is not None and _is_estimator(policy.estimator):
                 place = f"{path}.estimator"
                 overrides.append(_Override(place, ("controller", "estimator"), policy.estimator))
             if overrides:
                 self._changed(cell, overrides, path)
+
+
+def _is_estimator(name: str) -> bool:
+    return name in estimator_names() or is_class_path(name)
 
 
 def _shown(values: Sequence[Any]) -> list[Value]:

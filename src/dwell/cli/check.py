@@ -11,11 +11,14 @@ import typer
 
 from dwell.cellfile import load
 from dwell.cli.output import aligned, print_json
-from dwell.errors import Fault, ProblemError
+from dwell.errors import Fault, PolicyError, ProblemError
 from dwell.estimators import Profile
+from dwell.estimators import by_name as make_estimator
 from dwell.estimators.profile import mean_ms
 from dwell.live.lint import lint
 from dwell.model import Problem, Trace
+from dwell.model.user_classes import is_class_path
+from dwell.policies import by_name as make_policy
 
 __all__ = ["check_cell", "find_warnings"]
 
@@ -52,6 +55,14 @@ def check_cell(
         from dwell.cli.check_node import check_node
 
         return check_node(problem, cell, node, keys, insecure=insecure, as_json=as_json)
+    wrong = tuple(_own_classes(problem))
+    if wrong:
+        if as_json:
+            told = [_fault(fault) | {"line": None} for fault in wrong]
+            print_json({"valid": False, "faults": told})
+        else:
+            typer.echo("\n".join(f"{cell}: {fault}" for fault in wrong), err=True)
+        return False
     profile = Profile(problem)
     warnings = tuple(find_warnings(problem, profile))
     if as_json:
@@ -62,6 +73,21 @@ def check_cell(
         for warning in warnings:
             typer.echo(f"{cell}: warning: {warning}", err=True)
     return True
+
+
+def _own_classes(problem: Problem) -> Iterator[Fault]:
+    """Yield what is wrong with the policy and the estimator where these are a user's classes."""
+    settings = problem.controller
+    try:
+        if is_class_path(settings.policy) and settings.policy not in problem.candidates:
+            make_policy(settings.policy, problem)
+    except PolicyError as error:
+        yield Fault("controller.policy", str(error))
+    try:
+        if is_class_path(settings.estimator):
+            make_estimator(settings.estimator, problem)
+    except ProblemError as error:
+        yield Fault("controller.estimator", str(error))
 
 
 def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:

@@ -45,13 +45,18 @@ Policy = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="A policy, as dtp, or with its estimator, as cusum+corrected; or a candidate's name "
-        "for the placement that never moves; what the cell says if not given.",
+        help="A policy, as dtp, or with its estimator, as cusum+corrected; a class of your own, as "
+        "package.module:Class, beside the cell file or installed; or a candidate's name for the "
+        "placement that never moves; what the cell says if not given.",
     ),
 ]
 Estimator = Annotated[
     str | None,
-    typer.Option(metavar="NAME", help="An estimator; what the cell says if not given."),
+    typer.Option(
+        metavar="NAME",
+        help="An estimator, or a class of your own, as package.module:Class; what the cell says if "
+        "not given.",
+    ),
 ]
 Seed = Annotated[
     int,

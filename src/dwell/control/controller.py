@@ -18,6 +18,7 @@ from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
 from dwell.model.semantics import too_many_shadows
+from dwell.model.user_classes import is_class_path
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
 
@@ -105,6 +106,11 @@ class Controller:
         self.problem = problem
         if isinstance(policy, str):
             policy, estimator = _without_estimator(policy, estimator, problem)
+        named = (policy or problem.controller.policy, estimator or problem.controller.estimator)
+        #: Names of the policy and the estimator where these are classes of a user's own, else None.
+        self._own = tuple(
+            name if isinstance(name, str) and is_class_path(name) else None for name in named
+        )
         self.policy = _prepared_policy(policy, problem)
         if estimator is None or isinstance(estimator, str):
             name = estimator or problem.controller.estimator
@@ -168,11 +174,12 @@ class Controller:
     def described(self) -> dict[str, object]:
         """Policy, its parameters and estimator as the record of a run names them."""
         policy = self.policy
+        own_policy, own_estimator = self._own
         known = type(policy).__repr__ is not object.__repr__
         return {
-            "policy": repr(policy) if known else type(policy).__name__,
+            "policy": own_policy or (repr(policy) if known else type(policy).__name__),
             "parameters": parameters_of(policy),
-            "estimator": type(self.estimator).__name__,
+            "estimator": own_estimator or type(self.estimator).__name__,
         }
 
     @property

@@ -2,7 +2,8 @@
 
 Each estimator of ours is declared here, and nowhere else by name. The declarations load without the
 classes: these are imported when an estimator is made. Another package adds one by an entry point of
-the group ``dwell.estimators``; its class is imported only when that estimator is asked for.
+the group ``dwell.estimators``; its class is imported only when that estimator is asked for. A class
+of a user's own needs no entry: its name is ``package.module:Class``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 from dwell.errors import ProblemError, RunError
 from dwell.model.entry_points import class_named, names_with
 from dwell.model.semantics import nearest_of
+from dwell.model.user_classes import is_class_path, make_user_class
 
 if TYPE_CHECKING:
     from dwell.estimators.protocol import Estimator
@@ -97,12 +99,24 @@ def shadowing() -> frozenset[str]:
 def by_name(name: str, problem: Problem) -> Estimator:
     """Make an estimator for a problem.
 
+    Parameters
+    ----------
+    name : str
+        An estimator's name, or ``package.module:Class`` (see `dwell.model.user_classes`).
+    problem : Problem
+
     Raises
     ------
     ProblemError
         If there is none of that name (the message lists the known ones), or the package that
-        declares it cannot be imported.
+        declares it, or the class that is named, cannot be imported or made.
     """
+    if is_class_path(name):
+        own = make_user_class(name, problem, "estimate", "estimator", ProblemError)
+        start = getattr(own, "start", None)
+        if start is not None:
+            start(problem)
+        return cast("Estimator", own)
     path = REGISTRY[name].path if name in REGISTRY else None
     kind = class_named(name, path, GROUP, "estimator", ProblemError)
     if kind is None:
@@ -127,6 +141,6 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     told = str(meta.get("estimator") or "profile")
     classes = {entry.path.partition(":")[2]: name for name, entry in REGISTRY.items()}
     name = classes.get(told, told)
-    if name not in REGISTRY:
+    if name not in REGISTRY and not is_class_path(name):
         raise RunError(f"estimator {told!r} is not known (here: {', '.join(REGISTRY)})")
     return name

@@ -43,7 +43,8 @@ class ControllerSettings:
     on : str, optional
         Node; the first edge node, else the first node, where None.
     policy : str
-        A policy's name, or a candidate's for the placement that never moves.
+        A policy's name, ``package.module:Class`` of one, or a candidate's for the placement that
+        never moves.
     initial : str, optional
         Candidate to start with; the first where None.
     min_dwell : int
@@ -131,6 +132,9 @@ class Problem:
         Loop that every run's commands are tried on; none, and no tracking error, where None.
     live : LiveSettings
         For the live runtime.
+    folder : str, optional
+        Where classes that are named ``package.module:Class`` are looked for first: the cell file's.
+        No part of what the cell is.
 
     Raises
     ------
@@ -149,6 +153,7 @@ class Problem:
     warmup_windows: int = 0
     servo: Servo | None = None
     live: LiveSettings = field(default_factory=LiveSettings)
+    folder: str | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         WINDOW_CYCLES.check("window_cycles", self.window_cycles)

@@ -24,6 +24,7 @@ from dwell.model.scenario import (
     LinkDisturbance,
     NodeDisturbance,
 )
+from dwell.model.user_classes import is_class_path
 
 if TYPE_CHECKING:
     from dwell.model.problem import ControllerSettings
@@ -353,10 +354,14 @@ def _controller(parts: CellParts) -> Iterator[Fault]:
         yield from _unknown("controller.initial", "candidate", settings.initial, names)
     for index, name in enumerate(settings.fallbacks):
         yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
-    if parts.policies is not None:
+    if parts.policies is not None and not is_class_path(settings.policy):
         known = [*parts.policies, *names]
         yield from _unknown("controller.policy", "policy", settings.policy, known)
-    if parts.estimators is not None and settings.estimator not in parts.estimators:
+    if (
+        parts.estimators is not None
+        and settings.estimator not in parts.estimators
+        and not is_class_path(settings.estimator)
+    ):
         bound = f"one of {', '.join(parts.estimators)}"
         message = f"{shown(settings.estimator)} is not allowed; it must be {bound}"
         yield Fault("controller.estimator", message)

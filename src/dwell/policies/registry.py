@@ -2,7 +2,8 @@
 
 Each policy of ours is declared here, and nowhere else by name. The declarations load without the
 classes: these are imported when a policy is made. Another package adds a policy by an entry point
-of the group ``dwell.policies``; its class is imported only when that policy is asked for.
+of the group ``dwell.policies``; its class is imported only when that policy is asked for. A class
+of a user's own needs no entry: its name is ``package.module:Class``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, cast
 from dwell.errors import PolicyError
 from dwell.model.entry_points import class_at, class_named, names_with
 from dwell.model.semantics import nearest_of
+from dwell.model.user_classes import is_class_path, make_user_class
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
@@ -129,7 +131,8 @@ def by_name(name: str, problem: Problem) -> Policy:
     Parameters
     ----------
     name : str
-        A policy's name, or a candidate's for the placement that never moves.
+        A policy's name, a candidate's for the placement that never moves, or
+        ``package.module:Class`` (see `dwell.model.user_classes`).
     problem : Problem
 
     Raises
@@ -137,7 +140,7 @@ def by_name(name: str, problem: Problem) -> Policy:
     PolicyError
         If there is none of that name (the message lists the known ones), a candidate has it, too,
         the problem has no candidates that the policy could work with, or the package that declares
-        the policy cannot be imported.
+        the policy, or the class that is named, cannot be imported or made.
     """
     if name in REGISTRY and name in problem.candidates:
         raise PolicyError(f"{name!r} is a policy's name and a candidate's; rename the candidate")
@@ -147,6 +150,8 @@ def by_name(name: str, problem: Problem) -> Policy:
             "Policy",
             static(candidates=problem.candidates, initial=name, objective=problem.objective),
         )
+    if is_class_path(name):
+        return cast("Policy", make_user_class(name, problem, "decide", "policy", PolicyError))
     path = REGISTRY[name].path if name in REGISTRY else None
     kind = class_named(name, path, GROUP, "policy", PolicyError)
     if kind is None:

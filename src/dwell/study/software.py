@@ -15,6 +15,7 @@ from dwell import __version__
 from dwell.cellfile.sources import digest_of
 from dwell.errors import SimulationError
 from dwell.model.document import to_document
+from dwell.model.user_classes import is_class_path, source_digest
 from dwell.study.study import Contender, Study
 
 __all__ = ["describe", "software", "versions"]
@@ -54,6 +55,7 @@ def describe(study: Study) -> dict[str, Any]:
         If a policy or an estimator is an object that does not pickle.
     """
     cells = [to_document(point.problem) for point in study.points]
+    own = _own_sources(study)
     return {
         "name": study.name,
         "software": software(),
@@ -66,7 +68,18 @@ def describe(study: Study) -> dict[str, Any]:
         "points": [list(point.values.values()) for point in study.points],
         "cell": cells[0],
         "cells": hashlib.sha256(json.dumps(cells).encode()).hexdigest(),
+        **({"modules": own} if own else {}),
     }
+
+
+def _own_sources(study: Study) -> dict[str, str | None]:
+    """Return a digest of the module of every class of a user's own, by the class's name."""
+    settings = study.points[0].problem.controller
+    used = [part for one in study.contenders for part in (one.policy, one.estimator)]
+    folder = study.points[0].problem.folder
+    given = [settings.estimator, *(part for part in used if isinstance(part, str))]
+    names = sorted(filter(is_class_path, given))
+    return {name: source_digest(name, folder) for name in names}
 
 
 def _contender(contender: Contender) -> Mapping[str, Any]:

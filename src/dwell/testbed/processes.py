@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypeAlias
 
 import yaml
@@ -24,6 +25,7 @@ from dwell.live.trust import KEYS
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import to_document
+from dwell.model.user_classes import is_class_path
 from dwell.testbed.trace_names import move_traces
 
 __all__ = ["Inside", "Processes", "expected", "outright", "without_keys"]
@@ -45,6 +47,22 @@ def outright(node: str, words: Sequence[str]) -> Sequence[str]:
 def without_keys() -> dict[str, str]:
     """Return this process's environment but for the keyring, which is of a cell of its own."""
     return {name: value for name, value in os.environ.items() if name != KEYS}
+
+
+def _module_path(problems: Iterable[Problem]) -> dict[str, str]:
+    """Return the variable by which controllers find a user's own classes beside the cell files.
+
+    A testbed writes the cell files of its processes into a folder of its own.
+    """
+    settings = [(problem.folder, problem.controller) for problem in problems]
+    folders = [
+        folder
+        for folder, one in settings
+        if folder is not None and (is_class_path(one.policy) or is_class_path(one.estimator))
+    ]
+    before = os.environ.get("PYTHONPATH")
+    path = [*dict.fromkeys(folders), *([before] if before else [])]
+    return {"PYTHONPATH": os.pathsep.join(path)} if folders else {}
 
 
 def expected(problem: Problem, node: str) -> list[str]:
@@ -156,7 +174,7 @@ class Processes:
         cells = [problem for problem in self.problems if problem.controller_node == node]
         runs = self.folder / "runs" if out is None else out
         words = ["controller", "--out", str(runs), *self._on_cpus(node), *self._more, *more]
-        self._start(f"controller@{node}", node, words, cells)
+        self._start(f"controller@{node}", node, words, cells, _module_path(cells))
 
     def _on_cpus(self, node: str) -> list[str]:
         return ["--cpus", str(self._cpus[node])] if node in self._cpus else []
@@ -166,7 +184,12 @@ class Processes:
         return who if len(self.problems) == 1 else f"{who} of {problem.name}"
 
     def _start(
-        self, who: str, node: str, words: Sequence[str], problems: Sequence[Problem]
+        self,
+        who: str,
+        node: str,
+        words: Sequence[str],
+        problems: Sequence[Problem],
+        environment: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
@@ -179,7 +202,7 @@ class Processes:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env={**without_keys(), **self.environment},
+                env={**without_keys(), **self.environment, **environment},
                 process_group=0,
             )
 

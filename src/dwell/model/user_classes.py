@@ -1,0 +1,178 @@
+"""Classes of a user's own, named ``package.module:Class``: beside the cell file or installed."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import importlib
+import inspect
+import pkgutil
+import re
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from dwell.errors import DwellError
+
+if TYPE_CHECKING:
+    from dwell.model.problem import Problem
+
+__all__ = ["is_class_path", "make_user_class", "source_digest"]
+
+CLASS_PATH = re.compile(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*")
+
+#: Modules that were found beside a cell file, by its folder and their name.
+_beside: dict[tuple[str, str], ModuleType] = {}
+_importing = threading.RLock()
+
+
+def is_class_path(name: str) -> bool:
+    """Return whether a name has the form ``package.module:Class``."""
+    return CLASS_PATH.fullmatch(name) is not None
+
+
+def make_user_class(
+    name: str, problem: Problem, method: str, what: str, error: type[DwellError]
+) -> Any:
+    """Make an object of a user's class: by ``from_problem(problem)`` if there is one, else bare.
+
+    Parameters
+    ----------
+    name : str
+        ``package.module:Class``.
+    problem : Problem
+        Modules in its `folder` go before installed ones.
+    method : str
+        Which the object must have.
+    what : str
+        What it is, for messages: ``policy``.
+    error : type of DwellError
+
+    Raises
+    ------
+    DwellError
+        Of type `error`, if there is no such module or class, the module raises when it is imported,
+        the class wants arguments or raises, or its object has no such method.
+    """
+    who = f"{what} {name!r}"
+    module_name, _, attribute = name.partition(":")
+    module = _import(module_name, problem.folder, who, error)
+    kind = getattr(module, attribute, None)
+    if kind is None:
+        near = difflib.get_close_matches(attribute, dir(module), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise error(f"{who}: {module_name} has no class {attribute!r}{hint}")
+    if not isinstance(kind, type):
+        raise error(f"{who}: {attribute!r} in {module_name} is no class")
+    if not callable(getattr(kind, method, None)):
+        raise error(f"{who}: the class is no {what}: it has no method {method}")
+    from_problem = getattr(kind, "from_problem", None)
+    if from_problem is None:
+        wanted = _arguments(kind)
+        if wanted:
+            raise error(
+                f"{who}: the class wants arguments ({', '.join(wanted)}); give them defaults, or "
+                "the class a classmethod from_problem(problem)"
+            )
+    try:
+        return kind() if from_problem is None else from_problem(problem)
+    except DwellError:
+        raise
+    except Exception as fault:
+        call = f"{attribute}()" if from_problem is None else f"{attribute}.from_problem(problem)"
+        raise error(f"{who}: {call} failed: {_told(fault)}") from fault
+
+
+def source_digest(name: str, folder: str | None) -> str | None:
+    """Return a digest of the source of the module that ``package.module:Class`` names.
+
+    Returns
+    -------
+    str or None
+        None where the module cannot be imported, or has no source.
+    """
+    module_name = name.partition(":")[0]
+    try:
+        source = inspect.getsource(_import(module_name, folder, name, DwellError))
+    except (DwellError, OSError, TypeError):
+        return None
+    return hashlib.sha256(source.encode()).hexdigest()[:16]
+
+
+def _arguments(kind: type) -> list[str]:
+    """Return the names of the arguments that a class cannot be made without."""
+    try:
+        parameters = inspect.signature(kind).parameters.values()
+    except (TypeError, ValueError):  # a class in C may have no signature
+        return []
+    optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [one.name for one in parameters if one.default is one.empty and one.kind not in optional]
+
+
+def _import(name: str, folder: str | None, who: str, error: type[DwellError]) -> ModuleType:
+    """Import a module from a folder, or an installed one where the folder has none of that name."""
+    beside = folder is not None and name.partition(".")[0] in _modules_in(folder)
+    try:
+        if folder is not None and beside:
+            return _import_beside(name, folder)
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as fault:
+        missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
+        if missing is not None and f"{name}.".startswith(f"{missing}."):
+            place = "" if folder is None else f"neither beside the cell file ({folder}) nor "
+            raise error(f"{who}: there is no module {missing!r}, {place}installed") from None
+        raise error(f"{who}: importing {name} failed: {_told(fault)}") from fault
+
+
+def _import_beside(name: str, folder: str) -> ModuleType:
+    """Import a module from a folder, whatever another folder has under the same name."""
+    with _importing:
+        if (folder, name) not in _beside:
+            with _first_on_path(folder):
+                _beside[folder, name] = importlib.import_module(name)
+        return _beside[folder, name]
+
+
+@contextmanager
+def _first_on_path(folder: str) -> Iterator[None]:
+    """Look for modules in a folder first; modules of the same names from elsewhere come back."""
+    names = _modules_in(folder)
+    elsewhere = {
+        name: module
+        for name, module in sys.modules.items()
+        if name.partition(".")[0] in names and not _is_in(module, folder)
+    }
+    for name in elsewhere:
+        del sys.modules[name]
+    sys.path.insert(0, folder)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if folder in sys.path:
+            sys.path.remove(folder)
+        sys.modules.update(elsewhere)
+
+
+def _modules_in(folder: str) -> set[str]:
+    """Return the names of the modules and packages in a folder; none of them replaces ours."""
+    return {one.name for one in pkgutil.iter_modules([folder])} - {"dwell", "__main__"}
+
+
+def _is_in(module: ModuleType, folder: str) -> bool:
+    file = getattr(module, "__file__", None)
+    return isinstance(file, str) and file.startswith(f"{folder}/")
+
+
+def _told(fault: BaseException) -> str:
+    """Return ``ValueError: no frame (policy.py:12)``; only the first line of a long message."""
+    lines = str(fault).strip().splitlines()
+    told = f"{type(fault).__name__}: {lines[0]}" if lines else type(fault).__name__
+    frames = traceback.extract_tb(fault.__traceback__)
+    if isinstance(fault, SyntaxError) or not frames or "importlib" in frames[-1].filename:
+        return told
+    return f"{told} ({frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno})"
