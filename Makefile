@@ -63,7 +63,7 @@ faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on w
 	$(BIN)/python -m tests.live.faults $(ARGS)
 
 chaos: env ## Half an hour of chaos on a real cell, judged from the wire (ARGS="--minutes 2 --seed 7")
-	$(BIN)/python -m dwell live chaos --minutes 30 --faults 1000 $(ARGS)
+	$(BIN)/python -m dwell testbed chaos --minutes 30 --faults 1000 $(ARGS)
 
 soak: env ## An hour of a real cell at 25 Hz: memory, files, threads (ARGS="--minutes 10")
 	$(BIN)/python -m tests.live.soak $(ARGS)

@@ -21,7 +21,8 @@ from typing import Literal
 from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import SESSIONS, Locator, Role, Session, WiringEntry
-from dwell.testbed.losses import Losses, LossyTransport
+from dwell.testbed.linked_transport import LinkedTransport
+from dwell.testbed.message_links import LinkEnds
 
 __all__ = ["Specification", "paced"]
 
@@ -53,8 +54,8 @@ class Specification:
     hertz : float
         Messages a second of one flow.
     seconds : float
-    losses : str
-        File of the losses that a sender over Zenoh has; without any where empty.
+    links : str
+        File of the links that a sender over Zenoh has; without any where empty.
     """
 
     side: Literal["send", "receive"]
@@ -65,7 +66,7 @@ class Specification:
     flows: int
     hertz: float
     seconds: float
-    losses: str = ""
+    links: str = ""
 
     @property
     def count(self) -> int:
@@ -213,10 +214,10 @@ def _zenoh_sender(asked: Specification, stack: ExitStack) -> Callable[[int, byte
     while any(way.peers[asked.lane] == 0 for way in ways):
         time.sleep(0.01)
     senders: list[Transport] = [*ways]
-    if asked.losses:
-        path = Path(asked.losses)
+    if asked.links:
+        path = Path(asked.links)
         senders = [
-            LossyTransport(way, Losses(path, way.entry.role.who, way.entry.role.node))
+            LinkedTransport(way, LinkEnds(path, way.entry.role.who, way.entry.role.node))
             for way in ways
         ]
     return lambda flow, message: senders[flow].put(_key(flow), message, lane=asked.lane)

@@ -19,7 +19,6 @@ import yaml
 
 import dwell
 from benchmarks.timing import ROOT
-from dwell.demo.loopback import Loopback, on_this_machine
 from dwell.errors import LiveError
 from dwell.live.messages import Header, decode
 from dwell.live.operator_client import OperatorClient
@@ -27,6 +26,7 @@ from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.worker import Worker
 from dwell.model import Problem
+from dwell.testbed.loopback import Loopback, on_this_machine
 
 __all__ = ["ARRIVED", "NUMBER", "Applied", "LightCell", "document", "problem_of"]
 

@@ -25,7 +25,7 @@ from benchmarks.link_end import Specification
 from dwell.model import Constant, Normal
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.link import Passed, TunLink
-from dwell.testbed.losses import LossFile
+from dwell.testbed.message_links import LinkFile
 
 __all__ = ["measure"]
 
@@ -99,7 +99,7 @@ def measure(quick: bool) -> Section:
 class _Bench:
     """Two hosts and the link between."""
 
-    def __init__(self, hosts: Hosts, link: TunLink, losses: LossFile) -> None:
+    def __init__(self, hosts: Hosts, link: TunLink, losses: LinkFile) -> None:
         self.link = link
         self.worst_ms = 0.0
         self._direct_ms: dict[tuple[str, int], float] = {}
@@ -124,7 +124,7 @@ class _Bench:
         self.link.set(*AB, delay_ms=DELAY)
         self.link.set("B", "A", delay_ms=DELAY)
         loss = LOSS if kind.kind == "zenoh" else 0.0
-        self._losses.set(*AB, loss)
+        self._losses.set(*AB, loss=loss)
         found = [self._ages(kind, seconds) for _ in range(runs)]
         mean, std = _in_order(kind.hertz)
         direct_ms = self._direct_ms[kind.kind, kind.size_bytes]
@@ -145,7 +145,7 @@ class _Bench:
             megabits = kind.flows * kind.hertz * kind.size_bytes * 8e-6
             goal = Goal(high=CORE_PERCENT)
             yield Figure(f"  CPU of the link at {megabits:.0f} Mbit/s", cpu, "%", goal)
-        self._losses.set(*AB, 0.0)
+        self._losses.set(*AB, loss=0.0)
 
     def _ages(
         self, kind: _Kind, seconds: float, *, sender: str = "A"
@@ -154,7 +154,7 @@ class _Bench:
         address = self._hosts.address("B")
         receive = kind.asked("receive", address, seconds).words()
         asked = kind.asked("send", address, seconds)
-        send = replace(asked, losses=str(self._losses.path)).words()
+        send = replace(asked, links=str(self._losses.path)).words()
         with self._process("B", receive) as receiver:
             assert receiver.stdout is not None
             assert receiver.stdin is not None
@@ -187,7 +187,7 @@ def _bench() -> Iterator[_Bench]:
     name = f"bench{os.getpid()}"
     with tempfile.TemporaryDirectory() as folder, Hosts(name, NODES, [NODES]) as hosts:
         tuns = {"A": hosts.tun("A", "B"), "B": hosts.tun("B", "A")}
-        losses = LossFile(Path(folder) / "losses", NODES, seed=5)
+        losses = LinkFile(Path(folder) / "links", NODES, seed=5)
         with TunLink(NODES, tuns, seed=7) as link, losses:
             yield _Bench(hosts, link, losses)
 

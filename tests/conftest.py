@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 ALONE = (
     "chaos",
     "cli/test_live.py",
-    "cli/test_live_demo.py",
+    "cli/test_live_run.py",
     "cli/test_testbed.py",
     "live/test_real_faults.py",
     "live/transport",

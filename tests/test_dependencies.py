@@ -69,9 +69,14 @@ def project() -> dict[str, Any]:
 def test_the_package_uses_what_it_declares_and_no_more(project: dict[str, Any]) -> None:
     declared = project["project"]["dependencies"]
     extras = project["project"]["optional-dependencies"].values()
-    demo = project["dependency-groups"]["demo"]
-    all_of_them = [*declared, *(one for extra in [*extras, demo] for one in extra)]
+    all_of_them = [*declared, *(one for extra in extras for one in extra)]
     assert imported("src") == named(all_of_them) - {project["project"]["name"]}
+
+
+def test_the_examples_need_the_package_and_their_own_group(project: dict[str, Any]) -> None:
+    own = named(project["dependency-groups"]["demo"])
+    assert own <= imported("examples")
+    assert imported("examples") - own <= imported("src")
 
 
 def test_the_reproduction_needs_the_package_and_its_own_group(project: dict[str, Any]) -> None:

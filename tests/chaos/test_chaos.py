@@ -27,7 +27,7 @@ def test_the_cell_keeps_its_promises(tmp_path: Path, capsys: pytest.CaptureFixtu
         on_loopback(None, tmp_path, SEED),
         tmp_path,
         SEED,
-        f"dwell live chaos --seed {SEED}",
+        f"dwell testbed chaos --seed {SEED}",
         print,
     )
     result = campaign.run(until_s=time.monotonic() + SECONDS, faults=FAULTS)

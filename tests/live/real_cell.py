@@ -24,7 +24,7 @@ from dwell.chaos.stage import OnLoopback
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond
 from dwell.chaos.strike import strike as strike_by
-from dwell.demo.loopback import on_this_machine
+from dwell.testbed.loopback import on_this_machine
 
 __all__ = [
     "FAULTS",

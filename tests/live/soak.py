@@ -30,8 +30,8 @@ import dwell
 from dwell.chaos.harness import Harness, environment_of
 from dwell.chaos.light_cell import PERIOD_MS, document, exec_ms
 from dwell.chaos.stage import OnLoopback
-from dwell.demo.loopback import on_this_machine
 from dwell.errors import DwellError, LiveError
+from dwell.testbed.loopback import on_this_machine
 
 HOME = "SO"
 #: One second each.

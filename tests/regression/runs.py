@@ -21,7 +21,7 @@ __all__ = ["EXAMPLES", "Case", "cases", "play", "read", "write"]
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
-EXAMPLES = ("canonical", "fan-in", "cloud", "live/cell", "testbed/cell")
+EXAMPLES = ("canonical", "fan-in", "cloud", "live/cell", "visual_servoing/testbed")
 TABLES = ("cycles", "windows", "decisions")
 #: Windows beyond the warm-up.
 WINDOWS = 7

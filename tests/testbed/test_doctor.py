@@ -44,7 +44,7 @@ def system() -> list[str]:
 
 def with_quotas(*quotas: Quota) -> Problem:
     """The demo's cell; of its nodes the first have these quotas."""
-    problem = dwell.load(ROOT / "src" / "dwell" / "demo" / "cell.yaml")
+    problem = dwell.load(ROOT / "examples" / "visual_servoing" / "cell.yaml")
     nodes = dict(problem.fabric.nodes)
     for name, quota in zip(list(nodes), quotas, strict=False):
         nodes[name] = replace(nodes[name], cores=1, quota=quota)

@@ -11,7 +11,6 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.chaos.wiretap import entry_for
-from dwell.demo.loopback import on_this_machine
 from dwell.live.hosting import clock_of
 from dwell.live.keys import Keys
 from dwell.live.messages import Beat, decode
@@ -19,7 +18,9 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import wire
 from dwell.testbed.clocks import ClockFile
-from dwell.testbed.losses import LossFile, without_source
+from dwell.testbed.linked_transport import without_source
+from dwell.testbed.loopback import on_this_machine
+from dwell.testbed.message_links import LinkFile
 from dwell.testbed.process import FaultyPlatform, main, program
 from dwell.testbed.processes import Processes
 from tests.testbed.light_cell import document
@@ -49,10 +50,10 @@ def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:
         beat = decode(sample.payload, Beat)
         heard[beat.who] = source, beat.sent_ns - time.monotonic_ns()
 
-    losses, clocks = tmp_path / "losses", tmp_path / "clocks"
-    with LossFile(losses, NODES), ClockFile(clocks, NODES, time.monotonic_ns) as file:
+    links, clocks = tmp_path / "links", tmp_path / "clocks"
+    with LinkFile(links, NODES), ClockFile(clocks, NODES, time.monotonic_ns) as file:
         file.set("R1", jump_ns=HOUR_NS)
-        processes = Processes([problem], tmp_path, program=program(losses=losses, clocks=clocks))
+        processes = Processes([problem], tmp_path, program=program(links=links, clocks=clocks))
         processes.write()
         transport = ZenohTransport(entry_for(wire(problem), ["R1"]))
         try:

@@ -37,7 +37,7 @@ OWNER = """
 import sys, time
 from pathlib import Path
 import dwell
-from dwell.demo.loopback import on_this_machine
+from dwell.testbed.loopback import on_this_machine
 from dwell.testbed.processes import Processes
 
 processes = Processes([on_this_machine(dwell.load(sys.argv[1]))], Path(sys.argv[2]))

@@ -793,6 +793,10 @@ class LiveEntry(Entry):
     actuators: dict[str, str] | None = Field(
         None, description="What applies the commands of a sink task, as `package.module:Name`."
     )
+    observer: str | None = Field(
+        None,
+        description="What looks on where `dwell live run` runs the cell, as `package.module:Name`.",
+    )
 
 
 # ------------------------------------------------------------------------------------ cell

@@ -25,9 +25,9 @@ from dwell.chaos.stages import APPLY
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond, strike
 from dwell.chaos.timeline import Planned, planned
-from dwell.demo.loopback import on_this_machine
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
+from dwell.testbed.loopback import on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
 
 __all__ = ["Campaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from dwell.demo.loopback import Loopback
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
 from dwell.model import Problem
+from dwell.testbed.loopback import Loopback
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.processes import without_keys
 
@@ -87,7 +87,7 @@ class Stage(Protocol):
 
 
 class OnLoopback:
-    """All nodes on this computer's loopback; links are proxies of TCP.
+    """All nodes on this computer's loopback; links are of messages.
 
     Parameters
     ----------
@@ -146,11 +146,11 @@ class OnLoopback:
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
         """Cut a direction of a link; returns when that was."""
-        return self._play.links[frozenset((source, target))].cut(source, at_ns=at_ns)
+        return self._play.cut(source, target, at_ns)
 
     def heal(self, source: str, target: str) -> None:
         """End that."""
-        self._play.links[frozenset((source, target))].heal(source)
+        self._play.heal(source, target)
 
     def stress(self, node: str, threads: int) -> bool:
         """Do nothing: all nodes share the CPUs."""

@@ -125,7 +125,7 @@ def main() -> None:
     from dwell.live.security import INSECURE
     from dwell.live.transport.zenoh import ZenohTransport
     from dwell.live.wiring import wire
-    from dwell.testbed.losses import without_source
+    from dwell.testbed.linked_transport import without_source
 
     parent = Parent()
     try:

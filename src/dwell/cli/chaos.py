@@ -1,4 +1,4 @@
-"""`dwell live chaos`: faults befall a cell, and somebody watches whether it keeps its promises."""
+"""`dwell testbed chaos`: faults befall a cell, and somebody watches what it promises."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run_chaos(
         staging(cell, folder, seed),
         folder,
         seed,
-        f"dwell live chaos{what} --seed {seed}",
+        f"dwell testbed chaos{what} --seed {seed}",
         lambda line: typer.echo(line, err=True),
     )
     until_s = None if minutes is None else time.monotonic() + 60 * minutes

@@ -16,7 +16,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
-from dwell.cli.options import CellOption, Insecure, Json, Keys, Policy, Seed
+from dwell.cli.options import (
+    CellArgument,
+    CellOption,
+    Estimator,
+    Insecure,
+    Json,
+    Keys,
+    Policy,
+    Seed,
+)
 from dwell.cli.output import json_text, print_json
 
 if TYPE_CHECKING:
@@ -38,6 +47,8 @@ Owner = Annotated[
     int | None,
     typer.Option(metavar="PID", hidden=True, help="Process that this one ends with."),
 ]
+
+Former = Annotated[list[str] | None, typer.Argument(hidden=True)]
 
 live = typer.Typer(
     no_args_is_help=True, help="Look at live cells, and have a hand in what their controller does."
@@ -265,56 +276,55 @@ def undrain(
 
 
 @live.command()
-def demo(
-    out: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Where logs, the run and its report go.")
-    ] = Path("live-demo-out"),
+def run(
+    cell: CellArgument,
     scenario: Annotated[
-        str, typer.Option(metavar="NAME", help="What is played: demo, or baseline.")
-    ] = "demo",
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="One of the cell's scenarios; its first that disturbs something if not given.",
+        ),
+    ] = None,
     seconds: Annotated[
-        float, typer.Option(min=5, metavar="S", help="Length, the warm-up included.")
-    ] = 116,
+        float | None,
+        typer.Option(
+            min=5, metavar="S", help="Length, the warm-up included; as the scenario asks for."
+        ),
+    ] = None,
     policy: Policy = None,
+    estimator: Estimator = None,
     seed: Seed = 1,
-    as_json: Json = False,
-) -> None:
-    """Run a real visual-servoing cell on this machine for two minutes, and report on it."""
-    from dwell.cli.live_demo import play
-
-    play(out, scenario, seconds, policy, seed, as_json=as_json)
-
-
-@live.command()
-def chaos(
-    cell: Annotated[
-        Path | None,
-        typer.Argument(metavar="[CELL]", help="Cell file; a light cell if not given."),
-    ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
-    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
-    seed: Seed = 1,
-    only: Annotated[
-        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
-    ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
+        typer.Option(
+            metavar="FOLDER",
+            help="Where logs, the run and its report go; live-out/CELL if not given.",
+        ),
     ] = None,
-    hosts: Annotated[
-        bool,
-        typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
-    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
+    """Run a cell on this machine, without root: its stages, links and disturbances; and report."""
+    from dwell.cli.live_run import LiveRunRequest, run_live
 
-    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
-    after the other, by a seed, for two minutes if nothing else is said.
-    """
-    from dwell.cli.chaos import run_chaos
+    request = LiveRunRequest(cell, scenario, seconds, policy, estimator, seed, out)
+    run_live(request, as_json=as_json)
 
-    run_chaos(cell, minutes, faults, seed, only, out, hosts=hosts, as_json=as_json)
+
+@live.command("demo", hidden=True, context_settings={"ignore_unknown_options": True})
+def former_demo(words: Former = None) -> None:
+    """Say what has taken its place."""
+    _moved("live demo", "live run examples/visual_servoing/cell.yaml")
+
+
+@live.command("chaos", hidden=True, context_settings={"ignore_unknown_options": True})
+def former_chaos(words: Former = None) -> None:
+    """Say what has taken its place."""
+    _moved("live chaos", "testbed chaos")
+
+
+def _moved(before: str, now: str) -> NoReturn:
+    typer.echo(f"error: `dwell {before}` is `dwell {now}` now", err=True)
+    raise typer.Exit(2)
 
 
 def _ask(

@@ -46,17 +46,21 @@ class Look:
         The controller's last answer; empty before the first.
     answered_s : float
         When that was.
-    error_mm, error_px : float
-        Tracking error of the last second; NaN where unknown.
+    observed : mapping of str to float
+        What the cell's observer sees, by names with units; ``error_mm`` is drawn.
     active : sequence of Disturbed
     """
 
     at_s: float
     status: Mapping[str, Any]
     answered_s: float
-    error_mm: float
-    error_px: float
+    observed: Mapping[str, float]
     active: Sequence[Disturbed]
+
+    @property
+    def error_mm(self) -> float:
+        """Tracking error of the last second; NaN where unknown."""
+        return self.observed.get("error_mm", math.nan)
 
     @property
     def window(self) -> Mapping[str, Any]:
@@ -126,7 +130,7 @@ class Lines:
             f"{look.at_s:6.1f} s  {status.get('placement') or '-'}{by_guard}"
             f"  L95 {_number(window.get('l95_ms'), 'ms')}"
             f"  V_D {_number(_hundred(window.get('violation_rate')), '%')}"
-            f"  error {_number(look.error_mm, 'mm')}"
+            f"{_error(look)}"
             f"{'  the controller is silent' if silent else ''}"
             f"  {'; '.join(active) or 'nothing disturbs it'}"
             f"{f'  {headline}' if headline else ''}",
@@ -263,6 +267,8 @@ class Screen:
             ("V_D", _number(_hundred(window.get("violation_rate")), "%"), MOST_RATE, 0.05),
             ("error", _number(look.error_mm, "mm"), MOST_MM, math.inf),
         ):
+            if name == "error" and self.problem.live.observer is None:
+                continue
             strip = _sparkline(course.values.get(name, []), most, limit)
             strip.append(" " * (course.columns - len(strip)))
             yield self._line(name, strip, value)
@@ -392,6 +398,10 @@ def _sparkline(values: Sequence[float], most: float, limit: float) -> Text:
         step = min(max(int(value / most * len(BLOCKS)), 0), len(BLOCKS) - 1)
         text.append(BLOCKS[step], style=MISSED if value > limit else "default")
     return text
+
+
+def _error(look: Look) -> str:
+    return "" if math.isnan(look.error_mm) else f"  error {_number(look.error_mm, 'mm')}"
 
 
 def _float(value: object) -> float:

@@ -265,3 +265,35 @@ def calibrate(
 
 def _say(line: str) -> None:
     typer.echo(line, err=True)
+
+
+@testbed.command()
+def chaos(
+    cell: Annotated[
+        Path | None,
+        typer.Argument(metavar="[CELL]", help="Cell file; a light cell if not given."),
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
+    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
+    seed: Seed = 1,
+    only: Annotated[
+        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
+    ] = None,
+    hosts: Annotated[
+        bool,
+        typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
+
+    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
+    after the other, by a seed, for two minutes if nothing else is said.
+    """
+    from dwell.cli.chaos import run_chaos
+
+    run_chaos(cell, minutes, faults, seed, only, out, hosts=hosts, as_json=as_json)

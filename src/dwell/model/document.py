@@ -332,7 +332,7 @@ def fingerprint(problem: Problem) -> str:
     """
     document = to_document(problem)
     live = {**document.get("live", {})}
-    for key in ("hosts", "actuators", "mode"):
+    for key in ("hosts", "actuators", "mode", "observer"):
         live.pop(key, None)
     document["live"] = live
     for task in document["tasks"].values():

@@ -79,6 +79,9 @@ class LiveSettings:
         Cycles between two copies of a task's state to its fallback; 0 for none.
     actuators : mapping of str to str
         ``module:Name`` of what applies the commands of each sink task.
+    observer : str, optional
+        ``module:Name`` of what looks on, where `dwell live run` runs the cell: at the error of what
+        it controls, say.
     """
 
     hosts: Mapping[str, Host] = field(default_factory=FrozenDict)
@@ -90,6 +93,7 @@ class LiveSettings:
     silence: str = "hold"
     checkpoint_cycles: int = 25
     actuators: Mapping[str, str] = field(default_factory=FrozenDict)
+    observer: str | None = None
 
     def __post_init__(self) -> None:
         words = (("release", RELEASES), ("clock", CLOCKS), ("mode", MODES), ("silence", SILENCES))
@@ -101,6 +105,8 @@ class LiveSettings:
         CHECKPOINT_CYCLES.check("live.checkpoint_cycles", self.checkpoint_cycles)
         for task, name in self.actuators.items():
             require_callable_name(f"live.actuators.{task}", name)
+        if self.observer is not None:
+            require_callable_name("live.observer", self.observer)
         object.__setattr__(self, "hosts", FrozenDict(self.hosts))
         object.__setattr__(self, "actuators", FrozenDict(self.actuators))
 

@@ -10,7 +10,7 @@ What differs from a real link:
 * A bare acknowledgement of TCP is delayed like a message, and overtakes them.
 * It never loses a packet while it is up. Where a loss means that a message is sent again, its burst
   is held back by whole timeouts. Where it means that the message is gone, the transport of the
-  sender leaves it out (`dwell.testbed.losses`), because TCP would send it again.
+  sender leaves it out (`dwell.testbed.linked_transport`), because TCP would send it again.
 * While it is down packets vanish, and TCP sends them again after it is up: after 0.2 s at the
   soonest, and twice as long after every further attempt.
 """

@@ -29,10 +29,10 @@ from dwell.testbed.groups import PROBES, Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
 from dwell.testbed.link import TunLink
-from dwell.testbed.losses import LossFile
+from dwell.testbed.message_links import LinkFile
 from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected
+from dwell.testbed.processes import Processes, expected, modules_beside
 from dwell.testbed.stress import Stress
 from dwell.testbed.timeline import Change, differing, usual_conditions
 from dwell.testbed.watcher import Watcher
@@ -42,7 +42,7 @@ __all__ = ["NetnsTestbed", "require_playable"]
 FIRST_PORT = 7_450
 #: With a share of a CPU, a node's processes take a while to start.
 START_S = 120.0
-LOSS_FILE = "losses"
+LINK_FILE = "links"
 #: What the cell did until everybody was there.
 STARTING = "starting"
 
@@ -107,14 +107,6 @@ def _with_hosts(problems: Sequence[Problem], address: Callable[[str], str]) -> t
             following[node] = port + PORTS_PER_ROLE * there
         found.append(replace(problem, live=replace(problem.live, hosts=hosts)))
     return tuple(found)
-
-
-def _modules(beside: Path | None) -> dict[str, str]:
-    """Return the variable that makes the modules beside a cell file known to all processes."""
-    if beside is None:
-        return {}
-    paths = [str(beside.resolve()), os.environ.get("PYTHONPATH", "")]
-    return {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
 
 
 class NetnsTestbed:
@@ -226,12 +218,12 @@ class NetnsTestbed:
         self._groups = enter(Groups(self.name, {**self.shares, PROBES: Share()}))
         self.problems = _with_hosts(self.problems, self._hosts.address)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._losses = enter(LossFile(self.folder / LOSS_FILE, nodes, seed=self.seed))
+        self._losses = enter(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed))
         for number, pair in enumerate(pairs):
             self.links[frozenset(pair)] = enter(self._link(pair, number))
         for link in self._usual.values():
             if link.retransmit_ms is None:
-                self._losses.set(link.source, link.target, link.loss)
+                self._losses.set(link.source, link.target, loss=link.loss)
         for node in nodes:
             self._start_stress(node)
         self._stack.callback(self._stop_stress)
@@ -239,7 +231,7 @@ class NetnsTestbed:
             "DWELL_WORLD": str(self.folder / "world"),
             # Its hosts' addresses lead nowhere but to each other.
             INSECURE: "1",
-            **_modules(self._beside),
+            **modules_beside(self._beside),
             **self._environment,
         }
         self._processes = Processes(
@@ -249,7 +241,7 @@ class NetnsTestbed:
             environment=environment,
             more=self._more,
             traces=self._beside,
-            program=program(losses=self._losses.path, clocks=self._clocks),
+            program=program(links=self._losses.path, clocks=self._clocks),
         )
         self._processes.write()
         self._stack.callback(self._processes.stop)
@@ -428,7 +420,7 @@ class NetnsTestbed:
         changes = differing(self._conditions[link.name], now)
         self._conditions[link.name] = now
         if link.retransmit_ms is None and "loss" in changes:
-            self._losses.set(link.source, link.target, changes.pop("loss"))
+            self._losses.set(link.source, link.target, loss=changes.pop("loss"))
         if changes:
             way = self.links[frozenset((link.source, link.target))]
             way.set(link.source, link.target, **changes)

@@ -1,8 +1,8 @@
 """Agents, controllers and their processes with faults around them: a testbed's entry point.
 
-``python -m dwell.testbed.process [--losses FILE] [--clocks FILE] COMMAND ...`` runs the code of
+``python -m dwell.testbed.process [--links FILE] [--clocks FILE] COMMAND ...`` runs the code of
 ``dwell COMMAND ...`` (``agent`` or ``controller``), and that of ``python -m dwell.cli.process``
-where the command is ``process``. Its transport leaves out the messages that a `LossFile` says, and
+where the command is ``process``. Its messages meet the links that a `LinkFile` says, and
 its clock is wrong by what a `ClockFile` says.
 """
 
@@ -18,20 +18,21 @@ from dwell.live.security import Security
 from dwell.live.transport.transport import Transport
 from dwell.model import Problem
 from dwell.testbed.clocks import wrong_clock
-from dwell.testbed.losses import Losses, LossyTransport
+from dwell.testbed.linked_transport import LinkedTransport
+from dwell.testbed.message_links import LinkEnds
 
 __all__ = ["FaultyPlatform", "main", "program"]
 
 
-def program(*, losses: Path | None = None, clocks: Path | None = None) -> tuple[str, ...]:
+def program(*, links: Path | None = None, clocks: Path | None = None) -> tuple[str, ...]:
     """Return the module, and its first arguments, that runs agents and controllers with faults.
 
     Parameters
     ----------
-    losses, clocks : Path, optional
-        As a `LossFile` and a `ClockFile` have written them.
+    links, clocks : Path, optional
+        As a `LinkFile` and a `ClockFile` have written them.
     """
-    given = {"--losses": losses, "--clocks": clocks}
+    given = {"--links": links, "--clocks": clocks}
     words = [word for name, path in given.items() if path is not None for word in (name, str(path))]
     return "dwell.testbed.process", *words
 
@@ -41,13 +42,13 @@ class FaultyPlatform(Platform):
 
     Parameters
     ----------
-    losses, clocks : Path, optional
-        Without, no message is lost, or clocks are right.
+    links, clocks : Path, optional
+        Without, links are what they are, or clocks are right.
     """
 
-    def __init__(self, *, losses: Path | None = None, clocks: Path | None = None) -> None:
-        self.program = (*program(losses=losses, clocks=clocks), "process")
-        self._losses, self._clocks = losses, clocks
+    def __init__(self, *, links: Path | None = None, clocks: Path | None = None) -> None:
+        self.program = (*program(links=links, clocks=clocks), "process")
+        self._links, self._clocks = links, clocks
 
     def clock(self, problem: Problem, node: str) -> Clock:
         """Return what the processes of a node read the time from."""
@@ -56,10 +57,10 @@ class FaultyPlatform(Platform):
 
     def transport(self, security: Security, who: str, node: str) -> Transport:
         """Open the sessions of a process on a node."""
-        if self._losses is None:
+        if self._links is None:
             return super().transport(security, who, node)
-        losses = Losses(self._losses, who, node)
-        return LossyTransport(super().transport(security, who, node), losses)
+        ends = LinkEnds(self._links, who, node)
+        return LinkedTransport(super().transport(security, who, node), ends)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,12 +69,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from dwell.cli.process import main as process
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--losses", type=Path)
+    parser.add_argument("--links", type=Path)
     parser.add_argument("--clocks", type=Path)
     parser.add_argument("command", choices=("agent", "controller", "process"))
     parser.add_argument("words", nargs=argparse.REMAINDER)
     asked = parser.parse_args(arguments)
-    platform = FaultyPlatform(losses=asked.losses, clocks=asked.clocks)
+    platform = FaultyPlatform(links=asked.links, clocks=asked.clocks)
     if asked.command == "process":
         return process(asked.words, platform)
     dwell([asked.command, *asked.words], platform)

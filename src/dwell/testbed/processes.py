@@ -28,7 +28,7 @@ from dwell.model.document import to_document
 from dwell.model.user_classes import is_class_path
 from dwell.testbed.trace_names import move_traces
 
-__all__ = ["Inside", "Processes", "expected", "outright", "without_keys"]
+__all__ = ["Inside", "Processes", "expected", "modules_beside", "outright", "without_keys"]
 
 #: Takes a node and the words of a command; returns those that run it there, in the same process.
 Inside: TypeAlias = Callable[[str, Sequence[str]], Sequence[str]]
@@ -63,6 +63,14 @@ def _module_path(problems: Iterable[Problem]) -> dict[str, str]:
     before = os.environ.get("PYTHONPATH")
     path = [*dict.fromkeys(folders), *([before] if before else [])]
     return {"PYTHONPATH": os.pathsep.join(path)} if folders else {}
+
+
+def modules_beside(beside: Path | None) -> dict[str, str]:
+    """Return the variable that makes the modules beside a cell file known to all processes."""
+    if beside is None:
+        return {}
+    paths = [str(beside.resolve()), os.environ.get("PYTHONPATH", "")]
+    return {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
 
 
 def expected(problem: Problem, node: str) -> list[str]:

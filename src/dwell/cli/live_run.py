@@ -1,0 +1,314 @@
+"""`dwell live run`: a cell on this machine, its scenario, and what came of it."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+
+import dwell
+from dwell.cli.live_view import Look, View, live_view
+from dwell.cli.output import aligned, print_json, working, write_file
+from dwell.errors import LiveError
+from dwell.live.operator_client import OperatorClient
+from dwell.model import Problem, Scenario
+from dwell.record import Run, open_run, seal_run
+from dwell.report import run_html
+from dwell.report.formatting import listed, percent, write_number
+from dwell.report.phase_rows import PhaseRow, phase_rows
+from dwell.report.phases import Disturbed, disturbed
+from dwell.report.run_header import RunHeader
+from dwell.testbed.cell_observer import CellObserver, load_observer
+from dwell.testbed.loopback import Loopback, on_this_machine
+from dwell.testbed.playing import (
+    LOOK_S,
+    Ask,
+    Played,
+    begun,
+    come_up,
+    crowded,
+    interruptible,
+    longest_run,
+    make_folder,
+)
+from dwell.testbed.playing import play as play_changes
+from dwell.testbed.processes import without_keys
+from dwell.testbed.timeline import Change, timeline_of
+
+__all__ = ["LiveRunRequest", "run_live"]
+
+#: A folder with this file is a live run's, and may be replaced by the next.
+MARK = ".dwell-live-run"
+#: What the cell did before everybody was there belongs to the run, up to so many seconds of it.
+MOST_BEFORE_S = 4.0
+#: Of a cell that nothing is played on, and of what a scenario has after its last change.
+USUAL_S, AFTER_S = 60.0, 16.0
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True, slots=True)
+class LiveRunRequest:
+    """What was asked for.
+
+    Parameters
+    ----------
+    cell : Path
+    scenario : str or None
+        Played on it; the cell's first that disturbs something if not given.
+    seconds : float or None
+        Length; until some time after the scenario's last change if not given.
+    policy, estimator : str or None
+        What the cell says if not given.
+    seed : int
+        Of delays and losses.
+    out : Path or None
+        For logs, the run and its report.
+    """
+
+    cell: Path
+    scenario: str | None
+    seconds: float | None
+    policy: str | None
+    estimator: str | None
+    seed: int
+    out: Path | None
+
+
+def run_live(request: LiveRunRequest, *, as_json: bool) -> None:
+    """Run the cell, save the run, write its report, print what happened.
+
+    Interrupted, it ends everything and reports on what there is.
+
+    Raises
+    ------
+    DwellError
+        If the cell has tasks without a stage, does not come up, or the folder holds something else.
+    """
+    problem = dwell.load(request.cell)
+    _require_stages(problem, request.cell)
+    if request.policy is not None or request.estimator is not None:
+        names = (request.policy or problem.controller.policy, request.estimator)
+        problem = problem.under("+".join(name for name in names if name is not None))
+    scenario = request.scenario or _first_that_disturbs(problem)
+    seconds = request.seconds or _length_s(problem.scenario(scenario))
+    timeline = timeline_of(problem, scenario, seed=request.seed, seconds=seconds)
+    out = request.out or Path("live-out", problem.name)
+    make_folder(out, MARK, "a live run's")
+    problem = on_this_machine(problem)
+    beside = request.cell.resolve().parent
+    told = _Told(problem, scenario, request.seed, timeline, beside=beside)
+    interrupted = False
+    cell = Loopback(problem, out.resolve(), _cpus(problem), seed=request.seed, beside=told.beside)
+    with interruptible(), cell:
+        try:
+            _watch_from_start(cell, seconds, told)
+        except KeyboardInterrupt:
+            interrupted = True
+            typer.echo("interrupted; ending the cell", err=True)
+        with working("ending the cell"):
+            cell.stop_controller()
+            cell.close()
+    folder = longest_run(out / "runs")
+    if folder is None and interrupted:
+        raise typer.Exit(INTERRUPTED)
+    if folder is None:
+        raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
+    run = told.note(folder, **told.observed(folder))
+    run = seal_run(folder, warnings=crowded(run, problem))
+    _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
+    if interrupted:
+        raise typer.Exit(INTERRUPTED)
+
+
+def _require_stages(problem: Problem, cell: Path) -> None:
+    """Refuse a cell that says for some task not what it runs."""
+    without = [name for name, task in problem.pipeline.tasks.items() if task.run is None]
+    if without:
+        raise LiveError(
+            f"{cell}: nothing to run for {', '.join(without)}; a live cell needs `run: "
+            "module:Name` for every task (docs/live-tutorial.md)"
+        )
+
+
+def _first_that_disturbs(problem: Problem) -> str:
+    """Return the first of the cell's scenarios in which something is disturbed, or the first."""
+    names = list(problem.scenarios)
+    return next((name for name in names if problem.scenarios[name]), names[0])
+
+
+def _length_s(scenario: Scenario) -> float:
+    """Return how long a scenario is played where nothing is said: until all of it is over."""
+    ends_s = [item.end_s for item in scenario if math.isfinite(item.end_s)]
+    return max(ends_s, default=USUAL_S - AFTER_S) + AFTER_S
+
+
+@dataclass(slots=True)
+class _Told(Played):
+    """What is known of a run here, and not to its controller."""
+
+    beside: Path = Path()
+    observer: CellObserver | None = None
+
+    def planned(self) -> list[Disturbed]:
+        """Return what is to be played, as it is shown."""
+        return disturbed(self.timeline.items, self.problem.fabric)
+
+    def on(self) -> list[Disturbed]:
+        """Return what is on now, as it is shown."""
+        return disturbed(self.active(), self.problem.fabric)
+
+    def observed(self, folder: Path) -> dict[str, Any]:
+        """Return what the cell's observer has to say of the run."""
+        span = begun(open_run(folder))
+        if self.observer is None or span is None:
+            return {}
+        return dict(self.observer.told(span[0]))
+
+    def look(self) -> Mapping[str, float]:
+        """Return what the cell's observer sees now."""
+        return {} if self.observer is None else self.observer.look(time.monotonic_ns())
+
+
+def _cpus(problem: Problem) -> dict[str, int]:
+    """Give the robots one CPU, and the edge another where there is one."""
+    there = sorted(os.sched_getaffinity(0))
+    if len(there) < 2:
+        typer.echo("note: there is one CPU only; robots and edge share it", err=True)
+    return {
+        name: there[0] if node.tier == "robot" else there[-1]
+        for name, node in problem.fabric.nodes.items()
+    }
+
+
+def _watch_from_start(cell: Loopback, seconds: float, told: _Told) -> None:
+    """Wait until everybody is there, and play the scenario."""
+    awaited = [who for node in cell.problem.fabric.nodes for who in cell.expected(node)]
+    with OperatorClient(cell.problem, without_keys()) as visitor:
+
+        def ask(patience_s: float) -> Mapping[str, Any]:
+            return visitor.ask("status", patience_s=patience_s)
+
+        with working("starting the cell"):
+            status = come_up(ask, awaited, cell.folder)
+        now_ns = time.monotonic_ns()
+        origin_ns = status.get("origin_ns") or now_ns
+        begin_ns = max(int(origin_ns), now_ns - round(MOST_BEFORE_S * 1e9))
+        name = cell.problem.live.observer
+        if name is not None:
+            told.observer = load_observer(name, told.beside, cell.folder, begin_ns)
+        try:
+            with live_view(cell.problem, seconds, told.planned()) as view:
+                _watch(ask, cell, begin_ns, seconds, told, view)
+        finally:
+            if told.observer is not None:
+                told.look()
+                told.observer.close()
+
+
+def _watch(
+    ask: Ask,
+    cell: Loopback,
+    begin_ns: int,
+    seconds: float,
+    told: _Told,
+    view: View,
+) -> None:
+    """Play the changes at their times, and show how the cell is."""
+    status: Mapping[str, Any] = {}
+    answered_s = 0.0
+
+    def now_s() -> float:
+        return (time.monotonic_ns() - begin_ns) / 1e9
+
+    def apply(change: Change) -> None:
+        cell.apply(change)
+        told.changed(change)
+
+    def look(at_s: float) -> None:
+        nonlocal status, answered_s
+        try:
+            status = ask(LOOK_S)
+            answered_s = now_s()
+        except LiveError:
+            pass  # the view shows for how long nobody has answered
+        view.show(Look(at_s, status, answered_s, told.look(), told.on()))
+
+    play_changes(told.timeline.changes, seconds, now_s, apply, look)
+
+
+def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:
+    """Write the report, and print what the run was."""
+    cycles, decisions = run.cycles, run.decisions
+    guard = decisions.filter((decisions["reason"].cast(str) == "guard") & decisions["migrated"])
+    missed = cycles["missed"].to_numpy()
+    phases = phase_rows(run, RunHeader.of(run))
+    page = out / "report.html"
+    report: Path | None = page
+    # A run that ended within its warm-up has nothing to report on.
+    if run.windows.filter(~run.windows["warmup"]).is_empty():
+        report = None
+    else:
+        write_file(page, run_html(run))
+    rate = float(missed.mean()) if len(missed) else math.nan
+    lost = int(cycles["latency_ns"].is_null().sum())
+    migrations = int(decisions["migrated"].sum()) - len(guard)
+    if as_json:
+        print_json(
+            {
+                "cell": run.meta["cell"],
+                "scenario": run.meta["scenario"],
+                "seed": run.meta["seed"],
+                "interrupted": interrupted,
+                "cycles": len(cycles),
+                "violation_rate": rate,
+                "lost": lost,
+                "migrations": migrations,
+                "guard_moves": len(guard),
+                "warnings": run.meta["warnings"],
+                "phases": [row._asdict() for row in phases],
+                "run": folder,
+                "report": report,
+            }
+        )
+        return
+    typer.echo(
+        f"{len(cycles)} cycles, {100 * rate:.1f} % missed, {lost} without a command; "
+        f"{migrations} migrations by the controller, {len(guard)} by the guard\n"
+    )
+    if phases:
+        typer.echo(f"{_table(phases)}\n")
+    for warning in run.meta["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(f"run: {folder}")
+    typer.echo(f"report: {report}" if report else "no report: the run ended within its warm-up")
+
+
+def _table(phases: Sequence[PhaseRow]) -> str:
+    head = ("phase", "from", "to", "V_D", "L95", "lost", "moves", "guard", "error", "", "placed")
+    rows = [
+        (
+            row.name,
+            f"{row.begin_s:.0f} s",
+            f"{row.end_s:.0f} s",
+            f"{100 * row.violation_rate:.1f} %",
+            f"{write_number(row.l95_ms)} ms",
+            str(row.lost),
+            str(row.migrations),
+            str(row.guard_moves),
+            _known(row.rms_mm, "mm", 2),
+            _known(row.rms_px, "px", 1),
+            listed(f"{name} {percent(share)}" for name, share in row.shares.items()),
+        )
+        for row in phases
+    ]
+    return aligned(head, rows)
+
+
+def _known(value: float, unit: str, digits: int) -> str:
+    return f"{value:.{digits}f} {unit}" if math.isfinite(value) else "-"

@@ -1,0 +1,215 @@
+"""A cell on this machine, without root: agents, controller, links of messages, busy threads.
+
+Nothing here moves a stage: it plays a scenario of the cell file on the links and CPUs, and what the
+controller makes of it is the controller's.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from dwell.errors import LiveError
+from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.model import Host, Problem
+from dwell.testbed.burner import Burner
+from dwell.testbed.conditions import Conditions
+from dwell.testbed.message_links import LinkFile
+from dwell.testbed.process import program
+from dwell.testbed.processes import Processes, expected, modules_beside
+from dwell.testbed.timeline import Change, differing, usual_conditions
+
+__all__ = ["Loopback", "on_this_machine"]
+
+#: Where ports are looked for; below what the kernel gives out by itself.
+PORTS = range(10_000, 32_000, 500)
+LINK_FILE = "links"
+
+
+def on_this_machine(problem: Problem) -> Problem:
+    """Return the cell with all its nodes on this machine, on ports that are free now.
+
+    Raises
+    ------
+    LiveError
+        If there are not enough ports.
+    """
+    nodes = list(problem.fabric.nodes)
+    counts = [PORTS_PER_ROLE * sum(role.node == node for role in roles(problem)) for node in nodes]
+    for base in PORTS:
+        if all(_free(port) for port in range(base, base + sum(counts))):
+            begins = [base + sum(counts[:place]) for place in range(len(nodes))]
+            hosts = {
+                node: Host("127.0.0.1", begin) for node, begin in zip(nodes, begins, strict=True)
+            }
+            return replace(problem, live=replace(problem.live, hosts=hosts))
+    raise LiveError(f"no {sum(counts)} free ports in a row on this machine")
+
+
+def _free(port: int) -> bool:
+    with socket.socket() as one:
+        try:
+            one.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+class Loopback:
+    """A cell on this machine: agents, controller, links, burners; a context manager.
+
+    Parameters
+    ----------
+    problem : Problem
+        From `on_this_machine`.
+    folder : Path
+        For the cell file, states, logs and runs.
+    cpus : mapping of str to int
+        Of each node, and of its burners; a node that is not there uses any, and has none.
+    seed : int
+        Of delays and losses.
+    environment : mapping of str to str, optional
+        Variables that all processes get as well.
+    beside : Path, optional
+        Folder of the cell file: of its traces, and of the modules of its stages.
+    clocks : Path, optional
+        What is wrong with the nodes' clocks, of a `ClockFile`.
+    more : sequence of str
+        Further arguments of the controller.
+
+    Attributes
+    ----------
+    world : Path
+        Where the world is that its camera and arm share (see `World`).
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        folder: Path,
+        cpus: Mapping[str, int],
+        *,
+        seed: int = 0,
+        environment: Mapping[str, str] | None = None,
+        beside: Path | None = None,
+        clocks: Path | None = None,
+        more: Sequence[str] = (),
+    ) -> None:
+        self.problem, self.folder, self.cpus, self.seed = problem, folder, cpus, seed
+        self.world = folder / "world"
+        self.burners: dict[str, Burner] = {}
+        self._links: LinkFile | None = None
+        self._processes = Processes(
+            [problem],
+            folder,
+            environment={
+                "DWELL_WORLD": str(self.world),
+                **modules_beside(beside),
+                **(environment or {}),
+            },
+            cpus=cpus,
+            more=more,
+            traces=beside,
+            program=program(links=folder / LINK_FILE, clocks=clocks),
+        )
+        links = problem.fabric.links.items()
+        self._conditions = {name: usual_conditions(link) for name, link in links}
+        self._threads: dict[str, int] = {}
+        self._stack = ExitStack()
+
+    @property
+    def links(self) -> LinkFile:
+        """What the links are like, while the cell is there."""
+        if self._links is None:
+            raise LiveError("the cell has not been started")
+        return self._links
+
+    @property
+    def processes(self) -> dict[str, subprocess.Popen[bytes]]:
+        """Agents and controller, by name."""
+        return self._processes.running
+
+    def __enter__(self) -> Loopback:
+        """Start everything."""
+        try:
+            self._processes.write()
+            self._start_links()
+            for cpu in sorted(set(self.cpus.values())):
+                burner = Burner([cpu])
+                burner.start()
+                self._stack.callback(burner.stop)
+                for node in (node for node, its in self.cpus.items() if its == cpu):
+                    self.burners[node] = burner
+            for node in self.problem.fabric.nodes:
+                self.start_agent(node)
+            self.start_controller()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End everything."""
+        self.close()
+
+    def _start_links(self) -> None:
+        fabric = self.problem.fabric
+        links = tuple(fabric.links.values())
+        file = LinkFile(self.folder / LINK_FILE, tuple(fabric.nodes), links, seed=self.seed)
+        self._links = self._stack.enter_context(file)
+        for link in links:
+            usual = self._conditions[link.name]
+            changes = {name: getattr(usual, name) for name in usual.__slots__}
+            file.set(link.source, link.target, **changes)
+
+    def expected(self, node: str) -> list[str]:
+        """Return the processes of a node that its agent starts, and the agent."""
+        return expected(self.problem, node)
+
+    def start_agent(self, node: str) -> None:
+        """Start a node's agent, or start it again."""
+        self._processes.start_agent(node)
+
+    def start_controller(self) -> None:
+        """Start the controller, or start it again."""
+        self._processes.start_controllers()
+
+    def apply(self, change: Change) -> None:
+        """Have a link, or a node's CPU, be as a change says."""
+        place, state = change.place, change.state
+        if not isinstance(state, Conditions):
+            self._threads[place] = state.threads
+            burner = self.burners[place]
+            nodes = [node for node, its in self.burners.items() if its is burner]
+            burner.set(sum(self._threads.get(node, 0) for node in nodes))
+            return
+        link = self.problem.fabric.links[place]
+        changes = differing(self._conditions[place], state)
+        self._conditions[place] = state
+        if changes:
+            self.links.set(link.source, link.target, **changes)
+
+    def cut(self, source: str, target: str, at_ns: int) -> int:
+        """Lose what begins its way along a direction from an instant on; returns when that was."""
+        time.sleep(max(at_ns - time.monotonic_ns(), 0) / 1e9)
+        self.links.set(source, target, cut="drop")
+        return time.monotonic_ns()
+
+    def heal(self, source: str, target: str) -> None:
+        """End a cut of a direction."""
+        self.links.set(source, target, cut=None)
+
+    def stop_controller(self) -> None:
+        """End the controller and wait until it has written its run."""
+        self._processes.stop_controllers()
+
+    def close(self) -> None:
+        """End every process, links and burners last."""
+        self._processes.stop()
+        self._stack.close()
+        self._links = None

@@ -1,0 +1,335 @@
+"""Links of messages, emulated in the transports of the processes at their ends.
+
+All processes of a testbed without root share one `LinkFile`: for every direction, what it is like
+now (`Conditions`), and its backlog. A message meets a link as in the simulator: it begins its
+transmission at max(now, end of the one before it), whichever process sent that, takes its bytes at
+the rate, and then a delay that is drawn for it. Delays and losses are drawn by streams of each
+process's own.
+
+What differs from the simulator: messages of one sender under one key keep their order (a transport
+promises it); on a link that retransmits, a lost message is sent again after the time-out without
+taking its share of the rate again; and one that would leave more than `LONGEST_WAIT_S` from now is
+lost.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import math
+import mmap
+import os
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from dwell.errors import LiveError, ProblemError
+from dwell.files import write_whole
+from dwell.model import Link
+from dwell.testbed.conditions import Conditions, changed, to_json
+from dwell.testbed.draws import Draws
+
+__all__ = ["LinkEnds", "LinkFile", "Way", "transmission_ns"]
+
+_MAGIC = b"dwelllnk"
+# Magic, seed, bytes of the names that follow the directions.
+_HEAD = struct.Struct("<8sQQ")
+# Of a direction: how often its conditions have changed, when it is free, its last arrival.
+_CHANGES, _FREE_NS, _LAST_NS = range(3)
+_WAY = struct.Struct("<3q")
+#: What waits longer for its turn is lost.
+LONGEST_WAIT_S = 10.0
+#: Attempts at a message on a link that retransmits.
+MOST_ATTEMPTS = 20
+
+
+def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
+    """Return how long bytes take at a rate; nothing at an infinite one."""
+    return round(size_bytes * 8e3 / rate_mbps) if math.isfinite(rate_mbps) else 0
+
+
+class LinkFile:
+    """What the links of a testbed are like: the side that says so.
+
+    Parameters
+    ----------
+    path : Path
+        Made anew; beside it, a file for the conditions of every direction.
+    nodes : sequence of str
+    links : sequence of Link
+        Directions that are not among them have no delay, loss or limit.
+    seed : int
+        Of delays and losses, in [0, 2**63).
+
+    Raises
+    ------
+    LiveError
+        If it cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, nodes: Sequence[str], links: Sequence[Link] = (), *, seed: int = 0
+    ) -> None:
+        self.path, self.nodes = path, tuple(nodes)
+        self._kinds = {(link.source, link.target): link for link in links}
+        self._conditions: dict[tuple[str, str], Conditions] = {}
+        names = json.dumps(self.nodes).encode()
+        content = bytearray(_HEAD.size + _WAY.size * len(self.nodes) ** 2)
+        _HEAD.pack_into(content, 0, _MAGIC, seed, len(names))
+        try:
+            write_whole(path, bytes(content + names), durable=False)
+        except OSError as error:
+            raise LiveError(f"{path}: cannot be written ({error.strerror})") from None
+        with path.open("r+b") as file:
+            self._map = mmap.mmap(file.fileno(), len(content))
+        for source in self.nodes:
+            for target in self.nodes:
+                if source != target:
+                    self._conditions[source, target] = Conditions()
+                    self.set(source, target)
+
+    def set(self, source: str, target: str, **changes: object) -> None:
+        """Change some conditions of a direction for messages that begin their way from now on.
+
+        Parameters
+        ----------
+        source, target : str
+        **changes
+            Fields of `Conditions`.
+
+        Raises
+        ------
+        LiveError
+            If there is no such direction or field, or a value is out of its bounds.
+        """
+        way = source, target
+        if way not in self._conditions:
+            raise LiveError(f"{self.path}: no link {source}->{target}")
+        try:
+            self._conditions[way] = changed(self._conditions[way], to_json(changes))
+        except ProblemError as error:
+            raise LiveError(f"link {source}->{target}: {error}") from None
+        fields = {name: getattr(self._conditions[way], name) for name in Conditions.__slots__}
+        kind = self._kinds.get(way)
+        told = {
+            "conditions": to_json(fields),
+            "retransmit_ms": None if kind is None else kind.retransmit_ms,
+            "in_order": kind is not None and kind.in_order,
+        }
+        place = _place(self.nodes, source, target)
+        # Whoever sees the number reads the file, or a newer one.
+        write_whole(_file_of(self.path, place), json.dumps(told), durable=False)
+        (count,) = struct.unpack_from("<q", self._map, place)
+        struct.pack_into("<q", self._map, place, count + 1)
+
+    def conditions(self, source: str, target: str) -> Conditions:
+        """Return what a direction is like now."""
+        return self._conditions[source, target]
+
+    def close(self) -> None:
+        """Write no more; the files stay."""
+        self._map.close()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Write no more."""
+        self.close()
+
+
+def _place(nodes: Sequence[str], source: str, target: str) -> int:
+    """Return where a direction begins in the file."""
+    index = nodes.index(source) * len(nodes) + nodes.index(target)
+    return _HEAD.size + _WAY.size * index
+
+
+def _file_of(path: Path, place: int) -> Path:
+    return path.with_name(f"{path.name}.{place}")
+
+
+@dataclass(frozen=True, slots=True)
+class Passing:
+    """What became of a message that was to begin its way.
+
+    Parameters
+    ----------
+    arrival_ns : int
+        When it is there; -1 where it is not.
+    held : bool
+        Whether it has to wait: the direction is cut, and holds what it is sent.
+    """
+
+    arrival_ns: int
+    held: bool = False
+
+
+LOST, HELD = Passing(-1), Passing(-1, held=True)
+
+
+class Way:
+    """One direction of a link, as one process meets it.
+
+    Parameters
+    ----------
+    path : Path
+        Of the `LinkFile`.
+    place : int
+        Of the direction in it.
+    memory : mmap
+        That file.
+    seed : (int, int)
+        Of this process's draws.
+    """
+
+    def __init__(self, path: Path, place: int, memory: mmap.mmap, seed: tuple[int, int]) -> None:
+        self._path, self._place, self._memory = path, place, memory
+        self._draws = Draws(seed)
+        self._retransmit_ms: float | None = None
+        self._in_order = False
+        self._seen = 0
+        # Locks of files do not keep a process's own threads apart.
+        self._lock = threading.Lock()
+        self._file = os.open(path, os.O_RDWR)
+
+    def begin(self, size_bytes: int, now_ns: int) -> Passing:
+        """Let a message begin its way.
+
+        Parameters
+        ----------
+        size_bytes : int
+        now_ns : int
+            Of the clock that all processes on this computer share.
+        """
+        with self._lock:
+            self._refresh()
+            cut = self._draws.conditions.cut
+            if cut is not None:
+                return HELD if cut == "hold" or self._retransmit_ms is not None else LOST
+            sent_ns = self._transmitted(size_bytes, now_ns)
+            if sent_ns - now_ns > LONGEST_WAIT_S * 1e9:
+                return LOST
+            for _ in range(MOST_ATTEMPTS):
+                if not self._draws.lose():
+                    return Passing(self._arrived(sent_ns + self._draws.delay_ns()))
+                if self._retransmit_ms is None:
+                    return LOST
+                took_ns = transmission_ns(size_bytes, self._draws.conditions.rate_mbps)
+                sent_ns += round(self._retransmit_ms * 1e6) + took_ns
+            return LOST
+
+    def _refresh(self) -> None:
+        """Read the conditions where they have changed."""
+        (count,) = struct.unpack_from("<q", self._memory, self._place)
+        if count == self._seen:
+            return
+        told = json.loads(_file_of(self._path, self._place).read_text(encoding="utf-8"))
+        # A delay that stays goes on where it is.
+        known = to_json(
+            {name: getattr(self._draws.conditions, name) for name in Conditions.__slots__}
+        )
+        changes = {
+            name: value for name, value in told["conditions"].items() if known[name] != value
+        }
+        self._draws.apply(changes)
+        self._retransmit_ms, self._in_order = told["retransmit_ms"], told["in_order"]
+        self._seen = count
+
+    def _transmitted(self, size_bytes: int, now_ns: int) -> int:
+        """Take the direction for the message; returns when its transmission has ended."""
+        rate_mbps = self._draws.conditions.rate_mbps
+        if not math.isfinite(rate_mbps):
+            return now_ns
+        took_ns = transmission_ns(size_bytes, rate_mbps)
+        return self._later(_FREE_NS, now_ns, took_ns, round(LONGEST_WAIT_S * 1e9))
+
+    def _arrived(self, arrival_ns: int) -> int:
+        """Return when the message arrives: not before the one before it, where order is kept."""
+        return self._later(_LAST_NS, arrival_ns, 0) if self._in_order else arrival_ns
+
+    def _later(self, field: int, at_ns: int, more_ns: int, most_ns: int | None = None) -> int:
+        """Set an instant that all processes share to max(it, at) + more, and return it."""
+        place = self._place + 8 * field
+        fcntl.lockf(self._file, fcntl.LOCK_EX, 8, place)
+        try:
+            (known_ns,) = struct.unpack_from("<q", self._memory, place)
+            found = max(known_ns, at_ns) + more_ns
+            # What is lost for waiting too long takes no time of those behind it.
+            if most_ns is None or found - at_ns <= most_ns:
+                struct.pack_into("<q", self._memory, place, found)
+            return int(found)
+        finally:
+            fcntl.lockf(self._file, fcntl.LOCK_UN, 8, place)
+
+    def close(self) -> None:
+        """Let no more begin."""
+        os.close(self._file)
+
+
+class LinkEnds:
+    """The directions that begin or end at the node of a process.
+
+    Parameters
+    ----------
+    path : Path
+        As `LinkFile` has written it.
+    who, node : str
+        Process, and its node. One that is started again draws from the beginning.
+
+    Raises
+    ------
+    LiveError
+        If there is no such file, it is another kind of file, or has no such node.
+    """
+
+    def __init__(self, path: Path, who: str, node: str) -> None:
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise LiveError(f"{path}: cannot be read ({error.strerror})") from None
+        seed, names = _head(path, content)
+        if node not in names:
+            raise LiveError(f"{path}: no node {node}; it has {', '.join(names)}")
+        self.node = node
+        with path.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), len(content))
+
+        def way(source: str, target: str) -> Way:
+            words = f"{who}/{source}/{target}".encode()
+            stream = int.from_bytes(hashlib.sha256(words).digest()[:8], "little")
+            return Way(path, _place(names, source, target), self._memory, (seed, stream))
+
+        others = [name for name in names if name != node]
+        #: Those that begin here, by target, and that end here, by source.
+        self.to: Mapping[str, Way] = {name: way(node, name) for name in others}
+        self.since: Mapping[str, Way] = {name: way(name, node) for name in others}
+
+    def close(self) -> None:
+        """Let nothing more begin its way."""
+        for way in (*self.to.values(), *self.since.values()):
+            way.close()
+
+
+def _head(path: Path, content: bytes) -> tuple[int, tuple[str, ...]]:
+    """Return seed and nodes of a file.
+
+    Raises
+    ------
+    LiveError
+        If it is no `LinkFile`.
+    """
+    try:
+        magic, seed, length = _HEAD.unpack_from(content)
+        names = json.loads(content[len(content) - length :])
+        good = magic == _MAGIC and all(isinstance(name, str) for name in names)
+        good = good and len(content) == _HEAD.size + _WAY.size * len(names) ** 2 + length
+    except (struct.error, ValueError, TypeError):
+        good = False
+    if not good:
+        raise LiveError(f"{path}: is no file of links")
+    return seed, tuple(names)

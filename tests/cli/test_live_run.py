@@ -1,0 +1,346 @@
+"""`dwell live run`: what it shows meanwhile, what it writes into its run, how it ends."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import psutil
+import pytest
+import yaml
+from rich.console import Console
+from typer.testing import CliRunner
+
+import dwell
+from dwell.cli.commands import app
+from dwell.cli.live_run import MARK, _Told
+from dwell.cli.live_view import Lines, Look, Screen
+from dwell.errors import LiveError
+from dwell.live.trust import KEYS
+from dwell.model import Problem
+from dwell.report.phases import Disturbed, disturbed
+from dwell.testbed.playing import crowded, make_folder
+from dwell.testbed.timeline import timeline_of
+from tests.report.live_runs import PERIOD_NS, live_run
+
+CELL = Path(__file__).parents[2] / "examples" / "visual_servoing" / "cell.yaml"
+SECONDS = 116.0
+#: Far more than any of it takes, on a machine that has a lot else to do.
+PATIENCE_S = 60.0
+LIVE_RUN = (sys.executable, "-m", "dwell", "live", "run")
+TWO_CPUS = pytest.mark.skipif(
+    len(os.sched_getaffinity(0)) < 2, reason="robots and edge need a CPU each"
+)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return dwell.load(CELL)
+
+
+@pytest.fixture
+def plan(problem: Problem) -> list[Disturbed]:
+    return disturbed(problem.scenario("demo"), problem.fabric)
+
+
+def status(window: int, **more: Any) -> dict[str, Any]:
+    return {
+        "placement": "LOC",
+        "fallback": False,
+        "migrations": 3,
+        "guard_moves": 0,
+        "window": {
+            "number": window,
+            "l95_ms": 31.25,
+            "violation_rate": 0.025,
+            "estimates": {"LOC": 1.0, "SO": 1.25, "HYB": None},
+            "utilisation": {"R1": 0.6, "E": 0.3, "R2": 1.02},
+            "reason": "hold",
+        },
+        **more,
+    }
+
+
+class Terminal:
+    """A screen drawn on paper of a given size."""
+
+    def __init__(self, problem: Problem, plan: list[Disturbed], columns: int) -> None:
+        self.console = Console(
+            file=io.StringIO(), width=columns, force_terminal=True, color_system=None
+        )
+        self.screen = Screen(problem, SECONDS, plan, self.console, lambda _: None)
+
+    def lines(self) -> list[str]:
+        with self.console.capture() as capture:
+            self.console.print(self.screen.drawn())
+        return capture.get().splitlines()
+
+
+def look(at_s: float, told: dict[str, Any], active: list[Disturbed], **more: float) -> Look:
+    answered_s = more.get("answered_s", at_s)
+    return Look(at_s, told, answered_s, {"error_mm": 3.25, "error_px": 5.5}, active)
+
+
+@pytest.mark.parametrize(("columns", "width"), [(80, 80), (100, 100), (180, 100)])
+def test_it_fits_a_terminal_at_every_moment(
+    columns: int, width: int, problem: Problem, plan: list[Disturbed]
+) -> None:
+    terminal = Terminal(problem, plan, columns)
+    heights = set()
+    for second in range(0, 117, 3):
+        active = [one for one in plan if one.begin_s <= second < one.end_s]
+        placement = ("LOC", "SO", "HYB")[second % 3]
+        moved = status(second, placement=placement, fallback=second % 2 == 0)
+        terminal.screen.show(look(second, moved, active))
+        lines = terminal.lines()
+        assert {len(line) for line in lines} == {width}
+        heights.add(len(lines))
+    # It never jumps, and leaves room for a prompt.
+    assert len(heights) == 1
+    assert max(heights) < 23
+
+
+def test_it_shows_what_is_known_of_the_cell(problem: Problem, plan: list[Disturbed]) -> None:
+    terminal = Terminal(problem, plan, 80)
+    terminal.screen.show(look(10, {}, []))
+    assert "nothing disturbs it" in "\n".join(terminal.lines())
+    terminal.screen.show(look(20, status(4), plan[:1]))
+    terminal.screen.show(look(21, status(5, placement="SO", guard_moves=1, fallback=True), []))
+    text = "\n".join(terminal.lines())
+    for part in ("31.2 ms", "2.5 %", "3.2 mm", "3 migrations, 1 by the guard", "R1 ", " 60 %"):
+        assert part in text, part
+    assert "at 21 s by the guard: LOC → SO" in text
+    assert "perception E" in text
+    assert "▒" in text
+    terminal.screen.show(look(30, status(5), [], answered_s=21))
+    assert "no answer from the controller for 9 s" in "\n".join(terminal.lines())
+
+
+def test_logs_get_a_line_whenever_something_has_changed(
+    plan: list[Disturbed], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = Lines()
+    for second in range(10):
+        active = plan[:1] if second >= 5 else []
+        lines.show(look(second, status(second, placement="LOC" if second < 7 else "SO"), active))
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split()[0] for line in told] == ["0.0", "5.0", "7.0"]
+    assert "robot stress (R1: 2 busy threads)" in told[1]
+
+
+def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path) -> None:
+    folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
+    timeline = timeline_of(problem, "demo", seed=5, seconds=100)
+    told = _Told(problem, "demo", 5, timeline)
+    told.changed(timeline.changes[0], 20 * PERIOD_NS)
+    run = told.note(folder, **told.observed(folder))
+    assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
+    # Interrupted: it was on until the end.
+    (played,) = run.meta["played"]
+    assert played["node"] == "R1"
+    assert played["at_s"] == pytest.approx(10 * PERIOD_NS / 1e9, abs=1e-3)
+    assert played["for_s"] == pytest.approx(51 * PERIOD_NS / 1e9, abs=1e-3)
+    assert "tracking" not in run.meta
+
+
+@pytest.mark.parametrize("full", [("R1",), ("R1", "R2"), ()])
+def test_a_machine_that_was_full_while_nothing_disturbed_it_is_warned_of(
+    problem: Problem, full: tuple[str, ...]
+) -> None:
+    run = live_run(played=[{"node": "E", "at_s": 0.5, "for_s": 0.4}])
+    # E is full only while it is stressed: in the windows that begin at 0.33 and 0.73 s.
+    used = {
+        "u_R1": [1.0 if "R1" in full else 0.9] * 6,
+        "u_E": [0.3, 0.99, 0.99, 0.3, 0.3, 0.3],
+        "u_R2": [1.0 if "R2" in full else 0.9] * 6,
+    }
+    windows = run.windows.with_columns(**{name: pl.Series(of) for name, of in used.items()})
+    small = replace(problem, window_cycles=10)
+    tables = {"cycles": run.cycles, "windows": windows, "decisions": run.decisions}
+    warnings = crowded(dwell.Run(run.meta, tables), small)
+    assert [warning.partition(" ")[0] for warning in warnings] == list(full)
+
+
+def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:
+    timeline = timeline_of(problem, "demo", seed=1, seconds=1_000)
+    told = _Told(problem, "demo", 1, timeline)
+    seen = []
+    for change in timeline.changes:
+        told.changed(change)
+        seen.append(tuple(one.kind for one in told.on()))
+    assert list(dict.fromkeys(seen)) == [
+        ("robot stress",), (), ("network impairment",), ("edge stress",),
+    ]  # fmt: skip
+    assert told.on() == []
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(LiveError, match="is not a live run's"):
+        make_folder(tmp_path, MARK, "a live run's")
+    make_folder(tmp_path / "out", MARK, "a live run's")
+    (tmp_path / "out" / "runs").mkdir()
+    make_folder(tmp_path / "out", MARK, "a live run's")
+    assert not (tmp_path / "out" / "runs").exists()
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A cell that has begun to be played on."""
+    one = subprocess.Popen(
+        [*LIVE_RUN, str(CELL), "--out", str(tmp_path / "out"), "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # It makes a cell of its own: keys of another one are not for it.
+        env={**os.environ, KEYS: str(tmp_path / "of another cell")},
+    )
+    assert one.stderr is not None
+    try:
+        assert "nothing disturbs it" in one.stderr.readline()
+        yield one
+    finally:
+        one.kill()
+        one.communicate()
+
+
+def shared_by(processes: list[psutil.Process]) -> set[str]:
+    """Files of Zenoh's in shared memory that processes have mapped."""
+    found: set[str] = set()
+    for process in processes:
+        maps = Path(f"/proc/{process.pid}/maps").read_text()
+        found.update(line.split()[-1] for line in maps.splitlines() if line.endswith(".zenoh"))
+    return found
+
+
+@TWO_CPUS
+def test_interrupted_it_seals_its_run_and_ends_everything(
+    demo: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    of_it = psutil.Process(demo.pid).children(recursive=True)
+    assert len(of_it) > 15
+    demo.send_signal(signal.SIGINT)
+    told, said = demo.communicate(timeout=PATIENCE_S)
+    assert demo.returncode == 130
+    assert "Traceback" not in said
+    found = json.loads(told)
+    assert found["interrupted"]
+    run = dwell.open_run(found["run"])
+    assert run.meta["recovered"]["sealed"]
+    assert run.meta["scenario"] == "demo"
+    # Nothing had been played, and no window may have closed.
+    assert run.meta.get("played", []) == []
+    # Everything had ended before it told so.
+    assert not [process for process in of_it if process.is_running()]
+
+
+@TWO_CPUS
+def test_killed_it_leaves_no_process_port_or_shared_memory(demo: subprocess.Popen[str]) -> None:
+    of_it = psutil.Process(demo.pid).children(recursive=True)
+    shared = shared_by(of_it)
+    ports = {
+        entry.laddr.port
+        for process in of_it
+        for entry in process.net_connections("tcp")
+        if entry.status == psutil.CONN_LISTEN
+    }
+    assert shared
+    assert ports
+    demo.kill()
+    _, alive = psutil.wait_procs(of_it, timeout=PATIENCE_S)
+    assert alive == []
+    assert not [name for name in shared if Path(name).exists()]
+    for port in ports:
+        with socket.socket() as one:
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            one.bind(("127.0.0.1", port))
+
+
+@TWO_CPUS
+def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> None:
+    """The tutorial's cell with a delay on a link, and an observer beside it."""
+    beside = CELL.parents[1] / "live"
+    document = yaml.safe_load((beside / "cell.yaml").read_text())
+    delay = {"link": "R1->E", "both_ways": True, "at_s": 3, "for_s": 60, "add_delay_ms": 400}
+    document["scenarios"] = {"calm": [], "far": [delay]}
+    document["live"] = {**document.get("live", {}), "observer": "looking:Looking"}
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(document))
+    (tmp_path / "stages.py").write_text((beside / "stages.py").read_text())
+    (tmp_path / "looking.py").write_text(OBSERVER)
+    words = ["--scenario", "far", "--seconds", "12", "--policy", "SO", "--seed", "3"]
+    done = subprocess.run(
+        [*LIVE_RUN, str(tmp_path / "cell.yaml"), *words, "--out", str(tmp_path / "out"), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    run = dwell.open_run(told["run"])
+    assert (run.meta["scenario"], run.meta["seed"]) == ("far", 3)
+    assert run.meta["looked"] > 3
+    assert len(run.meta["played"]) == 2
+    assert Path(told["report"]).is_file()
+    # From then on nothing that goes over the edge is there in time, by the link alone.
+    begun_ns = run.disturbances[0].at_s * 1e9
+    before = run.cycles.filter(pl.col("release_ns") < begun_ns - 1e9)
+    after = run.cycles.filter(pl.col("release_ns") > begun_ns + 1e9)
+    on_edge = after.filter(pl.col("placement").cast(pl.String) == "SO")
+    assert before["missed"].mean() < 0.5  # type: ignore[operator]
+    if on_edge.height:
+        assert on_edge["missed"].all()
+        assert on_edge["latency_ns"].drop_nulls().min() > 400e6  # type: ignore[operator]
+
+
+OBSERVER = """
+class Looking:
+    def __init__(self, folder, begin_ns):
+        self.looks = 0
+    def look(self, now_ns):
+        self.looks += 1
+        return {}
+    def told(self, origin_ns):
+        return {"looked": self.looks}
+    def close(self):
+        pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"tasks": {"camera": {"run": None}}}, "nothing to run for camera"),
+        ({"live": {"observer": "looking"}}, "live.observer: looking is not allowed"),
+        ({"scenario": "storm"}, "storm"),
+    ],
+)
+def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
+    document = yaml.safe_load((CELL.parents[1] / "live" / "cell.yaml").read_text())
+    for task, values in change.get("tasks", {}).items():
+        document["tasks"][task] |= values
+    document["live"] = {**document.get("live", {}), **change.get("live", {})}
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(yaml.safe_dump(document))
+    words = ["live", "run", str(cell), "--out", str(tmp_path / "out")]
+    scenario = ["--scenario", change["scenario"]] if "scenario" in change else []
+    done = CliRunner().invoke(app, [*words, *scenario])
+    assert done.exit_code in (1, 2)
+    assert said in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_demo_of_before_says_what_has_taken_its_place() -> None:
+    done = CliRunner().invoke(app, ["live", "demo", "--seconds", "20"])
+    assert done.exit_code == 2
+    assert "dwell live run examples/visual_servoing/cell.yaml" in done.stderr

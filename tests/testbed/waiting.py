@@ -1,0 +1,19 @@
+"""Waiting until something holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+__all__ = ["PATIENCE_S", "wait_until"]
+
+# Longer than a machine under load ever takes: what does not come until then does not come.
+PATIENCE_S = 20.0
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """Look until something holds."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline, "it has not come true"
+        time.sleep(0.002)
