@@ -28,6 +28,7 @@ from dwell.cli.live_view import Lines, Look, Screen
 from dwell.errors import LiveError
 from dwell.live.trust import KEYS
 from dwell.model import Problem
+from dwell.model.document import to_document
 from dwell.report.phases import Disturbed, disturbed
 from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import timeline_of
@@ -270,7 +271,7 @@ def test_killed_it_leaves_no_process_port_or_shared_memory(demo: subprocess.Pope
 def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> None:
     """The tutorial's cell with a delay on a link, and an observer beside it."""
     beside = CELL.parents[1] / "live"
-    document = yaml.safe_load((beside / "cell.yaml").read_text())
+    document = to_document(dwell.load(beside / "cell.yaml"))
     delay = {"link": "R1->E", "both_ways": True, "at_s": 3, "for_s": 60, "add_delay_ms": 400}
     document["scenarios"] = {"calm": [], "far": [delay]}
     document["live"] = {**document.get("live", {}), "observer": "looking:Looking"}
@@ -320,15 +321,15 @@ class Looking:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"tasks": {"camera": {"run": None}}}, "nothing to run for camera"),
-        ({"live": {"observer": "looking"}}, "live.observer: looking is not allowed"),
+        ({"without": ["camera"]}, "nothing to run for camera"),
+        ({"live": {"observer": "looking"}}, "live.observer: 'looking' is not allowed"),
         ({"scenario": "storm"}, "storm"),
     ],
 )
 def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
-    document = yaml.safe_load((CELL.parents[1] / "live" / "cell.yaml").read_text())
-    for task, values in change.get("tasks", {}).items():
-        document["tasks"][task] |= values
+    document = to_document(dwell.load(CELL.parents[1] / "live" / "cell.yaml"))
+    for task in change.get("without", ()):
+        del document["tasks"][task]["run"]
     document["live"] = {**document.get("live", {}), **change.get("live", {})}
     cell = tmp_path / "cell.yaml"
     cell.write_text(yaml.safe_dump(document))
