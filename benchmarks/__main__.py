@@ -25,6 +25,7 @@ BENCHMARKS = {
     "draw": ("drawing", "measure"),
     "first-use": ("first_use", "measure"),
     "import": ("importing", "measure"),
+    "link": ("link", "measure"),
     "testbed-link": ("testbed_link", "measure"),
     "transport": ("transport", "measure"),
     "order": ("live", "decision"),
