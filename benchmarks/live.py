@@ -62,9 +62,9 @@ def decision(quick: bool) -> Section:
             target = ("SO", "LOC")[number % 2]
             time.sleep(draw.uniform(0.36, 0.40))
             asked.append((time.monotonic_ns(), target))
-            cell.visitor.ask("pin", target)
+            cell.client.ask("pin", target)
             cell.wait_until_at(target)
-        cell.stop_controller()
+        cell.processes.stop_controllers()
         run = open_run(next((cell.folder / "runs").iterdir()))
         origin_ns = run.meta["origin_ns"]
         rows = run.cycles.select("release_ns", "placement").rows()
@@ -136,7 +136,7 @@ def _moved(seed: int) -> dict[str, float]:
         for number in range(MOVES):
             target = ("OTHER", "EDGE")[number % 2]
             time.sleep(draw.uniform(0.2, 0.3))
-            cell.visitor.ask("pin", target)
+            cell.client.ask("pin", target)
             cell.wait_until_at(target)
         time.sleep(0.5)
         applied = [one for one in cell.applied() if one.cycle >= begin]
@@ -194,7 +194,7 @@ def _cpu_s(process: psutil.Process) -> float:
 
 def _processes(cell: LightCell) -> dict[str, psutil.Process]:
     found = {who: psutil.Process(pid) for who, pid in cell.pids().items()}
-    for who, top in cell.processes.items():
+    for who, top in cell.processes.running.items():
         found[who] = psutil.Process(top.pid)
     return found
 

@@ -21,7 +21,6 @@ import dwell
 from benchmarks.timing import ROOT
 from dwell.errors import LiveError
 from dwell.live.messages import Header, decode
-from dwell.live.operator_client import OperatorClient
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.worker import Worker
@@ -189,24 +188,15 @@ class LightCell(Loopback):
         environment = {OBSERVED: str(self._observed), "PYTHONPATH": os.pathsep.join(paths)}
         super().__init__(problem, folder, {}, environment=environment)
 
-    def __enter__(self) -> LightCell:
+    def start(self) -> None:
         """Start it; returns when its commands are applied."""
-        super().__enter__()
+        super().start()
         try:
-            self.visitor = OperatorClient(self.problem)
             self.wait_for("commands", lambda: len(self.applied()) > 10)
             self.wait_for("the controller", lambda: self.said().get("placement") is not None)
         except BaseException:
-            self.close()
+            self.stop()
             raise
-        return self
-
-    def close(self) -> None:
-        """End it."""
-        if hasattr(self, "visitor"):
-            self.visitor.__exit__()
-            del self.visitor
-        super().close()
 
     def applied(self) -> list[Applied]:
         """Return the actuator's calls so far."""
@@ -224,10 +214,10 @@ class LightCell(Loopback):
                 found[mark.stem] = int(json.loads(mark.read_text())["pid"])
         return found
 
-    def said(self) -> dict[str, Any]:
+    def said(self) -> Mapping[str, Any]:
         """Return what the controller says; nothing where it does not answer."""
         try:
-            return self.visitor.ask("status", patience_s=0.5)
+            return self.sample(0.5)
         except LiveError:
             return {}
 

@@ -104,7 +104,7 @@ def _example(folder: Path) -> Iterator[LightCell]:
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(EXAMPLE.parent), before]))
     try:
         with LightCell(found, folder / "cell", links=True) as cell:
-            cell.visitor.ask("pin", HOME)
+            cell.client.ask("pin", HOME)
             yield cell
     finally:
         if before is None:

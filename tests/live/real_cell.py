@@ -10,7 +10,7 @@ import yaml
 
 import dwell
 from dwell.chaos.faults import Fault, How
-from dwell.chaos.harness import Harness, environment_of
+from dwell.chaos.harness import CLOCK_FILE, Harness, environment_of
 from dwell.chaos.light_cell import (
     GUARD_CYCLES,
     HOMES,
@@ -20,11 +20,10 @@ from dwell.chaos.light_cell import (
     document,
     exec_ms,
 )
-from dwell.chaos.stage import OnLoopback
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond
 from dwell.chaos.strike import strike as strike_by
-from dwell.testbed.loopback import on_this_machine
+from dwell.testbed.loopback import Loopback, on_this_machine
 
 __all__ = [
     "FAULTS",
@@ -48,11 +47,13 @@ class RealCell(Harness):
         written.write_text(yaml.safe_dump(document(home, standby=standby)))
         problem = on_this_machine(dwell.load(written))
         environment = environment_of(folder, exec_ms(home))
-        super().__init__(OnLoopback(problem, folder, seed=seed, environment=environment), home=home)
-
-    def __enter__(self) -> RealCell:
-        super().__enter__()
-        return self
+        testbed = Loopback(
+            *(problem, folder, {}),
+            seed=seed,
+            environment=environment,
+            clocks=folder / CLOCK_FILE,
+        )
+        super().__init__(testbed, home=home)
 
     def check_run(self) -> list[str]:
         """Return what is wrong with the record of the run, as far as it goes."""

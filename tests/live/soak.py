@@ -27,11 +27,10 @@ import psutil
 import yaml
 
 import dwell
-from dwell.chaos.harness import Harness, environment_of
+from dwell.chaos.harness import CLOCK_FILE, Harness, environment_of
 from dwell.chaos.light_cell import PERIOD_MS, document, exec_ms
-from dwell.chaos.stage import OnLoopback
 from dwell.errors import DwellError, LiveError
-from dwell.testbed.loopback import on_this_machine
+from dwell.testbed.loopback import Loopback, on_this_machine
 
 HOME = "SO"
 #: One second each.
@@ -138,7 +137,9 @@ def _cell(folder: Path) -> Harness:
     written.write_text(yaml.safe_dump(cell))
     problem = on_this_machine(dwell.load(written))
     environment = environment_of(folder, exec_ms(HOME))
-    return Harness(OnLoopback(problem, folder, seed=1, environment=environment), home=HOME)
+    clocks = folder / CLOCK_FILE
+    testbed = Loopback(problem, folder, {}, seed=1, environment=environment, clocks=clocks)
+    return Harness(testbed, home=HOME)
 
 
 def look(processes: Mapping[str, psutil.Process]) -> dict[str, dict[str, float]]:
@@ -178,7 +179,7 @@ def soak(path: Path, minutes: float, every_s: float) -> None:
             writer = csv.writer(file)
             writer.writerow(["at_s", "process", *BOUNDS])
             cell.wait_for("the whole cell at home", cell.at_home, START_S)
-            names = [*cell.everybody, *cell.stage.processes]
+            names = [*cell.everybody, *cell.testbed.processes.running]
             processes = {who: psutil.Process(cell.pid(who)) for who in dict.fromkeys(names)}
             begun_s = time.monotonic()
             before = _actuated(cell)

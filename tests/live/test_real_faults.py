@@ -52,7 +52,7 @@ class Standing:
         if self._cell is None:
             self._count += 1
             cell = RealCell(home, self.folder / f"{home}-{self._count}", seed=SEED)
-            cell.__enter__()
+            cell.start()
             self._cell = cell
         return self._cell
 
@@ -65,7 +65,7 @@ class Standing:
         wrong = cell.check_run()
         if not (cell.runs[0] / "run.json").exists():
             wrong.append("no run.json, though the controller was told to end")
-        cell.close()
+        cell.stop()
         return wrong
 
     def survive(self, fault: Fault) -> str:

@@ -17,11 +17,10 @@ import yaml
 
 from dwell.errors import LiveError, ProblemError
 from dwell.model import LinkDisturbance, Normal
-from dwell.sim import NodeChange
 from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inventory
 from dwell.testbed.real_hosts import RealHosts, require_commands
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
-from dwell.testbed.timeline import Change, usual_conditions
+from dwell.testbed.timeline import Change, NodeState, usual_conditions
 from tests.study.cell import make_problem
 
 PROBLEM = make_problem()
@@ -209,10 +208,10 @@ def test_stress_runs_until_it_ends(tmp_path: Path) -> None:
     )
     cell = RealHosts(PROBLEM, over_there, tmp_path, name="one")
     Path(cell.there("E")).mkdir(parents=True)
-    cell.apply(Change(0, "E", NodeChange(0, "E", 3, False)))
+    cell.apply(Change(0, "E", NodeState(3)))
     until(lambda: threads.is_file() and threads.read_text() == "3\n")
     process = next(iter(cell.stress.values()))
-    cell.apply(Change(1, "E", NodeChange(1, "E", 0, False)))
+    cell.apply(Change(1, "E", NodeState(0)))
     assert process.poll() is not None
 
 

@@ -13,10 +13,9 @@ import dwell
 from dwell.cellfile import from_document
 from dwell.errors import LiveError
 from dwell.model import Constant
-from dwell.sim import NodeChange
 from dwell.testbed.hosts import namespace_path
 from dwell.testbed.netns_testbed import NetnsTestbed
-from dwell.testbed.timeline import Change, usual_conditions
+from dwell.testbed.timeline import Change, NodeState, usual_conditions
 from tests.testbed.light_cell import document, write_cell
 from tests.testbed.machine import no_groups, no_hosts, own_name
 
@@ -32,7 +31,6 @@ def testbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetnsTestbed]:
     folder = tmp_path_factory.mktemp("testbed")
     cell = write_cell(folder)
     with NetnsTestbed(dwell.load(cell), folder / "out", name=own_name(), beside=folder) as one:
-        one.come_up(patience_s=PATIENCE_S)
         yield one
 
 
@@ -66,26 +64,26 @@ def test_cells_that_share_a_link_have_to_agree_on_it(tmp_path: Path) -> None:
 def test_a_run_begins_anew_with_everybody_there(testbed: NetnsTestbed) -> None:
     (watcher,) = testbed.watchers
     begun_ns = time.monotonic_ns()
-    before = {testbed.begin(patience_s=PATIENCE_S)[0]}
+    before = {testbed.begin()[0]}
     # Nothing of the time until everybody was there is part of it.
     assert min(before) > begun_ns
     status = watcher.status(10.0)
     assert status["placement"] == "SO"
     assert status["origin_ns"] in before
     assert set(testbed.expected(testbed.problems[0])) <= status["processes"].keys()
-    testbed.stop_controllers()
+    testbed.processes.stop_controllers()
     # Another one is another run.
-    again = testbed.begin(patience_s=PATIENCE_S)[0]
+    again = testbed.begin()[0]
     assert again not in before
     assert watcher.status(10.0)["run"] != status["run"]
 
 
 def test_stress_is_in_the_group_of_its_node(testbed: NetnsTestbed) -> None:
-    testbed.apply(Change(0, "R2", NodeChange(0, "R2", 2, False)))
+    testbed.apply(Change(0, "R2", NodeState(2)))
     begun_ns = testbed.used_ns["R2"]()
     # Far less than its quota, far more than its stages take.
     wait_for(lambda: testbed.used_ns["R2"]() - begun_ns > 2_000_000_000, "two seconds of CPU time")
-    testbed.apply(Change(1, "R2", NodeChange(1, "R2", 0, False)))
+    testbed.apply(Change(1, "R2", NodeState(0)))
 
 
 def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None:
@@ -115,12 +113,12 @@ def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> No
 
 def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
     (watcher,) = testbed.watchers
-    if "controller@E" not in testbed._processes.running:
-        testbed.begin(patience_s=PATIENCE_S)
+    if "controller@E" not in testbed.processes.running:
+        testbed.begin()
     there = set(testbed._groups.pids("R2"))
-    testbed.apply(Change(0, "R2", NodeChange(0, "R2", 0, True)))
+    testbed.apply(Change(0, "R2", NodeState(0, down=True)))
     assert testbed._groups.pids("R2") == []
-    testbed.apply(Change(1, "R2", NodeChange(1, "R2", 0, False)))
+    testbed.apply(Change(1, "R2", NodeState(0)))
 
     def ready() -> bool:
         heard = watcher.status(10.0)["processes"]
@@ -135,5 +133,5 @@ def test_nothing_is_left(testbed: NetnsTestbed) -> None:
     """The last: it takes the testbed down."""
     namespaces = [namespace_path(testbed._hosts.namespace(node)) for node in testbed.nodes]
     assert all(path.exists() for path in namespaces)
-    testbed.close()
+    testbed.stop()
     assert not any(path.exists() for path in namespaces)

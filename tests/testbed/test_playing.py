@@ -13,7 +13,6 @@ import pytest
 from dwell.cellfile import from_document
 from dwell.errors import LiveError
 from dwell.model import Problem
-from dwell.sim import NodeChange
 from dwell.testbed.playing import (
     Played,
     come_up,
@@ -23,7 +22,7 @@ from dwell.testbed.playing import (
     play,
     undisturbed,
 )
-from dwell.testbed.timeline import Change, timeline_of
+from dwell.testbed.timeline import Change, NodeState, timeline_of
 from tests.report.live_runs import PERIOD_NS, live_run
 from tests.testbed.light_cell import document
 
@@ -70,8 +69,7 @@ def test_a_change_between_two_looks_is_not_late(
 ) -> None:
     clock = Clock(monkeypatch)
     made: list[float] = []
-    steps = [NodeChange(round(at_s * 1e9), "E", 1, False) for at_s in (0.3, 0.7)]
-    changes = [Change(step.at_ns, "E", step) for step in steps]
+    changes = [Change(round(at_s * 1e9), "E", NodeState(1)) for at_s in (0.3, 0.7)]
     play(changes, 1.0, clock.now_s, lambda change: made.append(clock.at_s), lambda at_s: None)
     assert made == pytest.approx([0.3, 0.7])
 

@@ -12,7 +12,14 @@ from dwell.model import Constant, Problem
 from dwell.sim import Realisation, draw
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.playing import play
-from dwell.testbed.timeline import Change, Timeline, differing, timeline_of, usual_conditions
+from dwell.testbed.timeline import (
+    Change,
+    NodeState,
+    Timeline,
+    differing,
+    timeline_of,
+    usual_conditions,
+)
 from tests.testbed.light_cell import document
 
 EPISODES = {
@@ -92,8 +99,12 @@ def test_what_is_applied_is_what_the_simulator_draws(
     drawn = draw(problem, scenario="some", seed=seed, windows=40)
     # It has episodes, and all of a ramp.
     assert len(testbed.applied) > 60
-    nodes = [change.state for change in testbed.applied if not isinstance(change.state, Conditions)]
-    assert nodes == [change for change in drawn.node_changes if change.at_ns < SECONDS * 1e9]
+    nodes = [
+        (change.at_ns, change.place, change.state.threads, change.state.down)
+        for change in testbed.applied
+        if isinstance(change.state, NodeState)
+    ]
+    assert nodes == [tuple(one) for one in drawn.node_changes if one.at_ns < SECONDS * 1e9]
     for link in ("R1->E", "E->R1"):
         segments = [
             segment

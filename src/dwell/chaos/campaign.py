@@ -17,23 +17,23 @@ import yaml
 import dwell
 from dwell.chaos.disk import may_mount
 from dwell.chaos.faults import Fault, Means, bound_of, faults_of
-from dwell.chaos.harness import STARVING_THREADS, Harness, environment_of
+from dwell.chaos.harness import CLOCK_FILE, STARVING_THREADS, Harness, environment_of
 from dwell.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.chaos.observer import Observer
-from dwell.chaos.stage import CLOCK_FILE, OnHosts, OnLoopback, Stage
 from dwell.chaos.stages import APPLY
 from dwell.chaos.stalls import StallDetector
 from dwell.chaos.strike import Outcome, beyond, strike
 from dwell.chaos.timeline import Planned, planned
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
-from dwell.testbed.loopback import on_this_machine
+from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
+from dwell.testbed.testbed import LocalTestbed
 
 __all__ = ["Campaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]
 
 #: Takes the number of a cell among those of a campaign; returns where it runs, and its home.
-Staging: TypeAlias = Callable[[int], tuple[Stage, str | None]]
+Staging: TypeAlias = Callable[[int], tuple[LocalTestbed, str | None]]
 
 LIGHT_HOME = "SO"
 #: What is on its way to a tap.
@@ -52,10 +52,12 @@ def on_loopback(cell: Path | None, out: Path, seed: int) -> Staging:
         Of delays and losses.
     """
 
-    def stage(number: int) -> tuple[Stage, str | None]:
+    def stage(number: int) -> tuple[LocalTestbed, str | None]:
         problem, folder, environment, home = _cell(cell, out, number, quotas=False)
         problem = on_this_machine(problem)
-        return OnLoopback(problem, folder, seed=seed, environment=environment), home
+        clocks = folder / CLOCK_FILE
+        play = Loopback(problem, folder, {}, seed=seed, environment=environment, clocks=clocks)
+        return play, home
 
     return stage
 
@@ -72,7 +74,7 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
         Of delays and losses.
     """
 
-    def stage(number: int) -> tuple[Stage, str | None]:
+    def stage(number: int) -> tuple[LocalTestbed, str | None]:
         problem, folder, environment, home = _cell(cell, out, number, quotas=True)
         beside = None if cell is None else cell.parent
         testbed = NetnsTestbed(
@@ -83,7 +85,7 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
             environment=environment,
             clocks=folder / CLOCK_FILE,
         )
-        return OnHosts(testbed), home
+        return testbed, home
 
     return stage
 
@@ -238,8 +240,8 @@ class Campaign:
         return self.result
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
-        stage, _ = self._staging(1)
-        there = list(faults_of(stage.problem, Means(disks=self._disks)))
+        testbed, _ = self._staging(1)
+        there = list(faults_of(testbed.problem, Means(disks=self._disks)))
         found = planned(self._seed, there)
         if only is not None:
             return islice(found, only - 1, only)
@@ -254,10 +256,10 @@ class Campaign:
         until_s: float | None,
     ) -> Planned | None:
         """Have one cell go through faults; returns the next fault where the cell is past help."""
-        stage, home = self._staging(number)
+        testbed, home = self._staging(number)
         with ExitStack() as stack:
-            cell = stack.enter_context(Harness(stage, home=home, disks=self._disks))
-            observer = stack.enter_context(Observer(stage, stage.folder / "cell.yaml"))
+            cell = stack.enter_context(Harness(testbed, home=home, disks=self._disks))
+            observer = stack.enter_context(Observer(testbed, testbed.folder / "cell.yaml"))
             while True:
                 one = first or next(plan, None)
                 first = None
@@ -268,7 +270,7 @@ class Campaign:
                     self._count(cell, observer)
                     return next(plan, None)
             self._count(cell, observer)
-            cell.stage.stop_controller()
+            cell.stop_controller()
             self.result.wrong += [f"record: {wrong}" for wrong in _unread(cell)]
         return None
 

@@ -16,18 +16,20 @@ import psutil
 from dwell.chaos.actuations import Actuations
 from dwell.chaos.disk import DiskHog, SmallDisk, limit_file_size
 from dwell.chaos.faults import Fault
-from dwell.chaos.stage import CLOCK_FILE, Stage
 from dwell.chaos.stages import APPLY, TOLD
 from dwell.errors import LiveError
 from dwell.live.hosting import clock_of
 from dwell.model import Problem
 from dwell.testbed.burner import Burner
+from dwell.testbed.child import Started
 from dwell.testbed.clocks import ClockFile
 from dwell.testbed.processes import expected
+from dwell.testbed.testbed import LocalTestbed
+from dwell.testbed.timeline import Change, NodeState
 
-__all__ = ["Harness", "environment_of", "pid_of"]
+__all__ = ["CLOCK_FILE", "Harness", "environment_of", "pid_of"]
 
-OBSERVED = "observed"
+OBSERVED, CLOCK_FILE = "observed", "clocks"
 #: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
 HEALTH_S = 5.0
 #: Busy threads beside the processes of a node that starves.
@@ -52,12 +54,12 @@ def pid_of(mark: Path) -> int | None:
         return None
 
 
-class Harness:
+class Harness(Started):
     """See the module; a context manager.
 
     Parameters
     ----------
-    stage : Stage
+    testbed : LocalTestbed
         With the variables of `environment_of` in its environment.
     home : str, optional
         Candidate that the controller wants; whatever it decides if left out.
@@ -65,9 +67,11 @@ class Harness:
         Whether nodes, and the runs, get disks of their own, which can be made full.
     """
 
-    def __init__(self, stage: Stage, *, home: str | None = None, disks: bool = False) -> None:
-        self.stage, self.home, self.disks = stage, home, disks
-        self.folder = stage.folder
+    def __init__(
+        self, testbed: LocalTestbed, *, home: str | None = None, disks: bool = False
+    ) -> None:
+        self.testbed, self.home, self.disks = testbed, home, disks
+        self.folder = testbed.folder
         self.folder.mkdir(parents=True, exist_ok=True)
         self.actuations = Actuations(self.folder / OBSERVED)
         self.starved_cpus: frozenset[int] = frozenset()
@@ -80,14 +84,14 @@ class Harness:
     @property
     def problem(self) -> Problem:
         """The cell."""
-        return self.stage.problem
+        return self.testbed.problem
 
     @property
     def period_ns(self) -> int:
         """P."""
         return round(self.problem.pipeline.period_ms * 1e6)
 
-    def __enter__(self) -> Harness:
+    def start(self) -> None:
         """Start everything, and wait until the cell is at home."""
         try:
             nodes = list(self.problem.fabric.nodes)
@@ -99,18 +103,13 @@ class Harness:
             clocks = ClockFile(self.folder / CLOCK_FILE, nodes, clock_of(self.problem))
             self._clocks = self._stack.enter_context(clocks)
             self._stack.callback(self._end_all)
-            self.stage.begin()
+            self.testbed.start()
             self.wait_for("the whole cell at home", self.at_home, 60.0)
         except BaseException:
-            self.close()
+            self.stop()
             raise
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        """End everything."""
-        self.close()
-
-    def close(self) -> None:
+    def stop(self) -> None:
         """End everything, also what is frozen or has no parent any more; safe to call twice."""
         self._stack.close()
 
@@ -119,10 +118,10 @@ class Harness:
         if self._hog is not None:
             self._hog.__exit__()
             self._hog = None
-        running = self.stage.processes.values()
+        running = self.testbed.processes.running.values()
         for pid in [*self._marked(), *(p.pid for p in running if p.poll() is None)]:
             _send(pid, signal.SIGCONT)
-        self.stage.close()
+        self.testbed.stop()
         for pid in self._marked():
             _send(pid, signal.SIGKILL)
 
@@ -149,8 +148,8 @@ class Harness:
 
     def pid(self, who: str) -> int:
         """Process id of one of the cell's processes."""
-        if who in self.stage.processes:
-            return self.stage.processes[who].pid
+        if who in self.testbed.processes.running:
+            return self.testbed.processes.running[who].pid
         node = who.partition("@")[2].partition(".")[0]
         pid = pid_of(self.folder / node / f"{who}.pid")
         if pid is None:
@@ -164,18 +163,18 @@ class Harness:
 
     def start_again(self, who: str) -> None:
         """Start an agent or the controller again, as an init system does."""
-        process = self.stage.processes.pop(who, None)
+        process = self.testbed.processes.running.pop(who, None)
         if process is not None:
             process.wait(10)
         kind, _, node = who.partition("@")
         if kind == "agent":
-            self.stage.start_agent(node)
+            self.testbed.processes.start_agent(node)
         else:
-            self.stage.start_controller()
+            self.testbed.processes.start_controllers()
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
-        self.stage.stop_controller()
+        self.testbed.processes.stop_controllers()
 
     def names(self, fault: Fault) -> list[str]:
         """Return the processes that a fault strikes."""
@@ -205,8 +204,9 @@ class Harness:
         Where nodes have CPUs of their own, the threads are there and nobody is moved. Where there
         is one CPU only, all nodes starve.
         """
-        if self.stage.stress(node, STARVING_THREADS):
+        if self.testbed.own_cpus:
             self._stressed = node
+            self._stress(node, STARVING_THREADS)
             return
         cpus = sorted(os.sched_getaffinity(0))
         self._burner = Burner(cpus[:1])
@@ -215,9 +215,12 @@ class Harness:
         for other in self.problem.fabric.nodes:
             self._pin(other, cpus[:1] if other == node else cpus[1:] or cpus)
 
+    def _stress(self, node: str, threads: int) -> None:
+        self.testbed.apply(Change(0, node, NodeState(threads)))
+
     def _feed(self) -> None:
         if self._stressed:
-            self.stage.stress(self._stressed, 0)
+            self._stress(self._stressed, 0)
             self._stressed = ""
         if self._burner is None:
             return
@@ -260,7 +263,7 @@ class Harness:
         """Have a fault begin at an instant of the true clock; returns when it did."""
         if fault.how == "cut":
             ways = [way.split("->") for way in fault.whom]
-            return min(self.stage.cut(source, target, at_ns) for source, target in ways)
+            return min(self.testbed.cut(source, target, at_ns) for source, target in ways)
         pids = [self.pid(who) for who in self.names(fault)] if fault.how in _SIGNALS else []
         wait_s = (at_ns - time.monotonic_ns()) / 1e9 - 0.001
         if wait_s > 0:
@@ -289,7 +292,7 @@ class Harness:
         match fault.how:
             case "cut":
                 for way in fault.whom:
-                    self.stage.heal(*way.split("->"))
+                    self.testbed.heal(*way.split("->"))
             case "freeze":
                 self.signal(self.names(fault), signal.SIGCONT)
             case "kill":
@@ -329,7 +332,7 @@ class Harness:
     def status(self) -> Mapping[str, Any]:
         """Return what the controller says; nothing where it does not answer."""
         try:
-            return self.stage.ask(0.4)
+            return self.testbed.sample(0.4)
         except LiveError:
             return {}
 

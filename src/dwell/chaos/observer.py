@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Self
 
 from dwell.chaos.invariants import Judge
-from dwell.chaos.stage import Stage
 from dwell.chaos.wiretap import Records, Wiretap
 from dwell.errors import LiveError
+from dwell.testbed.testbed import LocalTestbed
 
 __all__ = ["Observer"]
 
@@ -22,20 +22,20 @@ class Observer:
 
     Parameters
     ----------
-    stage : Stage
+    testbed : LocalTestbed
         That runs.
     cell : Path
         Its cell file.
     """
 
-    def __init__(self, stage: Stage, cell: Path) -> None:
-        self.judge = Judge(stage.problem)
+    def __init__(self, testbed: LocalTestbed, cell: Path) -> None:
+        self.judge = Judge(testbed.problem)
         self._taps: list[Wiretap] = []
         self._records: list[Records] = []
         self._stack = ExitStack()
-        for name, prefix in stage.taps().items():
-            out = stage.folder / f"heard-{name}"
-            self._taps.append(Wiretap(cell, stage.heard_at(name), out, prefix))
+        for nodes, prefix in testbed.taps().items():
+            out = testbed.folder / f"heard-{'-'.join(nodes)}"
+            self._taps.append(Wiretap(cell, nodes, out, prefix))
             self._records.append(Records(out))
 
     def __enter__(self) -> Self:

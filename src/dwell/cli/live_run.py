@@ -16,7 +16,6 @@ import dwell
 from dwell.cli.live_view import Look, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.errors import LiveError
-from dwell.live.operator_client import OperatorClient
 from dwell.model import Problem, Scenario
 from dwell.record import Run, open_run, seal_run
 from dwell.report import run_html
@@ -28,18 +27,15 @@ from dwell.testbed.cell_observer import CellObserver, load_observer
 from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.playing import (
     LOOK_S,
-    Ask,
     Played,
     begun,
-    come_up,
     crowded,
     interruptible,
     longest_run,
     make_folder,
+    play_on,
 )
-from dwell.testbed.playing import play as play_changes
-from dwell.testbed.processes import without_keys
-from dwell.testbed.timeline import Change, timeline_of
+from dwell.testbed.timeline import timeline_of
 
 __all__ = ["LiveRunRequest", "run_live"]
 
@@ -105,15 +101,15 @@ def run_live(request: LiveRunRequest, *, as_json: bool) -> None:
     told = _Told(problem, scenario, request.seed, timeline, beside=beside)
     interrupted = False
     cell = Loopback(problem, out.resolve(), _cpus(problem), seed=request.seed, beside=told.beside)
-    with interruptible(), cell:
+    with interruptible():
         try:
             _watch_from_start(cell, seconds, told)
         except KeyboardInterrupt:
             interrupted = True
             typer.echo("interrupted; ending the cell", err=True)
-        with working("ending the cell"):
-            cell.stop_controller()
-            cell.close()
+        finally:
+            with working("ending the cell"):
+                cell.stop()
     folder = longest_run(out / "runs")
     if folder is None and interrupted:
         raise typer.Exit(INTERRUPTED)
@@ -187,59 +183,38 @@ def _cpus(problem: Problem) -> dict[str, int]:
 
 
 def _watch_from_start(cell: Loopback, seconds: float, told: _Told) -> None:
-    """Wait until everybody is there, and play the scenario."""
-    awaited = [who for node in cell.problem.fabric.nodes for who in cell.expected(node)]
-    with OperatorClient(cell.problem, without_keys()) as visitor:
-
-        def ask(patience_s: float) -> Mapping[str, Any]:
-            return visitor.ask("status", patience_s=patience_s)
-
-        with working("starting the cell"):
-            status = come_up(ask, awaited, cell.folder)
-        now_ns = time.monotonic_ns()
-        origin_ns = status.get("origin_ns") or now_ns
-        begin_ns = max(int(origin_ns), now_ns - round(MOST_BEFORE_S * 1e9))
-        name = cell.problem.live.observer
-        if name is not None:
-            told.observer = load_observer(name, told.beside, cell.folder, begin_ns)
-        try:
-            with live_view(cell.problem, seconds, told.planned()) as view:
-                _watch(ask, cell, begin_ns, seconds, told, view)
-        finally:
-            if told.observer is not None:
-                told.look()
-                told.observer.close()
+    """Start the cell, and play the scenario."""
+    with working("starting the cell"):
+        cell.start()
+    earliest_ns = time.monotonic_ns() - round(MOST_BEFORE_S * 1e9)
+    cell.begun_ns = max(cell.begun_ns, earliest_ns)
+    name = cell.problem.live.observer
+    if name is not None:
+        told.observer = load_observer(name, told.beside, cell.folder, cell.begun_ns)
+    try:
+        with live_view(cell.problem, seconds, told.planned()) as view:
+            _watch(cell, seconds, told, view)
+    finally:
+        if told.observer is not None:
+            told.look()
+            told.observer.close()
 
 
-def _watch(
-    ask: Ask,
-    cell: Loopback,
-    begin_ns: int,
-    seconds: float,
-    told: _Told,
-    view: View,
-) -> None:
+def _watch(cell: Loopback, seconds: float, told: _Told, view: View) -> None:
     """Play the changes at their times, and show how the cell is."""
     status: Mapping[str, Any] = {}
     answered_s = 0.0
 
-    def now_s() -> float:
-        return (time.monotonic_ns() - begin_ns) / 1e9
-
-    def apply(change: Change) -> None:
-        cell.apply(change)
-        told.changed(change)
-
     def look(at_s: float) -> None:
         nonlocal status, answered_s
         try:
-            status = ask(LOOK_S)
-            answered_s = now_s()
+            status = cell.sample(LOOK_S)
+            answered_s = (time.monotonic_ns() - cell.begun_ns) / 1e9
         except LiveError:
             pass  # the view shows for how long nobody has answered
         view.show(Look(at_s, status, answered_s, told.look(), told.on()))
 
-    play_changes(told.timeline.changes, seconds, now_s, apply, look)
+    play_on(cell, told, seconds, look)
 
 
 def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:

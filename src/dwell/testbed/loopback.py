@@ -7,25 +7,31 @@ controller makes of it is the controller's.
 from __future__ import annotations
 
 import socket
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from dwell.errors import LiveError
+from dwell.live.hosting import clock_of
+from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Host, Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.message_links import LinkFile
+from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, modules_beside
+from dwell.testbed.processes import Processes, expected, modules_beside, without_keys
+from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, differing, usual_conditions
 
 __all__ = ["Loopback", "on_this_machine"]
 
+#: How long every process may take to be ready, on a machine that has a lot else to do.
+START_S = 60.0
 #: Where ports are looked for; below what the kernel gives out by itself.
 PORTS = range(10_000, 32_000, 500)
 LINK_FILE = "links"
@@ -60,7 +66,7 @@ def _free(port: int) -> bool:
     return True
 
 
-class Loopback:
+class Loopback(LocalTestbed):
     """A cell on this machine: agents, controller, links, burners; a context manager.
 
     Parameters
@@ -84,9 +90,13 @@ class Loopback:
 
     Attributes
     ----------
+    client : OperatorClient
+        Asks the controller, once it has been started.
     world : Path
         Where the world is that its camera and arm share (see `World`).
     """
+
+    own_cpus = False
 
     def __init__(
         self,
@@ -104,7 +114,7 @@ class Loopback:
         self.world = folder / "world"
         self.burners: dict[str, Burner] = {}
         self._links: LinkFile | None = None
-        self._processes = Processes(
+        self.processes = Processes(
             [problem],
             folder,
             environment={
@@ -129,15 +139,16 @@ class Loopback:
             raise LiveError("the cell has not been started")
         return self._links
 
-    @property
-    def processes(self) -> dict[str, subprocess.Popen[bytes]]:
-        """Agents and controller, by name."""
-        return self._processes.running
+    def start(self) -> None:
+        """Start everything, and wait until every process is ready; the run began before that.
 
-    def __enter__(self) -> Loopback:
-        """Start everything."""
+        Raises
+        ------
+        LiveError
+            If the cell does not come up.
+        """
         try:
-            self._processes.write()
+            self.processes.write()
             self._start_links()
             for cpu in sorted(set(self.cpus.values())):
                 burner = Burner([cpu])
@@ -145,17 +156,18 @@ class Loopback:
                 self._stack.callback(burner.stop)
                 for node in (node for node, its in self.cpus.items() if its == cpu):
                     self.burners[node] = burner
+            # Processes end before links and burners do.
+            self._stack.callback(self.processes.stop)
             for node in self.problem.fabric.nodes:
-                self.start_agent(node)
-            self.start_controller()
+                self.processes.start_agent(node)
+            self.processes.start_controllers()
+            self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
+            awaited = [who for node in self.problem.fabric.nodes for who in self.expected(node)]
+            status = come_up(self.sample, awaited, self.folder, patience_s=START_S)
+            self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
         except BaseException:
-            self.close()
+            self.stop()
             raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End everything."""
-        self.close()
 
     def _start_links(self) -> None:
         fabric = self.problem.fabric
@@ -170,14 +182,6 @@ class Loopback:
     def expected(self, node: str) -> list[str]:
         """Return the processes of a node that its agent starts, and the agent."""
         return expected(self.problem, node)
-
-    def start_agent(self, node: str) -> None:
-        """Start a node's agent, or start it again."""
-        self._processes.start_agent(node)
-
-    def start_controller(self) -> None:
-        """Start the controller, or start it again."""
-        self._processes.start_controllers()
 
     def apply(self, change: Change) -> None:
         """Have a link, or a node's CPU, be as a change says."""
@@ -204,12 +208,15 @@ class Loopback:
         """End a cut of a direction."""
         self.links.set(source, target, cut=None)
 
-    def stop_controller(self) -> None:
-        """End the controller and wait until it has written its run."""
-        self._processes.stop_controllers()
+    def sample(self, patience_s: float) -> Mapping[str, Any]:
+        """Return how the cell is, as its controller says."""
+        return self.client.ask("status", patience_s=patience_s)
 
-    def close(self) -> None:
+    def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
+        """Return how to run a command that reaches all nodes: as it is."""
+        return {tuple(self.problem.fabric.nodes): ()}
+
+    def stop(self) -> None:
         """End every process, links and burners last."""
-        self._processes.stop()
         self._stack.close()
         self._links = None

@@ -30,10 +30,11 @@ from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
 from dwell.testbed.link import TunLink
 from dwell.testbed.message_links import LinkFile
-from dwell.testbed.playing import come_up
+from dwell.testbed.playing import come_up, undisturbed
 from dwell.testbed.process import program
 from dwell.testbed.processes import Processes, expected, modules_beside
 from dwell.testbed.stress import Stress
+from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, differing, usual_conditions
 from dwell.testbed.watcher import Watcher
 
@@ -109,7 +110,7 @@ def _with_hosts(problems: Sequence[Problem], address: Callable[[str], str]) -> t
     return tuple(found)
 
 
-class NetnsTestbed:
+class NetnsTestbed(LocalTestbed):
     """Cells on hosts of their own on this machine; a context manager.
 
     Parameters
@@ -136,6 +137,7 @@ class NetnsTestbed:
     Attributes
     ----------
     problems : tuple of Problem
+        `problem` is the first, and so are its run and what is said of it.
     links : dict of frozenset of str to TunLink
         By pair of nodes.
     watchers : tuple of Watcher
@@ -146,6 +148,8 @@ class NetnsTestbed:
     LiveError
         If the cells cannot be played, or this machine has too few CPUs for their nodes.
     """
+
+    own_cpus = True
 
     def __init__(
         self,
@@ -161,6 +165,7 @@ class NetnsTestbed:
         clocks: Path | None = None,
     ) -> None:
         self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
+        self.problem = self.problems[0]
         require_playable(self.problems)
         self.shares = allot(self.problems, cpus or sorted(os.sched_getaffinity(0)))
         self.nodes: dict[str, Node] = nodes_of(self.problems)
@@ -195,21 +200,25 @@ class NetnsTestbed:
             self._stack.callback(remove_orphans)
             self._claimed = True
 
-    def __enter__(self) -> NetnsTestbed:
-        """Make hosts, links and groups, and start everything; `come_up` waits for it."""
+    def start(self) -> None:
+        """Make hosts, links and groups, start everything, and begin a run of every cell.
+
+        Raises
+        ------
+        LiveError
+            If something is missing, or the cells do not come up.
+        """
         try:
             self.claim()
             self._make()
             for node in self.nodes:
-                self._processes.start_agent(node)
+                self.processes.start_agent(node)
+            self._come_up()
+            self.begun_ns = self.begin()[0]
         except BaseException:
-            self.close()
+            with undisturbed():
+                self.stop()
             raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End everything."""
-        self.close()
 
     def _make(self) -> None:
         enter = self._stack.enter_context
@@ -217,6 +226,7 @@ class NetnsTestbed:
         self._hosts = enter(Hosts(self.name, nodes, pairs))
         self._groups = enter(Groups(self.name, {**self.shares, PROBES: Share()}))
         self.problems = _with_hosts(self.problems, self._hosts.address)
+        self.problem = self.problems[0]
         self.folder.mkdir(parents=True, exist_ok=True)
         self._losses = enter(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed))
         for number, pair in enumerate(pairs):
@@ -234,7 +244,7 @@ class NetnsTestbed:
             **modules_beside(self._beside),
             **self._environment,
         }
-        self._processes = Processes(
+        self.processes = Processes(
             self.problems,
             self.folder,
             inside=self._inside,
@@ -243,14 +253,9 @@ class NetnsTestbed:
             traces=self._beside,
             program=program(links=self._losses.path, clocks=self._clocks),
         )
-        self._processes.write()
-        self._stack.callback(self._processes.stop)
+        self.processes.write()
+        self._stack.callback(self.processes.stop)
         self.watchers = tuple(enter(self._watcher(problem)) for problem in self.problems)
-
-    @property
-    def processes(self) -> Processes:
-        """Agents and controllers."""
-        return self._processes
 
     @property
     def probing(self) -> list[str]:
@@ -284,7 +289,7 @@ class NetnsTestbed:
 
     def _watcher(self, problem: Problem) -> Watcher:
         prefix = self._hosts.inside(problem.controller_node, [])
-        return Watcher(self._processes.file_of(problem), prefix)
+        return Watcher(self.processes.file_of(problem), prefix)
 
     def _start_stress(self, node: str) -> None:
         stress = Stress(self._groups.inside(node, []), self.shares[node].cpus)
@@ -295,7 +300,7 @@ class NetnsTestbed:
         for node in list(self.stress):
             self.stress.pop(node).__exit__(None, None, None)
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """End everything, and leave nothing behind; safe to call twice."""
         self._stack.close()
         self._claimed = False
@@ -306,32 +311,26 @@ class NetnsTestbed:
         """Return the processes of a cell without its controller."""
         return [who for node in problem.fabric.nodes for who in expected(problem, node)]
 
-    def come_up(self, *, patience_s: float = START_S) -> None:
+    def _come_up(self) -> None:
         """Wait until everybody is there, with every cell on its initial placement.
 
         Controllers that never move anything look after the cells until then; the runs that they
         write are in `STARTING`, and no part of any measurement.
-
-        Raises
-        ------
-        LiveError
-            If the cells do not come up.
         """
         for problem in self.problems:
             node = problem.controller_node
-            if f"controller@{node}" not in self._processes.running:
+            if f"controller@{node}" not in self.processes.running:
                 more = ["--policy", problem.initial]
-                self._processes.start_controller(node, out=self.folder / STARTING, more=more)
+                self.processes.start_controller(node, out=self.folder / STARTING, more=more)
         # Interpreters that start would take most of a minute of what a small robot has.
         with self._groups.unlimited():
             for problem, watcher in zip(self.problems, self.watchers, strict=True):
                 status = come_up(
-                    watcher.status, self.expected(problem), self.folder, patience_s=patience_s
+                    watcher.status, self.expected(problem), self.folder, patience_s=START_S
                 )
                 self._past[problem.name] = status["run"]
-        self._processes.stop_controllers()
 
-    def begin(self, *, patience_s: float = START_S) -> list[int]:
+    def begin(self) -> list[int]:
         """Begin a new run of every cell, with controllers that know nothing of the time before.
 
         Returns
@@ -344,18 +343,19 @@ class NetnsTestbed:
         LiveError
             If a run does not begin, or somebody is missing.
         """
+        self.processes.stop_controllers()
         for problem in self.problems:
             self._restart_stamper(problem)
-        self._processes.start_controllers()
+        self.processes.start_controllers()
         return [
-            self._origin(problem, watcher, patience_s)
+            self._origin(problem, watcher)
             for problem, watcher in zip(self.problems, self.watchers, strict=True)
         ]
 
     def _restart_stamper(self, problem: Problem) -> None:
         """Have a stamper begin anew, as if its cell had never run."""
         node = problem.stamper_node
-        state = self._processes.folder_of(problem) / node
+        state = self.processes.folder_of(problem) / node
         mark = state / f"stamper@{node}.pid"
         pid = int(json.loads(mark.read_text(encoding="utf-8"))["pid"])
         with suppress(ProcessLookupError):
@@ -364,11 +364,11 @@ class NetnsTestbed:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
 
-    def _origin(self, problem: Problem, watcher: Watcher, patience_s: float) -> int:
-        until = time.monotonic() + patience_s
+    def _origin(self, problem: Problem, watcher: Watcher) -> int:
+        until = time.monotonic() + START_S
         while time.monotonic() < until:
             status = come_up(
-                watcher.status, self.expected(problem), self.folder, patience_s=patience_s
+                watcher.status, self.expected(problem), self.folder, patience_s=START_S
             )
             # A late answer of the controller before tells of the run before.
             new = status["run"] is not None and status["run"] != self._past.get(problem.name)
@@ -378,9 +378,9 @@ class NetnsTestbed:
             time.sleep(0.05)
         raise LiveError(f"cell {problem.name!r} releases no cycles; see the logs in {self.folder}")
 
-    def stop_controllers(self) -> None:
-        """End the controllers and wait until they have written their runs."""
-        self._processes.stop_controllers()
+    def sample(self, patience_s: float) -> Mapping[str, Any]:
+        """Return how the first cell is, as its controller says."""
+        return self.watchers[0].status(patience_s)
 
     # --------------------------------------------------------------------- disturbances
 
@@ -405,16 +405,16 @@ class NetnsTestbed:
     def _take_down(self, node: str) -> None:
         """Kill everything on a node at once, as a loss of power does."""
         self._groups.kill(node)
-        self._processes.forget(node)
+        self.processes.forget(node)
         with suppress(LiveError):
             self.stress.pop(node).__exit__(None, None, None)
 
     def _bring_up(self, node: str) -> None:
         self._start_stress(node)
         self.stress[node].set(self._threads[node])
-        self._processes.start_agent(node)
+        self.processes.start_agent(node)
         if any(problem.controller_node == node for problem in self.problems):
-            self._processes.start_controller(node)
+            self.processes.start_controller(node)
 
     def _apply_to_link(self, link: Link, now: Conditions) -> None:
         changes = differing(self._conditions[link.name], now)
@@ -425,7 +425,20 @@ class NetnsTestbed:
             way = self.links[frozenset((link.source, link.target))]
             way.set(link.source, link.target, **changes)
 
+    def cut(self, source: str, target: str, at_ns: int) -> int:
+        """Cut a direction of a link; returns when that was."""
+        way = self.links[frozenset((source, target))]
+        return way.down(source, target, True, at_ns=at_ns)
+
+    def heal(self, source: str, target: str) -> None:
+        """End a cut."""
+        self.links[frozenset((source, target))].down(source, target, False)
+
     # ---------------------------------------------------------------------------- facts
+
+    def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
+        """Return how to run a command beside the processes of each node: words to put first."""
+        return {(node,): self.beside(node) for node in self.problem.fabric.nodes}
 
     @property
     def used_ns(self) -> dict[str, Callable[[], int]]:

@@ -19,6 +19,7 @@ from dwell.model import Disturbance, Problem
 from dwell.model.document import disturbance_document
 from dwell.record import Run, open_run, seal_run
 from dwell.testbed.conditions import Conditions
+from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import Change, Timeline, first_ns, last_ns, step_ns
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "longest_run",
     "make_folder",
     "play",
+    "play_on",
     "undisturbed",
 ]
 
@@ -310,6 +312,34 @@ def play(
         if waiting:
             following_s = min(following_s, waiting[0].at_s)
         time.sleep(max(following_s - now_s(), 0.0))
+
+
+def play_on(
+    testbed: Testbed,
+    played: Played,
+    seconds: float,
+    look: Callable[[float], None] = lambda at_s: None,
+) -> None:
+    """Play a timeline on a testbed that has been started, and note what was done when.
+
+    Parameters
+    ----------
+    testbed : Testbed
+    played : Played
+        What is to be played.
+    seconds : float
+        From the first release on.
+    look : callable
+        As of `play`.
+    """
+    clock = clock_of(played.problem)
+
+    def apply(change: Change) -> None:
+        testbed.apply(change)
+        played.changed(change)
+
+    changes = played.timeline.changes
+    play(changes, seconds, lambda: (clock() - testbed.begun_ns) / 1e9, apply, look)
 
 
 def longest_run(runs: Path, cell: str | None = None) -> Path | None:

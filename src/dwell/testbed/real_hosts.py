@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
+from dwell.live.hosting import clock_of
 from dwell.live.operator_client import OperatorClient
 from dwell.model import Host, Link, LinkDisturbance, Normal, Problem
 from dwell.model.scenario import Disturbance
@@ -31,9 +32,10 @@ from dwell.policies.registry import by_name
 from dwell.record import open_run
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
-from dwell.testbed.playing import Played, come_up, longest_run, make_folder, play, undisturbed
+from dwell.testbed.playing import Played, come_up, longest_run, make_folder, play_on, undisturbed
 from dwell.testbed.processes import Processes, expected
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
+from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import Change, timeline_of, usual_conditions
 
 __all__ = ["RealHosts", "require_commands", "run_on_hosts"]
@@ -48,7 +50,7 @@ STOP_S = 10.0
 LEAST_LOSS = 1e-9
 
 
-class RealHosts:
+class RealHosts(Testbed):
     """A cell on real hosts; a context manager.
 
     Parameters
@@ -90,8 +92,14 @@ class RealHosts:
             [self.problem], self.folder, inside=self.inside, more=more, owner=SHELL_ID
         )
 
-    def __enter__(self) -> RealHosts:
-        """Put the cell file everywhere, and start the agents."""
+    def start(self) -> None:
+        """Put the cell file everywhere, start everything, and begin a run.
+
+        Raises
+        ------
+        LiveError
+            If a host cannot be reached, or the cell does not come up.
+        """
         try:
             self.processes.write()
             self._stack.callback(self._undisturb)
@@ -100,18 +108,22 @@ class RealHosts:
                 self._prepare(node)
             for node in self.problem.fabric.nodes:
                 self.processes.start_agent(node)
+            self._client = self._stack.enter_context(OperatorClient(self.problem))
+            self._begin()
+            # The stamper's clock is another one: this one's, since the run was seen to begin.
+            self.begun_ns = clock_of(self.problem)()
         except BaseException:
-            self.close()
+            with undisturbed():
+                self.stop()
             raise
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        """End everything."""
-        self.close()
-
-    def close(self) -> None:
-        """End everything, and take disturbances back."""
+    def stop(self) -> None:
+        """End everything, and take disturbances back; runs stay there until the next start."""
         self._stack.close()
+
+    def sample(self, patience_s: float) -> Mapping[str, Any]:
+        """Return how the cell is, as its controller says."""
+        return self._client.ask("status", patience_s=patience_s)
 
     # ------------------------------------------------------------------------ commands
 
@@ -178,24 +190,13 @@ class RealHosts:
 
     # ------------------------------------------------------------------------- running
 
-    def begin(self, visitor: OperatorClient) -> None:
-        """Wait until everybody is there, and begin a run that knows nothing of the time before.
-
-        Raises
-        ------
-        LiveError
-            If the cell does not come up.
-        """
+    def _begin(self) -> None:
+        """Wait until everybody is there, and begin a run that knows nothing of the time before."""
         problem = self.problem
         node = problem.controller_node
-        awaited = [who for name in problem.fabric.nodes for who in expected(problem, name)]
-
-        def ask(patience_s: float) -> Mapping[str, Any]:
-            return visitor.ask("status", patience_s=patience_s)
-
         more = ["--policy", problem.initial]
         self.processes.start_controller(node, out=self.folder / "starting", more=more)
-        come_up(ask, awaited, self.folder, patience_s=START_S)
+        self._came_up()
         self.processes.stop_controllers()
         stamper = problem.stamper_node
         mark = f"{shlex.quote(self.there(stamper))}/{stamper}/stamper@{stamper}"
@@ -203,10 +204,16 @@ class RealHosts:
         self.shell(stamper, f"rm -f {mark}.book; kill -KILL $({number})")
         self.processes.start_controller(node)
         until = time.monotonic() + START_S
-        while come_up(ask, awaited, self.folder, patience_s=START_S).get("origin_ns") is None:
+        while self._came_up().get("origin_ns") is None:
             if time.monotonic() > until:
                 raise LiveError(f"cell {problem.name!r} releases no cycles; see {self.folder}")
             time.sleep(0.05)
+
+    def _came_up(self) -> Mapping[str, Any]:
+        """Wait until everybody is there; returns how the cell is then."""
+        problem = self.problem
+        awaited = [who for node in problem.fabric.nodes for who in expected(problem, node)]
+        return come_up(self.sample, awaited, self.folder, patience_s=START_S)
 
     def fetch_runs(self) -> None:
         """Bring what the controller has written to this computer.
@@ -345,33 +352,19 @@ def run_on_hosts(
     require_commands(inventory, timeline.items)
     make_folder(out, MARK, "a testbed's")
     played = Played(problem, scenario, seed, timeline)
-    with ExitStack() as stack:
-
-        def close() -> None:
-            with undisturbed():
-                hosts.close()
-
-        stack.callback(close)
-        hosts.__enter__()
-        visitor = stack.enter_context(OperatorClient(hosts.problem))
-        hosts.begin(visitor)
-        begun_ns = time.monotonic_ns()
-
-        def now_s() -> float:
-            return (time.monotonic_ns() - begun_ns) / 1e9
-
-        def apply(change: Change) -> None:
-            hosts.apply(change)
-            played.changed(change, time.monotonic_ns())
-
-        play(timeline.changes, seconds, now_s, apply, lambda at_s: None)
+    try:
+        hosts.start()
+        play_on(hosts, played, seconds)
         hosts.processes.stop_controllers()
         hosts.fetch_runs()
+    finally:
+        with undisturbed():
+            hosts.stop()
     folder = longest_run(out / "runs")
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    # By this computer's clock, since the run was seen to begin: its stamper's is another one.
     release_ns = open_run(folder).cycles["release_ns"]
-    played.note(folder, (begun_ns, begun_ns + int(release_ns[-1]) if len(release_ns) else begun_ns))
+    last_ns = hosts.begun_ns + (int(release_ns[-1]) if len(release_ns) else 0)
+    played.note(folder, (hosts.begun_ns, last_ns))
     shutil.rmtree(out / "starting", ignore_errors=True)
     return folder

@@ -21,12 +21,12 @@ from dwell.testbed.playing import (
     interruptible,
     longest_run,
     make_folder,
-    play,
+    play_on,
     undisturbed,
 )
 from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
-from dwell.testbed.timeline import Change, timeline_of
+from dwell.testbed.timeline import timeline_of
 
 __all__ = ["MARK", "length_s", "require_machine", "run_once", "spans_of"]
 
@@ -128,14 +128,13 @@ def run_once(
                 # A folder that is replaced may be that of a testbed that runs.
                 testbed.claim()
                 make_folder(out, MARK, "a testbed's")
-                testbed.__enter__()
                 tell("starting the cell")
-                testbed.come_up()
+                testbed.start()
                 tell(f"playing {scenario} for {seconds:g} s")
                 _play(testbed, seconds, played, samplers, rule)
             finally:
                 with undisturbed():
-                    testbed.close()
+                    testbed.stop()
     except KeyboardInterrupt:
         # Before it was played, what is there may be a run of long ago.
         folder = longest_run(out / "runs") if samplers else None
@@ -159,20 +158,13 @@ def _play(
     rule: Rule,
 ) -> None:
     clock = clock_of(played.problem)
-    (origin_ns,) = testbed.begin()
     links = {"-".join(link.nodes): link for link in testbed.links.values()}
-
-    def apply(change: Change) -> None:
-        testbed.apply(change)
-        played.changed(change)
-
     with Sampler(
         testbed.cpus, testbed.used_ns, testbed.switches, links, clock, rule, testbed.probing
     ) as sampler:
         samplers.append(sampler)
-        changes = played.timeline.changes
-        play(changes, seconds, lambda: (clock() - origin_ns) / 1e9, apply, lambda at_s: None)
-    testbed.stop_controllers()
+        play_on(testbed, played, seconds)
+    testbed.processes.stop_controllers()
 
 
 def _seal(

@@ -18,10 +18,11 @@ from dwell.model.scenario import RAMP_STEPS, Disturbance
 from dwell.testbed.conditions import Conditions
 
 if TYPE_CHECKING:
-    from dwell.sim import LinkSegment, NodeChange
+    from dwell.sim import LinkSegment
 
 __all__ = [
     "Change",
+    "NodeState",
     "Timeline",
     "differing",
     "first_ns",
@@ -36,6 +37,14 @@ NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, slots=True)
+class NodeState:
+    """What is done to a node: foreign threads that it has, and whether it is down."""
+
+    threads: int
+    down: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Change:
     """A node or a link is another one from an instant on.
 
@@ -45,13 +54,13 @@ class Change:
         Since the first release.
     place : str
         Node, or link (``R1->E``).
-    state : NodeChange or Conditions
+    state : NodeState or Conditions
         All of what it is like from then on: of a node, or of a link.
     """
 
     at_ns: int
     place: str
-    state: NodeChange | Conditions
+    state: NodeState | Conditions
 
     @property
     def at_s(self) -> float:
@@ -109,7 +118,7 @@ def timeline_of(
     problem = _without_bursts(problem)
     items = drawn_scenario(problem, scenario=scenario, **asked)
     nodes, segments = draw_changes(problem, scenario=scenario, **asked)
-    changes = [Change(one.at_ns, one.node, one) for one in nodes]
+    changes = [Change(one.at_ns, one.node, NodeState(one.threads, one.down)) for one in nodes]
     # A link's first segment is the link as it is, unless something is on from the beginning.
     at_once = {item.place for item in items if first_ns(item) == 0}
     changes += [

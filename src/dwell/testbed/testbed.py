@@ -1,0 +1,82 @@
+"""Testbed: where a cell of real processes runs, and a scenario is played on it.
+
+Three there are: processes without root (`loopback`), hosts on this machine (`netns_testbed`), and
+the hosts of an inventory (`real_hosts`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from dwell.model import Problem
+from dwell.testbed.child import Started
+from dwell.testbed.processes import Processes
+from dwell.testbed.timeline import Change
+
+__all__ = ["LocalTestbed", "Testbed"]
+
+
+class Testbed(Started):
+    """A cell on hosts, links and CPUs that can be disturbed; a context manager.
+
+    `start` starts everything, waits until every process is ready, and begins a run; `stop` ends
+    everything, the controller first, so that the run is written, and leaves nothing behind. It is
+    safe to call twice.
+
+    Attributes
+    ----------
+    problem : Problem
+        The cell, with its hosts.
+    folder : Path
+        Of cell file, states, logs and runs on this computer.
+    processes : Processes
+        Agents and controller, once it has been started.
+    begun_ns : int
+        First release of the run, by the clock that processes on this computer read.
+    """
+
+    problem: Problem
+    folder: Path
+    processes: Processes
+    begun_ns: int
+
+    @abstractmethod
+    def apply(self, change: Change) -> None:
+        """Have a node or a link be as a change says, from now on."""
+
+    @abstractmethod
+    def sample(self, patience_s: float) -> Mapping[str, Any]:
+        """Return how the cell is, as its controller says.
+
+        Raises
+        ------
+        LiveError
+            If nobody answers in time.
+        """
+
+
+class LocalTestbed(Testbed):
+    """A testbed on this machine: its links can be cut, and its nodes listened to.
+
+    Attributes
+    ----------
+    own_cpus : bool
+        Whether every node has CPU time of its own, which foreign threads can load.
+    """
+
+    own_cpus: bool
+
+    @abstractmethod
+    def cut(self, source: str, target: str, at_ns: int) -> int:
+        """Cut a direction of a link at an instant of the monotonic clock; returns when that was."""
+
+    @abstractmethod
+    def heal(self, source: str, target: str) -> None:
+        """End a cut."""
+
+    @abstractmethod
+    def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:
+        """Return how to run a command that reaches nodes directly: words to put first, by nodes."""
