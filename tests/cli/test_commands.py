@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 import dwell
 from dwell.cli.commands import app
-from dwell.cli.demo import find_examples
+from dwell.cli.examples import find_examples
 from dwell.errors import ProblemError, RunError
 from dwell.model.document import to_document
 from dwell.record import Run

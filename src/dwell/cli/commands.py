@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from dwell import __version__
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
+from dwell.cli.new import Origin
 from dwell.cli.options import (
     CellArgument,
     Estimator,
@@ -308,13 +309,40 @@ def validate(
 
 
 @app.command()
-def schema() -> None:
-    """Print the JSON Schema of the cell file."""
-    import json
+def new(
+    name: Annotated[Path, typer.Argument(metavar="NAME", help="Folder to make.")],
+    origin: Annotated[
+        Origin, typer.Option("--from", help="Example to begin as: simulated, or live.")
+    ] = Origin.CANONICAL,
+) -> None:
+    """Make a folder with a cell of your own: cell.yaml, policy.py, stages.py, test_cell.py.
 
-    from dwell.cellfile import schema as cell_schema
+    All of it works as it is; comments say what to change.
+    """
+    from dwell.cli.new import new_cell
 
-    typer.echo(json.dumps(cell_schema(), indent=2))
+    new_cell(name, origin)
+
+
+@app.command()
+def schema(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="What to write; cell.schema.json if not given."),
+    ] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="Write it, for an editor, instead of printing it.")
+    ] = False,
+) -> None:
+    """Print the JSON Schema of the cell file, or write it."""
+    from dwell.cli.schema import SCHEMA_FILE, schema_text, write_schema
+
+    if write:
+        write_schema(file or Path(SCHEMA_FILE))
+    elif file is not None:
+        raise typer.BadParameter(f"say --write to write {file}")
+    else:
+        typer.echo(schema_text(), nl=False)
 
 
 @app.command()

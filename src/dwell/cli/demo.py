@@ -7,14 +7,12 @@ from pathlib import Path
 
 import typer
 
-import dwell
+from dwell.cli.examples import find_examples
 from dwell.cli.output import print_json, progress, working, write_file
-from dwell.errors import ProblemError
 from dwell.report import comparison_html, comparison_text
 from dwell.study import Comparison, StudyResult, canonical_demo, real_demo, tenants_demo
-from dwell.study.demo import CANONICAL
 
-__all__ = ["find_examples", "run_demo"]
+__all__ = ["run_demo"]
 
 
 def run_demo(
@@ -71,25 +69,3 @@ def run_demo(
         print_json({"report": page, "comparisons": tables})
     else:
         typer.echo(f"report: {page}")
-
-
-def find_examples(given: Path | None) -> Path:
-    """Return the folder with the example cells.
-
-    Raises
-    ------
-    ProblemError
-        If it is not given and neither beside the package nor here.
-    """
-    if given is not None:
-        return given
-    package = Path(dwell.__file__).parent
-    # Of a wheel, of a checkout, and here.
-    places = (package / "examples", package.parents[1] / "examples", Path("examples"))
-    for place in places:
-        if (place / CANONICAL).is_file():
-            return place
-    raise ProblemError(
-        "the example cells are not installed with the package; run this in a checkout of the "
-        "repository, or name their folder with --examples"
-    )

@@ -1,0 +1,120 @@
+"""`dwell new`: a cell, a policy, stages and a test to begin with, made from the examples."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from enum import StrEnum
+from pathlib import Path
+
+import typer
+
+from dwell.cli.examples import find_examples
+from dwell.cli.schema import SCHEMA_FILE, schema_text
+from dwell.errors import ProblemError
+
+__all__ = ["Origin", "new_cell"]
+
+FOLDER = re.compile(r"\w[\w.+-]{0,62}")
+
+
+class Origin(StrEnum):
+    """The example that a new cell begins as."""
+
+    CANONICAL = "canonical"
+    LIVE = "live"
+
+
+CELLS = {Origin.CANONICAL: "canonical.yaml", Origin.LIVE: "live/cell.yaml"}
+STAGES = {Origin.CANONICAL: "stages.py", Origin.LIVE: "live/stages.py"}
+
+#: First lines of the cell file, after the one for editors.
+HEAD = """\
+# The cell {name}, which began as Dwell's example `{origin}`. Change, from top to bottom:
+#   period_ms           how often your pipeline runs; deadline_ms, by when a cycle must be done
+#   nodes, links        your computers, and what connects them
+#   tasks, flows        your stages: where each may run, how long it takes there, what it sends
+#   candidates          the placements to choose from
+#   scenarios           what may happen to the nodes and links
+#   objective           what a good placement is: weights, targets, caps
+#   controller.policy   who decides: `policy:Patient` is the class in policy.py
+{more}
+# `dwell check cell.yaml` finds every fault in it; `python test_cell.py` plays it.
+"""
+MORE = {
+    Origin.CANONICAL: "# Execution times: `dwell profile --node R1 --task "
+    "perception=stages:perceive --inputs stages:frame`\n# measures functions of stages.py here.",
+    Origin.LIVE: "#   tasks.*.run         functions and classes in stages.py that do the work\n"
+    "#   live.hosts          addresses of your computers",
+}
+STAGES_HEAD = {
+    Origin.CANONICAL: '"""Stages to measure: change them to what your tasks do."""\n',
+    Origin.LIVE: '"""Stages, and the drive that they steer: change them to yours."""\n',
+}
+
+
+def new_cell(path: Path, origin: Origin) -> None:
+    """Make the folder of a new cell, and say what to do next.
+
+    Parameters
+    ----------
+    path : Path
+        The folder; its last part names the cell.
+    origin : Origin
+
+    Raises
+    ------
+    ProblemError
+        If there is something of that name already, it cannot name a folder, or the folder around it
+        is not there.
+    OSError
+        If it cannot be written; nothing of it is left then.
+    """
+    if FOLDER.fullmatch(path.name) is None:
+        raise ProblemError(
+            f"{str(path)!r} is no name for a cell's folder; use letters, digits, _ - . and +, a "
+            "letter, a digit or _ first, at most 63 characters"
+        )
+    if not path.parent.is_dir():
+        raise ProblemError(f"there is no folder {path.parent} to make {path.name} in")
+    files = _files(find_examples(None), path.name, origin)
+    try:
+        path.mkdir()
+    except FileExistsError:
+        raise ProblemError(f"{path} is there already; choose another name") from None
+    try:
+        for name, text in files.items():
+            (path / name).write_text(text, encoding="utf-8")
+    except OSError:
+        shutil.rmtree(path, ignore_errors=True)
+        raise
+    typer.echo(
+        f"made {path}: {', '.join(files)}\n\n"
+        f"cd {path}\n"
+        "dwell check cell.yaml\n"
+        "python test_cell.py\n"
+        "dwell run cell.yaml --policy policy:Patient --windows 20"
+    )
+
+
+def _files(examples: Path, name: str, origin: Origin) -> dict[str, str]:
+    """Return the texts of the files of a new cell by their names."""
+    given = {
+        file: (examples / place).read_text(encoding="utf-8")
+        for file, place in {
+            "cell.yaml": CELLS[origin],
+            "policy.py": "new/policy.py",
+            "stages.py": STAGES[origin],
+            "test_cell.py": "new/test_cell.py",
+        }.items()
+    }
+    head = HEAD.format(name=name, origin=origin.value, more=MORE[origin])
+    cell = re.sub(r"\A(#.*\n)+", "", given["cell.yaml"])
+    cell = re.sub(r"^name: .*$", f"name: '{name}'", cell, count=1, flags=re.MULTILINE)
+    stages = given["stages.py"].partition("\n")[2]
+    return {
+        **given,
+        "cell.yaml": f"# yaml-language-server: $schema={SCHEMA_FILE}\n{head}{cell}",
+        "stages.py": STAGES_HEAD[origin] + stages,
+        SCHEMA_FILE: schema_text(),
+    }

@@ -1,0 +1,53 @@
+"""`dwell schema`: the JSON Schema of the cell file, printed or written for an editor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import typer
+
+from dwell.cellfile import schema
+from dwell.cli.output import write_file
+from dwell.errors import ProblemError
+
+__all__ = ["SCHEMA_FILE", "schema_text", "write_schema"]
+
+#: What a cell file's first line calls its schema.
+SCHEMA_FILE = "cell.schema.json"
+
+
+def schema_text() -> str:
+    """Return the schema as a file has it."""
+    return json.dumps(schema(), indent=2) + "\n"
+
+
+def write_schema(path: Path) -> None:
+    """Write the schema, and say what to put into a cell file.
+
+    Raises
+    ------
+    ProblemError
+        If there is another file of that name, or a folder, or the folder around it is not there.
+    OSError
+        If it cannot be written; an older schema stays then.
+    """
+    if path.is_dir():
+        raise ProblemError(f"{path} is a folder; name a file")
+    if not path.parent.is_dir():
+        raise ProblemError(f"there is no folder {path.parent} to write {path.name} in")
+    if path.exists() and not _is_schema(path):
+        raise ProblemError(f"{path} is there already, and is no schema; choose another file")
+    write_file(path, schema_text())
+    typer.echo(
+        f"wrote {path}; the first line of a cell file beside it:\n"
+        f"# yaml-language-server: $schema={path.name}"
+    )
+
+
+def _is_schema(path: Path) -> bool:
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return isinstance(known, dict) and known.get("title") == schema()["title"]

@@ -1,0 +1,120 @@
+"""`dwell new` and `dwell schema`: what they make, and what they refuse."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dwell
+from tests.cli.test_commands import ROOT, call
+
+FILES = {"cell.yaml", "policy.py", "stages.py", "test_cell.py", "cell.schema.json"}
+CELLS = [
+    path
+    for path in sorted((ROOT / "examples").rglob("*.yaml"))
+    if re.search("^dwell: ", path.read_text(encoding="utf-8"), re.MULTILINE)
+]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty folder, the current one."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("origin", ["canonical", "live"])
+def test_a_new_cell_passes_its_check_and_its_own_test(here: Path, origin: str) -> None:
+    assert call("new", "hall", "--from", origin).exit_code == 0
+    assert {path.name for path in (here / "hall").iterdir()} == FILES
+    assert call("check", "hall/cell.yaml").exit_code == 0
+    assert dwell.load("hall/cell.yaml").name == "hall"
+    for command in (["test_cell.py"], ["-m", "pytest", "-q", "-p", "no:cacheprovider"]):
+        found = subprocess.run(
+            (sys.executable, *command), cwd="hall", capture_output=True, text=True, check=False
+        )
+        assert found.returncode == 0, found.stdout + found.stderr
+
+
+def test_the_default_is_the_canonical_cell(here: Path) -> None:
+    assert call("new", "hall").exit_code == 0
+    ours, theirs = (
+        dwell.load(path) for path in ("hall/cell.yaml", ROOT / "examples" / "canonical.yaml")
+    )
+    assert ours.candidates == theirs.candidates
+    assert ours.scenarios == theirs.scenarios
+
+
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", ".hall", "a:b", "a b", "a\tb", "x" * 64, "./-hall"]
+)
+def test_names_that_are_no_folders(here: Path, name: str) -> None:
+    found = call("new", name)
+    assert found.exit_code == 2
+    assert "is no name for a cell's folder" in found.stderr
+    assert list(here.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "link"])
+def test_nothing_is_overwritten(here: Path, kind: str) -> None:
+    if kind == "folder":
+        Path("hall").mkdir()
+    elif kind == "file":
+        Path("hall").write_text("mine", encoding="utf-8")
+    else:
+        Path("hall").symlink_to("nowhere")
+    found = call("new", "hall")
+    assert (found.exit_code, found.stderr) == (
+        2,
+        "error: hall is there already; choose another name\n",
+    )
+    assert kind != "folder" or list(Path("hall").iterdir()) == []
+    assert kind != "file" or Path("hall").read_text(encoding="utf-8") == "mine"
+
+
+def test_a_folder_around_it_that_is_missing(here: Path) -> None:
+    found = call("new", "absent/hall")
+    assert (found.exit_code, found.stderr.count("\n")) == (2, 1)
+    assert "there is no folder absent" in found.stderr
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_examples_name_their_schema(cell: Path) -> None:
+    first = cell.read_text(encoding="utf-8").partition("\n")[0]
+    place = first.removeprefix("# yaml-language-server: $schema=")
+    known = (cell.parent / place).read_text(encoding="utf-8")
+    # Made by `dwell schema --write examples/cell.schema.json`.
+    assert known == call("schema").stdout
+
+
+def test_a_schema_is_written_and_replaced(here: Path) -> None:
+    for arguments in ((), ("cell.schema.json",), ("other.json",)):
+        assert call("schema", "--write", *arguments).exit_code == 0
+    assert {path.name for path in here.iterdir()} == {"cell.schema.json", "other.json"}
+    text = Path("cell.schema.json").read_text(encoding="utf-8")
+    assert text == Path("other.json").read_text(encoding="utf-8") == call("schema").stdout
+
+
+def test_a_schema_that_cannot_be_written(here: Path) -> None:
+    Path("cell.yaml").write_text("dwell: 1\n", encoding="utf-8")
+    Path("folder").mkdir()
+    for name in ("cell.yaml", "folder", "absent/cell.schema.json"):
+        found = call("schema", "--write", name)
+        assert (found.exit_code, found.stderr.count("\n")) == (2, 1)
+    assert Path("cell.yaml").read_text(encoding="utf-8") == "dwell: 1\n"
+    assert call("schema", "other.json").exit_code == 2
+    assert not Path("other.json").exists()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written(here: Path) -> None:
+    here.chmod(0o555)
+    for command in (("new", "hall"), ("schema", "--write")):
+        found = call(*command)
+        assert (found.exit_code, found.stderr.count("\n")) == (1, 1)
+    here.chmod(0o755)
