@@ -86,6 +86,7 @@ class RealHosts(Testbed):
         self.problem = replace(problem, live=replace(problem.live, hosts=hosts))
         self.inventory, self.folder, self.name = inventory, folder.resolve(), name
         self.stress: dict[str, subprocess.Popen[bytes]] = {}
+        self._threads: dict[str, int] = {}
         self._disturbed: set[str] = set()
         self._stack = ExitStack()
         self.processes = Processes(
@@ -237,6 +238,10 @@ class RealHosts(Testbed):
             self._disturb(self.problem.fabric.links[change.place], state)
             return
         node = change.place
+        # The steps of a ramp are many more than whole threads.
+        if state.threads == self._threads.get(node, 0):
+            return
+        self._threads[node] = state.threads
         self._end_stress(node)
         if state.threads:
             line = self.inventory.hosts[node].stress.format(threads=state.threads)
@@ -267,6 +272,7 @@ class RealHosts(Testbed):
     def _undisturb(self) -> None:
         for node in list(self.stress):
             self._end_stress(node)
+        self._threads.clear()
         for name in sorted(self._disturbed):
             source = self.problem.fabric.links[name].source
             self.shell(source, self.inventory.links[name].end)
