@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from dwell.kernels import compiled
+from dwell.kernels import cache_name, compiled
 from dwell.kernels.advance import advance
 
 
@@ -34,8 +34,8 @@ class Package:
 
 def test_the_fingerprint_changes_with_every_source(monkeypatch: pytest.MonkeyPatch) -> None:
     def of(*sources: Source) -> str:
-        monkeypatch.setattr(compiled, "files", lambda _package: Package(*sources))
-        return compiled._fingerprint()
+        monkeypatch.setattr(cache_name, "files", lambda _package: Package(*sources))
+        return cache_name.fingerprint()
 
     one, two = Source("advance.py", b"A"), Source("nodes.py", b"B")
     base = of(one, two)
@@ -49,4 +49,4 @@ def test_the_fingerprint_changes_with_every_source(monkeypatch: pytest.MonkeyPat
 @pytest.mark.skipif(not compiled.COMPILED, reason="kernels are not compiled (NUMBA_DISABLE_JIT)")
 def test_the_cache_of_a_kernel_carries_the_fingerprint() -> None:
     stamp = advance._cache._cache_file._source_stamp  # type: ignore[attr-defined]
-    assert stamp[1] == compiled._fingerprint()
+    assert stamp[1] == cache_name.fingerprint()

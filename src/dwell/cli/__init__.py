@@ -29,7 +29,10 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     # Pydantic would look for plugins in all that is installed; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
+        from dwell.cli import first_answer
         from dwell.cli.commands import app
+
+        first_answer.own_process = True
 
         app(arguments, prog_name="dwell", obj=platform)
     except KeyboardInterrupt:

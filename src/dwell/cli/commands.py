@@ -179,14 +179,19 @@ def run(
     300 windows, if neither --windows nor --seconds is given.
     """
     import dwell
-    from dwell.cli.run import RunRequest, run_cell
+    from dwell.cli.first_answer import prepare
 
     require_one_length(windows, seconds)
     problem = dwell.load(cell, traces=traces)
     if seconds is not None:
         windows = windows_of(problem, seconds)
+    windows = windows or 300
+    how = prepare(windows * problem.window_cycles)
+    # Imports the kernels.
+    from dwell.cli.run import RunRequest, run_cell
+
     request = RunRequest(
-        problem, scenario, policy, estimator, seed, windows or 300, out, jobs, guard, force
+        problem, scenario, policy, estimator, seed, windows, out, jobs, guard, force, how
     )
     if not run_cell(request, as_json=as_json):
         raise typer.Exit(FAILED)

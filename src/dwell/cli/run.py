@@ -25,7 +25,10 @@ __all__ = ["RunRequest", "run_cell"]
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What a run was asked to be; None is what the cell says, or the default folder."""
+    """What a run was asked to be; None is what the cell says, or the default folder.
+
+    `how` says how it is played, where that is worth a word (see `dwell.cli.first_answer`).
+    """
 
     problem: Problem
     scenario: str
@@ -37,6 +40,7 @@ class RunRequest:
     jobs: bool
     guard: bool = False
     force: bool = False
+    how: str | None = None
 
 
 def run_cell(request: RunRequest, *, as_json: bool) -> bool:
@@ -58,7 +62,8 @@ def run_cell(request: RunRequest, *, as_json: bool) -> bool:
     require_free(folder)
     if not request.force:
         _require_same(folder, problem, request, policy)
-    with working(f"simulating {request.windows} windows"):
+    how = f" ({request.how})" if request.how else ""
+    with working(f"simulating {request.windows} windows{how}"):
         result = dwell.simulate(
             problem,
             scenario=request.scenario,

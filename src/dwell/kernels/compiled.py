@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
-from importlib.resources import files
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
@@ -13,6 +11,8 @@ from numba import types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 from numpy.typing import NDArray
+
+from dwell.kernels.cache_name import cache_suffix, fingerprint
 
 __all__ = ["COMPILED", "fixed_columns", "index", "kernel", "phase"]
 
@@ -26,16 +26,6 @@ COMPILED: bool = not config.DISABLE_JIT
 P = ParamSpec("P")
 R = TypeVar("R")
 T = TypeVar("T", bound=np.generic)
-
-
-def _fingerprint() -> str:
-    """Hash of the sources of all kernels."""
-    digest = hashlib.sha256()
-    for source in sorted(files(__package__).iterdir(), key=lambda entry: entry.name):
-        if source.name.endswith(".py"):
-            digest.update(source.name.encode())
-            digest.update(source.read_bytes())
-    return digest.hexdigest()
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -53,9 +43,8 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     except RuntimeError:
         return cast(Callable[P, R], njit(**options)(function))
     if COMPILED:
-        cache, stamp = compiled._cache, _fingerprint()
-        host = hashlib.sha256(repr(compiled.targetctx.codegen().magic_tuple()).encode())
-        name = f"{cache._impl.filename_base}.{stamp[:16]}.{host.hexdigest()[:8]}"
+        cache, stamp = compiled._cache, fingerprint()
+        name = f"{cache._impl.filename_base}.{cache_suffix()}"
         file = cache._cache_file
         cache._cache_file = type(file)(cache.cache_path, name, (file._source_stamp, stamp))
     return cast(Callable[P, R], compiled)

@@ -1,0 +1,156 @@
+"""The first answer does not wait for the compiler.
+
+Compiling the simulator takes longer than playing a few windows as plain Python. So where no
+compiled kernels are cached and the work is short, the process plays interpreted from its start,
+with the same results, while a detached process compiles for the runs after it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dwell
+
+__all__ = ["Kernels", "compile_kernels", "find_kernels", "prepare"]
+
+#: Cycles that are played sooner than the kernels are compiled, whatever the cell.
+SHORT_CYCLES = 30_000
+
+#: Whether this process is a command of its own: in another one kernels stay as they are.
+own_process = False
+
+
+@dataclass(frozen=True, slots=True)
+class Kernels:
+    """The compiled kernels of this version on this processor.
+
+    Parameters
+    ----------
+    folder : Path, optional
+        Of their cache; None where no folder can hold one.
+    suffix : str
+        Of the names of their files.
+    """
+
+    folder: Path | None
+    suffix: str
+
+    @property
+    def cached(self) -> bool:
+        """Whether the event loop is there, which is nearly all that has to be compiled."""
+        pattern = f"advance.advance-*.{self.suffix}.*.nbc"
+        return self.folder is not None and any(self.folder.glob(pattern))
+
+
+def find_kernels() -> Kernels:
+    """Look where Numba keeps the code of the kernels, before they are imported."""
+    from numba.core import caching
+
+    from dwell.kernels.cache_name import cache_suffix
+
+    # Numba chooses the folder by a function's file.
+    source = str(Path(dwell.__file__).parent / "kernels" / "advance.py")
+    found: dict[str, Any] = {}
+    exec(compile("def advance(): pass", source, "exec"), found)  # noqa: S102
+    try:
+        kept: Any = caching.CompileResultCacheImpl
+        place = kept(found["advance"]).locator.get_cache_path()
+    except RuntimeError:
+        return Kernels(None, cache_suffix())
+    return Kernels(Path(place), cache_suffix())
+
+
+def prepare(cycles: int) -> str | None:
+    """Choose how this process plays its work, before the simulator is imported.
+
+    Parameters
+    ----------
+    cycles : int
+        How long the work is.
+
+    Returns
+    -------
+    str or None
+        What to tell the user of it; None where compiled kernels are there.
+    """
+    if not own_process or "dwell.kernels.compiled" in sys.modules:
+        return None
+    from numba.core import config as numba_config
+
+    config: Any = numba_config
+    if config.DISABLE_JIT:
+        return None
+    kernels = find_kernels()
+    if kernels.cached:
+        return None
+    if cycles > SHORT_CYCLES:
+        return "compiling the simulator, once"
+    config.DISABLE_JIT = 1
+    if kernels.folder is None:
+        return "no folder can keep the compiled simulator: interpreting it"
+    started = _start_compiler(kernels.folder, kernels.suffix)
+    return f"interpreting the simulator; {'' if started else 'no '}compiler runs beside it"
+
+
+def _start_compiler(folder: Path, suffix: str) -> bool:
+    """Start the process that compiles, but where there is one; return whether one runs now.
+
+    The process inherits the lock, which ends with it, however it ends.
+    """
+    import fcntl
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder / f"compiling.{suffix}.lock", os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        subprocess.Popen(
+            (sys.executable, "-m", "dwell.cli.first_answer"),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            # Where this package is found, installed or not, and no folder of the user's is held.
+            cwd=Path(dwell.__file__).parents[1],
+            env=_environment(),
+            pass_fds=(lock,),
+            start_new_session=True,
+        )
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    finally:
+        os.close(lock)
+    return True
+
+
+def _environment() -> dict[str, str]:
+    """Return that of this process, with a cache folder that another current folder leaves."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    return {**os.environ, **({"NUMBA_CACHE_DIR": str(Path(given).resolve())} if given else {})}
+
+
+def compile_kernels() -> None:
+    """Compile every kernel, and have Numba keep the code."""
+    from dwell.cli.examples import find_examples
+    from dwell.study.summary import summarise
+
+    problem = dwell.load(find_examples(None) / "canonical.yaml")
+    dwell.simulate(problem, policy="cusum", estimator="corrected", seed=1, windows=2)
+    windows = problem.warmup_windows + 1
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=windows)
+    summarise(run, problem, {})  # the servo's loop
+
+
+if __name__ == "__main__":
+    with suppress(OSError):
+        os.nice(19)
+    compile_kernels()
