@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,21 @@ def test_a_new_cell_passes_its_check_and_its_own_test(here: Path, origin: str) -
             (sys.executable, *command), cwd="hall", capture_output=True, text=True, check=False
         )
         assert found.returncode == 0, found.stdout + found.stderr
+
+
+def test_a_new_live_cell_runs_under_its_own_policy(here: Path) -> None:
+    assert "dwell live run cell.yaml" in call("new", "hall", "--from", "live").stdout
+    words = ("live", "run", "hall/cell.yaml", "--seconds", "6", "--out", "out")
+    found = subprocess.run(
+        (sys.executable, "-m", "dwell", *words, "--policy", "policy:Patient"),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    (folder,) = (here / "out" / "runs").iterdir()
+    shutil.rmtree("hall")
+    assert dwell.open_run(folder).meta["policy"] == "policy:Patient"
 
 
 def test_the_default_is_the_canonical_cell(here: Path) -> None:

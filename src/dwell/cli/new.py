@@ -47,6 +47,11 @@ MORE = {
     Origin.LIVE: "#   tasks.*.run         functions and classes in stages.py that do the work\n"
     "#   live.hosts          addresses of your computers",
 }
+#: How its policy is tried.
+RUN = {
+    Origin.CANONICAL: "dwell run cell.yaml --windows 20",
+    Origin.LIVE: "dwell live run cell.yaml --seconds 20",
+}
 STAGES_HEAD = {
     Origin.CANONICAL: '"""Stages to measure: change them to what your tasks do."""\n',
     Origin.LIVE: '"""Stages, and the drive that they steer: change them to yours."""\n',
@@ -93,7 +98,7 @@ def new_cell(path: Path, origin: Origin) -> None:
         f"cd {path}\n"
         "dwell check cell.yaml\n"
         "python test_cell.py\n"
-        "dwell run cell.yaml --policy policy:Patient --windows 20"
+        f"{RUN[origin]} --policy policy:Patient"
     )
 
 
