@@ -24,9 +24,9 @@ import dwell
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import Applied, LightCell
 from benchmarks.timing import ROOT
-from dwell.chaos.stalls import StallDetector
 from dwell.model.document import to_document
 from dwell.testbed.burner import Burner
+from dwell.testbed.chaos.stalls import StallDetector
 
 __all__ = ["measure"]
 

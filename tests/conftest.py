@@ -22,7 +22,7 @@ settings.load_profile("dwell")
 
 HERE = Path(__file__).parent
 ALONE = (
-    "chaos",
+    "testbed/chaos",
     "cli/test_live.py",
     "cli/test_live_run.py",
     "cli/test_testbed.py",

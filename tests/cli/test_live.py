@@ -17,12 +17,12 @@ import yaml
 from typer.testing import CliRunner
 
 import dwell
-from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.cli.commands import app
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import roles
 from dwell.model.document import to_document
+from dwell.testbed.chaos.disk import SmallDisk, may_mount
 from tests.cli.live_cell import EXAMPLE, MOODY, PATIENCE_S, RealCell
 
 ROOT = Path(__file__).parents[2]

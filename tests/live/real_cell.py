@@ -9,9 +9,9 @@ from pathlib import Path
 import yaml
 
 import dwell
-from dwell.chaos.faults import Fault, How
-from dwell.chaos.harness import CLOCK_FILE, Harness, environment_of
-from dwell.chaos.light_cell import (
+from dwell.testbed.chaos.faults import Fault, How
+from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
+from dwell.testbed.chaos.light_cell import (
     GUARD_CYCLES,
     HOMES,
     MAX_AGE_MS,
@@ -20,9 +20,9 @@ from dwell.chaos.light_cell import (
     document,
     exec_ms,
 )
-from dwell.chaos.stalls import StallDetector
-from dwell.chaos.strike import Outcome, beyond
-from dwell.chaos.strike import strike as strike_by
+from dwell.testbed.chaos.stalls import StallDetector
+from dwell.testbed.chaos.strike import Outcome, beyond
+from dwell.testbed.chaos.strike import strike as strike_by
 from dwell.testbed.loopback import Loopback, on_this_machine
 
 __all__ = [

@@ -27,9 +27,9 @@ import psutil
 import yaml
 
 import dwell
-from dwell.chaos.harness import CLOCK_FILE, Harness, environment_of
-from dwell.chaos.light_cell import PERIOD_MS, document, exec_ms
 from dwell.errors import DwellError, LiveError
+from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
+from dwell.testbed.chaos.light_cell import PERIOD_MS, document, exec_ms
 from dwell.testbed.loopback import Loopback, on_this_machine
 
 HOME = "SO"

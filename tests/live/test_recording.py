@@ -19,7 +19,6 @@ import pytest
 from typer.testing import CliRunner
 
 import dwell
-from dwell.chaos.disk import limit_file_size
 from dwell.cli.commands import app
 from dwell.control import Controller
 from dwell.errors import LiveError
@@ -29,6 +28,7 @@ from dwell.live.recording import RunRecorder
 from dwell.model import Problem
 from dwell.record import open_run
 from dwell.record.journal import JOURNAL, MARK
+from dwell.testbed.chaos.disk import limit_file_size
 from tests.live.small_world import World
 
 #: A cell in memory, at full speed; its controller records as that of real processes does.

@@ -14,10 +14,10 @@ from pathlib import Path
 import psutil
 import pytest
 
-from dwell.chaos.disk import SmallDisk, may_mount
 from dwell.live import supervision
 from dwell.live.state_files import InFlight
 from dwell.live.supervision import SupervisedProcess, Supervisor
+from dwell.testbed.chaos.disk import SmallDisk, may_mount
 
 PATIENCE_S = 20.0
 

@@ -17,10 +17,10 @@ from typing import Any
 import polars as pl
 import pytest
 
-from dwell.chaos.disk import SmallDisk, limit_file_size, may_mount
 from dwell.errors import RunError, UnwritableError
 from dwell.record import Journal, Run, open_run, require_free, seal_run
 from dwell.record.journal import JOURNAL
+from dwell.testbed.chaos.disk import SmallDisk, limit_file_size, may_mount
 
 COLUMNS: dict[str, dict[str, Any]] = {
     "cycles": {"cycle": "Int64", "placement": ["LOC", "SO"], "latency_ns": "Int64"},

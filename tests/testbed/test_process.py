@@ -10,13 +10,13 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.chaos.wiretap import entry_for
 from dwell.live.hosting import clock_of
 from dwell.live.keys import Keys
 from dwell.live.messages import Beat, decode
 from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import wire
+from dwell.testbed.chaos.wiretap import entry_for
 from dwell.testbed.clocks import ClockFile
 from dwell.testbed.linked_transport import without_source
 from dwell.testbed.loopback import on_this_machine

@@ -35,8 +35,8 @@ def run_chaos(
     DwellError
         If the cell does not come up, or the folder holds something else.
     """
-    from dwell.chaos.campaign import Campaign, on_hosts, on_loopback, summary
-    from dwell.chaos.disk import unmount_leftovers
+    from dwell.testbed.chaos.disk import unmount_leftovers
+    from dwell.testbed.chaos.fault_campaign import FaultCampaign, on_hosts, on_loopback, summary
     from dwell.testbed.playing import interruptible, make_folder
 
     if minutes is None and faults is None:
@@ -47,7 +47,7 @@ def run_chaos(
         make_folder(out, MARK, "a chaos campaign's")
     what = ("" if cell is None else f" {cell}") + (" --hosts" if hosts else "")
     staging = on_hosts if hosts else on_loopback
-    campaign = Campaign(
+    campaign = FaultCampaign(
         staging(cell, folder, seed),
         folder,
         seed,

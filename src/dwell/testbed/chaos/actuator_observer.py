@@ -1,4 +1,4 @@
-"""Observer: hears a cell through its own sessions, and judges what it hears."""
+"""ActuatorObserver: hears a cell through its own sessions, and judges what it hears."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
-from dwell.chaos.invariants import Judge
-from dwell.chaos.wiretap import Records, Wiretap
 from dwell.errors import LiveError
+from dwell.testbed.chaos.invariants import Judge
+from dwell.testbed.chaos.wiretap import Records, Wiretap
 from dwell.testbed.testbed import LocalTestbed
 
-__all__ = ["Observer"]
+__all__ = ["ActuatorObserver"]
 
 HEARD_S = 20.0
 
 
-class Observer:
+class ActuatorObserver:
     """Ears wherever they are needed, and a judge; a context manager.
 
     Parameters

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from dwell.chaos.light_cell import CANDIDATES
-from dwell.chaos.stages import APPLY, HOLD, NODES, RECORD, ZERO
+from dwell.testbed.chaos.light_cell import CANDIDATES
+from dwell.testbed.chaos.stages import APPLY, HOLD, NODES, RECORD, ZERO
 
 __all__ = ["Actuations", "Seen", "out_of_order", "unsafe"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dwell.chaos.stages import FRAME_BYTES, NODES
+from dwell.testbed.chaos.stages import FRAME_BYTES, NODES
 
 __all__ = [
     "CANDIDATES",
@@ -87,7 +87,7 @@ def document(
             node: {"exec_ms": ms * (1 if at_home in (None, node) else WARY), **spare}
             for node, ms in nodes.items()
         }
-        tasks[task] = {"run": f"dwell.chaos.stages:{task.capitalize()}", "on": on}
+        tasks[task] = {"run": f"dwell.testbed.chaos.stages:{task.capitalize()}", "on": on}
     links = [
         {"from": a, "to": b, "both_ways": True, "delay_ms": ms, "rate_mbps": 1000}
         for pair, ms in DELAY_MS[home].items()
@@ -123,6 +123,6 @@ def document(
         },
         "live": {
             "max_age_ms": period_ms * MAX_AGE_MS // PERIOD_MS, "silence": "hold",
-            "actuators": {"control": "dwell.chaos.stages:Witness"},
+            "actuators": {"control": "dwell.testbed.chaos.stages:Witness"},
         },
     }  # fmt: skip

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from dwell.chaos.disk import DiskHog, SmallDisk, limit_file_size, may_mount
 from dwell.errors import LiveError
+from dwell.testbed.chaos.disk import DiskHog, SmallDisk, limit_file_size, may_mount
 
 WRITER = """
 import sys

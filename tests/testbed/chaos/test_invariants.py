@@ -6,8 +6,6 @@ import pytest
 import yaml
 
 import dwell
-from dwell.chaos.invariants import Judge
-from dwell.chaos.light_cell import MIN_DWELL, WINDOW_CYCLES, document
 from dwell.live.keys import Keys
 from dwell.live.messages import (
     Accepted,
@@ -20,6 +18,8 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.model import Problem
+from dwell.testbed.chaos.invariants import Judge
+from dwell.testbed.chaos.light_cell import MIN_DWELL, WINDOW_CYCLES, document
 
 RUN = 7
 APART = (MIN_DWELL + 1) * WINDOW_CYCLES

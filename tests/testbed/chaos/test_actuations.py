@@ -2,8 +2,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dwell.chaos.actuations import Actuations, Seen, out_of_order, unsafe
-from dwell.chaos.stages import APPLY, HOLD, NODES, RECORD, START
+from dwell.testbed.chaos.actuations import Actuations, Seen, out_of_order, unsafe
+from dwell.testbed.chaos.stages import APPLY, HOLD, NODES, RECORD, START
 
 MS = 1_000_000
 

@@ -13,14 +13,14 @@ from typing import Any
 
 import psutil
 
-from dwell.chaos.actuations import Actuations
-from dwell.chaos.disk import DiskHog, SmallDisk, limit_file_size
-from dwell.chaos.faults import Fault
-from dwell.chaos.stages import APPLY, TOLD
 from dwell.errors import LiveError
 from dwell.live.hosting import clock_of
 from dwell.model import Problem
 from dwell.testbed.burner import Burner
+from dwell.testbed.chaos.actuations import Actuations
+from dwell.testbed.chaos.disk import DiskHog, SmallDisk, limit_file_size
+from dwell.testbed.chaos.faults import Fault
+from dwell.testbed.chaos.stages import APPLY, TOLD
 from dwell.testbed.child import Started
 from dwell.testbed.clocks import ClockFile
 from dwell.testbed.processes import expected

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dwell.chaos.campaign import Campaign, on_loopback
+from dwell.testbed.chaos.fault_campaign import FaultCampaign, on_loopback
 
 pytestmark = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2,
@@ -23,7 +23,7 @@ FEWEST = 8
 
 
 def test_the_cell_keeps_its_promises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    campaign = Campaign(
+    campaign = FaultCampaign(
         on_loopback(None, tmp_path, SEED),
         tmp_path,
         SEED,

@@ -7,11 +7,11 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from dwell.chaos.actuations import out_of_order, unsafe
-from dwell.chaos.faults import Fault, hit_by
-from dwell.chaos.harness import Harness
-from dwell.chaos.stages import APPLY, HOLD, ZERO
-from dwell.chaos.stalls import StallDetector
+from dwell.testbed.chaos.actuations import out_of_order, unsafe
+from dwell.testbed.chaos.faults import Fault, hit_by
+from dwell.testbed.chaos.harness import Harness
+from dwell.testbed.chaos.stages import APPLY, HOLD, ZERO
+from dwell.testbed.chaos.stalls import StallDetector
 
 __all__ = ["Outcome", "beyond", "strike"]
 

@@ -7,10 +7,10 @@ import pytest
 import yaml
 
 import dwell
-from dwell.chaos.faults import Fault, Means, bound_of, faults_of
-from dwell.chaos.light_cell import document
-from dwell.chaos.timeline import planned
 from dwell.model import Problem
+from dwell.testbed.chaos.fault_timeline import planned
+from dwell.testbed.chaos.faults import Fault, Means, bound_of, faults_of
+from dwell.testbed.chaos.light_cell import document
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,9 @@ class Wiretap(Started):
             "nodes": list(nodes),
             "out": str(out),
         }
-        self._child = Child("dwell.chaos.wiretap", f"tap at {','.join(nodes)}", prefix=prefix)
+        self._child = Child(
+            "dwell.testbed.chaos.wiretap", f"tap at {','.join(nodes)}", prefix=prefix
+        )
 
     def start(self) -> None:
         """Start it.

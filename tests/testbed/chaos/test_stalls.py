@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dwell.chaos.stalls import StallDetector
+from dwell.testbed.chaos.stalls import StallDetector
 
 
 def test_the_worst_stall_of_a_time_and_of_the_other_cpus() -> None:

@@ -6,9 +6,9 @@ import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from dwell.chaos.faults import Fault
+from dwell.testbed.chaos.faults import Fault
 
-__all__ = ["Planned", "planned"]
+__all__ = ["PlannedFault", "planned"]
 
 #: How long faults last, seconds: shorter and longer than a session's lease.
 LASTS_S = 0.5, 2.4
@@ -17,7 +17,7 @@ RESTS_S = 0.0, 1.5
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedFault:
     """A fault of a timeline.
 
     Parameters
@@ -38,7 +38,7 @@ class Planned:
     rests_s: float
 
 
-def planned(seed: int, faults: Sequence[Fault]) -> Iterator[Planned]:
+def planned(seed: int, faults: Sequence[Fault]) -> Iterator[PlannedFault]:
     """Yield the faults of a seed, without end.
 
     Each kind comes once a round, in a random order, and its faults in a random order, too: none
@@ -60,7 +60,7 @@ def planned(seed: int, faults: Sequence[Fault]) -> Iterator[Planned]:
             if not waiting[kind]:
                 waiting[kind] = draw.sample(kinds[kind], len(kinds[kind]))
             number += 1
-            yield Planned(
+            yield PlannedFault(
                 number,
                 waiting[kind].pop(),
                 draw.random(),

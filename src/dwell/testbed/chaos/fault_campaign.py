@@ -1,4 +1,4 @@
-"""Campaign: faults of a timeline befall a cell, one after the other, and are judged."""
+"""FaultCampaign: faults of a timeline befall a cell, one after the other, and are judged."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from typing import Any, TypeAlias
 import yaml
 
 import dwell
-from dwell.chaos.disk import may_mount
-from dwell.chaos.faults import Fault, Means, bound_of, faults_of
-from dwell.chaos.harness import CLOCK_FILE, STARVING_THREADS, Harness, environment_of
-from dwell.chaos.light_cell import PATIENT_MS, document, exec_ms
-from dwell.chaos.observer import Observer
-from dwell.chaos.stages import APPLY
-from dwell.chaos.stalls import StallDetector
-from dwell.chaos.strike import Outcome, beyond, strike
-from dwell.chaos.timeline import Planned, planned
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
+from dwell.testbed.chaos.actuator_observer import ActuatorObserver
+from dwell.testbed.chaos.disk import may_mount
+from dwell.testbed.chaos.fault_timeline import PlannedFault, planned
+from dwell.testbed.chaos.faults import Fault, Means, bound_of, faults_of
+from dwell.testbed.chaos.harness import CLOCK_FILE, STARVING_THREADS, Harness, environment_of
+from dwell.testbed.chaos.light_cell import PATIENT_MS, document, exec_ms
+from dwell.testbed.chaos.stages import APPLY
+from dwell.testbed.chaos.stalls import StallDetector
+from dwell.testbed.chaos.strike import Outcome, beyond, strike
 from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.testbed import LocalTestbed
 
-__all__ = ["Campaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]
+__all__ = ["FaultCampaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]
 
 #: Takes the number of a cell among those of a campaign; returns where it runs, and its home.
 Staging: TypeAlias = Callable[[int], tuple[LocalTestbed, str | None]]
@@ -111,7 +111,7 @@ def _witnessed(problem: Problem, folder: Path, beside: Path) -> tuple[Problem, d
     actuators = dict(problem.live.actuators)
     if len(actuators) != 1:
         raise LiveError("chaos needs a cell with one sink, whose actuator live.actuators names")
-    witnessed = FrozenDict(dict.fromkeys(actuators, "dwell.chaos.stages:Witnessed"))
+    witnessed = FrozenDict(dict.fromkeys(actuators, "dwell.testbed.chaos.stages:Witnessed"))
     environment = environment_of(folder, {}, actuators=actuators)
     paths = [str(beside), os.environ.get("PYTHONPATH", "")]
     environment["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
@@ -125,7 +125,7 @@ class Result:
     Parameters
     ----------
     seed : int
-    outcomes : list of (Planned, Outcome)
+    outcomes : list of (PlannedFault, Outcome)
     stalled : int
         Faults in which a bound was missed, or a silence was too long, while the machine stalled.
     wrong : list of str
@@ -139,7 +139,7 @@ class Result:
     """
 
     seed: int
-    outcomes: list[tuple[Planned, Outcome]] = field(default_factory=list)
+    outcomes: list[tuple[PlannedFault, Outcome]] = field(default_factory=list)
     stalled: int = 0
     wrong: list[str] = field(default_factory=list)
     heard: dict[str, int] = field(default_factory=dict)
@@ -174,7 +174,7 @@ class Result:
         }
 
 
-class Campaign:
+class FaultCampaign:
     """See the module.
 
     Parameters
@@ -251,15 +251,15 @@ class Campaign:
         self,
         number: int,
         plan: Any,
-        first: Planned | None,
+        first: PlannedFault | None,
         stalls: StallDetector,
         until_s: float | None,
-    ) -> Planned | None:
+    ) -> PlannedFault | None:
         """Have one cell go through faults; returns the next fault where the cell is past help."""
         testbed, home = self._staging(number)
         with ExitStack() as stack:
             cell = stack.enter_context(Harness(testbed, home=home, disks=self._disks))
-            observer = stack.enter_context(Observer(testbed, testbed.folder / "cell.yaml"))
+            observer = stack.enter_context(ActuatorObserver(testbed, testbed.folder / "cell.yaml"))
             while True:
                 one = first or next(plan, None)
                 first = None
@@ -274,7 +274,9 @@ class Campaign:
             self.result.wrong += [f"record: {wrong}" for wrong in _unread(cell)]
         return None
 
-    def _one(self, cell: Harness, observer: Observer, one: Planned, stalls: StallDetector) -> bool:
+    def _one(
+        self, cell: Harness, observer: ActuatorObserver, one: PlannedFault, stalls: StallDetector
+    ) -> bool:
         """Have a fault befall a cell; returns whether the cell can go on."""
         fault = one.fault
         outcome = Outcome(fault.name, self._seed, one.phase)
@@ -305,7 +307,7 @@ class Campaign:
         self._keep(cell, one, outcome)
         return usable
 
-    def _keep(self, cell: Harness, one: Planned, outcome: Outcome) -> None:
+    def _keep(self, cell: Harness, one: PlannedFault, outcome: Outcome) -> None:
         wrong = list(outcome.wrong)
         if outcome.stall_ms >= cell.problem.pipeline.period_ms and outcome.late:
             self.result.stalled += 1
@@ -321,13 +323,13 @@ class Campaign:
         for what in wrong:
             self._say(f"    VIOLATION {what}; again: {again}")
 
-    def _count(self, cell: Harness, observer: Observer) -> None:
+    def _count(self, cell: Harness, observer: ActuatorObserver) -> None:
         for kind, count in observer.judge.counts.items():
             self.result.heard[kind] = self.result.heard.get(kind, 0) + count
         self.result.actuated += len(cell.actuations.applied)
 
 
-def _recovered(observer: Observer, outcome: Outcome, home: str | None) -> None:
+def _recovered(observer: ActuatorObserver, outcome: Outcome, home: str | None) -> None:
     """Take the recovery from the wire: the first cycle that an order stands behind.
 
     None follows where the guard's own move has brought the cell home; that is said beside it.
@@ -356,7 +358,7 @@ def _settle(cell: Harness, rests_s: float, outcome: Outcome) -> None:
         outcome.note = f"left alone, it had to be waited for: {missing}"
 
 
-def _old(cell: Harness, observer: Observer, fault: Fault, outcome: Outcome) -> list[str]:
+def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outcome) -> list[str]:
     """Return commands that were applied too long after their stamp was heard."""
     if fault.how in ("jump", "drift"):
         return []
@@ -384,7 +386,7 @@ def _unread(cell: Harness) -> Sequence[str]:
     return found
 
 
-def _line(one: Planned, outcome: Outcome) -> str:
+def _line(one: PlannedFault, outcome: Outcome) -> str:
     bound = "-" if outcome.bound is None else str(outcome.bound)
     note = f"  {outcome.note}" if outcome.note else ""
     return (
