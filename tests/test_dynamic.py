@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dwell.model import Problem
 from dwell.sim import draw, simulate_realisation
-from tests.dynamic import dynamic_problem
+from tests.cells.dynamic import dynamic_problem
 
 WINDOWS, SEEDS = 300, (101, 102)
 WINDOW_S = 100 / 30

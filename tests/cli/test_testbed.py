@@ -18,7 +18,7 @@ import dwell
 from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.groups import group_name
 from dwell.testbed.hosts import namespace_name, namespace_path
-from tests.testbed.light_cell import QUOTAS, document, write_cell
+from tests.cells.light import QUOTAS, document, write_cell
 from tests.testbed.machine import no_groups, no_hosts, own_name
 
 PATIENCE_S = 240.0

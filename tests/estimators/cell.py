@@ -20,7 +20,7 @@ from dwell.model import (
     Task,
 )
 from dwell.model.fabric import Scheduler
-from tests.generate import make_problem
+from tests.cells.generated import make_problem
 
 __all__ = ["DISTURBED", "MOVES", "TASKS", "cell", "truth"]
 

@@ -33,9 +33,9 @@ from dwell.model import (
     Task,
 )
 from dwell.model.fabric import Scheduler
+from tests.cells.generated import make_problem, random_problem, random_stamps
 from tests.estimators.cell import MOVES, cell, truth
 from tests.estimators.windows import Row, window
-from tests.generate import make_problem, random_problem, random_stamps
 
 SEEN = QoS(1.0, 0.0, {"R": 0.0, "E": 0.0})
 NO_WORK = {"R": 0.0, "E": 0.0}

@@ -12,8 +12,8 @@ import pytest
 from dwell.estimators import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of
 from dwell.model import Constant, Execution, Flow, Link, Node, Problem, Task
+from tests.cells.generated import make_problem
 from tests.estimators.windows import Row, window
-from tests.generate import make_problem
 
 ONE = Execution(Constant(1.0))
 CHAIN = ("A", "B", "C", "D")

@@ -32,7 +32,7 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from tests.generate import make_problem
+from tests.cells.generated import make_problem
 
 R1, E, R2 = Node("R1", "robot", 4), Node("E", "edge", 8), Node("R2", "robot", 4)
 

@@ -8,7 +8,7 @@ from dwell.errors import ProblemError
 from dwell.estimators import Estimator, Profile, by_name
 from dwell.estimators.registry import REGISTRY, shadowing
 from dwell.model import Constant, Execution, Node, Task
-from tests.generate import make_problem
+from tests.cells.generated import make_problem
 
 PROBLEM = make_problem([Node("R1", "robot")], [Task("only", {"R1": Execution(Constant(1.0))})])
 

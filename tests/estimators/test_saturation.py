@@ -21,8 +21,8 @@ from dwell.model import (
     QoS,
     Task,
 )
+from tests.cells.generated import make_problem
 from tests.estimators.windows import Row, window
-from tests.generate import make_problem
 
 ESTIMATORS = ("profile", "shadow", "scaling", "corrected")
 

@@ -31,8 +31,8 @@ from dwell.model import (
     Uniform,
 )
 from dwell.sim import Realisation, draw, simulate_realisation
+from tests.cells.generated import make_problem
 from tests.estimators.windows import Row, window
-from tests.generate import make_problem
 
 MS = 1_000_000
 PERIOD_MS = 20.0

@@ -29,9 +29,9 @@ from dwell.model import (
     QoS,
     Task,
 )
+from tests.cells.generated import make_problem
 from tests.estimators.cell import MOVES, cell, truth
 from tests.estimators.windows import Row, window
-from tests.generate import make_problem
 
 SEEN = QoS(1.0, 0.0, {"R": 0.0, "E": 0.0})
 NO_WORK = {"R": 0.0, "E": 0.0}

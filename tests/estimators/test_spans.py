@@ -9,8 +9,8 @@ import pytest
 
 from dwell.estimators.spans import Spans, patience_ns, spans_of
 from dwell.model import Constant, Execution, Flow, Link, Node, Problem, Task
+from tests.cells.generated import make_problem
 from tests.estimators.windows import MS, Row, instants
-from tests.generate import make_problem
 
 LIMIT_MS = 50.0
 

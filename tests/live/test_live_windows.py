@@ -31,7 +31,7 @@ from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, T
 from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant
 from dwell.record import Journal, Run, seal_run
-from tests.generate import make_problem
+from tests.cells.generated import make_problem
 
 MS, S = 1_000_000, 1_000_000_000
 CANONICAL = Path(__file__).parents[2] / "examples" / "canonical.yaml"

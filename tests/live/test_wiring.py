@@ -38,7 +38,7 @@ from dwell.model import (
     Problem,
     Task,
 )
-from tests.generate import make_problem, random_problem
+from tests.cells.generated import make_problem, random_problem
 
 NODES = [Node("R1", "robot", 2), Node("E", "edge", 4), Node("R2", "robot", 2)]
 FLOWS = [

@@ -42,7 +42,7 @@ from dwell.sim.engine import play as advance_to_end
 from dwell.sim.random_draws import draw_shadows
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from dwell.sim.tables import make_tables
-from tests.generate import (
+from tests.cells.generated import (
     MS,
     Scheduler,
     make_problem,

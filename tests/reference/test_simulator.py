@@ -19,7 +19,7 @@ from dwell.model import (
     Task,
 )
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
-from tests.generate import MS, make_problem, make_realisation
+from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import Result, Split, attempt_uniform, simulate, transmission_ns
 
 R, E = Node("R", "robot"), Node("E", "edge")

@@ -8,7 +8,7 @@ import polars as pl
 
 from dwell import Run
 from dwell.model.document import to_document
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 __all__ = ["PERIOD_NS", "live_run"]
 

@@ -11,7 +11,7 @@ from dwell.report.page import Fact
 from dwell.report.page import Page as Shown
 from dwell.report.table import Table
 from dwell.study import Comparison, compare
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 __all__ = ["Page", "facts_of", "small_comparison", "small_run", "table_of"]
 

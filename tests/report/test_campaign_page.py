@@ -15,8 +15,8 @@ from dwell.report.campaign_page import campaign_html, campaign_page, campaign_te
 from dwell.study.measured_campaign import MeasuredCampaign, read_measured
 from dwell.testbed.campaign import Campaign, default_entrants, default_scenarios, entrant
 from dwell.testbed.execution import run_campaign
+from tests.cells.small import make_problem
 from tests.report.pages import Page, facts_of, table_of
-from tests.study.cell import make_problem
 from tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
 
 PROBLEM = make_problem()

@@ -14,8 +14,8 @@ from dwell.report import comparison_html, comparison_text
 from dwell.report.comparison_page import comparison_page
 from dwell.report.policy_blocks import PolicyBlocks
 from dwell.study import compare, tenants_demo
+from tests.cells.small import SEEDS, make_comparison, make_problem
 from tests.report.pages import Page, small_comparison, table_of
-from tests.study.cell import SEEDS, make_comparison, make_problem
 
 Shown: TypeAlias = dict[tuple[str, str], Mapping[str, float | Sequence[float]]]
 

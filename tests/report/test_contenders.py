@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dwell.report.contenders import describe_contenders, palette_of
 from dwell.report.palette import Palette
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 NAMES = ("LOC", "SO", "HYB", "atp", "dtp", "latency-first", "dtp+corrected", "cusum+corrected")
 

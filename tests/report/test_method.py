@@ -23,7 +23,7 @@ from dwell.model import (
     Uniform,
 )
 from dwell.report.method import cell_definitions, placements_table, scenarios_table
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 EPISODES = Episodes("edge", every_s=Exponential(30.0), for_s=Uniform(2.0, 10.0))
 TABLE = TraceTable(file="delays.csv", columns={"delay_ms": np.array([1.0, 3.0])})

@@ -13,8 +13,8 @@ from dwell.errors import RunError
 from dwell.model import Episodes, Exponential, LinkDisturbance, NodeDisturbance
 from dwell.report import run_html
 from dwell.report.run_page import run_page
+from tests.cells.small import make_problem
 from tests.report.pages import Page, facts_of, small_run, table_of
-from tests.study.cell import make_problem
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from dwell.errors import RunError
 from dwell.report import study_html
 from dwell.report.study_page import study_page
 from dwell.study import Contender, Point, Study, open_study, run_study
+from tests.cells.small import make_problem
 from tests.report.pages import Page, table_of
-from tests.study.cell import make_problem
 
 DWELL, LATE = "controller.min_dwell", "controller.min_improvement"
 

@@ -12,8 +12,8 @@ from dwell import Run, simulate
 from dwell.errors import RunError
 from dwell.report import trace_events
 from dwell.report.trace_events import TraceEvent
+from tests.cells.small import make_problem
 from tests.report.pages import small_run
-from tests.study.cell import make_problem
 
 
 @pytest.fixture(scope="module")

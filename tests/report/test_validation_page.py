@@ -8,8 +8,8 @@ from functools import cache
 from dwell import Run, simulate
 from dwell.report.validation_page import validation_html, validation_page, validation_text
 from dwell.study.validation import Validation, validate
+from tests.cells.small import make_problem
 from tests.report.pages import Page, table_of
-from tests.study.cell import make_problem
 from tests.study.test_validation import slower
 
 

@@ -28,7 +28,7 @@ from dwell.model import (
     Task,
 )
 from dwell.sim.realisation import NodeChange, Realisation
-from tests.generate import MS, make_problem, make_realisation
+from tests.cells.generated import MS, make_problem, make_realisation
 
 Floats = NDArray[np.float64]
 BATCHES = 40

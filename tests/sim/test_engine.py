@@ -42,7 +42,7 @@ from dwell.policies import DTP
 from dwell.policies.registry import REGISTRY as POLICIES
 from dwell.record import Run
 from dwell.sim import Phase, describe
-from tests.generate import MS, make_problem
+from tests.cells.generated import MS, make_problem
 
 ROOT = Path(__file__).parents[2]
 CELLS = ("canonical", "fan-in", "cloud")

@@ -32,8 +32,8 @@ from dwell.model.scenario import MAX_LAYERS, RAMP_STEPS
 from dwell.sim import draw
 from dwell.sim.random_draws import drawn_scenario
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
-from tests.dynamic import dynamic_problem
-from tests.generate import MS, make_problem
+from tests.cells.dynamic import dynamic_problem
+from tests.cells.generated import MS, make_problem
 
 S = 1000 * MS
 LINK = Link("R", "E", Constant(1.0), rate_mbps=100.0, loss=0.1)

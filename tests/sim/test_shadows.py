@@ -39,7 +39,7 @@ from dwell.model import (
 )
 from dwell.sim.random_draws import draw_shadows
 from dwell.sim.realisation import NodeChange
-from tests.generate import MS, make_problem, make_realisation
+from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import ITSELF, SHADOW, shadow_stamp, simulate
 from tests.reference.test_against import (
     Case,

@@ -27,7 +27,7 @@ from dwell.model import (
 from dwell.sim import simulate_realisation
 from dwell.sim.realisation import LinkSegment, NodeChange
 from dwell.sim.simulated_guard import back_ns
-from tests.generate import MS, make_problem, make_realisation
+from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import way_back
 from tests.reference.test_against import Case, Played, Replay, differences
 from tests.reference.test_against import play as play_case

@@ -15,7 +15,7 @@ from dwell.policies import Static
 from dwell.study import Comparison, compare
 from dwell.study.intervals import mean_interval, share_limits
 from dwell.study.summary import summarise
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 POLICIES = ("LOC", "SO", "HYB", "dtp")
 PROBLEM = make_problem()

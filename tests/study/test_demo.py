@@ -12,7 +12,7 @@ from dwell.errors import TraceError
 from dwell.model import Problem, Trace, TraceTable
 from dwell.study import canonical_demo, real_demo, tenants_demo
 from dwell.study.demo import longest_run
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 ROOT = Path(__file__).parents[2]
 TRACES = ROOT.parent / "shared" / "data"

@@ -16,7 +16,7 @@ from dwell.sim import draw, simulate_realisation
 from dwell.study import Contender, Point, Study, run_study
 from dwell.study.hindsight import Hindsight
 from dwell.study.reference import play_alone
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
 SCENARIO = "network-impairment"

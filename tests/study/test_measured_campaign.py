@@ -29,7 +29,7 @@ from dwell.study.measured_campaign import MeasuredCampaign, read_measured, witho
 from dwell.study.summary import summarise
 from dwell.testbed.campaign import Campaign, entrant
 from dwell.testbed.execution import run_campaign
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 from tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
 
 PROBLEM = make_problem()

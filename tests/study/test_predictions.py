@@ -14,7 +14,7 @@ from dwell.study.predictions import (
     judge_placement,
     paper_predictions,
 )
-from tests.study.cell import SEEDS, make_comparison
+from tests.cells.small import SEEDS, make_comparison
 
 BY_SCENARIO = {prediction.scenario: prediction for prediction in PAPER}
 NOISE = np.linspace(-0.02, 0.02, len(SEEDS))

@@ -38,7 +38,7 @@ from dwell.study.reference import (
 )
 from dwell.study.script import Script
 from dwell.study.summary import summarise
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 W = 10
 SETTINGS = ControllerSettings(on="C", min_dwell=1)

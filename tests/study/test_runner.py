@@ -22,7 +22,7 @@ from dwell.study.judging import judged_cost, judged_costs
 from dwell.study.player import Player
 from dwell.study.reference import references
 from dwell.study.summary import summarise
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 from tests.study.test_study import grid, make_study
 
 PROBLEM = make_problem()

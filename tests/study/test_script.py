@@ -12,7 +12,7 @@ from dwell.model import NodeDisturbance, Problem
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
 from dwell.study.script import Script
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 WINDOWS = 24
 # The controller's node is down for these spans, in seconds; a window is 0.33 s, so that the first

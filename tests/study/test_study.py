@@ -16,7 +16,7 @@ from dwell.model import Constant, Problem
 from dwell.policies import Static
 from dwell.study import Contender, Point, Study
 from dwell.study.software import describe
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
 

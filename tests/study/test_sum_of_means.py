@@ -17,7 +17,7 @@ from dwell.model import (
     Scenario,
 )
 from dwell.study.sum_of_means import sum_of_means, sums_of_shares
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 
 def with_scenario(*items: object) -> Problem:

@@ -25,7 +25,7 @@ from dwell.study.summary import (
     order_statistic,
     summarise,
 )
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 W = 4
 LABELS: dict[str, str | int] = {"scenario": "baseline", "policy": "dtp", "seed": 1}

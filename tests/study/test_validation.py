@@ -27,8 +27,8 @@ from dwell.model import (
 from dwell.study.measured_run import excluded_windows, read_measured
 from dwell.study.qos_sample import piece_of
 from dwell.study.validation import GOALS, Validation, validate
+from tests.cells.small import make_problem
 from tests.report.live_runs import live_run
-from tests.study.cell import make_problem
 
 WINDOWS = 102
 SEEDS = 6

@@ -10,7 +10,7 @@ from dwell.cellfile import from_document
 from dwell.errors import LiveError
 from dwell.model import FrozenDict, Problem, Quota
 from dwell.testbed.allotment import allot
-from tests.testbed.light_cell import document
+from tests.cells.light import document
 
 
 @pytest.fixture

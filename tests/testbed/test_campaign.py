@@ -14,7 +14,7 @@ from dwell.errors import LiveError, PolicyError, ProblemError, RunError
 from dwell.record import open_run
 from dwell.testbed.campaign import Campaign, Planned, default_entrants, default_scenarios, entrant
 from dwell.testbed.execution import State, read_campaign, run_campaign
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 from tests.testbed.simulated_runs import ALWAYS_IDLE, SimulatedRuns
 
 PROBLEM = make_problem()

@@ -21,7 +21,7 @@ from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inve
 from dwell.testbed.real_hosts import RealHosts, require_commands
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.timeline import Change, NodeState, usual_conditions
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
 SHELL = ("sh", "-c")

@@ -14,7 +14,7 @@ import dwell
 from dwell.errors import LiveError
 from dwell.model import Constant, Execution, Flow, Link, Node, Normal, Task
 from dwell.testbed.message_links import HELD, LinkEnds, LinkFile, transmission_ns
-from tests.generate import make_problem
+from tests.cells.generated import make_problem
 
 NODES = "R1", "E", "R2"
 MS = 1_000_000

@@ -16,7 +16,7 @@ from dwell.model import Constant
 from dwell.testbed.hosts import namespace_path
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.timeline import Change, NodeState, usual_conditions
-from tests.testbed.light_cell import document, write_cell
+from tests.cells.light import document, write_cell
 from tests.testbed.machine import no_groups, no_hosts, own_name
 
 #: Far more than any of it takes, on a machine that has a lot else to do.

@@ -23,8 +23,8 @@ from dwell.testbed.playing import (
     undisturbed,
 )
 from dwell.testbed.timeline import Change, NodeState, timeline_of
+from tests.cells.light import document
 from tests.report.live_runs import PERIOD_NS, live_run
-from tests.testbed.light_cell import document
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from dwell.testbed.loopback import on_this_machine
 from dwell.testbed.message_links import LinkFile
 from dwell.testbed.process import FaultyPlatform, main, program
 from dwell.testbed.processes import Processes
-from tests.testbed.light_cell import document
+from tests.cells.light import document
 
 HOUR_NS = 3_600_000_000_000
 NODES = ("R1", "E", "R2")

@@ -23,7 +23,7 @@ from dwell.live.trust import KEYS
 from dwell.live.wiring import Role
 from dwell.model import Problem
 from dwell.testbed.processes import Processes, expected, without_keys
-from tests.testbed.light_cell import document, write_cell
+from tests.cells.light import document, write_cell
 
 # Notes its words and a variable, and stays; it takes SIGTERM as it comes.
 STAYS = (

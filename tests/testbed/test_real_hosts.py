@@ -13,7 +13,7 @@ import dwell
 from dwell.sim.random_draws import drawn_scenario
 from dwell.testbed.inventory import load_inventory
 from dwell.testbed.real_hosts import run_on_hosts
-from tests.testbed.light_cell import write_cell
+from tests.cells.light import write_cell
 
 WIND = {"name": "wind", "every_s": 1, "for_s": 1}
 SCENARIO = [

@@ -17,8 +17,8 @@ from dwell.sim.random_draws import drawn_scenario
 from dwell.testbed.playing import Played
 from dwell.testbed.run import MARK, length_s, require_machine, run_once, spans_of
 from dwell.testbed.timeline import Timeline, timeline_of
+from tests.cells.light import document, write_cell
 from tests.report.live_runs import PERIOD_NS, live_run
-from tests.testbed.light_cell import document, write_cell
 from tests.testbed.machine import own_name
 
 ORIGIN_NS = 10 * PERIOD_NS

@@ -11,7 +11,7 @@ from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.testbed.measured import Disturbed, Measured, Visit
 from dwell.testbed.sensitivity import LEAST_POINTS, TOGETHER, sensitivities, usual_of
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 CELL = to_document(replace(make_problem(), warmup_windows=0))
 SEE, FIND = ("see", "R1"), ("find", "E")

@@ -13,7 +13,7 @@ from dwell.model import Problem, Trace
 from dwell.model.document import to_document
 from dwell.record import Run
 from dwell.testbed.speeds import Usual, at_speed_of, slowed, window_work_ms, work_ms
-from tests.study.cell import make_problem
+from tests.cells.small import make_problem
 
 META = {
     "problem": to_document(replace(make_problem(), warmup_windows=1)),

@@ -20,7 +20,7 @@ from dwell.testbed.timeline import (
     timeline_of,
     usual_conditions,
 )
-from tests.testbed.light_cell import document
+from tests.cells.light import document
 
 EPISODES = {
     "name": "wind",

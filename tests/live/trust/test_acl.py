@@ -21,7 +21,7 @@ from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.qos import QoS
-from tests.generate import random_problem
+from tests.cells.generated import random_problem
 from tests.live.small_world import Counting, World
 
 NOBODY = "nobody.1"

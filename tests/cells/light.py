@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from tests.testbed import light_stages
+from tests.cells import light_stages
 
 __all__ = ["document", "write_cell"]
 

@@ -12,7 +12,7 @@ from dwell.model import Problem
 
 __all__ = ["dynamic_problem"]
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def dynamic_problem() -> Problem:
