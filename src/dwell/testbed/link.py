@@ -17,14 +17,13 @@ What differs from a real link:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import cast
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Json
-from dwell.testbed.conditions import Conditions
-from dwell.testbed.emulated_link import EmulatedLink
+from dwell.testbed.child import Child, Json, Started
+from dwell.testbed.conditions import Conditions, Scheduling, to_json
 
 __all__ = ["GAP_MS", "LONGEST_MS", "Passed", "TunLink"]
 
@@ -78,8 +77,10 @@ class Passed:
     cpu_s: float
 
 
-class TunLink(EmulatedLink):
+class TunLink(Started):
     """The link between two hosts, as its parent sees it; a context manager.
+
+    Its conditions can be changed at any time.
 
     Parameters
     ----------
@@ -118,7 +119,11 @@ class TunLink(EmulatedLink):
         if nodes[0] == nodes[1] or set(descriptors) != set(nodes):
             raise LiveError(f"link {'-'.join(nodes)}: needs one device each of two nodes")
         files = [descriptors[node] for node in nodes]
-        super().__init__("dwell.testbed.forwarder", nodes, files)
+        self.nodes = nodes
+        self.name = f"link {nodes[0]}-{nodes[1]}"
+        #: How well it can keep its instants beside busy threads.
+        self.scheduling: Scheduling = "usual"
+        self._child = Child("dwell.testbed.forwarder", self.name, files)
         timeouts = dict(retransmit_ms or {})
         for source, target in timeouts:
             self._require(source, target)
@@ -134,6 +139,17 @@ class TunLink(EmulatedLink):
             "cpus": sorted(cpus) if cpus is not None else None,
         }
 
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._child.pid
+
+    @property
+    def ways(self) -> tuple[tuple[str, str], tuple[str, str]]:
+        """Both directions, as (source, target)."""
+        first, second = self.nodes
+        return (first, second), (second, first)
+
     def start(self) -> None:
         """Start it; returns when it forwards.
 
@@ -142,7 +158,36 @@ class TunLink(EmulatedLink):
         LiveError
             If a value of the conditions is out of its bounds, or it does not start.
         """
-        self._started(self._settings)
+        answer = self._child.start(self._settings)
+        self.scheduling = cast("Scheduling", answer["scheduling"])
+
+    def stop(self) -> None:
+        """End it; what is on its way is lost. Safe to call twice."""
+        self._child.stop()
+
+    def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
+        """Change some conditions of a direction for what begins its way from then on.
+
+        Parameters
+        ----------
+        source, target : str
+        at_ns : int, optional
+            When, by the monotonic clock; at once if left out or past.
+        **changes
+            Fields of `Conditions`.
+
+        Returns
+        -------
+        int
+            The instant from which they hold, ns of the monotonic clock.
+
+        Raises
+        ------
+        LiveError
+            If there is no such direction or field, a value is out of its bounds or none that this
+            kind of link has, or the process has ended.
+        """
+        return self._send([self._change(source, target, changes)], at_ns)
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
         """Begin or end an outage of a direction; returns the instant, as `set`.
@@ -163,6 +208,17 @@ class TunLink(EmulatedLink):
         counted = cast("dict[str, Json]", answer["stats"])
         return {way: _passed(counted[way[0]]) for way in self.ways}
 
+    def _usual(self, conditions: Mapping[tuple[str, str], Conditions]) -> list[Json]:
+        """Return the changes that make up the conditions at the beginning."""
+        return [
+            self._change(*way, {name: getattr(each, name) for name in Conditions.__slots__})
+            for way, each in conditions.items()
+        ]
+
+    def _require(self, source: str, target: str) -> None:
+        if (source, target) not in self.ways:
+            raise LiveError(f"{self.name} does not go from {source} to {target}")
+
     def _change(self, source: str, target: str, changes: Mapping[str, object]) -> Json:
         self._require(source, target)
         way = f"{self.name}, {source} to {target}"
@@ -173,7 +229,11 @@ class TunLink(EmulatedLink):
             )
         if changes.get("cut") == "hold":
             raise LiveError(f"{way}: what is sent while it is down vanishes (cut='drop')")
-        return super()._change(source, target, changes)
+        return {"source": source, "changes": to_json(changes)}
+
+    def _send(self, sets: Iterable[Json], at_ns: int | None) -> int:
+        answer = self._child.ask({"do": "set", "sets": list(sets), "at_ns": at_ns})
+        return cast("int", answer["at_ns"])
 
 
 def _passed(counted: Json) -> Passed:
