@@ -8,9 +8,10 @@ import re
 import polars as pl
 import pytest
 
-from dwell.report.charts import is_wide, limit_rule, thinned
+from dwell.report.charts import intervals, is_wide, limit_rule, thinned
 from dwell.report.figure import Figure, Spec, pdf, printed_svg, svg
-from dwell.report.palette import INK, PRINTED
+from dwell.report.formatting import Measure
+from dwell.report.palette import INK, PRINTED, Palette
 
 
 def draw(width: float) -> Spec:
@@ -92,3 +93,17 @@ def test_of_many_values_the_tail_is_kept() -> None:
     assert (kept[1:] > kept[:-1]).all()
     assert thinned(0).tolist() == []
     assert thinned(3).tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("low", "kind"), [(5.0, "log"), (-2.0, "symlog")])
+def test_an_axis_has_room_for_an_interval_that_reaches_below_nothing(low: float, kind: str) -> None:
+    rows = [("a", "LOC", 10.0, low, 20.0, None, None), ("a", "LOC", None, None, None, 1, 10.0)]
+    rows.append(("a", "LOC", None, None, None, 2, 900.0))
+    names = ["scenario", "policy", "mean", "low", "high", "seed", "value"]
+    frame = pl.DataFrame(rows, schema=names, orient="row", infer_schema_length=None)
+    styles = Palette.of(("LOC",), ("LOC",)).policies
+    figure = intervals("l95", frame, Measure("l95_ms", "L95", "ms"), styles)
+    layers = figure.spec()["layer"]
+    scales = {layer["encoding"]["x"]["scale"]["type"] for layer in layers}
+    assert scales == {kind}
+    assert "NaN" not in svg(figure)

@@ -9,10 +9,13 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import polars as pl
 import pytest
 
 from dwell.report import comparison_html, run_html
+from dwell.report.charts import cumulative
 from dwell.report.page import Fact, Page, Section, page_html
+from dwell.report.palette import ramp_styles
 from dwell.report.table import Table, Text
 from tests.report.pages import Page as Parsed
 from tests.report.pages import small_comparison, small_run
@@ -119,6 +122,21 @@ def test_policies_and_seeds_are_chosen_and_tables_sorted(tmp_path: Path) -> None
     assert told["before"] > 0
     assert told["after"] == pytest.approx(told["before"] * 4 / 5)
     assert told["hidden"] > 0
+
+
+@in_browser
+def test_what_stands_in_place_of_policies_is_not_theirs_to_choose(tmp_path: Path) -> None:
+    rows = [("a", "R1->E", float(n), n / 10) for n in range(10)]
+    names = ["scenario", "policy", "value", "share"]
+    frame = pl.DataFrame(rows, schema=names, orient="row")
+    figure = cumulative("delays", frame, ramp_styles(["R1->E"]), ("ms", "share"))
+    page = Page("t", "s", [Section("", [figure])], policies={"LOC": "#0072b2"})
+    shown = dom(page_html(page), tmp_path)
+    assert 'class="drawing live"' in shown
+    (line,) = re.findall(r'<path [^>]*stroke="var\(--ramp-4\)"[^>]*>', shown.split("<svg", 1)[1])[
+        -1:
+    ]
+    assert 'd="M' in line
 
 
 @in_browser

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -37,7 +39,9 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.at_s = 0.0
-        monkeypatch.setattr("dwell.testbed.playing.time.sleep", self.sleep)
+        # In that module alone: threads that other tests have left sleep, too.
+        own = SimpleNamespace(sleep=self.sleep, monotonic=time.monotonic)
+        monkeypatch.setattr("dwell.testbed.playing.time", own)
 
     def sleep(self, seconds: float) -> None:
         self.at_s += seconds

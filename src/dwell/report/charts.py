@@ -6,6 +6,7 @@ says under the pointer what a mark stands for.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -170,12 +171,15 @@ def intervals(
     limit_name, title, caption : str
     """
     facets, policies = _facets(frame), list(styles)
-    numbers = [*frame["value"].drop_nulls(), *frame["mean"].drop_nulls()]
+    shown = [frame[name].drop_nulls().to_list() for name in ("value", "mean", "low")]
     scale: Spec = {"nice": True}
-    if is_wide(numbers):
-        zero = min(numbers, default=0.0) <= 0
+    ticks = {"tickCount": 4, "labelOverlap": "greedy", "labelSeparation": 4}
+    # Of a utilisation nobody asks how often it is another one.
+    if is_wide([*shown[0], *shown[1]]) and not measure.column.startswith("u_"):
+        # An interval may reach below what any run has shown.
+        zero = min(itertools.chain(*shown)) <= 0
         scale = {"type": "symlog", "constant": 1} if zero else {"type": "log"}
-    across = quantity("mean", measure.heading, scale=scale, axis={"tickCount": 4})
+    across = quantity("mean", measure.heading, scale=scale, axis=ticks)
     down = name_of("policy", sort=policies)
     colours = styled(styles)
     about = [name_of("policy", title="policy"), name_of("scenario", title="scenario")]

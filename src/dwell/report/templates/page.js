@@ -27,7 +27,9 @@
     return vegaEmbed(place, fit(spec, figure.clientWidth), options).then((result) => {
       figure.replaceChildren(place);
       figure.classList.add("live");
-      views.push(result.view);
+      const signals = result.view.getState().signals;
+      // What stands in place of policies elsewhere (links, say) is not the form's to choose.
+      views.push({ view: result.view, lines: signals.policies, seeds: "seed" in signals });
     });
   }
 
@@ -46,13 +48,12 @@
   function choose() {
     if (!form) return;
     const boxes = [...form.querySelectorAll("[name=policy]")];
-    const shown = boxes.filter((box) => box.checked).map((box) => box.value);
+    const hidden = new Set(boxes.filter((box) => !box.checked).map((box) => box.value));
     const select = form.querySelector("[name=seed]");
     const seed = select && select.value !== "" ? Number(select.value) : null;
-    for (const view of views) {
-      const signals = Object.keys(view.getState().signals);
-      if (boxes.length && signals.includes("policies")) view.signal("policies", shown);
-      if (signals.includes("seed")) view.signal("seed", seed);
+    for (const { view, lines, seeds } of views) {
+      if (lines) view.signal("policies", lines.filter((name) => !hidden.has(name)));
+      if (seeds) view.signal("seed", seed);
       view.runAsync();
     }
     for (const row of document.querySelectorAll("tr[data-policy]")) {
