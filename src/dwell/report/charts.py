@@ -226,9 +226,7 @@ def intervals(
     ]
 
     def draw(width: float) -> Spec:
-        columns, across_px = panels(width, len(facets))
-        size = {"width": across_px, "height": ROW_PX * max(len(policies), 1)}
-        return {**faceted(layers, facets, columns, size), "params": chosen(policies, seeds=True)}
+        return {**_rows(layers, facets, policies, width), "params": chosen(policies, seeds=True)}
 
     return Figure(slug, title, {"rows": frame}, draw, caption)
 
@@ -284,10 +282,8 @@ def stacked(
     }
 
     def draw(width: float) -> Spec:
-        columns, across_px = panels(width, len(facets))
-        size = {"width": across_px, "height": ROW_PX * max(len(policies), 1)}
         layers = [bars, *limit_rule("x", limit, limit_name)]
-        return {**faceted(layers, facets, columns, size), "params": chosen(policies)}
+        return {**_rows(layers, facets, policies, width), "params": chosen(policies)}
 
     return Figure(slug, title, {"rows": frame}, draw, caption)
 
@@ -345,9 +341,7 @@ def distributions(
                 "encoding": {"y": {"datum": 0.05}},
             },
         ]
-        columns, across_px = panels(width, len(facets), beside=60)
-        size = {"width": across_px, "height": min(180, round(0.6 * across_px))}
-        return {**faceted(layers, facets, columns, size), "params": chosen(list(styles))}
+        return {**_plots(layers, facets, 180, width), "params": chosen(list(styles))}
 
     return Figure(slug, title, {"rows": frame}, draw, caption)
 
@@ -394,10 +388,8 @@ def cumulative(
                 ],
             },
         }
-        columns, across_px = panels(width, len(facets), beside=60)
-        size = {"width": across_px, "height": min(150, round(0.6 * across_px))}
         layers = [lines, *limit_rule("x", limit, limit_name)]
-        return {**faceted(layers, facets, columns, size), "params": chosen(list(styles))}
+        return {**_plots(layers, facets, 150, width), "params": chosen(list(styles))}
 
     return Figure(slug, title, {"rows": frame}, draw, caption)
 
@@ -482,11 +474,28 @@ def curves(
                 },
             },
         ]
-        columns, across_px = panels(width, len(facets), beside=60, most=3)
-        size = {"width": across_px, "height": min(170, round(0.6 * across_px))}
-        return {**faceted(layers, facets, columns, size), "params": chosen(list(styles))}
+        drawn = _plots(layers, facets, 170, width, most=3)
+        return {**drawn, "params": chosen(list(styles))}
 
     return Figure(slug, title, {"rows": frame}, draw, caption)
+
+
+def _rows(
+    layers: Sequence[Spec], facets: Sequence[str], policies: Sequence[str], width: float
+) -> Spec:
+    """Return layers with a row for each policy, a panel a scenario."""
+    columns, across_px = panels(width, len(facets))
+    size = {"width": across_px, "height": ROW_PX * max(len(policies), 1)}
+    return faceted(layers, facets, columns, size)
+
+
+def _plots(
+    layers: Sequence[Spec], facets: Sequence[str], tallest_px: int, width: float, most: int = 4
+) -> Spec:
+    """Return layers over two numbers, a panel a scenario."""
+    columns, across_px = panels(width, len(facets), beside=60, most=most)
+    size = {"width": across_px, "height": min(tallest_px, round(0.6 * across_px))}
+    return faceted(layers, facets, columns, size)
 
 
 def _of(encoded: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:

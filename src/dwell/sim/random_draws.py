@@ -109,15 +109,15 @@ def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) 
     TraceError
         If the times of episodes are a trace that is too short or is not there.
     """
-    disturbances = problem.scenario(scenario)
-    drawing = _Draw(problem, scenario, disturbances, seed, windows)
-    return tuple(one for item in disturbances for one in drawing.episodes_of(item))
+    return _Draw(problem, scenario, problem.scenario(scenario), seed, windows).episodes()
 
 
 def draw_changes(
     problem: Problem, *, scenario: str, seed: int, windows: int
-) -> tuple[NodeChanges, LinkSegments]:
+) -> tuple[Scenario, NodeChanges, LinkSegments]:
     """Draw what a realisation says of nodes and links, and nothing of its jobs and messages.
+
+    First comes the scenario that they are of, as of `drawn_scenario`.
 
     Parameters
     ----------
@@ -131,7 +131,8 @@ def draw_changes(
     TraceError
         If the times of episodes are a trace that is too short or is not there.
     """
-    return _Draw(problem, scenario, problem.scenario(scenario), seed, windows).changes()
+    drawing = _Draw(problem, scenario, problem.scenario(scenario), seed, windows)
+    return drawing.episodes(), *drawing.changes()
 
 
 def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
@@ -356,6 +357,10 @@ class _Draw:
         rngs = self._rng(f"episodes/{name}/every"), self._rng(f"episodes/{name}/for")
         drawn = drawn_intervals(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
         return drawn.until(end_ns)
+
+    def episodes(self) -> Scenario:
+        """Return the scenario with a disturbance for each of the episodes drawn."""
+        return tuple(one for item in self.scenario for one in self.episodes_of(item))
 
     def episodes_of(self, item: Disturbance) -> Iterator[Disturbance]:
         """Yield a disturbance for each time that one is on; itself where it has no episodes."""

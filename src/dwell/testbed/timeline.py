@@ -111,13 +111,12 @@ def timeline_of(
     written = problem.scenario(scenario)
     if not written:
         return Timeline()
-    from dwell.sim.random_draws import draw_changes, drawn_scenario
+    from dwell.sim.random_draws import draw_changes
 
     window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
-    asked = {"seed": seed, "windows": math.floor(seconds / window_s) + 1}
+    windows = math.floor(seconds / window_s) + 1
     problem = _without_bursts(problem)
-    items = drawn_scenario(problem, scenario=scenario, **asked)
-    nodes, segments = draw_changes(problem, scenario=scenario, **asked)
+    items, nodes, segments = draw_changes(problem, scenario=scenario, seed=seed, windows=windows)
     changes = [Change(one.at_ns, one.node, NodeState(one.threads, one.down)) for one in nodes]
     # A link's first segment is the link as it is, unless something is on from the beginning.
     at_once = {item.place for item in items if first_ns(item) == 0}
