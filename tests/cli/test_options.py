@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import cast
 
 import click
+import polars as pl
 import pytest
 import typer
+import yaml
 from typer.testing import CliRunner
 
 import dwell
@@ -75,9 +77,9 @@ def test_an_old_spelling_works_with_a_warning(
 def test_seconds_are_whole_windows() -> None:
     problem = dwell.load(CANONICAL)
     window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
-    assert windows_of(problem, 3 * window_s) == 3
-    assert windows_of(problem, 3.01 * window_s) == 4
-    assert windows_of(problem, window_s / 10) == 1
+    assert windows_of(3 * window_s, problem) == 3
+    assert windows_of(3.01 * window_s, problem, problem) == 4
+    assert windows_of(window_s / 10, problem) == 1
 
 
 def test_a_run_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
@@ -91,6 +93,34 @@ def test_a_run_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
     assert (made.meta["estimator"], made.meta["policy"][:5]) == ("Corrected", "Cusum")
     both = CliRunner().invoke(app, [*words, "--seconds", seconds, "--windows", "4"])
     assert (both.exit_code, "give one of them" in both.stderr) == (2, True)
+
+
+def test_a_study_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
+    problem = dwell.load(CANONICAL)
+    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
+    study = tmp_path / "study.yaml"
+    study.write_text(
+        yaml.safe_dump(
+            {"dwell-study": 1, "name": "short", "cell": str(CANONICAL), "policies": ["LOC"]}
+        )
+    )
+    words = ["study", str(study), "--seeds", "1", "--processes", "1"]
+    words += ["--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*words, "--seconds", str(6.5 * window_s)])
+    assert done.exit_code == 0, done.output
+    runs = pl.read_parquet(tmp_path / "out" / "runs.parquet")
+    assert set(runs["windows"]) == {7 - problem.warmup_windows}
+    both = CliRunner().invoke(app, [*words, "--seconds", "20", "--windows", "4"])
+    assert (both.exit_code, "give one of them" in both.stderr) == (2, True)
+
+
+def test_seconds_of_windows_that_differ_in_length_are_refused(tmp_path: Path) -> None:
+    told = {"dwell-study": 1, "name": "s", "cell": str(CANONICAL), "policies": ["LOC"]}
+    study = tmp_path / "study.yaml"
+    study.write_text(yaml.safe_dump({**told, "parameters": {"window_cycles": [50, 100]}}))
+    refused = CliRunner().invoke(app, ["study", str(study), "--seconds", "20"])
+    assert refused.exit_code == 2
+    assert "--seconds 20: windows last 1.66667, 3.33333 s here; give --windows" in refused.stderr
 
 
 def test_an_estimator_that_is_named_twice_is_refused(tmp_path: Path) -> None:

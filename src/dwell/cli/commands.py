@@ -184,7 +184,7 @@ def run(
     require_one_length(windows, seconds)
     problem = dwell.load(cell, traces=traces)
     if seconds is not None:
-        windows = windows_of(problem, seconds)
+        windows = windows_of(seconds, problem)
     windows = windows or 300
     how = prepare(windows * problem.window_cycles)
     # Imports the kernels.
@@ -221,6 +221,7 @@ def study(
         ),
     ] = None,
     windows: Windows = None,
+    seconds: Seconds = None,
     # Options of what was `dwell study paper`; they say where that is.
     quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
     chapter: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
@@ -231,7 +232,7 @@ def study(
     """Simulate every scenario, policy, parameter and seed of a study.
 
     What is finished stays in the folder, whatever ends the work: the same command goes on. Runs are
-    as long as the file says, if --windows is not given.
+    as long as the file says, if neither --windows nor --seconds is given.
     """
     if str(file) == "paper" or quick or chapter or real or examples:
         raise typer.BadParameter(
@@ -240,7 +241,9 @@ def study(
         )
     from dwell.cli.study import StudyRequest, run_study_file
 
-    run_study_file(StudyRequest(file, out, processes, dask, seeds, windows), as_json=as_json)
+    require_one_length(windows, seconds)
+    asked = StudyRequest(file, out, processes, dask, seeds, windows, seconds)
+    run_study_file(asked, as_json=as_json)
 
 
 @app.command()
@@ -357,7 +360,8 @@ def demo(
         typer.Option(metavar="FOLDER", help="Replay the measurements in this folder instead."),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 to N of every run.")] = 20,
-    windows: Windows = 150,
+    windows: Windows = None,
+    seconds: Seconds = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html goes.")] = Path(
         "demo-out"
     ),
@@ -368,13 +372,18 @@ def demo(
     processes: Processes = None,
     as_json: Json = False,
 ) -> None:
-    """Compare all policies in all scenarios of an example, and write the report."""
+    """Compare all policies in all scenarios of an example, and write the report.
+
+    Runs are 150 windows long, if neither --windows nor --seconds is given.
+    """
     from dwell.cli.demo import run_demo
 
+    require_one_length(windows, seconds)
     run_demo(
         real,
         seeds=seeds,
-        windows=windows or 150,
+        windows=windows,
+        seconds=seconds,
         out=out,
         examples=examples,
         processes=processes,

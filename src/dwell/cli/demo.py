@@ -7,10 +7,13 @@ from pathlib import Path
 
 import typer
 
+from dwell.cellfile import load
 from dwell.cli.examples import find_examples
+from dwell.cli.options import windows_of
 from dwell.cli.output import print_json, progress, working, write_file
 from dwell.report import comparison_html, comparison_text
 from dwell.study import Comparison, StudyResult, canonical_demo, real_demo, tenants_demo
+from dwell.study.demo import CANONICAL, REAL, WINDOWS
 
 __all__ = ["run_demo"]
 
@@ -19,7 +22,8 @@ def run_demo(
     real: Path | None,
     *,
     seeds: int,
-    windows: int,
+    windows: int | None,
+    seconds: float | None,
     out: Path,
     examples: Path | None,
     processes: int | None,
@@ -31,8 +35,12 @@ def run_demo(
     ----------
     real : Path or None
         Folder with the measurements to replay; None takes the canonical cell.
-    seeds, windows, processes
+    seeds, processes
         See `dwell.study.canonical_demo`.
+    windows : int, optional
+        Length of every run; 150 if neither it nor `seconds` is given.
+    seconds : float, optional
+        The length in seconds instead.
     out : Path
         Folder for ``report.html``.
     examples : Path or None
@@ -41,6 +49,10 @@ def run_demo(
         Print the tables as JSON.
     """
     folder = find_examples(examples)
+    if seconds is not None:
+        cells = (CANONICAL,) if real is None else REAL
+        windows = windows_of(seconds, *(load(folder / name, traces=real) for name in cells))
+    windows = windows or WINDOWS
     with progress("simulating") as shown:
         comparisons: Sequence[Comparison]
         tenants: StudyResult | None = None

@@ -133,7 +133,18 @@ def require_one_length(windows: int | None, seconds: float | None) -> None:
         raise typer.BadParameter("--windows and --seconds: give one of them")
 
 
-def windows_of(problem: Problem, seconds: float) -> int:
-    """Return the least number of whole windows that last so many seconds, at least 1."""
-    window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
-    return max(1, math.ceil(round(seconds / window_s, 9)))
+def windows_of(seconds: float, *problems: Problem) -> int:
+    """Return the least number of whole windows that last so many seconds, at least 1.
+
+    Raises
+    ------
+    typer.BadParameter
+        If the problems' windows have not all the same length.
+    """
+    each_s = sorted({one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems})
+    if len(each_s) > 1:
+        lengths = ", ".join(f"{window_s:g}" for window_s in each_s)
+        raise typer.BadParameter(
+            f"--seconds {seconds:g}: windows last {lengths} s here; give --windows"
+        )
+    return max(1, math.ceil(round(seconds / each_s[0], 9)))

@@ -11,6 +11,7 @@ from typing import Any
 
 import typer
 
+from dwell.cli.options import windows_of
 from dwell.cli.output import Progress, aligned, print_json, progress, working
 from dwell.report.formatting import Measure, shown_policy, shown_scenario, write_interval
 from dwell.study import Interval, Study, StudyResult, load_study, run_study
@@ -38,6 +39,7 @@ class StudyRequest:
     dask: str | None
     seeds: int | None
     windows: int | None
+    seconds: float | None
 
 
 def run_study_file(request: StudyRequest, *, as_json: bool) -> None:
@@ -54,8 +56,11 @@ def run_study_file(request: StudyRequest, *, as_json: bool) -> None:
     study = load_study(request.file)
     if request.seeds is not None:
         study = replace(study, seeds=tuple(range(1, request.seeds + 1)))
-    if request.windows is not None:
-        study = replace(study, windows=request.windows)
+    windows = request.windows
+    if request.seconds is not None:
+        windows = windows_of(request.seconds, *(point.problem for point in study.points))
+    if windows is not None:
+        study = replace(study, windows=windows)
     folder = request.out or Path("studies", re.sub(r"[^\w.-]", "_", study.name))
     with _interruptible(folder, study) as shown:
         result = run_study(
