@@ -112,7 +112,6 @@ def tier_utilisation(utilisation: Mapping[str, float], objective: Objective) -> 
     ----------
     utilisation : mapping of str to float
         Busy share of each node's cores; every node of ``objective.tiers``, others are ignored.
-    objective : Objective
 
     Raises
     ------
@@ -155,7 +154,6 @@ def price(
         U_r, U_e, U_c; `cloud` is ignored unless ``objective.weights.cloud`` is given.
     switching : float or array
         S, the share of tasks moved.
-    objective : Objective
 
     Returns
     -------
@@ -183,7 +181,6 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
         Observed or estimated metrics of the window.
     current, previous : Placement
         Over the same tasks; equal where nothing moved.
-    objective : Objective
 
     Returns
     -------

@@ -153,10 +153,6 @@ def installing(extra: str) -> str:
 def missing_package(error: ModuleNotFoundError) -> DwellError | None:
     """Return the error that names an optional package and the command that installs it.
 
-    Parameters
-    ----------
-    error : ModuleNotFoundError
-
     Returns
     -------
     DwellError or None

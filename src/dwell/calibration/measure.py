@@ -143,7 +143,6 @@ def time_runs(
     ----------
     call : callable
         Takes nothing, or what `inputs` returns.
-    settings : Settings
     inputs : callable, optional
         Called before every run with its number, from 0 (the warm-up counts from 0 as well), so
         that run k has the same inputs on every node.

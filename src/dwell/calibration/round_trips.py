@@ -211,8 +211,6 @@ def time_round_trips(
 
     Parameters
     ----------
-    host : str
-    port : int
     payload_bytes : int
         Of the larger message; random bytes, so that nothing on the way compresses them.
     settings : Settings

@@ -111,7 +111,6 @@ def put(document: Any, steps: tuple[Step, ...], value: object) -> Any:
     document : dict or list
     steps : tuple of str and int
         See `steps_of`; mappings on the way are made where there are none.
-    value : object
     """
     if not steps:
         return value
@@ -130,7 +129,6 @@ def with_settings(problem: Problem, settings: Mapping[str, object]) -> Problem:
 
     Parameters
     ----------
-    problem : Problem
     settings : mapping of str to object
         Values as in a cell file by their paths, which begin with one of `SETTINGS`:
         ``{"controller.min_dwell": 1, "objective.weights.switching": 0.5}``.

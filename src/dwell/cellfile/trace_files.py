@@ -40,7 +40,6 @@ class Reading:
 
     Parameters
     ----------
-    source : Source
     uses : sequence of (str, TraceEntry)
         The declarations that share it, with their places in the cell file.
     folder : Path

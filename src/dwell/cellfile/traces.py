@@ -57,7 +57,6 @@ def read_traces(entry: CellEntry, folder: Path, faults: Faults) -> Tables:
 
     Parameters
     ----------
-    entry : CellEntry
     folder : Path
         Where relative file names start.
     faults : Faults

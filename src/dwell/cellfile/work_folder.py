@@ -54,8 +54,6 @@ def claimed(folder: Path, claim: FolderMark, description: Description) -> Iterat
 
     Parameters
     ----------
-    folder : Path
-    claim : FolderMark
     description : mapping
         JSON-able: all that the results depend on.
 

@@ -66,7 +66,6 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
 
     Parameters
     ----------
-    path : str
     faults : Faults
         Takes what is wrong with the file as such, and the line of every value.
     what, begin : str

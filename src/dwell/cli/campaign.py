@@ -38,13 +38,10 @@ class CampaignRequest:
 
     Parameters
     ----------
-    cell : Path
     scenarios, policies : tuple of str
         Empty for the default ones.
-    repetitions : int
     seconds : float
         Of each run.
-    seed : int
     out : Path or None
     name : str
         Of the testbed.
@@ -164,12 +161,10 @@ def report_campaign(
 
     Parameters
     ----------
-    folder, page : Path
     figures : Path, optional
         Folder for its figures and tables as files.
     static : bool
         Whether the page is without scripts.
-    as_json : bool
 
     Raises
     ------

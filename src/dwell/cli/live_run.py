@@ -54,7 +54,6 @@ class LiveRunRequest:
 
     Parameters
     ----------
-    cell : Path
     scenario : str or None
         Played on it; the cell's first that disturbs something if not given.
     seconds : float or None

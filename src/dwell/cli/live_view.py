@@ -89,7 +89,6 @@ def live_view(problem: Problem, seconds: float, plan: Sequence[Disturbed]) -> It
 
     Parameters
     ----------
-    problem : Problem
     seconds : float
         How long it will be shown.
     plan : sequence of Disturbed
@@ -174,10 +173,7 @@ class Screen:
 
     Parameters
     ----------
-    problem : Problem
-    seconds : float
     plan : sequence of Disturbed
-    console : Console
     update : callable
         Takes what is to be seen now.
     """

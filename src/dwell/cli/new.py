@@ -65,7 +65,6 @@ def new_cell(path: Path, origin: Origin) -> None:
     ----------
     path : Path
         The folder; its last part names the cell.
-    origin : Origin
 
     Raises
     ------

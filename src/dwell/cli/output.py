@@ -76,8 +76,6 @@ def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) 
 
     Parameters
     ----------
-    page : Page
-    path : Path
     figures : Path, optional
         Made where there is none; files of the same names are replaced.
     static : bool

@@ -50,8 +50,6 @@ def words(
 
     Parameters
     ----------
-    cell : Path
-    who : str
     state : Path
         Folder of its node's files.
     cpus : iterable of int, optional

@@ -80,7 +80,6 @@ class Controller:
 
     Parameters
     ----------
-    problem : Problem
     policy : policy, str, or None
         An object with `decide`, a policy's or candidate's name, a policy's with an estimator's
         (``cusum+corrected``), or None for the cell file's choice. The caller's object is copied,
@@ -209,7 +208,6 @@ class Controller:
 
         Parameters
         ----------
-        window : ClosedWindow
         proven : str, optional
             Candidate that enough probes have completed through, for a cell that is on a fallback;
             it is left for no other (see `adopt`).
@@ -505,7 +503,6 @@ def static_columns(
 
     Parameters
     ----------
-    controller : Controller
     profile : Profile
         Its `fixed_profile`.
     window : ClosedWindow

@@ -220,7 +220,6 @@ class Guard:
 
         Parameters
         ----------
-        now_ns : int
         whole : callable of str to bool, or mapping
             Whether all nodes, links and workers of a candidate were heard lately; see
             `Presence`. Fallbacks are asked for in order, up to the first that is.
@@ -243,7 +242,6 @@ class Guard:
 
         Parameters
         ----------
-        candidate : str
         fallback : bool
             Whether the guard itself makes it (`check` said so), and no order. An order for the
             placement that holds already is a move, too: it makes a fallback the controller's.

@@ -118,7 +118,6 @@ class Corrected:
 
     Parameters
     ----------
-    problem : Problem
     shadow_fraction : float, optional
         Share of the cycles sent through each alternative; the cell file's where None. 0 learns
         from the active placement alone.

@@ -50,11 +50,9 @@ class Evidence:
 
     Parameters
     ----------
-    close_ns : int
     release_ns : int64 array, shape (W,)
     placement : int array, shape (W,)
         Index of the candidate that each cycle ran under.
-    cycles : Instants
     shadow_placement : int array, shape (W,)
         Index of the candidate that a cycle was also sent through; -1 for none.
     shadows : Instants or None

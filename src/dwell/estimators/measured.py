@@ -57,12 +57,7 @@ def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
 
 
 class Meter:
-    """Takes windows apart into the times of the parts that their jobs and messages went through.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
+    """Takes windows apart into the times of the parts that their jobs and messages went through."""
 
     def __init__(self, problem: Problem) -> None:
         self._pipeline = problem.pipeline
@@ -134,8 +129,6 @@ class _Columns:
 
     Parameters
     ----------
-    pipeline : Pipeline
-    placement : Placement
     tasks : frozenset of str
         The tasks that they went through there: all, or what a shadow does not share.
     """

@@ -28,7 +28,6 @@ class Input(NamedTuple):
 
     Parameters
     ----------
-    flow : Flow
     column : int
         Place of the flow in the pipeline.
     source : int
@@ -45,7 +44,6 @@ class Step(NamedTuple):
 
     Parameters
     ----------
-    task : str
     column : int
         Place of the task in the pipeline.
     offset_ms : float

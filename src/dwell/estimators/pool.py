@@ -100,7 +100,6 @@ class Pool:
         ----------
         times : float64 array, shape (n,)
             At least one, infinite where it was lost.
-        window : int
         memory : float
             Windows after which a time is forgotten.
 

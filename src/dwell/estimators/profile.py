@@ -56,7 +56,6 @@ class Profile:
 
     Parameters
     ----------
-    problem : Problem
     samples : int
         Sample cycles.
     seed : int

@@ -103,7 +103,6 @@ def by_name(name: str, problem: Problem) -> Estimator:
     ----------
     name : str
         An estimator's name, or ``package.module:Class`` (see `dwell.model.user_classes`).
-    problem : Problem
 
     Raises
     ------

@@ -66,7 +66,6 @@ class Scaling:
 
     Parameters
     ----------
-    problem : Problem
     ratios : mapping of (task, node, other node) to float, optional
         Compute time on the other node over that on the node; what is missing is the 95th percentile
         of the profile's there over its median here.

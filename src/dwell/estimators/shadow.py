@@ -80,7 +80,6 @@ class Shadow:
 
     Parameters
     ----------
-    problem : Problem
     shadow_fraction : float, optional
         Share of the cycles sent through each alternative; the cell file's where None.
     half_life_windows : float, optional

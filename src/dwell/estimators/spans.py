@@ -52,7 +52,6 @@ def spans_of(instants: Instants, sent_ns: Ints, limit_ns: int) -> Spans:
 
     Parameters
     ----------
-    instants : Instants
     sent_ns : int64 array, shape (n, flows)
         When the source of each message completed.
     limit_ns : int

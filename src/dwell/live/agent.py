@@ -119,9 +119,6 @@ class Agent:
 
     Parameters
     ----------
-    place : RolePlace
-    supervisor : Supervisor
-    cpu : CpuCount
     accelerator : Gauge, optional
         Tells the utilisation of the node's accelerator.
     """

@@ -34,10 +34,6 @@ Cycle: TypeAlias = tuple[int, int]
 class Continuity:
     """Tells cycles that go on from those believed before from those that leap.
 
-    Parameters
-    ----------
-    period_ns : int
-
     Attributes
     ----------
     newest : (int, int) or None

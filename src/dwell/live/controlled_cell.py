@@ -86,9 +86,6 @@ class ControlledCell:
 
     Parameters
     ----------
-    place : RolePlace
-    controller : Controller
-    recorder : Recorder
     name : str
         Name of this controller, by which others that would take charge tell it apart.
     """

@@ -48,7 +48,6 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
     Parameters
     ----------
-    run, number, term : int
     placement, shadow : str
         As stamped.
     at_ns : int
@@ -174,13 +173,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
 
 class Ledger:
-    """Puts what messages say of cycles on the stamper's clock, and adds it up.
-
-    Parameters
-    ----------
-    problem : Problem
-    offsets : Offsets
-    """
+    """Puts what messages say of cycles on the stamper's clock, and adds it up."""
 
     def __init__(self, problem: Problem, offsets: Offsets) -> None:
         pipeline = problem.pipeline
@@ -214,7 +207,6 @@ class Ledger:
 
         Parameters
         ----------
-        cycle : LiveCycle
         most_ns : int, optional
             Leave it for later where the clocks' bound is above that; the bound may tighten.
         """
@@ -386,7 +378,6 @@ class Ledger:
         ----------
         cycles : sequence of LiveCycle
         release_ns : int64 array, shape (W,)
-        close_ns : int
         shadows : bool
             Whether cycles may have been sent through alternatives.
         """

@@ -39,7 +39,6 @@ def end_process(what: str, error: BaseException) -> NoReturn:
     ----------
     what : str
         What has failed.
-    error : BaseException
     """
     # There may be no memory left to say it, and no room where it is said.
     with suppress(BaseException):
@@ -55,7 +54,6 @@ def start_thread(name: str, run: Callable[..., object], *arguments: object) -> t
 
     Parameters
     ----------
-    name : str
     run : callable
         Called with the arguments.
 

@@ -39,10 +39,6 @@ def silent_after_ns(problem: Problem) -> int:
 
     The guard's g periods, and what the controller is behind by: who beats seldom does so every
     `AGENT_BEAT` periods, and the relay's agent tells of beats as often.
-
-    Parameters
-    ----------
-    problem : Problem
     """
     periods = problem.controller.guard_cycles + 2 * AGENT_BEAT
     return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
@@ -52,10 +48,6 @@ def window_late_ns(problem: Problem) -> int:
     """Return the age from which the last window is too old.
 
     A window that a move interrupts begins anew.
-
-    Parameters
-    ----------
-    problem : Problem
     """
     window_ms = problem.window_cycles * problem.pipeline.period_ms
     return round((2 * window_ms + problem.controller.close_grace_ms) * 1e6) + PATIENCE_NS
@@ -66,7 +58,6 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
 
     Parameters
     ----------
-    problem : Problem
     status : mapping
         Of `dwell.live.controlled_cell.ControlledCell.status`.
 

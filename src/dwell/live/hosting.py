@@ -81,8 +81,6 @@ class Hosted:
 
     Parameters
     ----------
-    role : RoleLogic
-    transport : Transport
     clock : callable
         The node's clock, nanoseconds.
     heard : callable, optional
@@ -203,9 +201,6 @@ def work(
 
     Parameters
     ----------
-    worker : Worker
-    transport : Transport
-    stopped : Event
     note : callable, optional
         Told what job begins, and None when it is over.
     clock : callable

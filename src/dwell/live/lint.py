@@ -14,10 +14,6 @@ def lint(problem: Problem) -> Iterator[Fault]:
     """Yield what a live cell does not do as its file says, or not as well as it could.
 
     A cell for the simulator alone, with neither hosts nor stages, gets no warning.
-
-    Parameters
-    ----------
-    problem : Problem
     """
     if problem.live.hosts or any(task.run for task in problem.pipeline.tasks.values()):
         yield from _side_by_side(problem)

@@ -82,7 +82,6 @@ class LiveWindow:
 
     Parameters
     ----------
-    number : int
     cycles : list of LiveCycle
     close_ns : int
         Since the origin.
@@ -120,11 +119,8 @@ class LiveWindows:
 
     Parameters
     ----------
-    problem : Problem
     offsets : Offsets
         Its reference is the stamper's node, its node the controller's.
-    controller : Controller
-    resume : Resume, optional
 
     Attributes
     ----------

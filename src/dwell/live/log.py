@@ -55,7 +55,6 @@ class Log:
     ----------
     say : callable
         Takes the lines.
-    every_s : float
     clock : callable
         Seconds.
     """

@@ -59,7 +59,6 @@ class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
     ----------
     run : int
         Run id; later runs have larger ones.
-    cycle : int
     term : int
         Grows at every change of placement.
     placement : str
@@ -109,10 +108,8 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    task, node : str
     arrived_ns : int
         When the last of its inputs was there.
-    started_ns, ended_ns : int
     inputs : tuple of (str, int)
         For every flow into the task: its source, and when its message was handed over here.
     state_age : int
@@ -146,7 +143,6 @@ class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    stamp : Stamp
     source : str
         Task that sent it.
     node : str
@@ -175,7 +171,6 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    stamp : Stamp
     sink : str
         Task.
     done_ns : int
@@ -206,7 +201,6 @@ class Heard(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    who, node : str
     beat_ns : int
         When that beat was sent, on the clock of who sent it.
     at_ns : int
@@ -228,7 +222,6 @@ class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Process and its node.
     life : int
         Grows with every start of the process.
-    sent_ns : int
     ready : bool
         Whether it can do its work: its stage has started and does not hang.
     heard : tuple of Heard
@@ -326,7 +319,6 @@ class Answer(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    number : str
     refused : str
         Why not; empty if it was done.
     status : dict
@@ -343,7 +335,6 @@ class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    node : str
     life : int
         Life of the agent that counts; another life counts from another beginning.
     at_ns : int
@@ -412,8 +403,6 @@ class Restored(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    number : int
-    task, node : str
     run, cycle : int
         The last cycle that is in the state now.
     failed : str
@@ -433,14 +422,12 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     Parameters
     ----------
-    number : int
     controller : str
         Whose order it answers.
     refused : str
         Empty where it was accepted; else ``stale term``, ``stale run``, ``stale order``,
         ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``,
         with details.
-    run, term : int
     placement : str
         What holds now.
     cycle : int
@@ -499,7 +486,6 @@ def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
 
     Parameters
     ----------
-    data : bytes
     kind : type
         What it has to be.
     limit : int

@@ -52,15 +52,12 @@ def run_agent(
 
     Parameters
     ----------
-    problem : Problem
-    node : str
     folder : Path
         Where they keep their files.
     program : sequence of str
         Command of the process that the others are forked from (`ForkServer`).
     words : callable
         Returns what it is told to start a process, by the process's name.
-    stopped : Event
     cpus : iterable of int, optional
         Those that the node may use.
     accelerator : callable, optional
@@ -166,7 +163,6 @@ def run_controller(
     problems : sequence of Problem
     out : Path
         Where the runs' folders go, one a cell and run.
-    stopped : Event
     policy : str, optional
         Instead of the cells' own.
     name : str, optional

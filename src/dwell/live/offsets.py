@@ -51,7 +51,6 @@ class Instant(NamedTuple):
 
     Parameters
     ----------
-    instant_ns : int
     bound_ns : int
         `UNBOUNDED_NS` where messages have not gone both ways yet.
     """
@@ -201,7 +200,6 @@ class Offsets:
 
         Parameters
         ----------
-        beat : Beat
         at_ns : int
             When it arrived, on this node's clock.
         """
@@ -244,11 +242,6 @@ class Offsets:
 
     def to_reference(self, node: str, instant_ns: int) -> Instant:
         """Convert an instant of a node's clock to the reference's.
-
-        Parameters
-        ----------
-        node : str
-        instant_ns : int
 
         Returns
         -------

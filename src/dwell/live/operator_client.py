@@ -29,7 +29,6 @@ class OperatorClient:
 
     Parameters
     ----------
-    problem : Problem
     environment : mapping of str to str, optional
         With the variables of `dwell.live.security`; this process's own if left out.
 
@@ -78,7 +77,6 @@ class OperatorClient:
             ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``.
         about : str
             Candidate to pin, node to drain.
-        patience_s : float
 
         Raises
         ------
@@ -99,10 +97,6 @@ class OperatorClient:
 
     def look(self, *, patience_s: float = 3.0) -> dict[str, Any]:
         """Return how the cell is, and that nobody answers where that is so.
-
-        Parameters
-        ----------
-        patience_s : float
 
         Returns
         -------

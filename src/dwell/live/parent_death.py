@@ -41,7 +41,6 @@ def end_with_owner(stopped: threading.Event, owner: int | None) -> None:
 
     Parameters
     ----------
-    stopped : Event
     owner : int, optional
         Its process id.
     """

@@ -74,7 +74,6 @@ def read_payload(kind: str, data: bytes, expected: type | None = None) -> Payloa
     ----------
     kind : str
         As its header says.
-    data : bytes
     expected : type, optional
         Struct that the stage declares for this input.
 

@@ -20,10 +20,6 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
     """Return who may put, by key; the names are those of nodes, and `CONTROLLER`.
 
     Questions are missing: who may ask them is in nobody's cell file.
-
-    Parameters
-    ----------
-    problem : Problem
     """
     keys, pipeline = Keys(problem.name), problem.pipeline
     stamper, relay = problem.stamper_node, problem.live.relay or problem.controller_node
@@ -79,13 +75,7 @@ def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
 
 
 def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
-    """Return who of a roster may put, by key.
-
-    Parameters
-    ----------
-    problem : Problem
-    roster : Roster
-    """
+    """Return who of a roster may put, by key."""
     keys = Keys(problem.name)
     of_role: Mapping[str, Iterable[str]] = {
         role: [subject.name for subject in roster.of_role(role)]

@@ -38,8 +38,6 @@ class RunRecorder:
     ----------
     out : Path
         Folder of folders.
-    problem : Problem
-    controller : Controller
     say : callable
         Takes lines for the log.
     jobs : bool

@@ -90,10 +90,8 @@ class RolePlace:
 
     Parameters
     ----------
-    problem : Problem
     who, node : str
         Name of the process, unique in the cell, and its node.
-    transport : Transport
     life : int
         Grows with every start of the process.
     complaints : dict of str to int
@@ -163,7 +161,6 @@ class RolePlace:
 
         Parameters
         ----------
-        sample : Arrival
         kind : type
             What it has to be.
         by : callable
@@ -312,7 +309,6 @@ class Pulse:
 
     Parameters
     ----------
-    place : RolePlace
     state : callable
         Returns whether the process is ready, and what keeps it from that or went wrong last.
     holds : callable, optional

@@ -40,12 +40,10 @@ def run_process(
 
     Parameters
     ----------
-    problem : Problem
     who : str
         As in `wiring.roles`: a stamper, worker, shadow, standby or sink.
     folder : Path
         Where the node's processes keep their files.
-    stopped : Event
     platform : Platform, optional
         Its clock and transport; without faults if left out.
 

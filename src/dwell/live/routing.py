@@ -31,10 +31,6 @@ class Routes:
 
     A shadow shares with its cycle what both placements run alike. Behind the first task that they
     run on different nodes it has messages of its own, down to the sinks' nodes.
-
-    Parameters
-    ----------
-    problem : Problem
     """
 
     def __init__(self, problem: Problem) -> None:

@@ -41,7 +41,6 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
 
     Parameters
     ----------
-    controller : Controller
     jobs : bool
         Whether it keeps those that are kept on request.
     """
@@ -98,10 +97,8 @@ def window_values(
 
     Parameters
     ----------
-    window : LiveWindow
     nodes : sequence of str
         In the order of the columns of its `used`.
-    warmup : bool
     l95_ms : float
         L95 of final latencies.
     missed : int
@@ -146,7 +143,6 @@ def decision_values(
 
     Parameters
     ----------
-    controller : Controller
     row : sequence
         Of its log.
     why : str, optional

@@ -45,7 +45,6 @@ class Security:
 
     Parameters
     ----------
-    problem : Problem
     keyring : Keyring, optional
         Its keys; without, whoever reaches its ports can say anything.
     """
@@ -61,7 +60,6 @@ class Security:
 
         Parameters
         ----------
-        problem : Problem
         role : Role
             A process of the cell, or a visitor.
         environment : mapping of str to str, optional
@@ -242,12 +240,7 @@ def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
 
 
 def exposed(problem: Problem) -> Iterator[Fault]:
-    """Yield every address of a cell that takes it beyond this computer.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
+    """Yield every address of a cell that takes it beyond this computer."""
     for path, address in _beyond(problem).items():
         yield Fault(
             path,

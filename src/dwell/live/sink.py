@@ -36,11 +36,8 @@ class Sink:
 
     Parameters
     ----------
-    place : RolePlace
     task : str
         Sink task whose commands it takes.
-    actuator : Actuator
-    highest : Highest
     expected : type, optional
         Struct that the actuator takes.
     """

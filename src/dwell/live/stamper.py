@@ -47,8 +47,6 @@ class StamperState:
         Run id.
     reserved : int
         No cycle from this number on has been stamped.
-    term : int
-    placement : str
     on_fallback : bool
         Whether the placement is the guard's.
     """
@@ -77,11 +75,8 @@ class Stamper:
 
     Parameters
     ----------
-    place : RolePlace
-    book : Book
     run : int
         Run id where the book has none; larger than any before.
-    now_ns : int
     """
 
     def __init__(self, place: RolePlace, book: Book, run: int, now_ns: int) -> None:

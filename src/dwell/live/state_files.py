@@ -65,10 +65,6 @@ class BookFile:
     A disk that is full keeps nobody from writing it, and a process that dies while it writes spoils
     the slot only that was not the last.
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     LiveError
@@ -148,12 +144,7 @@ def _checksum(run: int, cycle: int) -> int:
 
 
 class InFlight:
-    """What a worker is working on, in mapped memory: what it died of, if it dies.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """What a worker is working on, in mapped memory: what it died of, if it dies."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -48,7 +48,6 @@ class SupervisedProcess:
 
     Parameters
     ----------
-    who : str
     command : sequence of str
     folder : Path
         Where it keeps its files.

@@ -65,8 +65,6 @@ class Role:
     who : str
         Its name, unique in the cell: ``perception@E``, ``perception@E.shadow``, ``control@R2.1``,
         ``sink.control@R2``, ``stamper@R1``, ``agent@E``, ``controller@E``.
-    node : str
-    kind : str
     task : str
         Task of a worker or sink; empty for the other kinds.
     index : int
@@ -105,7 +103,6 @@ class Wire:
 
     Parameters
     ----------
-    session : str
     source, target : str
         Who connects, and who listens.
     """
@@ -125,8 +122,6 @@ class Passage:
     ----------
     source, target : str
         Nodes: of who connects, and of who listens.
-    session : str
-    seen, to : Locator
     """
 
     source: str
@@ -142,7 +137,6 @@ class WiringEntry:
 
     Parameters
     ----------
-    role : Role
     listen : mapping of str to Locator
         By session; those that nobody connects to are missing.
     connect : mapping of str to tuple of Locator
@@ -169,7 +163,6 @@ class Wiring:
 
     Parameters
     ----------
-    cell : str
     entries : mapping of str to WiringEntry
         By who.
     wires : tuple of Wire
@@ -231,10 +224,6 @@ def roles(problem: Problem) -> tuple[Role, ...]:
 
     Later ones connect to earlier ones: first those that hardly ever start anew, then workers along
     the flows, last the controller, which may come and go.
-
-    Parameters
-    ----------
-    problem : Problem
     """
     pipeline = problem.pipeline
     order = pipeline.topological()
@@ -336,13 +325,7 @@ def longest_bytes(declared_bytes: int) -> int:
 
 
 def longest_message_bytes(problem: Problem, session: Session) -> int:
-    """Longest message that anybody in a cell sends in a session: headers and key are in it.
-
-    Parameters
-    ----------
-    problem : Problem
-    session : str
-    """
+    """Longest message that anybody in a cell sends in a session: headers and key are in it."""
     pipeline = problem.pipeline
     declared = [flow.payload_bytes for flow in pipeline.flows]
     declared += [task.state_bytes for task in pipeline.tasks.values()]
@@ -356,8 +339,6 @@ def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
 
     Parameters
     ----------
-    entry : WiringEntry
-    lane : str
     key : str
         ``dwell/CELL/in/TASK/NODE/...`` or ``dwell/CELL/state/TASK/NODE`` where the lane is
         `images`: what stays on the node goes through `local`.

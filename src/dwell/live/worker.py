@@ -49,7 +49,6 @@ class Job:
         Header of any of the inputs; its stamp is the cycle's.
     inputs : dict of str to (Header, bytes, int)
         By source task: header, payload, and when it was handed over.
-    shadow : bool
     """
 
     header: Header
@@ -171,9 +170,6 @@ class Worker:
 
     Parameters
     ----------
-    place : RolePlace
-    task : str
-    stage : Stage
     shadow : bool
         Whether it runs shadows.
     stands_by : str

@@ -44,10 +44,6 @@ def to_document(problem: Problem) -> Document:
     `dwell.cellfile.from_document` makes an equal problem of it. A trace is named, not copied: its
     declaration carries a digest of the data, so that other data are not taken for it.
 
-    Parameters
-    ----------
-    problem : Problem
-
     Returns
     -------
     dict
@@ -96,10 +92,6 @@ def to_document(problem: Problem) -> Document:
 
 def digest(trace: Trace) -> str:
     """Return the SHA-256 of what a trace replays: values, groups and instants, in hexadecimal.
-
-    Parameters
-    ----------
-    trace : Trace
 
     Returns
     -------

@@ -37,7 +37,6 @@ def class_named(name: str, path: str | None, group: str, what: str, error: type[
 
     Parameters
     ----------
-    name : str
     path : str, optional
         Of ours, as `class_at` takes it; None where the name is none of ours.
     group : str

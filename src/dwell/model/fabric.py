@@ -60,7 +60,6 @@ class Quota:
 
     Parameters
     ----------
-    cpu, period_ms : float
     slack_ms : float
         Run time that a core has drawn and keeps, beyond the end of a period, when it goes idle.
         Linux keeps 1 ms.
@@ -89,9 +88,6 @@ class Node:
 
     Parameters
     ----------
-    name : str
-    tier : {"robot", "edge", "cloud"}
-    cores : int
     scheduler : {"fair", "fifo", "priority"}
         How jobs share the cores.
     accelerators : mapping of str to int

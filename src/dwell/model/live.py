@@ -34,7 +34,6 @@ class Host:
 
     Parameters
     ----------
-    address : str
     port : int
         First port; each process of the node takes three.
     seen_from : mapping of str to Endpoint

@@ -69,7 +69,6 @@ class Task:
 
     Parameters
     ----------
-    name : str
     on : mapping of str to Execution
         Feasible nodes (N_v); one makes the task anchored, more make it relocatable.
     depth : int

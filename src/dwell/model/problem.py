@@ -53,7 +53,6 @@ class ControllerSettings:
         Delta_min, in units of J.
     escape : bool
         Whether an incumbent over a cap may leave before the hysteresis is met.
-    estimator : str
     shadow_fraction : float
         Share of the cycles that are also sent through each alternative, where the estimator
         measures it with shadow jobs.
@@ -115,15 +114,10 @@ class Problem:
 
     Parameters
     ----------
-    name : str
-    pipeline : Pipeline
-    fabric : Fabric
     candidates : mapping of str to Placement
         Pi_cand; each covers every task.
-    objective : Objective
     scenarios : mapping of str to tuple of disturbances
         `baseline`, the empty one, is added where it is missing.
-    controller : ControllerSettings
     window_cycles : int
         W.
     warmup_windows : int

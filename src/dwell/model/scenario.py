@@ -70,12 +70,10 @@ class NodeDisturbance:
 
     Parameters
     ----------
-    node : str
     at_s, for_s : float
         Begin and duration, seconds.
     stress_threads : int
         Foreign threads; along a ramp, rounded to whole ones.
-    down : bool
     episodes : Episodes, optional
         When it is on within that time; all the time where None.
     ramp_s : float

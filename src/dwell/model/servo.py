@@ -22,7 +22,6 @@ class MovingTarget:
     ----------
     amplitude_mm : float
         All errors are proportional to it.
-    period_s : float
     """
 
     amplitude_mm: float
@@ -48,7 +47,6 @@ class Servo:
         The command is a velocity, or an acceleration.
     gain : float
         Command for an error of 1: 1/s for the integrator, 1/s² for the double integrator.
-    target : MovingTarget
     damping : float
         Command for an error that grows by 1 a second, 1/s; above 0 for the double integrator, 0 for
         the integrator.

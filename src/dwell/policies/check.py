@@ -65,7 +65,6 @@ def check_policy(policy: MinimalPolicy, problem: Problem) -> tuple[str, ...]:
     ----------
     policy : MinimalPolicy
         Left as it is; it must allow ``copy.deepcopy``.
-    problem : Problem
 
     Returns
     -------

@@ -60,7 +60,6 @@ class Pricing:
     Parameters
     ----------
     candidates : mapping of str to Placement
-    objective : Objective
     """
 
     __slots__ = ("_cloud", "_edge", "_robot", "_rows", "candidates", "objective")

@@ -133,7 +133,6 @@ def by_name(name: str, problem: Problem) -> Policy:
     name : str
         A policy's name, a candidate's for the placement that never moves, or
         ``package.module:Class`` (see `dwell.model.user_classes`).
-    problem : Problem
 
     Raises
     ------

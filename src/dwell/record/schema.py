@@ -427,7 +427,6 @@ def frame_of(
     ----------
     table : str
         One of `TABLES`.
-    problem : Problem
     values : mapping of str to sequence, array or Series
         By column; all of one length.
     features : collection of {"live", "shadows", "support"}

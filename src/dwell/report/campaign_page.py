@@ -42,7 +42,6 @@ def campaign_html(measured: MeasuredCampaign, *, static: bool = False) -> str:
 
     Parameters
     ----------
-    measured : MeasuredCampaign
     static : bool
         Whether scripts are left out.
     """
@@ -272,7 +271,6 @@ def campaign_text(measured: MeasuredCampaign, *, width: int | None = None) -> st
 
     Parameters
     ----------
-    measured : MeasuredCampaign
     width : int, optional
         Columns of the terminal; as wide as it takes where None.
     """

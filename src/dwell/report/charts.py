@@ -159,16 +159,13 @@ def intervals(
 
     Parameters
     ----------
-    slug : str
     frame : DataFrame
         ``scenario``, ``policy``, ``mean``, ``low``, ``high``, ``seed``, ``value``, in the
         measure's shown unit: a row a policy without a seed, and a row a seed without a mean.
-    measure : Measure
     styles : mapping of str to Style
         By policy, in the order of the rows.
     limit : float
         In the shown unit.
-    limit_name, title, caption : str
     """
     facets, policies = _facets(frame), list(styles)
     shown = [frame[name].drop_nulls().to_list() for name in ("value", "mean", "low")]
@@ -247,7 +244,6 @@ def stacked(
 
     Parameters
     ----------
-    slug : str
     frame : DataFrame
         ``scenario``, ``policy``, ``part``, ``value``.
     policies : sequence of str
@@ -256,8 +252,6 @@ def stacked(
         Colours, in the order of the bars.
     heading : str
         Of the axis, with its unit.
-    limit : float
-    limit_name, title, caption : str
     """
     facets, names = _facets(frame), list(parts)
     order = {"calculate": f"indexof({names!r}, datum.part)", "as": "place"}
@@ -301,12 +295,9 @@ def distributions(
 
     Parameters
     ----------
-    slug : str
     frame : DataFrame
         ``scenario``, ``policy``, ``latency_ms``, ``longer``: share of the cycles, above 0.
     styles : mapping of str to Style
-    deadline_ms : float
-    title, caption : str
     """
     facets = _facets(frame)
 
@@ -361,14 +352,11 @@ def cumulative(
 
     Parameters
     ----------
-    slug : str
     frame : DataFrame
         ``scenario``, ``policy``, ``value``, ``share`` at or below it.
     styles : mapping of str to Style
     headings : (str, str)
         Of the axes: values, shares.
-    limit : float
-    limit_name, title, caption : str
     """
     facets = _facets(frame)
 
@@ -410,17 +398,14 @@ def curves(
 
     Parameters
     ----------
-    slug : str
     frame : DataFrame
         ``scenario``, ``policy``, ``at`` (the parameter's values, texts or numbers), ``mean``,
         ``low``, ``high`` in the measure's shown unit.
-    measure : Measure
     styles : mapping of str to Style
     heading : str
         Of the parameter.
     limit : float
         In the shown unit.
-    limit_name, title, caption : str
     """
     facets = _facets(frame)
 

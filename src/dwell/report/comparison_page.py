@@ -227,7 +227,6 @@ def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
 
     Parameters
     ----------
-    comparison : Comparison
     width : int, optional
         Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
     """

@@ -59,7 +59,6 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
 
     Parameters
     ----------
-    problem : Problem
     names : iterable of str
         As in tables; those that nothing is known of are left out.
 

@@ -41,10 +41,6 @@ ESCAPES = {
 def figure_files(page: Page) -> Iterator[tuple[str, bytes | str]]:
     """Yield every figure and table of a page as files.
 
-    Parameters
-    ----------
-    page : Page
-
     Yields
     ------
     (str, bytes or str)

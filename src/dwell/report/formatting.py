@@ -52,7 +52,6 @@ class Measure(NamedTuple):
         Behind the name; empty where there is none.
     factor : float
         From the column's unit to the one shown.
-    decimals : int
     ends : bool
         Whether the interval is always written by its ends.
     signed : bool
@@ -106,8 +105,6 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
 
     Parameters
     ----------
-    interval : Interval
-    measure : Measure
     larger_half : bool
         Whether ``±`` stands before the larger half however much they differ, as long as it is
         finite: for tables that are short of room and say so.

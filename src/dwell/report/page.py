@@ -34,7 +34,6 @@ class Fact(NamedTuple):
 
     Parameters
     ----------
-    name : str
     value : str
         With its unit.
     error : str
@@ -64,7 +63,6 @@ class Section:
 
     Parameters
     ----------
-    title : str
     blocks : sequence of Figure, Table or Definitions
     note : str
         Fixed text under the heading.
@@ -87,7 +85,6 @@ class Page:
 
     Parameters
     ----------
-    title : str
     subtitle : str
         Of what it is a report.
     facts : sequence of Fact
@@ -123,7 +120,6 @@ def page_html(page: Page, *, static: bool = False) -> str:
 
     Parameters
     ----------
-    page : Page
     static : bool
         Whether scripts, and the data that they draw, are left out.
 

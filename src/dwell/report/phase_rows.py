@@ -24,8 +24,6 @@ class PhaseRow(NamedTuple):
 
     Parameters
     ----------
-    name : str
-    begin_s, end_s : float
     cycles : int
         Released in it.
     violation_rate, l95_ms : float

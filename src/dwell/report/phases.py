@@ -35,7 +35,6 @@ class Disturbed(NamedTuple):
 
     Parameters
     ----------
-    begin_s, end_s : float
     what : str
         As ``R1: 1 busy thread``.
     kind : str
@@ -55,7 +54,6 @@ class Phase(NamedTuple):
     ----------
     name : str
         ``baseline``, or the kinds of what was on.
-    begin_s, end_s : float
     """
 
     name: str

@@ -59,7 +59,6 @@ class PolicyBlocks:
 
     Parameters
     ----------
-    problem : Problem
     runs : DataFrame
         One row a run: ``scenario``, ``policy``, ``seed`` and numbers.
     latencies : DataFrame
@@ -109,10 +108,8 @@ class PolicyBlocks:
 
         Parameters
         ----------
-        measure : Measure
         limit : float
             In the column's unit.
-        limit_name, title, caption : str
         """
         import polars as pl
 
@@ -362,7 +359,6 @@ def scaled(frame: pl.DataFrame, measure: Measure) -> pl.DataFrame:
     ----------
     frame : DataFrame
         Of `dwell.study.over_seeds`.
-    measure : Measure
     """
     import polars as pl
 

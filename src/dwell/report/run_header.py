@@ -27,14 +27,12 @@ class RunHeader(NamedTuple):
     candidates : mapping of str to mapping of str to str
         Node of every task.
     nodes : tuple of str
-    period_ms, deadline_ms : float
     window_cycles : int
         W.
     versions : mapping of str to str
     disturbed : tuple of Disturbed
         What was done to nodes and links: as it was played, where the run says so, and as its
         scenario has it elsewhere.
-    tracking : Tracking, optional
     recovered : mapping of str to object
         What was lost of a live run's journal.
     """

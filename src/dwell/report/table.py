@@ -68,7 +68,6 @@ class Cell(NamedTuple):
 
     Parameters
     ----------
-    text : str
     error : str
         What is known of a number's error.
     kind : str
@@ -79,7 +78,6 @@ class Cell(NamedTuple):
         Of the mark before a name.
     ring : bool
         Whether that mark is a ring: of what moves.
-    link : str
     """
 
     text: str
@@ -201,7 +199,6 @@ def table_text(table: Table, *, width: int | None = None) -> str:
 
     Parameters
     ----------
-    table : Table
     width : int, optional
         Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
     """

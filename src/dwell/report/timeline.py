@@ -64,17 +64,13 @@ def run_timeline(
         Of the run.
     begin_s : float64 array, shape (windows,)
         When each window began, seconds.
-    slug : str
     palette : Palette
         Of the candidates.
     nodes : sequence of str
-    deadline_ms : float
     disturbed : iterable of Disturbed
         What happened meanwhile. What went on beyond the run is cut.
-    tracking : Tracking, optional
     links : mapping of int to str, optional
         Where windows lead to, by their numbers.
-    title, caption : str
     """
     import polars as pl
 

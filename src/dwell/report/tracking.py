@@ -21,7 +21,6 @@ class Tracking(NamedTuple):
     ----------
     begin_s : float
         From the first release of the run to the first stretch.
-    step_s : float
     mm, px : float64 array, shape (stretches,)
         NaN where the error is not known.
     """

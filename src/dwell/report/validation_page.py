@@ -60,7 +60,6 @@ def validation_html(validation: Validation, *, static: bool = False) -> str:
 
     Parameters
     ----------
-    validation : Validation
     static : bool
         Whether scripts are left out.
     """
@@ -84,7 +83,6 @@ def validation_text(validation: Validation, *, width: int | None = None) -> str:
 
     Parameters
     ----------
-    validation : Validation
     width : int, optional
         Columns of the terminal; as wide as it takes where None.
     """

@@ -55,7 +55,6 @@ def simulate(
 
     Parameters
     ----------
-    problem : Problem
     scenario : str
         Name of one of the problem's scenarios; ``baseline`` exists always.
     policy : policy, str, or None

@@ -81,7 +81,6 @@ def drawn_intervals(
 
     Parameters
     ----------
-    every, length : Process
     unit_ns : float
         What their values count.
     rngs : pair of Generator

@@ -62,7 +62,6 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
 
     Parameters
     ----------
-    problem : Problem
     scenario : str
         Name of one of its scenarios.
     seed : int

@@ -30,7 +30,6 @@ class LinkSegment(NamedTuple):
         Begin; the first segment of a link begins at 0.
     link : str
         ``R1->E``.
-    down : bool
     loss : float
         Probability that one attempt is lost.
     rate_mbps : float
@@ -160,7 +159,6 @@ class Realisation:
 
     Parameters
     ----------
-    scenario : str
     seed : int or None
         None where it was recorded, not drawn.
     windows : int

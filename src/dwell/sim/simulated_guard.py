@@ -47,7 +47,6 @@ class SimulatedGuard:
     ----------
     problem : Problem
         With fallbacks.
-    realisation : Realisation
     tables : Tables
         What is about to be played; the guard is armed in it.
     """

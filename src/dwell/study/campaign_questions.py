@@ -45,7 +45,6 @@ class CampaignQuestion(NamedTuple):
 
     Parameters
     ----------
-    title : str
     answer : {"yes", "no", "in part", "not shown"}
         By V_D: lower than all others in every scenario, in some, in none and higher in some, or
         not told.
@@ -172,7 +171,6 @@ def answer_of(table: pl.DataFrame, first: str, others: Sequence[str]) -> Answer:
     ----------
     table : DataFrame
         With ``metric``, ``scenario``, ``first``, ``second`` and ``word``.
-    first : str
     others : sequence of str
     """
     mine = table.filter(

@@ -190,7 +190,6 @@ def _free_at(decided: Bools, min_dwell: int) -> Ints:
     ----------
     decided : bool array, shape (K,)
         Whether a decision follows the close of each window.
-    min_dwell : int
 
     Returns
     -------

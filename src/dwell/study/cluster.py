@@ -40,7 +40,6 @@ def spread_on_dask(
     ----------
     task : callable
         It, the units and the results must pickle.
-    units : sequence
     address : str
         Of the scheduler, as ``tcp://host:8786``.
     take : callable

@@ -43,7 +43,6 @@ class Comparison:
 
     Parameters
     ----------
-    problem : Problem
     scenarios, policies : tuple of str
         In the order of tables and figures; a policy that has a candidate's name never moves.
     seeds : tuple of int
@@ -166,7 +165,6 @@ def compare(
 
     Parameters
     ----------
-    problem : Problem
     scenarios : sequence of str, optional
         All of the problem's where None.
     policies : sequence of str or Contender, or mapping of str to policy or str

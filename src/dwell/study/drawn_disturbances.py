@@ -31,8 +31,6 @@ def drawn_disturbances(problem: Problem, scenario: str, seed: int, windows: int)
 
     Parameters
     ----------
-    problem : Problem
-    scenario : str
     seed, windows : int
         Of the run; episodes are drawn as far as it reaches.
     """

@@ -73,7 +73,6 @@ class Family:
         ----------
         runs : DataFrame
             One row a run, with a column ``seed``; see `dwell.study.StudyResult`.
-        question, metric : str
         pairs : mapping of str to (labels, labels)
             By a name; what columns are in the runs of each group. Both leave one run a seed.
 
@@ -150,7 +149,6 @@ def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
     ----------
     runs : DataFrame
         One row a run.
-    column : str
     labels : mapping of str to object
         Leave one run a seed.
 

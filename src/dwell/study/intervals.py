@@ -209,7 +209,6 @@ def under(values: Values, limit: float = 0.05) -> Verdict:
     ----------
     values : sequence of float
         One a seed (of a trace: one a run), in [0, 1], at least one.
-    limit : float
 
     Returns
     -------

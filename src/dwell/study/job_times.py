@@ -31,7 +31,6 @@ def jobs_of(run: Run, scenario: str, policy: str, number: int) -> pl.DataFrame:
     ----------
     run : Run
         With its jobs.
-    scenario, policy : str
     number : int
         Tells the run from others.
 
@@ -64,7 +63,6 @@ def profiles_of(jobs: pl.DataFrame | None, problem: Problem) -> pl.DataFrame:
     ----------
     jobs : DataFrame or None
         Of all runs; None where none kept them.
-    problem : Problem
 
     Returns
     -------
@@ -124,7 +122,6 @@ def links_of(jobs: pl.DataFrame | None, problem: Problem) -> tuple[pl.DataFrame,
     Parameters
     ----------
     jobs : DataFrame or None
-    problem : Problem
 
     Returns
     -------

@@ -30,7 +30,6 @@ def judged_cost(run: Run, problem: Problem) -> float:
     ----------
     run : Run
         A run of this problem, or of one with another controller and objective.
-    problem : Problem
 
     Returns
     -------

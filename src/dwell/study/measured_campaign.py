@@ -169,7 +169,6 @@ def without_excluded(run: Run, problem: Problem) -> Run:
     ----------
     run : Run
         Its ``meta`` say under ``pressure`` which windows are excluded.
-    problem : Problem
     """
     import polars as pl
 

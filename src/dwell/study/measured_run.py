@@ -44,14 +44,11 @@ class MeasuredRun:
     ----------
     name : str
         Of the run's folder.
-    run : Run
     problem : Problem
         The calibrated cell with this run's warm-up, its scenario as it was played and, where it
         never moved, its placement.
-    scenario : str
     policy : str
         A policy's name, or a candidate's for the placement that never moves.
-    estimator : str
     guard : bool
         Whether the cell's guard could act.
     excluded : mapping of int to str

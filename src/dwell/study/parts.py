@@ -33,7 +33,6 @@ class Parts:
 
     Parameters
     ----------
-    folder : Path
     names : frozenset of str
         Of all items of the study.
     """
@@ -106,7 +105,6 @@ def opened(folder: Path, description: Description, names: Sequence[str]) -> Iter
 
     Parameters
     ----------
-    folder : Path
     description : mapping
         JSON-able: all that the tables depend on.
     names : sequence of str

@@ -54,7 +54,6 @@ class Player:
 
     Parameters
     ----------
-    study : Study
     software : mapping of str to str
         Of the process that asks; a process with other software refuses to play.
     kept : tuple of int

@@ -21,10 +21,6 @@ class Asked:
 
     Parameters
     ----------
-    problem : Problem
-    scenario, policy, estimator : str
-    windows : int
-    guard, jobs : bool
     excluded : frozenset of int
         Windows that are left out, as they are of the measured run.
     """
@@ -62,7 +58,6 @@ class Simulator:
     Parameters
     ----------
     groups : tuple of tuple of Asked
-    seeds : int
     """
 
     groups: tuple[tuple[Asked, ...], ...]

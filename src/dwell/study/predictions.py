@@ -253,7 +253,6 @@ class Judgement:
 
     Parameters
     ----------
-    prediction : Prediction
     answer : {"agrees", "agrees in part", "differs", "open"}
         In part: the predicted placement leads, and neither every seed nor the interval has the
         share that its words ask for. Open: the interval over seeds allows for either.
@@ -287,7 +286,6 @@ def judge_placement(comparison: Comparison, prediction: Prediction, policy: str 
     ----------
     comparison : Comparison
         With the prediction's scenario and `policy`, of a cell to which the paper applies.
-    prediction : Prediction
     policy : str
         The one that is called DTP.
     """

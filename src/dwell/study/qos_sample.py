@@ -65,8 +65,6 @@ def piece_of(run: Run, problem: Problem, excluded: Collection[int] = ()) -> Piec
 
     Parameters
     ----------
-    run : Run
-    problem : Problem
     excluded : collection of int
         Numbers of windows.
 
@@ -103,7 +101,6 @@ class QosSample:
         Ascending; infinite for cycles that never finished.
     late : bool array, shape (cycles,)
         Whether each missed though it took no longer than D: its window was closed by then.
-    deadline_ms : float
     lengths : tuple of int
         Units of each run.
     grid_ms : float64 array, shape (points,)
@@ -115,7 +112,6 @@ class QosSample:
         Mean over cycles that finished of the time spent computing, waiting and on the network.
     placed : mapping of str to int
         Cycles by candidate.
-    windows : int
     """
 
     latency_ms: Floats
@@ -137,7 +133,6 @@ class QosSample:
         ----------
         pieces : sequence of Piece
             At least one.
-        problem : Problem
         by_window : bool
             Whether the windows are the units; the runs elsewhere.
         """

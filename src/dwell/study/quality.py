@@ -126,7 +126,6 @@ def age_of_information(actuated: EffectiveCommands, begin_ns: int, end_ns: int) 
 
     Parameters
     ----------
-    actuated : EffectiveCommands
     begin_ns, end_ns : int
         The stretch of time; the begin not before the first release, the end after the begin.
 
@@ -209,7 +208,6 @@ def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int)
 
     Parameters
     ----------
-    servo : Servo
     actuated : EffectiveCommands
         A command is made of what is seen at its cycle's release, and held until the next.
     begin_ns, end_ns : int

@@ -115,7 +115,6 @@ def play_alone(problem: Problem, realisation: Realisation) -> dict[str, Run]:
 
     Parameters
     ----------
-    problem : Problem
     realisation : Realisation
         Drawn for this problem.
     """
@@ -138,7 +137,6 @@ def references(
 
     Parameters
     ----------
-    problem : Problem
     realisation : Realisation
         Drawn for this problem.
     min_dwell : int, optional
@@ -201,7 +199,6 @@ def regret(run_cost: float, references: References) -> float:
     ----------
     run_cost : float
         `mean_cost` of a run of the same realisation.
-    references : References
 
     Returns
     -------
@@ -219,8 +216,6 @@ def kept(run: Run, references: References, problem: Problem, limit: float = 0.05
     ----------
     run : Run
         A run of the same realisation.
-    references : References
-    problem : Problem
     limit : float
         Share of a window's cycles.
 
@@ -264,7 +259,6 @@ def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats
 
     Parameters
     ----------
-    run : Run
     problem, realisation
         What it is a run of.
 

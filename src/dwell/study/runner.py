@@ -63,7 +63,6 @@ class StudyResult:
 
     Parameters
     ----------
-    study : Study
     runs : DataFrame
         One row a point, scenario, policy and seed: the values of the point's parameters in columns
         that begin with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and what
@@ -117,7 +116,6 @@ def run_study(
 
     Parameters
     ----------
-    study : Study
     folder : Path, optional
         Where a part for each finished item and the tables go (``runs.parquet``, ``costs.parquet``,
         ``latencies.parquet``); a study that was stopped there goes on. Nothing is written where
@@ -166,7 +164,6 @@ def play_in_memory(
 
     Parameters
     ----------
-    player : Player
     processes, dask, progress
         See `run_study`.
 
@@ -255,7 +252,6 @@ def play(
 
     Parameters
     ----------
-    player : Player
     items : sequence of Item
     processes, dask
         See `run_study`.
@@ -306,7 +302,6 @@ def assemble(study: Study, frame: pl.DataFrame) -> StudyTables:
 
     Parameters
     ----------
-    study : Study
     frame : DataFrame
         Those of all items (see `as_frame`), one below the other in any order.
     """

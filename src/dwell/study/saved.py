@@ -26,7 +26,6 @@ class SavedStudy:
 
     Parameters
     ----------
-    name : str
     problem : Problem
         Of its first point.
     scenarios, policies : tuple of str
@@ -60,10 +59,6 @@ def is_study(folder: Path) -> bool:
 
 def open_study(folder: str | Path) -> SavedStudy:
     """Read the folder of a study that is finished.
-
-    Parameters
-    ----------
-    folder : path
 
     Raises
     ------

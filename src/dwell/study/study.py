@@ -107,8 +107,6 @@ class Item:
     ----------
     points : tuple of int
         Points whose realisations are the same: they differ in nothing that is drawn.
-    scenario : str
-    seed : int
     """
 
     points: tuple[int, ...]
@@ -127,7 +125,6 @@ class Study:
 
     Parameters
     ----------
-    name : str
     points : tuple of Point
         All with the same parameters, candidates and nodes, and different values.
     scenarios : tuple of str

@@ -28,8 +28,6 @@ def sum_of_means(
 
     Parameters
     ----------
-    problem : Problem
-    placement : Placement
     scenario : str
         Disturbances count by the share of the time in which they are on.
     begin_s, end_s : float
@@ -78,7 +76,6 @@ def sums_of_shares(
         By candidate.
     cycles : mapping of str to int
         How many cycles were measured under each: the predictor is told where they ran.
-    deadline_ms : float
 
     Returns
     -------

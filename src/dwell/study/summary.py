@@ -107,7 +107,6 @@ def count_in(run: Run, window_cycles: int) -> Counted:
 
     Parameters
     ----------
-    run : Run
     window_cycles : int
         W.
 
@@ -143,7 +142,6 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
 
     Parameters
     ----------
-    run : Run
     problem : Problem
         The one it was made with.
     labels : mapping

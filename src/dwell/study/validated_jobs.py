@@ -36,8 +36,6 @@ def job_times(
 
     Parameters
     ----------
-    scenario, policy : str
-    problem : Problem
     measured, predicted : sequence of DataFrame
         What `finished_jobs` gives of the runs that kept their jobs, and of simulations of them.
 

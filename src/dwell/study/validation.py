@@ -87,7 +87,6 @@ class Group:
 
     Parameters
     ----------
-    scenario : str
     policy : str
         With its estimator where it may move: ``dtp+corrected``.
     runs : tuple of str
@@ -95,7 +94,6 @@ class Group:
         Measured time that counts.
     excluded : int
         Windows left out for a reason that the runs give.
-    measured, predicted : QosSample
     figures : mapping of str to Judged
         By metric: ``l95_ms``, ``window_l95_ms`` (mean over windows of what the controller saw),
         ``violation_rate``, ``u_NODE``, ``share_CANDIDATE``, ``migrations`` (of a run), and the

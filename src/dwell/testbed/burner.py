@@ -92,7 +92,6 @@ class Burner(Started):
 
         Parameters
         ----------
-        threads : int
         at_ns : int, optional
             When, by the monotonic clock; at once if left out or past.
 

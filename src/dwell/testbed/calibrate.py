@@ -59,7 +59,6 @@ class Calibrated:
 
     Parameters
     ----------
-    cell, samples, sidecar : Path
     problem : Problem
         As the cell file says it now.
     report : dict

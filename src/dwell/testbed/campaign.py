@@ -49,8 +49,6 @@ class Entrant(NamedTuple):
     ----------
     name : str
         In tables: ``LOC``, ``atp``, ``cusum+corrected``.
-    policy : str
-    estimator : str
     """
 
     name: str
@@ -72,7 +70,6 @@ class Planned(NamedTuple):
         In the order of the campaign, from 1.
     repetition : int
         From 1.
-    scenario : str
     policy : str
         Name of the entrant.
     seed : int
@@ -97,10 +94,8 @@ class Campaign:
 
     Parameters
     ----------
-    problem : Problem
     scenarios : tuple of str
     entrants : tuple of Entrant
-    repetitions : int
     seconds : float
         Of each run, warm-up included.
     seed : int
@@ -203,7 +198,6 @@ def entrant(problem: Problem, name: str) -> Entrant:
 
     Parameters
     ----------
-    problem : Problem
     name : str
         ``LOC`` (a candidate, which never moves), ``dtp`` (with the estimator of the cell), or
         ``cusum+corrected``. What estimates nothing has the profile unless it says otherwise.

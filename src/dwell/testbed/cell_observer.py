@@ -49,8 +49,6 @@ def load_observer(name: str, beside: Path, folder: Path, begin_ns: int) -> CellO
         ``package.module:Name``.
     beside : Path
         Folder of the cell file, where its module may be.
-    folder : Path
-    begin_ns : int
 
     Raises
     ------

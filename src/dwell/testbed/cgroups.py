@@ -22,7 +22,6 @@ class Cgroups:
 
     Parameters
     ----------
-    version : {1, 2}
     folders : mapping of str to Path
         Controller to the top of its hierarchy. With version 2 all are the same.
     """

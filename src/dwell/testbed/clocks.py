@@ -67,7 +67,6 @@ class ClockFile:
 
         Parameters
         ----------
-        node : str
         jump_ns : int
             Added to what it is ahead by already.
         drift_ppb : int

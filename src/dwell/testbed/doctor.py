@@ -56,7 +56,6 @@ class Finding:
     ----------
     name : str
         What, in a few words.
-    ok : bool
     found : str
         What was found.
     remedy : str

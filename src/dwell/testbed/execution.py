@@ -79,7 +79,6 @@ class State(NamedTuple):
     ----------
     planned : int
         Runs.
-    done : int
     given_up : tuple of str
         Names of runs that failed as often as they are repeated.
     failures : int
@@ -117,10 +116,8 @@ def run_campaign(
 
     Parameters
     ----------
-    campaign : Campaign
     folder : Path
         Its own; one of the same campaign is gone on with.
-    play : Play
     name : str
         Of the testbed, among others on this machine.
     quiet : Quiet, optional

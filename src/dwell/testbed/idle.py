@@ -68,7 +68,6 @@ class Idle(NamedTuple):
 
     Parameters
     ----------
-    idle : bool
     waited_s : float
         Until it was, or until patience was over.
     busy : float
@@ -109,7 +108,6 @@ def wait_until_idle(
 
     Parameters
     ----------
-    quiet : Quiet
     read, sleep : callable
         Of this machine unless a test says otherwise.
 

@@ -83,7 +83,6 @@ class LinkCommands:
     ----------
     begin : str
         With ``{mean_ms}``, ``{std_ms}`` of the extra delay, ``{loss_percent}``, ``{rate_mbps}``.
-    end : str
     """
 
     begin: str

@@ -170,7 +170,6 @@ class TunLink(Started):
 
         Parameters
         ----------
-        source, target : str
         at_ns : int, optional
             When, by the monotonic clock; at once if left out or past.
         **changes

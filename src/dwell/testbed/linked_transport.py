@@ -67,7 +67,6 @@ class LinkedTransport:
 
     Parameters
     ----------
-    transport : Transport
     ends : LinkEnds
         Of the process's node.
     """

@@ -100,9 +100,6 @@ class Measured:
 
     Parameters
     ----------
-    name : str
-    run : Run
-    disturbed : Disturbed
     placement : str
         Candidate of all its windows; empty where it moved.
     windows, cycles : int

@@ -97,7 +97,6 @@ class LinkFile:
 
         Parameters
         ----------
-        source, target : str
         **changes
             Fields of `Conditions`.
 
@@ -202,7 +201,6 @@ class Way:
 
         Parameters
         ----------
-        size_bytes : int
         now_ns : int
             Of the clock that all processes on this computer share.
         """

@@ -55,10 +55,6 @@ class Played:
 
     Parameters
     ----------
-    problem : Problem
-    scenario : str
-    seed : int
-    timeline : Timeline
     made_ns : dict of (str, int) to int
         When changes were made, by the place and the instant of each.
     threads : dict of str to list of (int, int)
@@ -111,7 +107,6 @@ class Played:
 
         Parameters
         ----------
-        folder : Path
         span : (int, int), optional
             First and last release; what the run says of them if left out.
         **more
@@ -159,7 +154,6 @@ def crowded(run: Run, problem: Problem) -> list[str]:
     ----------
     run : Run
         One that was played: its meta say when it was disturbed.
-    problem : Problem
 
     Returns
     -------
@@ -246,7 +240,6 @@ def come_up(
         Names of processes.
     folder : Path
         Where the logs are, for the message.
-    patience_s : float
 
     Raises
     ------
@@ -300,7 +293,6 @@ def play(
         Makes a change.
     look : callable
         Takes the time; called after every change, and at every multiple of `every_s`.
-    every_s : float
     """
     waiting = list(changes)
     while (at_s := now_s()) < seconds:
@@ -324,7 +316,6 @@ def play_on(
 
     Parameters
     ----------
-    testbed : Testbed
     played : Played
         What is to be played.
     seconds : float
@@ -347,7 +338,6 @@ def longest_run(runs: Path, cell: str | None = None) -> Path | None:
 
     Parameters
     ----------
-    runs : Path
     cell : str, optional
         Runs of other cells do not count.
     """

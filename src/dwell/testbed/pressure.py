@@ -110,10 +110,8 @@ class Span:
 
     Parameters
     ----------
-    number : int
     begin_ns, end_ns : int
         On the clock of the samples.
-    warmup : bool
     stressed : mapping of str to float
         Capacity in cores of the nodes that had foreign threads all the time.
     """
@@ -134,7 +132,6 @@ def judged(samples: Sequence[Sample], spans: Sequence[Span], rule: Rule) -> dict
         In the order of time.
     spans : sequence of Span
         The run's windows.
-    rule : Rule
 
     Returns
     -------

@@ -34,8 +34,6 @@ class Lateness:
 
     Parameters
     ----------
-    wakes : int
-    mean_ms, max_ms : float
     work_ms : float or None
         CPU time of its piece of work, the mean; None where it has done none.
     """
@@ -51,7 +49,6 @@ class Probe(Started):
 
     Parameters
     ----------
-    cpu : int
     prefix : sequence of str
         First words of its command.
     """

@@ -57,7 +57,6 @@ class RealHosts(Testbed):
     ----------
     problem : Problem
         Where its nodes are is put into it.
-    inventory : Inventory
     folder : Path
         For cell file and logs on this computer.
     name : str
@@ -333,16 +332,12 @@ def run_on_hosts(
 
     Parameters
     ----------
-    inventory : Inventory
-    problem : Problem
-    scenario, policy : str
     seconds : float
         From the first release on, the warm-up included.
     seed : int
         Of the episodes of disturbances; delays and losses are the links'.
     out : Path
         For logs and the run; one of a run before is replaced.
-    name : str
     jobs : bool
         Whether the run keeps its jobs.
 

@@ -79,8 +79,6 @@ def run_once(
 
     Parameters
     ----------
-    problem : Problem
-    scenario : str
     policy : str or None
         A policy or a candidate; the cell's own where None.
     seconds : float

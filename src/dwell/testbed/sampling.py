@@ -40,7 +40,6 @@ class Sampler:
         By name. Their counters are read, and begin anew.
     clock : callable
         The run's, ns.
-    rule : Rule
     prefix : sequence of str
         First words of the probes' commands.
     """

@@ -115,8 +115,6 @@ def at_speed_of(run: Run, problem: Problem, usual: Usual) -> Problem:
 
     Parameters
     ----------
-    run : Run
-    problem : Problem
     usual : Usual
         Where the cell was measured.
     """
@@ -132,7 +130,6 @@ def slowed(
 
     Parameters
     ----------
-    problem : Problem
     factors : mapping of str to float
         By node. What was measured takes longer (execution times that are replayed, backgrounds,
         what others take); what was not stays as it is.

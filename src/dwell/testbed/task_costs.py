@@ -77,7 +77,6 @@ def sites(
         CPU time that a worker takes for a job besides its stage (`messaging`).
     known : OnTheWay
         What of that lies on the way of messages.
-    problem : Problem
     usual : Usual
         How fast the CPUs were in all runs together: samples are of CPUs as fast as that.
     """

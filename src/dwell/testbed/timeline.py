@@ -91,8 +91,6 @@ def timeline_of(
 
     Parameters
     ----------
-    problem : Problem
-    scenario : str
     seed : int
         At least 0; a simulation of this seed meets the same.
     seconds : float

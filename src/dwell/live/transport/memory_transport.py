@@ -95,10 +95,8 @@ class NetworkConditions:
     loss, duplication, reordering : float
         Probabilities: that a message is lost, that it arrives twice, that it is held back by
         `reorder_ns` and others may overtake it.
-    reorder_ns : int
     stalled : bool
         Whether messages wait until this is lifted; the oldest beyond `waiting` are dropped.
-    waiting : int
     """
 
     delay_ns: int | Callable[[Random], int] = 0
@@ -243,7 +241,6 @@ class Network:
 
         Parameters
         ----------
-        who : str
         node : str, optional
             What follows the ``@`` in its name where None, without what follows a dot there.
         clock : Clock, optional
@@ -290,7 +287,6 @@ class Network:
 
         Parameters
         ----------
-        conditions : NetworkConditions
         source, target : str
             Name of a process or of a node, or ``*``; the other direction is not touched.
         key : str

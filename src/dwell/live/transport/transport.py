@@ -18,8 +18,6 @@ class Arrival:
 
     Parameters
     ----------
-    key : str
-    payload : bytes
     header : bytes
         Empty where none was sent.
     """

@@ -139,7 +139,6 @@ class ZenohTransport:
     ----------
     entry : WiringEntry
         Where it listens and to whom it connects, from `Wiring.entry`.
-    settings : ZenohSettings
 
     Raises
     ------

@@ -27,7 +27,6 @@ def access_control(
 
     Parameters
     ----------
-    roster : Roster
     root : str
         What all keys of the cell begin with.
     may_put : mapping of str to iterable of str

@@ -42,9 +42,6 @@ class Authority:
     ----------
     folder : Path
         With a folder for the authority, and one for each subject, to be taken to its host.
-    key : Ed25519PrivateKey
-    certificate : Certificate
-    roster : Roster
     """
 
     def __init__(
@@ -132,7 +129,6 @@ class Authority:
 
         Parameters
         ----------
-        name : str
         role : {"node", "controller", "operator", "observer"}, optional
             The one that it had if left out.
         addresses : collection of str, optional

@@ -30,8 +30,6 @@ class Keyring:
     ----------
     folder : Path
         With ``ca.pem``, ``cert.pem``, ``key.pem`` and ``roster.json``.
-    own : Subject
-    roster : Roster
     expires : datetime
         When its certificate ends.
     """
@@ -51,7 +49,6 @@ class Keyring:
 
         Parameters
         ----------
-        folder : Path
         cell : str, optional
             Cell that it has to be of.
 

@@ -39,7 +39,6 @@ class Subject:
     ----------
     name : str
         A node's name, or another one.
-    role : {"node", "controller", "operator", "observer"}
     generation : int
         Counts its certificates from 1: the name in a certificate has it, so that one that was
         revoked is not taken for the one that followed.

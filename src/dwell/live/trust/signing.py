@@ -45,7 +45,6 @@ class Seals:
         ----------
         word : str
             What kind of message it is.
-        data : bytes
         """
         return self._keyring.sign(self._of(word), data) + data
 
@@ -54,10 +53,8 @@ class Seals:
 
         Parameters
         ----------
-        word : str
         name : str
             Common name of the subject.
-        sealed : bytes
         """
         known = word, name, sealed
         if known in self._good:

@@ -25,7 +25,6 @@ class Seen:
         `APPLY`, `HOLD`, `ZERO`, or `START` of its process.
     placement : str
         Candidate of the light cell that the command came through, by its own account.
-    pid : int
     cycle : int
         As the runtime says.
     said : int
@@ -51,12 +50,7 @@ class Seen:
 
 
 class Actuations:
-    """What the actuator has written, as far as it has been read.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """What the actuator has written, as far as it has been read."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.all = path, list[Seen]()

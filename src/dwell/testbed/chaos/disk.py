@@ -37,10 +37,6 @@ class SmallDisk:
 
     When it is taken away, what was on it is in the folder.
 
-    Parameters
-    ----------
-    folder : Path
-
     Raises
     ------
     LiveError
@@ -126,11 +122,6 @@ class DiskHog:
 
     A disk that is slow by itself cannot be had without a device of its own. What is slowed down is
     whoever waits for this disk; by how much is measured.
-
-    Parameters
-    ----------
-    folder : Path
-    writers : int
 
     Attributes
     ----------

@@ -47,7 +47,6 @@ def on_loopback(cell: Path | None, out: Path, seed: int) -> Staging:
     ----------
     cell : Path, optional
         Cell file; the light cell if left out.
-    out : Path
     seed : int
         Of delays and losses.
     """
@@ -69,7 +68,6 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
     ----------
     cell : Path, optional
         Cell file; the light cell if left out.
-    out : Path
     seed : int
         Of delays and losses.
     """
@@ -124,7 +122,6 @@ class Result:
 
     Parameters
     ----------
-    seed : int
     outcomes : list of (PlannedFault, Outcome)
     stalled : int
         Faults in which a bound was missed, or a silence was too long, while the machine stalled.
@@ -132,8 +129,6 @@ class Result:
         Violations, each with the seed and the fault.
     heard : dict of str to int
         Messages, by their kind, that were held against the cell file.
-    actuated : int
-    seconds : float
     means : dict of str to str
         How what needs a right that not everybody has was brought about.
     """
@@ -182,7 +177,6 @@ class FaultCampaign:
     staging : callable
     out : Path
         For the cells' folders and ``faults.jsonl``.
-    seed : int
     again : str
         Command that repeats it; the number of a fault is added.
     say : callable

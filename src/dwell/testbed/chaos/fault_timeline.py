@@ -24,7 +24,6 @@ class PlannedFault:
     ----------
     number : int
         From 1.
-    fault : Fault
     phase : float
         Of the period at which it begins.
     lasts_s, rests_s : float
@@ -46,7 +45,6 @@ def planned(seed: int, faults: Sequence[Fault]) -> Iterator[PlannedFault]:
 
     Parameters
     ----------
-    seed : int
     faults : sequence of Fault
     """
     kinds: dict[str, list[Fault]] = {}

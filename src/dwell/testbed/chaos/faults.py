@@ -26,8 +26,6 @@ class Fault:
 
     Parameters
     ----------
-    name : str
-    how : {"kill", "freeze", "cut", "jump", "drift", "starve", "fill", "hog"}
     whom : tuple of str
         Processes, ``*E`` for all of a node; directions of a cut, as ``R1->E``; nodes; ``runs`` for
         the disk that the runs are kept on.
@@ -151,8 +149,6 @@ def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
 
     Parameters
     ----------
-    problem : Problem
-    fault : Fault
     placement : str
         Candidate that holds when it strikes.
     """

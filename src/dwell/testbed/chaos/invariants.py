@@ -39,11 +39,8 @@ class Term:
 
     Parameters
     ----------
-    term : int
-    placement : str
     cycle : int
         First that was heard to be stamped with it.
-    at_ns : int
     ordered : bool, optional
         Whether the controller holds it there, and not the guard; None until the stamper was heard
         to say so.
@@ -62,10 +59,6 @@ class Term:
 @dataclass(slots=True)
 class Judge:
     """Hears everything that is said, in the order in which it arrived, and finds what is wrong.
-
-    Parameters
-    ----------
-    problem : Problem
 
     Attributes
     ----------

@@ -70,8 +70,6 @@ def document(
 
     Parameters
     ----------
-    home : str
-    period_ms : int
     standby : bool
         Whether sensing and control have one.
     quotas : bool

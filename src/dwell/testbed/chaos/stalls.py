@@ -54,7 +54,6 @@ class StallDetector:
 
         Parameters
         ----------
-        since_ns, until_ns : int
         but : collection of int
             CPUs that are kept busy on purpose.
         """

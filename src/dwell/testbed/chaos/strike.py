@@ -28,8 +28,6 @@ class Outcome:
 
     Parameters
     ----------
-    fault : str
-    seed : int
     phase : float
         Of the period, after a release, at which it began.
     lost, lost_after : int
@@ -49,7 +47,6 @@ class Outcome:
         Consecutive cycles that may be lost.
     begin_ns, end_ns, back_ns : int
         When it began, ended, and the cell had recovered, on the true clock.
-    note : str
     wrong : list of str
         What should not be.
     late : list of str
@@ -93,8 +90,6 @@ def strike(
     ----------
     cell : Harness
         At home, and healthy where the fault makes it move.
-    fault : Fault
-    stalls : StallDetector
     phase : float
         Of the period, after a release.
     seed : int

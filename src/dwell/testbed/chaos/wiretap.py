@@ -90,12 +90,7 @@ class Wiretap(Started):
 
 
 class Records:
-    """The records that a wiretap has written, as far as they have been read.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """The records that a wiretap has written, as far as they have been read."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._read = path, 0
