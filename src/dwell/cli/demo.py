@@ -9,6 +9,7 @@ import typer
 
 from dwell.cellfile import load
 from dwell.cli.examples import find_examples
+from dwell.cli.first_answer import compile_first
 from dwell.cli.options import windows_of
 from dwell.cli.output import print_json, progress, working, write_file
 from dwell.report import comparison_html, comparison_text
@@ -53,6 +54,7 @@ def run_demo(
         cells = (CANONICAL,) if real is None else REAL
         windows = windows_of(seconds, *(load(folder / name, traces=real) for name in cells))
     windows = windows or WINDOWS
+    compile_first()
     with progress("simulating") as shown:
         comparisons: Sequence[Comparison]
         tenants: StudyResult | None = None

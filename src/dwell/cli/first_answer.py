@@ -2,7 +2,8 @@
 
 Compiling the simulator takes longer than playing a few windows as plain Python. So where no
 compiled kernels are cached and the work is short, the process plays interpreted from its start,
-with the same results, while a detached process compiles for the runs after it.
+with the same results, while a detached process compiles for the runs after it. Long work compiles
+before it begins, once for all the processes that it takes.
 """
 
 from __future__ import annotations
@@ -10,14 +11,18 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import dwell
+from dwell.cli.output import working
+from dwell.model import Problem, QoS
 
-__all__ = ["Kernels", "compile_kernels", "find_kernels", "prepare"]
+__all__ = ["Kernels", "compile_first", "compile_kernels", "find_kernels", "prepare"]
 
 #: Cycles that are played sooner than the kernels are compiled, whatever the cell.
 SHORT_CYCLES = 30_000
@@ -79,23 +84,45 @@ def prepare(cycles: int) -> str | None:
     str or None
         What to tell the user of it; None where compiled kernels are there.
     """
-    if not own_process or "dwell.kernels.compiled" in sys.modules:
-        return None
-    from numba.core import config as numba_config
-
-    config: Any = numba_config
-    if config.DISABLE_JIT:
-        return None
-    kernels = find_kernels()
-    if kernels.cached:
+    kernels = None if "dwell.kernels.compiled" in sys.modules else _uncompiled()
+    if kernels is None:
         return None
     if cycles > SHORT_CYCLES:
-        return "compiling the simulator, once"
-    config.DISABLE_JIT = 1
+        _compile(kernels)
+        return None
+    _numba_config().DISABLE_JIT = 1
     if kernels.folder is None:
         return "no folder can keep the compiled simulator: interpreting it"
     started = _start_compiler(kernels.folder, kernels.suffix)
     return f"interpreting the simulator; {'' if started else 'no '}compiler runs beside it"
+
+
+def compile_first() -> None:
+    """Compile before several processes begin, each of which would have to."""
+    kernels = _uncompiled()
+    if kernels is not None and kernels.folder is not None:
+        _compile(kernels)
+
+
+def _uncompiled() -> Kernels | None:
+    """Return where this process has to compile to; None where it need not."""
+    if not own_process or _numba_config().DISABLE_JIT:
+        return None
+    kernels = find_kernels()
+    return None if kernels.cached else kernels
+
+
+def _numba_config() -> Any:
+    """Return Numba's configuration, whose settings its types do not know."""
+    from numba.core import config
+
+    return config
+
+
+def _compile(kernels: Kernels) -> None:
+    nowhere = "" if kernels.folder else ": no folder can keep it"
+    with working(f"compiling the simulator{nowhere or ', once'}"):
+        compile_kernels()
 
 
 def _start_compiler(folder: Path, suffix: str) -> bool:
@@ -138,15 +165,32 @@ def _environment() -> dict[str, str]:
     return {**os.environ, **({"NUMBA_CACHE_DIR": str(Path(given).resolve())} if given else {})}
 
 
+class _Restless:
+    """The policy that moves at every close."""
+
+    def start(self, problem: Problem) -> None:
+        self.placements = cycle(problem.candidates)
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        return next(self.placements)
+
+
 def compile_kernels() -> None:
     """Compile every kernel, and have Numba keep the code."""
     from dwell.cli.examples import find_examples
     from dwell.study.summary import summarise
 
     problem = dwell.load(find_examples(None) / "canonical.yaml")
-    dwell.simulate(problem, policy="cusum", estimator="corrected", seed=1, windows=2)
-    windows = problem.warmup_windows + 1
-    run = dwell.simulate(problem, policy="LOC", seed=1, windows=windows)
+    # Steps of a cold migration, and the state that it carries, have kernels of their own.
+    tasks = problem.pipeline.tasks
+    stateful = {name: replace(task, state_bytes=1000) for name, task in tasks.items()}
+    problem = replace(
+        problem,
+        pipeline=replace(problem.pipeline, tasks=stateful),
+        controller=replace(problem.controller, migration="cold"),
+    )
+    windows = problem.warmup_windows + 2
+    run = dwell.simulate(problem, policy=_Restless(), seed=1, windows=windows)
     summarise(run, problem, {})  # the servo's loop
 
 

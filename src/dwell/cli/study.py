@@ -11,6 +11,7 @@ from typing import Any
 
 import typer
 
+from dwell.cli.first_answer import compile_first
 from dwell.cli.options import windows_of
 from dwell.cli.output import Progress, aligned, print_json, progress, working
 from dwell.report.formatting import Measure, shown_policy, shown_scenario, write_interval
@@ -62,6 +63,8 @@ def run_study_file(request: StudyRequest, *, as_json: bool) -> None:
     if windows is not None:
         study = replace(study, windows=windows)
     folder = request.out or Path("studies", re.sub(r"[^\w.-]", "_", study.name))
+    if request.dask is None:
+        compile_first()
     with _interruptible(folder, study) as shown:
         result = run_study(
             study,

@@ -11,6 +11,7 @@ from typing import Any
 import typer
 
 import dwell
+from dwell.cli.first_answer import compile_first
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
 from dwell.record import Run, open_run
@@ -46,6 +47,7 @@ def validate_runs(request: ValidationRequest, *, as_json: bool) -> None:
     runs = _open(request.runs)
     ids, usual = _sidecar(request.cell)
     used = [*ids, *(path.resolve().name for path in request.calibrated_from)]
+    compile_first()
     with progress("simulating") as show:
         validation = validate(
             runs,
