@@ -1,7 +1,8 @@
-"""The command line as its helps say it: every command, argument and option."""
+"""The command line: every command, its arguments and options, and what it may exit with."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -11,33 +12,44 @@ import typer
 from typer.testing import CliRunner
 
 from dwell.cli.commands import app
+from dwell.cli.exit_codes import ExitCode
 
 __all__ = ["FILE", "surface"]
 
 FILE = Path(__file__).parent / "data" / "commands.txt"
-COLUMNS = 80
+#: So many that every option has one line of its help.
+COLUMNS = 2000
+#: An option, its help, and what holds of its value.
+OPTION = re.compile(r"^  (-.*?)  .*?( \[[^\]]*\])?$", re.MULTILINE)
 
 
 def surface() -> str:
-    """Return the helps of all commands, one after another."""
+    """Return a line a command and, below it, a line an option."""
     root = cast(click.Group, typer.main.get_command(app))
-    return "\n".join(f"$ {' '.join(words)} --help\n{_help(words)}" for words in _commands(root, ()))
+    codes = ", ".join(f"{code} {code.name.lower()}" for code in ExitCode)
+    lines = (line for words in _commands(root, ()) for line in _lines(words))
+    return "\n".join([f"exit codes: {codes}", *lines]) + "\n"
 
 
 def _commands(command: click.Command, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    yield ("dwell", *words)
+    yield words
     for name, inner in getattr(command, "commands", {}).items():
         yield from _commands(inner, (*words, name))
 
 
-def _help(words: tuple[str, ...]) -> str:
+def _lines(words: tuple[str, ...]) -> Iterator[str]:
+    """Yield the usage of a command, and its options, as its help says them."""
     found = CliRunner().invoke(
         app,
-        [*words[1:], "--help"],
+        [*words, "--help"],
         prog_name="dwell",
         terminal_width=COLUMNS,
         max_content_width=COLUMNS,
         color=False,
     )
     assert found.exit_code == 0, found.output
-    return found.stdout
+    usage = found.stdout.partition("\n")[0].removeprefix("Usage: ").replace(" [OPTIONS]", "")
+    yield from ("", usage)
+    for option, holds in OPTION.findall(found.stdout):
+        if option != "--help":
+            yield f"    {option}{holds}"

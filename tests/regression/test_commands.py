@@ -1,4 +1,4 @@
-"""Every command with its arguments, options and helps is the one that was written down."""
+"""Every command with its arguments and options, and the exit codes, as they were written down."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The command `dwell`: arguments, progress, exit codes.
-
-Exit codes: 0 done, 1 the work failed, 2 the input is wrong, 130 interrupted.
-"""
+"""The command `dwell`: arguments, progress, exit codes."""
 
 from __future__ import annotations
 
@@ -9,6 +6,8 @@ import os
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
+
+from dwell.cli.exit_codes import ExitCode
 
 if TYPE_CHECKING:
     from dwell.live.hosting import Platform
@@ -36,4 +35,4 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
 
         app(arguments, prog_name="dwell", obj=platform)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(ExitCode.INTERRUPTED)

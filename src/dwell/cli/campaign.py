@@ -12,6 +12,7 @@ from typing import Any
 import typer
 
 import dwell
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.output import print_json, working, write_report
 from dwell.model import Problem
 from dwell.report.campaign_page import campaign_page, campaign_text
@@ -28,7 +29,6 @@ from dwell.testbed.timeline import require_playable_scenario
 
 __all__ = ["CampaignRequest", "report_campaign", "run_campaign_file"]
 
-INTERRUPTED = 130
 PAGE = "report.html"
 
 
@@ -146,7 +146,7 @@ def _run(campaign: Campaign, folder: Path, play: Play, request: CampaignRequest)
             "the same command goes on from there",
             err=True,
         )
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def report_campaign(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import typer
 
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.output import json_text, print_json, write_file
 
 __all__ = ["run_chaos"]
@@ -75,4 +76,4 @@ def run_chaos(
         else:
             shutil.rmtree(folder, ignore_errors=True)
     if result.wrong:
-        raise typer.Exit(1)
+        raise typer.Exit(ExitCode.FAILED)

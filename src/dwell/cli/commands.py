@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from dwell import __version__
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
 from dwell.cli.new import Origin
@@ -45,8 +46,6 @@ from dwell.errors import (
 
 __all__ = ["app"]
 
-FAILED, WRONG, INTERRUPTED = 1, 2, 130
-
 # A TraceError is a ProblemError.
 MISTAKES = (
     ProblemError,
@@ -73,24 +72,26 @@ class Commands(TyperGroup):
         except DwellError as error:
             located = isinstance(error, ProblemError) and error.source is not None
             typer.echo(str(error) if located else f"error: {error}", err=True)
-            raise typer.Exit(WRONG if isinstance(error, MISTAKES) else FAILED) from None
+            raise typer.Exit(
+                ExitCode.WRONG if isinstance(error, MISTAKES) else ExitCode.FAILED
+            ) from None
         except ModuleNotFoundError as error:
             missing = missing_package(error)
             if missing is None:
                 raise
             typer.echo(f"error: {missing}", err=True)
-            raise typer.Exit(FAILED) from None
+            raise typer.Exit(ExitCode.FAILED) from None
         except BrokenPipeError:
             raise
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
             typer.echo(f"error: {where}{error.strerror or error}", err=True)
-            raise typer.Exit(FAILED) from None
+            raise typer.Exit(ExitCode.FAILED) from None
         except MemoryError:
             typer.echo("error: not enough memory; ask for fewer windows", err=True)
-            raise typer.Exit(FAILED) from None
+            raise typer.Exit(ExitCode.FAILED) from None
         except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 app = typer.Typer(
@@ -145,7 +146,7 @@ def check(
     from dwell.cli.check import check_cell
 
     if not check_cell(cell, traces, node=node, keys=keys, insecure=insecure, as_json=as_json):
-        raise typer.Exit(WRONG)
+        raise typer.Exit(ExitCode.WRONG)
 
 
 @app.command()
@@ -194,7 +195,7 @@ def run(
         problem, scenario, policy, estimator, seed, windows, out, jobs, guard, force, how
     )
     if not run_cell(request, as_json=as_json):
-        raise typer.Exit(FAILED)
+        raise typer.Exit(ExitCode.FAILED)
 
 
 @app.command()

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
     CellOption,
@@ -203,7 +204,7 @@ def status(
     else:
         typer.echo("\n".join(told(found)))
     if absent or (check and found["headline"]):
-        raise typer.Exit(1)
+        raise typer.Exit(ExitCode.FAILED)
 
 
 def _watch(visitor: OperatorClient, *, as_json: bool) -> NoReturn:
@@ -324,7 +325,7 @@ def former_chaos(words: Former = None) -> None:
 
 def _moved(before: str, now: str) -> NoReturn:
     typer.echo(f"error: `dwell {before}` is `dwell {now}` now", err=True)
-    raise typer.Exit(2)
+    raise typer.Exit(ExitCode.WRONG)
 
 
 def _ask(

@@ -13,6 +13,7 @@ from typing import Any
 import typer
 
 import dwell
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.live_view import Look, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.errors import LiveError
@@ -45,7 +46,6 @@ MARK = ".dwell-live-run"
 MOST_BEFORE_S = 4.0
 #: Of a cell that nothing is played on, and of what a scenario has after its last change.
 USUAL_S, AFTER_S = 60.0, 16.0
-INTERRUPTED = 130
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,14 +111,14 @@ def run_live(request: LiveRunRequest, *, as_json: bool) -> None:
                 cell.stop()
     folder = longest_run(out / "runs")
     if folder is None and interrupted:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(ExitCode.INTERRUPTED)
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
     run = told.note(folder, **told.observed(folder))
     run = seal_run(folder, warnings=crowded(run, problem))
     _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
     if interrupted:
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(ExitCode.INTERRUPTED)
 
 
 def _require_stages(problem: Problem, cell: Path) -> None:

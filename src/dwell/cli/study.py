@@ -11,6 +11,7 @@ from typing import Any
 
 import typer
 
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.first_answer import compile_first
 from dwell.cli.options import windows_of
 from dwell.cli.output import Progress, aligned, print_json, progress, working
@@ -20,7 +21,6 @@ from dwell.study.over_seeds import over_seeds
 
 __all__ = ["StudyRequest", "run_study_file", "study_text"]
 
-INTERRUPTED = 130
 # Groups of a point and a scenario that the terminal shows; the tables have all.
 SHOWN = 40
 
@@ -104,7 +104,7 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
             "command goes on from there",
             err=True,
         )
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
 def _measures(study: Study) -> tuple[Measure, ...]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
     Json,
@@ -22,8 +23,6 @@ from dwell.cli.options import (
 from dwell.cli.output import aligned, print_json
 
 __all__ = ["testbed"]
-
-FAILED = 1
 
 Name = Annotated[str, typer.Option(help="Of the testbed, among others on this machine.")]
 
@@ -102,7 +101,7 @@ def _sum_up(folder: Path, *, as_json: bool) -> None:
             f"error: the machine was the bottleneck in {told['excluded']} of {told['windows']} "
             f"windows ({pressure['why']}); run it on a machine that does nothing else"
         )
-        raise typer.Exit(FAILED)
+        raise typer.Exit(ExitCode.FAILED)
 
 
 def _lines(told: dict[str, Any]) -> str:
@@ -156,7 +155,7 @@ def doctor(
             if not one.ok and one.remedy:
                 typer.echo(f"{'':8} {one.remedy}")
     if missing:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(ExitCode.FAILED)
 
 
 @testbed.command()
@@ -209,7 +208,7 @@ def campaign(
     )
     request = replace(request, minutes=minutes, inventory=inventory, report=report)
     if not run_campaign_file(request, as_json=as_json):
-        raise typer.Exit(FAILED)
+        raise typer.Exit(ExitCode.FAILED)
 
 
 def _run_s(cell: Path, windows: int | None, seconds: float | None) -> float:
