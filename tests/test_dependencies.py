@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 DISTRIBUTIONS = packages_distributions()
 
 #: Tools that are run, not imported.
-NOT_IMPORTED = {"pytest-xdist"}
+NOT_IMPORTED = {"ipykernel", "pytest-xdist"}
 #: Parts of others, which pin them.
 PARTS = {"pydantic-core"}
 #: What imports by name; its first argument is a module.

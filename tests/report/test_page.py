@@ -68,6 +68,8 @@ def test_a_page_may_load_nothing_and_evaluate_nothing() -> None:
 def test_a_static_page_has_no_scripts_and_the_same_figures() -> None:
     page, static = run_html(small_run()), run_html(small_run(), static=True)
     assert "<script" not in static
+    assert 'href="#window-' in static
+    assert not re.search(r'href="(?!#)', static)
     drawings = re.compile(r'<div class="drawing".*?</svg>', re.DOTALL)
     assert drawings.findall(static) == drawings.findall(page)
     assert len(drawings.findall(page)) > 5

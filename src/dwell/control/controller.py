@@ -53,6 +53,9 @@ class ClosedWindow:
     core_ns: Floats
     evidence: Callable[[], Evidence] | None = None
 
+    def __repr__(self) -> str:
+        return f"<ClosedWindow of {self.latency_ns.shape[-1]} cycles>"
+
 
 @dataclass(slots=True)
 class DecisionLog:
@@ -73,6 +76,9 @@ class DecisionLog:
 
     seen: list[tuple[float | None, ...]] = field(default_factory=list)
     decisions: list[tuple[object, ...]] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"<DecisionLog: {len(self.seen)} windows, {len(self.decisions)} decisions>"
 
 
 class Controller:
@@ -149,6 +155,13 @@ class Controller:
         #: By which caps candidates are eligible: the policy's own, where it has any.
         self.objective: Objective = getattr(self.policy, "objective", None) or problem.objective
         self._has_caps = self.objective.caps != Caps()
+
+    def __repr__(self) -> str:
+        policy, estimator = type(self.policy).__name__, type(self.estimator).__name__
+        return (
+            f"<Controller of {self.problem.name}: {policy}, {estimator}; at {self.incumbent} after "
+            f"{len(self.log.seen)} windows>"
+        )
 
     @property
     def decision_columns(self) -> tuple[str, ...]:

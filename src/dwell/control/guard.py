@@ -290,6 +290,9 @@ class Presence:
         self.within_ns = within_ns
         self._heard_ns: dict[str, int] = {}
 
+    def __repr__(self) -> str:
+        return f"<Presence of {len(self._heard_ns)} parts, within {self.within_ns / 1e6:g} ms>"
+
     @classmethod
     def of(cls, problem: Problem) -> Presence:
         """Make that of all candidates of a cell: heard within g - 1 periods.

@@ -154,6 +154,9 @@ class Corrected:
         self.seed = seed
         self.start(problem)
 
+    def __repr__(self) -> str:
+        return f"Corrected(shadow_fraction={self.shadow_fraction:g}, regimes={self.regimes})"
+
     def start(self, problem: Problem) -> None:
         """Forget everything but the profile."""
         self.problem = problem

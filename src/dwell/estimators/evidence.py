@@ -39,6 +39,9 @@ class Instants:
     end_ns: Ints
     arrived_ns: Ints
 
+    def __repr__(self) -> str:
+        return f"<Instants of {len(self.end_ns)} cycles>"
+
     def at(self, rows: Rows) -> Instants:
         """Instants of some of the cycles."""
         return Instants(self.ready_ns[rows], self.end_ns[rows], self.arrived_ns[rows])
@@ -66,3 +69,7 @@ class Evidence:
     cycles: Instants
     shadow_placement: NDArray[np.integer]
     shadows: Instants | None
+
+    def __repr__(self) -> str:
+        shadows = int((self.shadow_placement >= 0).sum())
+        return f"<Evidence of {len(self.release_ns)} cycles, {shadows} of them with a shadow>"

@@ -79,6 +79,7 @@ class Profile:
     def __init__(self, problem: Problem, samples: int = 4000, seed: int = SEED) -> None:
         require(1 <= samples <= 10_000_000, "samples", samples, "from 1 to 10000000")
         require(seed >= 0, "seed", seed, "a whole number of at least 0")
+        self._samples, self._seed = samples, seed
         cycles = SampleCycles(problem, samples, seed)
         l95_ms, violation_rate, own = {}, {}, {}
         for name, placement in problem.candidates.items():
@@ -96,6 +97,9 @@ class Profile:
             for name in problem.candidates
         )
         self.start(problem)
+
+    def __repr__(self) -> str:
+        return f"Profile(samples={self._samples}, seed={self._seed})"
 
     def start(self, problem: Problem) -> None:
         """Forget every window."""

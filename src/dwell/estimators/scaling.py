@@ -88,6 +88,9 @@ class Scaling:
         self._given, self._bounds = dict(ratios or {}), dict(bounds_ms or {})
         self.start(problem)
 
+    def __repr__(self) -> str:
+        return f"Scaling(ratios={self._given}, bounds_ms={self._bounds})"
+
     def start(self, problem: Problem) -> None:
         """Forget the last window."""
         faults = [*_unknown_ratios(self._given, problem), *_unknown_bounds(self._bounds, problem)]

@@ -105,6 +105,9 @@ class Shadow:
         self.decay = 0.5 ** (1 / half_life)
         self.start(problem)
 
+    def __repr__(self) -> str:
+        return f"Shadow(shadow_fraction={self.shadow_fraction:g})"
+
     def start(self, problem: Problem) -> None:
         """Forget all samples."""
         self.problem = problem

@@ -25,7 +25,7 @@ from dwell.model.bounds import (
     RETRANSMIT_MS,
     require,
 )
-from dwell.model.frozen import FrozenDict, require_names
+from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.objective import TIERS, Tier
 from dwell.model.process import Constant, Process, require_mean
 
@@ -263,6 +263,10 @@ class Fabric:
         require_names("links", self.links)
         object.__setattr__(self, "nodes", FrozenDict(self.nodes))
         object.__setattr__(self, "links", FrozenDict(self.links))
+
+    def __repr__(self) -> str:
+        nodes = [f"{one.name} ({one.tier}, {one.cores} cores)" for one in self.nodes.values()]
+        return f"<Fabric: {shortened(nodes)}; {len(self.links)} links>"
 
     def tier(self, tier: Tier) -> tuple[str, ...]:
         """Names of a tier's nodes, in the file's order."""

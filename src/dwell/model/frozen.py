@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from itertools import islice
 from typing import NoReturn, Protocol, TypeVar
 
 from dwell.model.bounds import require
 
-__all__ = ["FrozenDict", "Named", "require_names"]
+__all__ = ["FrozenDict", "Named", "require_names", "shortened"]
+
+#: Names that are shown of many.
+SHOWN = 6
 
 K = TypeVar("K")
 V = TypeVar("V")
@@ -55,3 +59,10 @@ def require_names(path: str, items: Mapping[str, Named]) -> None:
     """Raise a ProblemError unless every key is the name of its item."""
     for key, item in items.items():
         require(item.name == key, f"{path}.{key}", item.name, f"named as its key, {key!r}")
+
+
+def shortened(names: Collection[str], between: str = ", ") -> str:
+    """Return names as text, the first few of many."""
+    more = len(names) - SHOWN
+    shown = between.join(islice(names, SHOWN))
+    return f"{shown}{between}{more} more" if more > 0 else shown or "none"

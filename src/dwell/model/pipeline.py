@@ -19,7 +19,7 @@ from dwell.model.bounds import (
     WORKERS,
     require,
 )
-from dwell.model.frozen import FrozenDict, require_names
+from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 
@@ -161,6 +161,12 @@ class Pipeline:
         object.__setattr__(self, "tasks", FrozenDict(self.tasks))
         object.__setattr__(self, "flows", tuple(self.flows))
         object.__setattr__(self, "scales", FrozenDict(self.scales))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Pipeline: {shortened(self.topological(), ' -> ')}; period {self.period_ms:g} ms, "
+            f"deadline {self.deadline_ms:g} ms>"
+        )
 
     def inputs(self, task: str) -> tuple[Flow, ...]:
         """Flows into a task."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import (
     GUARD_CYCLES,
@@ -20,7 +21,7 @@ from dwell.model.bounds import (
     require,
 )
 from dwell.model.fabric import Fabric
-from dwell.model.frozen import FrozenDict
+from dwell.model.frozen import FrozenDict, shortened
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
@@ -109,7 +110,7 @@ class ControllerSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class Problem(Displayed):
     """A cell, checked as a whole: one that exists is valid.
 
     Parameters
@@ -161,6 +162,23 @@ class Problem:
         faults = [*find_faults(self._parts()), *self._unplaced()]
         if faults:
             raise ProblemError(faults)
+
+    def __repr__(self) -> str:
+        """Say what it is made of; `dwell.model.document` has all of it."""
+        pipeline, controller = self.pipeline, self.controller
+        counted = {"scenario": self.scenarios, "candidate": self.candidates}
+        names = [f"{what}s: {shortened(these)}" for what, these in counted.items()]
+        return "\n  ".join(
+            (
+                f"<Problem {self.name!r}",
+                f"{pipeline!r}",
+                f"{self.fabric!r}",
+                *names,
+                f"windows of {self.window_cycles} cycles, {self.warmup_windows} of warm-up",
+                f"controller on {self.controller_node}: {controller.policy}, "
+                f"{controller.estimator}, begins with {self.initial}>",
+            )
+        )
 
     def _unplaced(self) -> list[Fault]:
         """Anchored tasks that a placement leaves out (a cell file's may, a Placement may not)."""

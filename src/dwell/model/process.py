@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkabl
 
 from dwell.errors import Fault, TraceError
 from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, Bound, require
+from dwell.model.frozen import shortened
 
 if TYPE_CHECKING:
     import numpy as np
@@ -298,6 +299,10 @@ class TraceTable:
             raise TraceError([Fault(self.file, "needs columns of one length, at least one row")])
         if self.by == "time" and self.time_ms is None:
             raise TraceError([Fault(self.file, "has no instants; `by: time` needs a time column")])
+
+    def __repr__(self) -> str:
+        columns = shortened(self.columns)
+        return f"<TraceTable {self.file!r}: {self.rows} rows of {columns}; by {self.by}>"
 
     @property
     def rows(self) -> int:

@@ -340,6 +340,9 @@ class Journal:
             self._descriptor = -1
             raise
 
+    def __repr__(self) -> str:
+        return f"<Journal of {self.run} in {str(self.folder)!r}>"
+
     def _require_place(self) -> None:
         if (self.folder / "run.json").is_file():
             raise RunError(f"{self.folder} holds a finished run; choose another folder")

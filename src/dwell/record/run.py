@@ -13,6 +13,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from dwell.display import Displayed
 from dwell.errors import ProblemError, RunError
 from dwell.files import write_whole
 from dwell.model import Problem, Scenario
@@ -32,7 +33,7 @@ ON_REQUEST = tuple(name for name, table in TABLES.items() if table.on_request)
 Table: TypeAlias = "pl.DataFrame | Callable[[], pl.DataFrame]"
 
 
-class Run:
+class Run(Displayed):
     """Tables of one run and what they are the record of.
 
     Parameters
@@ -47,6 +48,15 @@ class Run:
     def __init__(self, meta: Mapping[str, Any], tables: Mapping[str, Table]) -> None:
         self.meta: dict[str, Any] = {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
         self._tables: dict[str, Table] = dict(tables)
+
+    def __repr__(self) -> str:
+        told = {name: self.meta.get(name) for name in ("scenario", "policy", "seed", "windows")}
+        known = ", ".join(f"{name} {value}" for name, value in told.items() if value is not None)
+        cell = self.meta.get("problem")
+        name = cell.get("name") if isinstance(cell, Mapping) else None
+        return (
+            f"<Run of {name or 'an unknown cell'}, {self.meta.get('kind', 'simulated')}: {known}>"
+        )
 
     def _table(self, name: str) -> pl.DataFrame:
         table = self._tables[name]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from dwell.report.charts import curves
@@ -44,18 +45,26 @@ def comparison_html(
     return page_html(comparison_page(*comparisons, tenants=tenants), static=static)
 
 
-def comparison_page(*comparisons: Comparison, tenants: StudyResult | None = None) -> Page:
-    """Return what there is to show of comparisons; see `comparison_html`."""
+def comparison_page(
+    *comparisons: Comparison, tenants: StudyResult | None = None, sections: int | None = None
+) -> Page:
+    """Return what there is to show of comparisons; see `comparison_html`.
+
+    Parameters
+    ----------
+    sections : int, optional
+        How many are made of each, from the first, the answer; all if left out.
+    """
     several = len(comparisons) > 1
-    sections: list[Section] = []
+    parts: list[Section] = []
     policies: dict[str, str] = {}
     for comparison in comparisons:
         prefix = f"{comparison.problem.name}-" if several else ""
         blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies, prefix)
         policies |= {name: style.colour for name, style in blocks.styles.items()}
-        for part in _sections(comparison, blocks, tenants):
+        for part in islice(_sections(comparison, blocks, tenants), sections):
             title = f"{comparison.problem.name}: {part.title}" if several else part.title
-            sections.append(Section(title.removesuffix(": "), part.blocks, part.note))
+            parts.append(Section(title.removesuffix(": "), part.blocks, part.note))
     first = comparisons[0]
     runs = sum(one.runs.height for one in comparisons)
     cells = ", ".join(one.problem.name for one in comparisons)
@@ -63,7 +72,7 @@ def comparison_page(*comparisons: Comparison, tenants: StudyResult | None = None
         title=f"Placement policies compared on {cells}",
         subtitle=f"{runs} simulated runs: {len(first.scenarios)} scenarios, {len(first.policies)} "
         f"policies, seeds {ranges(first.seeds)}, {first.windows} windows",
-        sections=sections,
+        sections=parts,
         policies=policies,
         seeds=first.seeds,
     )

@@ -84,6 +84,8 @@ def svg(figure: Figure) -> str:
     import vl_convert
 
     text = vl_convert.vegalite_to_svg(figure.spec())
+    # Links within the page are taken for those of a site of Vega's.
+    text = text.replace("https://vega.github.io/vega-datasets/#", "#")
     # Sizes are the page's; what a page has many of must not be huge.
     text = re.sub(r"(?<=\d\.\d\d)\d+", "", text)
     text = re.sub(r' (?:role|aria-\w+)="[^"]*"', "", text)

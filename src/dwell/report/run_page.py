@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,18 +71,25 @@ def run_html(run: Run, *, static: bool = False) -> str:
     return page_html(run_page(run), static=static)
 
 
-def run_page(run: Run) -> Page:
-    """Return what there is to show of a run; see `run_html`."""
+def run_page(run: Run, *, sections: int | None = None) -> Page:
+    """Return what there is to show of a run; see `run_html`.
+
+    Parameters
+    ----------
+    sections : int, optional
+        How many are made, from the first, the answer; all if left out.
+    """
     header = RunHeader.of(run)
     counted = count_in(run, header.window_cycles)
-    return _RunPage(run, header, counted).page()
+    return _RunPage(run, header, counted, sections).page()
 
 
 class _RunPage:
     """What the parts of a run's page are made from."""
 
-    def __init__(self, run: Run, header: RunHeader, counted: Counted) -> None:
+    def __init__(self, run: Run, header: RunHeader, counted: Counted, sections: int | None) -> None:
         self.run = run
+        self.most = sections
         self.header = header
         self.counted = counted
         self.palette = Palette.of(header.candidates)
@@ -107,7 +115,7 @@ class _RunPage:
                 )
             ),
             facts=list(self._facts()),
-            sections=list(self._sections()),
+            sections=list(islice(self._sections(), self.most)),
         )
 
     def _policy(self) -> str:
@@ -156,7 +164,9 @@ class _RunPage:
     # ------------------------------------------------------------------------------ in time
 
     def _timeline(self) -> Figure:
-        links = {number: f"#window-{number}" for number in self.worst["window"].to_list()}
+        # Cycles of windows are further sections.
+        worst = [] if self.most == 1 else self.worst["window"].to_list()
+        links = {number: f"#window-{number}" for number in worst}
         return run_timeline(
             self.run.windows,
             self.run.decisions,
@@ -172,8 +182,8 @@ class _RunPage:
                 "A mark is a window, in the colour of the placement that was active. Thin lines: "
                 "J of the other placements as the policy estimated it. Dashed: the aim of 5 %, and "
                 "the deadline. Upright lines: migrations; in colour, the guard's. Shaded: warm-up "
-                "and disturbances. U: all of a node's load, foreign work included. Marks of the "
-                "worst windows lead to their cycles."
+                "and disturbances. U: all of a node's load, foreign work included."
+                f"{' Marks of the worst windows lead to their cycles.' if links else ''}"
             ),
         )
 

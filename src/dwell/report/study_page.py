@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from dwell.report.charts import curves
@@ -37,8 +38,14 @@ def study_html(study: SavedStudy, *, static: bool = False) -> str:
     return page_html(study_page(study), static=static)
 
 
-def study_page(study: SavedStudy) -> Page:
-    """Return what there is to show of a study; see `study_html`."""
+def study_page(study: SavedStudy, *, sections: int | None = None) -> Page:
+    """Return what there is to show of a study; see `study_html`.
+
+    Parameters
+    ----------
+    sections : int, optional
+        How many are made, from the first, the answer; all if left out.
+    """
     blocks = PolicyBlocks(study.problem, study.runs, study.latencies)
     points = study.runs.select(study.parameters).unique().height if study.parameters else 1
     return Page(
@@ -46,7 +53,7 @@ def study_page(study: SavedStudy) -> Page:
         subtitle=f"{study.runs.height} runs: {len(study.scenarios)} scenarios, "
         f"{len(study.policies)} policies, {points} points, seeds {ranges(study.seeds)}, "
         f"{study.windows} windows",
-        sections=list(_sections(study, blocks)),
+        sections=list(islice(_sections(study, blocks), sections)),
         policies={name: style.colour for name, style in blocks.styles.items()},
         seeds=() if study.parameters else study.seeds,
     )

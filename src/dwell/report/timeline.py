@@ -316,7 +316,8 @@ def _marks(
                 scale={"domain": list(shown), "range": [palette.placements[one] for one in shown]},
                 legend={"symbolSize": 60} if field == "v_d" else None,
             ),
-            "href": {"field": "link", "type": "nominal"},
+            # What leads nowhere would lead away from the page.
+            "href": {"condition": {"test": "datum.link !== null", "field": "link"}},
             "tooltip": [
                 quantity("window", "window"),
                 quantity("time", "at (s)", format=".1f"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,15 +67,21 @@ def validation_html(validation: Validation, *, static: bool = False) -> str:
     return page_html(validation_page(validation), static=static)
 
 
-def validation_page(validation: Validation) -> Page:
-    """Return what there is to show of a validation; see `validation_html`."""
+def validation_page(validation: Validation, *, sections: int | None = None) -> Page:
+    """Return what there is to show of a validation; see `validation_html`.
+
+    Parameters
+    ----------
+    sections : int, optional
+        How many are made, from the first, the answer; all if left out.
+    """
     runs = sum(len(group.runs) for group in validation.groups)
     minutes = sum(group.minutes for group in validation.groups)
     return Page(
         title=f"Predicted beside measured: {validation.problem.name}",
         subtitle=f"{len(validation.groups)} groups of a scenario and a policy, {runs} runs, "
         f"{write_number(minutes)} minutes that count, each run simulated {validation.seeds} times",
-        sections=list(_sections(validation)),
+        sections=list(islice(_sections(validation), sections)),
     )
 
 

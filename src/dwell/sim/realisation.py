@@ -206,6 +206,12 @@ class Realisation:
         object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))
         object.__setattr__(self, "link_segments", LinkSegments.of(self.link_segments))
 
+    def __repr__(self) -> str:
+        return (
+            f"<Realisation: {self.scenario}, seed {self.seed}, {self.windows} windows, "
+            f"{self.cycles} cycles; {len(self.sites)} sites, {len(self.hops)} hops>"
+        )
+
     @property
     def cycles(self) -> int:
         """N."""

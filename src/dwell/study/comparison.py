@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.display import Displayed
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import Problem
 from dwell.model.semantics import nearest
@@ -38,7 +39,7 @@ AIM = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class Comparison(Displayed):
     """Runs of policies on the same realisations, and the statistics over their seeds.
 
     Parameters
@@ -73,6 +74,12 @@ class Comparison:
     latencies: pl.DataFrame
     examples: Mapping[tuple[str, str], Example]
     versions: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        return (
+            f"<Comparison on {self.problem.name}: {len(self.scenarios)} scenarios, "
+            f"{len(self.policies)} policies, {len(self.seeds)} seeds, {self.windows} windows>"
+        )
 
     @classmethod
     def of_study(cls, result: StudyResult) -> Comparison:

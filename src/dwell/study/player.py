@@ -31,6 +31,9 @@ class Example:
     windows: pl.DataFrame
     decisions: pl.DataFrame
 
+    def __repr__(self) -> str:
+        return f"<Example: {self.windows.height} windows, {self.decisions.height} decisions>"
+
 
 @dataclass(frozen=True, slots=True)
 class PlayedItem:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from dwell.display import Displayed
 from dwell.errors import SimulationError
 from dwell.study.over_seeds import over_seeds
 from dwell.study.parts import opened
@@ -58,7 +59,7 @@ class StudyTables:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StudyResult:
+class StudyResult(Displayed):
     """All runs of a study in numbers.
 
     Parameters
@@ -87,6 +88,9 @@ class StudyResult:
     latencies: pl.DataFrame
     versions: Mapping[str, str]
     folder: Path | None
+
+    def __repr__(self) -> str:
+        return f"<StudyResult of {self.study!r}>"
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dwell.cellfile import from_record
+from dwell.display import Displayed
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem
 from dwell.study.parts import STUDY
-from dwell.study.runner import PARAMETER
+from dwell.study.runner import PARAMETER, StudyResult
 
 if TYPE_CHECKING:
     import polars as pl
@@ -21,7 +22,7 @@ __all__ = ["SavedStudy", "is_study", "open_study"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SavedStudy:
+class SavedStudy(Displayed):
     """A finished study, as its folder has it.
 
     Parameters
@@ -50,6 +51,30 @@ class SavedStudy:
     costs: pl.DataFrame
     latencies: pl.DataFrame
     versions: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        return (
+            f"<SavedStudy {self.name}: {self.runs.height} runs, {len(self.scenarios)} scenarios, "
+            f"{len(self.policies)} policies, {len(self.seeds)} seeds, {self.windows} windows>"
+        )
+
+    @classmethod
+    def of(cls, result: StudyResult) -> SavedStudy:
+        """Return what the folder of a study's result would hold."""
+        study = result.study
+        return cls(
+            name=study.name,
+            problem=study.points[0].problem,
+            scenarios=study.scenarios,
+            policies=study.policies,
+            seeds=study.seeds,
+            windows=study.windows,
+            parameters=result.parameters,
+            runs=result.runs,
+            costs=result.costs,
+            latencies=result.latencies,
+            versions=result.versions,
+        )
 
 
 def is_study(folder: Path) -> bool:

@@ -98,6 +98,9 @@ class Point:
         }
         object.__setattr__(self, "values", FrozenDict(values))
 
+    def __repr__(self) -> str:
+        return f"<Point of {self.problem.name}: {dict(self.values)}>"
+
 
 @dataclass(frozen=True, slots=True)
 class Item:
@@ -162,6 +165,12 @@ class Study:
         reserved = [name for name in names if self.references and name in REFERENCES]
         if reserved:
             raise SimulationError(f"{reserved[0]!r} is a reference's name; choose another")
+
+    def __repr__(self) -> str:
+        return (
+            f"<Study {self.name}: {len(self.points)} points, {len(self.scenarios)} scenarios, "
+            f"{len(self.contenders)} policies, {len(self.seeds)} seeds, {self.windows} windows>"
+        )
 
     def _check(self, point: Point) -> None:
         first, problem = self.points[0], point.problem

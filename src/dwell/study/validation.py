@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.display import Displayed
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem
 from dwell.study.intervals import Interval, rule_of_three
@@ -137,7 +138,7 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Validation:
+class Validation(Displayed):
     """Predictions beside measurements.
 
     Parameters
@@ -168,6 +169,13 @@ class Validation:
     table: pl.DataFrame
     jobs: pl.DataFrame
     versions: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        runs = sum(len(group.runs) for group in self.groups)
+        return (
+            f"<Validation of {self.problem.name}: {len(self.groups)} groups, {runs} runs, each "
+            f"simulated {self.seeds} times>"
+        )
 
     def verdict(self, goal: str) -> Outcome:
         """Return the verdict on one of `GOALS` in all groups together: the worst."""

@@ -1,0 +1,138 @@
+"""The topology of a cell: nodes, the links between them, and the tasks that may run on each."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from dwell.model import Problem, Trace
+from dwell.report.figure import Figure, Spec
+from dwell.report.formatting import write_number
+from dwell.report.palette import INK, MUTED, PAPER, SHADE
+
+if TYPE_CHECKING:
+    from dwell.model import Link
+
+__all__ = ["topology"]
+
+#: Size of a node, and the height of a line in it, pixels.
+NODE_PX, LINE_PX = 150, 15
+#: Nodes stand on an ellipse, the edge and the cloud on top, robots below.
+TIERS = ("cloud", "edge", "robot")
+
+
+def topology(problem: Problem) -> Figure:
+    """Draw a cell's topology.
+
+    A line stands for the links of both ways, with the delay and the rate of the first that is
+    declared. Tasks in a node may run there; those that one node only can run are in parentheses.
+    """
+    import polars as pl
+
+    nodes = sorted(problem.fabric.nodes.values(), key=lambda node: TIERS.index(node.tier))
+    step = 2 * math.pi / len(nodes)
+    # Half a turn of the robots, so that they stand on the lower half.
+    places = {
+        node.name: (math.sin(i * step), math.cos(i * step)) if len(nodes) > 1 else (0.0, 0.0)
+        for i, node in enumerate(nodes)
+    }
+    texts = {
+        node.name: [f"{node.name}: {node.tier}, {node.cores} cores", *_tasks(problem, node.name)]
+        for node in nodes
+    }
+    boxes = [
+        {"node": name, "x": x, "y": y, "line": line, "text": text, "head": line == 0}
+        for name, (x, y) in places.items()
+        for line, text in enumerate(texts[name])
+    ]
+    pairs: dict[frozenset[str], Link] = {}
+    for link in problem.fabric.links.values():
+        pairs.setdefault(frozenset((link.source, link.target)), link)
+    lines = [
+        {
+            "x": places[link.source][0],
+            "y": places[link.source][1],
+            "x2": places[link.target][0],
+            "y2": places[link.target][1],
+            "mx": (places[link.source][0] + places[link.target][0]) / 2,
+            "my": (places[link.source][1] + places[link.target][1]) / 2,
+            "text": _link(link),
+        }
+        for link in pairs.values()
+    ]
+    schema = dict.fromkeys(("x", "y", "x2", "y2", "mx", "my"), pl.Float64) | {"text": pl.String}
+    frames = {"boxes": pl.DataFrame(boxes), "links": pl.DataFrame(lines, schema=schema)}
+    tall = LINE_PX * max(len(lines) for lines in texts.values()) + 14
+    height = tall if len(nodes) == 1 else max(2.6 * tall, 75 * len(nodes))
+
+    def draw(width: float) -> Spec:
+        across = min(width, 620.0)
+        x = {"type": "quantitative", "axis": None, "scale": {"domain": [-1.0, 1.0]}}
+        low, high = min(y for _, y in places.values()), max(y for _, y in places.values())
+        y = {"type": "quantitative", "axis": None, "scale": {"domain": [low, high or 1.0]}}
+        at = {"x": {"field": "x", **x}, "y": {"field": "y", **y}}
+        ends = {**at, "x2": {"field": "x2"}, "y2": {"field": "y2"}}
+        middle = {"x": {"field": "mx", **x}, "y": {"field": "my", **y}}
+        box = {"type": "rect", "width": NODE_PX, "height": tall, "cornerRadius": 4}
+        label = {"type": "text", "color": MUTED, "stroke": None}
+        halo = {**label, "stroke": PAPER, "strokeWidth": 6, "strokeJoin": "round"}
+        first = -(tall - LINE_PX) / 2 + 7
+        written: list[Spec] = [
+            {
+                "data": {"name": "boxes"},
+                "transform": [{"filter": f"datum.line == {line}"}],
+                "mark": {
+                    "type": "text",
+                    "dy": first + line * LINE_PX,
+                    "color": MUTED if line else INK,
+                    "fontWeight": "normal" if line else 600,
+                },
+                "encoding": {**at, "text": {"field": "text"}},
+            }
+            for line in range(max(len(lines) for lines in texts.values()))
+        ]
+        return {
+            "width": across - NODE_PX,
+            "height": height - tall,
+            "padding": {"left": NODE_PX / 2, "right": NODE_PX / 2, "top": tall, "bottom": tall},
+            "layer": [
+                {
+                    "data": {"name": "links"},
+                    "mark": {"type": "rule", "color": MUTED, "strokeWidth": 1.2},
+                    "encoding": ends,
+                },
+                *(
+                    {
+                        "data": {"name": "links"},
+                        "mark": mark,
+                        "encoding": {**middle, "text": {"field": "text"}},
+                    }
+                    for mark in (halo, label)
+                ),
+                {
+                    "data": {"name": "boxes"},
+                    "transform": [{"filter": "datum.head"}],
+                    "mark": {**box, "fill": SHADE, "stroke": MUTED},
+                    "encoding": at,
+                },
+                *written,
+            ],
+        }
+
+    return Figure("topology", f"Topology of {problem.name}", frames, draw)
+
+
+def _tasks(problem: Problem, node: str) -> list[str]:
+    """Return the tasks that a node can run."""
+    tasks = problem.pipeline.tasks.values()
+    return [f"({one.name})" if one.anchored else one.name for one in tasks if node in one.on]
+
+
+def _link(link: Link) -> str:
+    delay = "as recorded" if isinstance(link.delay_ms, Trace) else _mean(link)
+    rate = "" if math.isinf(link.rate_mbps) else f", {write_number(link.rate_mbps, 0)} Mbit/s"
+    return f"{delay}{rate}"
+
+
+def _mean(link: Link) -> str:
+    return f"{write_number(link.delay_ms.expectation, 1)} ms"
