@@ -8,9 +8,9 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -50,15 +50,25 @@ def test_the_wheel_has_the_examples_and_nothing_else(installed: Path) -> None:
 UV = Path(sys.executable).with_name("uv")
 
 
-def run(*words: str | Path, **how: Any) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end, away from the checkout and from this environment."""
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in ("PYTHONPATH", "VIRTUAL_ENV")
-    }
+def run(
+    *words: str | Path, cwd: Path | None = None, **more: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end, away from the checkout and from this environment.
+
+    Parameters
+    ----------
+    more : str
+        Variables of its environment.
+    """
+    ours = ("PYTHONPATH", "VIRTUAL_ENV", "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT")
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
     return subprocess.run(
-        list(map(str, words)), check=False, capture_output=True, text=True, env=kept, **how
+        list(map(str, words)),
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**kept, **more},
     )
 
 
@@ -119,13 +129,41 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
 
 
-def test_the_demo_runs_from_the_extra_all(
-    environment: Callable[[str], Path], tmp_path: Path
+def test_a_stranger_s_way_from_the_wheel_to_a_report_of_his_own_policy(
+    environment: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Nothing is compiled, cached or configured; the log gets the seconds of each step."""
+    home = tmp_path / "home"
+    home.mkdir()
+    begin = time.perf_counter()
+    took_s: list[tuple[str, float]] = []
+
+    def done(step: str) -> None:
+        took_s.append((step, time.perf_counter() - begin - sum(each for _, each in took_s)))
+
     python = environment("all")
-    words = ("--seeds", "2", "--windows", "12", "--processes", "1")
-    out = ("--out", tmp_path / "out")
-    done = run(python, "-m", "dwell", "demo", "--json", *words, *out, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)
-    assert (tmp_path / "out" / "report.html").is_file()
+    done("install")
+    cell = next((python.parents[1] / "lib").glob("*/site-packages/dwell/examples/canonical.yaml"))
+
+    def dwell_does(words: str) -> str:
+        found = run(python, "-m", "dwell", *words.split(), cwd=home, HOME=str(home))
+        assert found.returncode == 0, found.stderr
+        done(f"dwell {words}".replace(str(cell), "CELL"))
+        return found.stdout
+
+    assert "missed deadlines" in dwell_does(f"run {cell} --windows 20 --out first")
+    dwell_does("report first")
+    dwell_does("new hall")
+    assert "no faults" in dwell_does("check hall/cell.yaml")
+    dwell_does("run hall/cell.yaml --windows 20 --out second")
+    with (home / "hall" / "policy.py").open("a", encoding="utf-8") as file:
+        file.write('\n\nclass Mine(Patient):\n    """A policy of one\'s own."""\n')
+    dwell_does("run hall/cell.yaml --windows 20 --out third --policy policy:Mine")
+    dwell_does("report third")
+    words = "--seeds 2 --windows 12 --processes 1"
+    assert json.loads(dwell_does(f"demo --json {words} --out demo"))
+    for folder in ("first", "third", "demo"):
+        assert (home / folder / "report.html").is_file()
+    assert dwell.open_run(home / "third").meta["policy"] == "policy:Mine"
+    with capsys.disabled():
+        print("", *(f"{seconds:6.1f} s  {step}" for step, seconds in took_s), sep="\n")
