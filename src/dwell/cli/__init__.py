@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dwell.cli.completion import LINE, answer
 from dwell.cli.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     # Pydantic would look for plugins in all that is installed; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
+        if LINE in os.environ:
+            return answer(os.environ[LINE])
         from dwell.cli import first_answer
         from dwell.cli.commands import app
 

@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from dwell import __version__
+from dwell.cli.completion import Shell, script
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.keys import keys
 from dwell.cli.live import agent, controller, live
@@ -390,6 +391,18 @@ def demo(
         processes=processes,
         as_json=as_json,
     )
+
+
+@app.command()
+def completion(
+    shell: Annotated[Shell, typer.Argument(help="Yours.")],
+) -> None:
+    """Print the script that has a shell complete commands, options and their values.
+
+    Read it where your shell begins: source <(dwell completion bash) in ~/.bashrc, the same with zsh
+    in ~/.zshrc after compinit, dwell completion fish | source in ~/.config/fish/config.fish.
+    """
+    typer.echo(script(shell), nl=False)
 
 
 app.command()(agent)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import typer
 
-from dwell.cellfile import schema
 from dwell.cli.output import write_file
 from dwell.errors import ProblemError
 
@@ -19,6 +18,8 @@ SCHEMA_FILE = "cell.schema.json"
 
 def schema_text() -> str:
     """Return the schema as a file has it."""
+    from dwell.cellfile import schema
+
     return json.dumps(schema(), indent=2) + "\n"
 
 
@@ -50,4 +51,4 @@ def _is_schema(path: Path) -> bool:
         known = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
         return False
-    return isinstance(known, dict) and known.get("title") == schema()["title"]
+    return isinstance(known, dict) and known.get("title") == json.loads(schema_text())["title"]
