@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dwell.control import shadow_stamps
+
+
+@given(
+    first=st.integers(0, 10**6),
+    candidates=st.integers(2, 6),
+    active=st.integers(0, 5),
+    percent=st.integers(1, 20),
+)
+def test_every_alternative_gets_its_share_of_any_stretch(
+    first: int, candidates: int, active: int, percent: int
+) -> None:
+    active %= candidates
+    fraction = percent / 100
+    stamps = shadow_stamps(first, first + 2_000, active, candidates, fraction)
+    assert stamps.shape == (2_000,)
+    counts = {name: int((stamps == name).sum()) for name in range(candidates)}
+    assert counts.pop(active) == 0
+    # Few cycles off, in any stretch: golden steps are spread evenly.
+    assert all(abs(count - 2_000 * fraction) <= 4 for count in counts.values())
+
+
+@given(first=st.integers(0, 1_000), length=st.integers(0, 200), cut=st.integers(0, 200))
+def test_a_stretch_is_the_sum_of_its_parts(first: int, length: int, cut: int) -> None:
+    middle, last = first + min(cut, length), first + length
+    whole = shadow_stamps(first, last, 1, 3, 0.1)
+    parts = [shadow_stamps(first, middle, 1, 3, 0.1), shadow_stamps(middle, last, 1, 3, 0.1)]
+    np.testing.assert_array_equal(whole, np.concatenate(parts))
+
+
+def test_without_a_fraction_or_an_alternative_there_is_none() -> None:
+    assert set(shadow_stamps(0, 50, 0, 3, 0.0)) == {-1}
+    assert set(shadow_stamps(0, 50, 0, 1, 0.5)) == {-1}

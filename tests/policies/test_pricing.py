@@ -1,0 +1,67 @@
+from __future__ import annotations
+
+import pytest
+
+from dwell.cost import cost
+from dwell.errors import MetricError, PolicyError
+from dwell.model import Caps, Objective, Placement, QoS, Targets, Weights
+from dwell.policies.pricing import Pricing
+
+CANDIDATES = {
+    "LOC": Placement({"perception": "R1", "planning": "R2"}),
+    "SO": Placement({"perception": "E", "planning": "E"}),
+}
+TIERS = {"R1": "robot", "R2": "robot", "E": "edge"}
+OBJECTIVE = Objective(Weights(), Targets(30.0), Caps(100.0, 0.9), TIERS)  # type: ignore[arg-type]
+
+
+def qos(l95_ms: float = 20.0, used: float = 0.5) -> QoS:
+    return QoS(l95_ms, 0.0, dict.fromkeys(TIERS, used))
+
+
+def pricing(objective: Objective = OBJECTIVE) -> Pricing:
+    return Pricing(CANDIDATES, objective)
+
+
+def test_prices_are_those_of_the_formulas() -> None:
+    estimates = {"LOC": qos(), "SO": qos(40.0)}
+    found = pricing().estimated(estimates, "LOC")
+    for name, placement in CANDIDATES.items():
+        assert found[name] == cost(estimates[name], placement, CANDIDATES["LOC"], OBJECTIVE)
+    assert pricing().observed(qos(), "SO", "LOC") == cost(
+        qos(), CANDIDATES["SO"], CANDIDATES["LOC"], OBJECTIVE
+    )
+
+
+def test_candidates_within_the_caps_are_eligible() -> None:
+    estimates = {"LOC": qos(used=0.95), "SO": qos()}
+    assert pricing().eligible(estimates) == (["SO"], True)
+
+
+def test_where_none_is_those_nearest_to_their_caps_are() -> None:
+    both = {"LOC": qos(used=0.99), "SO": qos(used=0.99 + 1e-9)}
+    assert pricing().eligible(both) == (["LOC", "SO"], False)
+    one = {"LOC": qos(used=0.99), "SO": qos(l95_ms=500.0)}
+    assert pricing().eligible(one) == (["LOC"], False)
+
+
+def test_the_reason_tells_what_a_cap_has_done() -> None:
+    costs = {"LOC": 1.0, "SO": 2.0}
+    assert pricing().reason("SO", costs, ["SO"], within_caps=True) == "capped"
+    assert pricing().reason("LOC", costs, ["LOC", "SO"], within_caps=True) == "migrate"
+    assert pricing().reason("LOC", costs, ["LOC"], within_caps=False) == "infeasible"
+
+
+def test_what_cannot_be_priced_is_named() -> None:
+    with pytest.raises(PolicyError, match="must be an Objective"):
+        Pricing(CANDIDATES, "cheap")  # type: ignore[arg-type]
+    with pytest.raises(MetricError, match="nothing for candidate SO"):
+        pricing().estimated({"LOC": qos()}, "LOC")
+    with pytest.raises(MetricError, match="observed has no utilisation of R2"):
+        pricing().observed(QoS(1.0, 0.0, {"R1": 0.1, "E": 0.1}), "LOC", "LOC")
+    with pytest.raises(MetricError, match="must be a QoS"):
+        pricing().observed(3, "LOC", "LOC")  # type: ignore[arg-type]
+    with pytest.raises(MetricError, match="no finite J"):
+        pricing(Objective(Weights(latency=1e9), Targets(1e-9), tiers=OBJECTIVE.tiers)).observed(
+            qos(1e300), "LOC", "LOC"
+        )
