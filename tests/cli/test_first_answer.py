@@ -81,6 +81,36 @@ def compilers(lock: Path) -> list[psutil.Process]:
     return found
 
 
+def interrupted_after(words: bytes, *command: str) -> tuple[bytes, int]:
+    """Run a command on a terminal until it says something.
+
+    Returns
+    -------
+    (bytes, int)
+        What it has said, and the exit code after Ctrl-C.
+    """
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        (sys.executable, "-m", "dwell", *command),
+        stdout=subprocess.DEVNULL,
+        stderr=theirs,
+        env={**os.environ, "COLUMNS": "80", "TERM": "xterm"},
+    )
+    os.close(theirs)
+    said = b""
+    try:
+        while words not in said:
+            said += os.read(ours, 1000)  # raises where the process has ended
+    finally:
+        process.send_signal(signal.SIGINT)
+        # A terminal that nobody reads would hold the process.
+        with suppress(OSError):
+            while os.read(ours, 1000):
+                pass
+        os.close(ours)
+    return said, process.wait(timeout=120)
+
+
 def test_who_plays_a_run_does_not_matter(cell: Path) -> None:
     lock = lock_file()
     with locked(lock):
@@ -129,27 +159,9 @@ def test_long_work_says_that_it_compiles(cell: Path, command: str) -> None:
         encoding="utf-8",
     )
     words = {"run": (str(cell), "--windows", "4000"), "study": ("study.yaml",)}.get(command, ())
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        (sys.executable, "-m", "dwell", command, *words),
-        stdout=subprocess.DEVNULL,
-        stderr=theirs,
-        env={**os.environ, "COLUMNS": "80", "TERM": "xterm"},
-    )
-    os.close(theirs)
-    said = b""
-    try:
-        while b"compiling the simulator, once" not in said:
-            said += os.read(ours, 1000)  # raises where the process has ended
-    finally:
-        process.send_signal(signal.SIGINT)
-        # A terminal that nobody reads would hold the process.
-        with suppress(OSError):
-            while os.read(ours, 1000):
-                pass
-        os.close(ours)
+    said, code = interrupted_after(b"compiling the simulator, once", command, *words)
     assert b"simulating" not in said
-    assert process.wait(timeout=120) == 130
+    assert code == 130
 
 
 def test_a_cache_that_cannot_be_written(cell: Path) -> None:
@@ -157,6 +169,17 @@ def test_a_cache_that_cannot_be_written(cell: Path) -> None:
     Path("cache").write_text("no folder", encoding="utf-8")
     run(cell, "first")
     assert Path("cache").read_text(encoding="utf-8") == "no folder"
+
+
+def test_no_cache_can_be_written_at_all(cell: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = copied(Path("package").resolve(), "0.8")
+    (package / "dwell" / "kernels" / "__pycache__").write_text("no folder", encoding="utf-8")
+    for name, value in (("PYTHONPATH", package), ("HOME", "/dev/null"), ("NUMBA_CACHE_DIR", "")):
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null/cache")
+    run(cell, "first")
+    said, code = interrupted_after(b"each process compiles", "demo", "--out", "demo")
+    assert (said.splitlines()[0][:5], code) == (b"note:", 130)
 
 
 # ----------------------------------------------------------------- versions side by side

@@ -18,6 +18,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+import typer
+
 import dwell
 from dwell.cli.output import working
 from dwell.model import Problem, QoS
@@ -100,7 +102,13 @@ def prepare(cycles: int) -> str | None:
 def compile_first() -> None:
     """Compile before several processes begin, each of which would have to."""
     kernels = _uncompiled()
-    if kernels is not None and kernels.folder is not None:
+    if kernels is None:
+        return
+    if kernels.folder is None:
+        typer.echo(
+            "note: no folder can keep the compiled simulator: each process compiles", err=True
+        )
+    else:
         _compile(kernels)
 
 
