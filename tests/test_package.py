@@ -81,14 +81,15 @@ def environment(installed: Path, tmp_path: Path) -> Callable[[str], Path]:
     pins = ROOT / "requirements" / "dev.txt"
 
     def made(extra: str) -> Path:
-        folder = tmp_path / extra
+        folder = tmp_path / (extra or "base")
         run(UV, "venv", "--quiet", "--python", sys.executable, folder)
         python = folder / "bin" / "python"
         into = (UV, "pip", "install", "--quiet", "--python", python, "--constraint", pins)
         reached = run(*into, "numpy")
         if reached.returncode:
             pytest.skip(f"no packages can be installed here: {reached.stderr.strip()[-200:]}")
-        done = run(*into, f"dwell-placement[{extra}] @ {wheel.as_uri()}")
+        wanted = f"dwell-placement[{extra}]" if extra else "dwell-placement"
+        done = run(*into, f"{wanted} @ {wheel.as_uri()}")
         assert done.returncode == 0, done.stderr
         return python
 

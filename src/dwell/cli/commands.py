@@ -394,8 +394,33 @@ def demo(
 
 
 @app.command()
+def doctor(
+    cell: Annotated[
+        Path | None,
+        typer.Argument(metavar="CELL", help="Cell file whose ports, quotas and keys to look at."),
+    ] = None,
+    keys: Keys = None,
+    clear_cache: Annotated[
+        bool, typer.Option("--clear-cache", help="Remove the compiled simulator.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Say what this computer has for Dwell and what it lacks, with the line that mends it.
+
+    Compiled simulators of older versions are removed. The exit code is 1 where something is broken;
+    an extra that is not installed is not.
+    """
+    import dwell
+    from dwell.cli.doctor import DoctorRequest, consult
+
+    problem = None if cell is None else dwell.load(cell)
+    if not consult(DoctorRequest(problem, keys, clear_cache), as_json=as_json):
+        raise typer.Exit(ExitCode.FAILED)
+
+
+@app.command()
 def completion(
-    shell: Annotated[Shell, typer.Argument(help="Yours.")],
+    shell: Annotated[Shell, typer.Argument(metavar="SHELL", help="bash, zsh or fish.")],
 ) -> None:
     """Print the script that has a shell complete commands, options and their values.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -137,23 +137,16 @@ def doctor(
 ) -> None:
     """Say what this machine can do as a testbed and what it cannot, and what to install."""
     import dwell
+    from dwell.cli.doctor import print_findings
     from dwell.testbed.doctor import examine
 
     findings = examine([dwell.load(cell) for cell in cells or ()], watch_s=watch)
     missing = [one for one in findings if one.needed and not one.ok]
     if as_json:
-        rows = [
-            {"name": one.name, "ok": one.ok, "needed": one.needed, "found": one.found}
-            | {"remedy": one.remedy}
-            for one in findings
-        ]
+        rows = [asdict(one) for one in findings]
         print_json({"ok": not missing, "findings": rows})
     else:
-        for one in findings:
-            mark = "ok" if one.ok else "MISSING" if one.needed else "without"
-            typer.echo(f"{mark:8} {one.name}: {one.found}")
-            if not one.ok and one.remedy:
-                typer.echo(f"{'':8} {one.remedy}")
+        print_findings(findings, broken="MISSING", lacking="without")
     if missing:
         raise typer.Exit(ExitCode.FAILED)
 

@@ -1,0 +1,420 @@
+"""`dwell doctor`: what this computer has for Dwell, what it lacks, and the line that mends it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import shutil
+import socket
+import sys
+import textwrap
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from pathlib import Path
+
+import typer
+
+import dwell
+from dwell.calibration.machine_conditions import MachineCounters, processor
+from dwell.cli.output import print_json
+from dwell.errors import DISTRIBUTION, OPTIONAL, LiveError, TrustError, installing
+from dwell.model import Host, Problem
+from dwell.testbed import doctor as testbed_doctor
+from dwell.testbed.cgroups import find_cgroups
+from dwell.testbed.doctor import Finding
+from dwell.testbed.pressure import Rule
+
+__all__ = ["DoctorRequest", "consult", "print_findings"]
+
+#: What each extra is for.
+EXTRAS = {
+    "sim": "dwell run, study, demo, validate",
+    "report": "dwell report",
+    "live": "dwell live, agent, controller, keys",
+    "dask": "dwell study --dask",
+}
+#: How many ports are looked at where no cell says which.
+DEFAULT_PORTS = 50
+#: Clocks that take long to be read.
+SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "refined-jiffies")
+#: Files of compiled kernels, in a folder that has no others.
+CACHED = ("*.nbi", "*.nbc", "compiling.*.lock")
+LISTENS = "0A"
+
+
+@dataclass(frozen=True, slots=True)
+class DoctorRequest:
+    """What is asked of the doctor.
+
+    Parameters
+    ----------
+    keys : Path or None
+        A keyring, or a folder of keyrings.
+    clear_cache : bool
+        Whether all compiled kernels are removed, not only those of older versions.
+    """
+
+    problem: Problem | None
+    keys: Path | None
+    clear_cache: bool
+
+
+def consult(request: DoctorRequest, *, as_json: bool) -> bool:
+    """Look at everything and print it.
+
+    Returns
+    -------
+    bool
+        Whether nothing is broken; what is merely not installed is not.
+    """
+    counters = MachineCounters(os.sched_getaffinity(0))
+    extras = [_extra(name) for name in EXTRAS]
+    problems = [] if request.problem is None else [request.problem]
+    testbed = testbed_doctor.examine(problems)
+    parts = {
+        "extras": extras,
+        "cache": list(_cache(clear=request.clear_cache)),
+        "CPU": list(_cpu(counters)),
+        "clocks": [_synchronised(), _clock_source()],
+        "ports": [_ports(request.problem)],
+        "certificates": list(_certificates(request)),
+        "testbed": [replace(one, needed=False) for one in testbed],
+        "runs here": list(_runs(extras, testbed)),
+    }
+    parts = {part: [_well_needs_nothing(one) for one in rows] for part, rows in parts.items()}
+    broken = [one for rows in parts.values() for one in rows if one.needed and not one.ok]
+    if as_json:
+        rows = [{"part": part, **asdict(one)} for part, found in parts.items() for one in found]
+        print_json({"ok": not broken, "version": dwell.__version__, "findings": rows})
+        return not broken
+    system = f"{platform.system()} {platform.release()} ({platform.machine()})"
+    typer.echo(f"dwell {dwell.__version__}, Python {platform.python_version()}, {system}")
+    for part, found in parts.items():
+        typer.echo(f"\n{part}")
+        print_findings(found, broken="BROKEN", lacking="note")
+    return not broken
+
+
+def _well_needs_nothing(one: Finding) -> Finding:
+    return replace(one, remedy="") if one.ok else one
+
+
+def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) -> None:
+    """Print findings, each with its remedy below; long lines are broken on a terminal.
+
+    Parameters
+    ----------
+    broken, lacking : str
+        Marks of what is needed and not well, and of what is not well and not needed.
+    """
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+    for one in findings:
+        mark = "ok" if one.ok else broken if one.needed else lacking
+        lines = [f"{mark:8} {one.name}: {one.found}"]
+        lines += [f"{'':8} {one.remedy}"] * bool(not one.ok and one.remedy)
+        for line in lines:
+            indent = " " * 9
+            typer.echo(
+                textwrap.fill(line, columns, subsequent_indent=indent, break_on_hyphens=False)
+            )
+
+
+# ------------------------------------------------------------------------- extras and cache
+
+
+def _extra(name: str) -> Finding:
+    """Import what an extra brings: installed is not enough."""
+    try:
+        lines = requires(DISTRIBUTION) or []
+    except PackageNotFoundError:
+        found = f"{DISTRIBUTION} itself is not installed, only its sources are there"
+        return Finding(name, False, found, installing(name), needed=False)
+    modules = {dist: one for one in OPTIONAL for dist in packages_distributions().get(one, ())}
+    wanted = [
+        re.split(r"[^\w.-]", line)[0]
+        for line in lines
+        if re.search(rf"extra == ['\"]{name}['\"]", line)
+    ]
+    missing, failed, there = [], [], []
+    for package in wanted:
+        try:
+            there.append(f"{package} {version(package)}")
+            if package in modules:
+                import_module(modules[package])
+        except PackageNotFoundError:
+            missing.append(package)
+        except Exception as error:
+            told = (str(error).strip() or type(error).__name__).splitlines()[0]
+            failed.append(f"{package} cannot be imported: {told}")
+    if failed:
+        again = installing(name).replace("install", "install --force-reinstall")
+        return Finding(name, False, "; ".join(failed), again)
+    if missing:
+        found = f"not installed: {', '.join(missing)}"
+        return Finding(name, False, found, installing(name), needed=False)
+    return Finding(name, True, ", ".join(there))
+
+
+def _cache(*, clear: bool) -> Iterator[Finding]:
+    """Look at the compiled kernels; those of older versions are removed."""
+    name = "compiled simulator"
+    try:
+        from dwell.cli.first_answer import find_kernels
+
+        kernels = find_kernels()
+    except ImportError:
+        yield Finding(name, True, "none: the extra sim is not installed")
+        return
+    if kernels.folder is None:
+        remedy = "export NUMBA_CACHE_DIR=FOLDER, one that you may write to"
+        found = "no folder can keep it: every command compiles for itself"
+        yield Finding(name, False, found, remedy, needed=False)
+        return
+    stamp = kernels.suffix.partition(".")[0]
+    files = [file for pattern in CACHED for file in kernels.folder.glob(pattern)]
+    outdated = [file for file in files if clear or f".{stamp}." not in file.name]
+    if outdated:
+        bytes_ = _bytes(outdated)
+        whose = "removed" if clear else "of older versions, removed"
+        try:
+            for file in outdated:
+                file.unlink(missing_ok=True)
+            found = f"{len(outdated)} files, {bytes_ / 1e6:.1f} MB, {whose}"
+            yield Finding("compiled before", True, found)
+        except OSError as error:
+            found = f"{error.filename}: {error.strerror}"
+            remedy = f"rm {kernels.folder}/*.nb[ci]"
+            yield Finding("compiled before", False, found, remedy, needed=False)
+    if kernels.cached:
+        kept = _bytes(file for file in files if file.exists())
+        yield Finding(name, True, f"of this version, {kept / 1e6:.1f} MB in {kernels.folder}")
+    else:
+        found = f"not yet there: the first run compiles it, into {kernels.folder}"
+        yield Finding(name, True, found)
+
+
+def _bytes(files: Iterable[Path]) -> int:
+    total = 0
+    for file in files:
+        with suppress(FileNotFoundError):
+            total += file.stat().st_size
+    return total
+
+
+# ------------------------------------------------------------------------- CPU and clocks
+
+
+def _cpu(counters: MachineCounters) -> Iterator[Finding]:
+    """Yield what this process may use, and what disturbs it."""
+    seen, usable = counters.conditions(), len(os.sched_getaffinity(0))
+    yield Finding("CPUs", True, f"{usable} of {seen.cpus} for this process; {processor()}")
+    quota = _quota()
+    found = "none on this process" if quota is None else f"this process gets {quota:g} CPU at most"
+    remedy = "start it in a control group without (docker --cpus, systemd CPUQuota=)"
+    yield Finding("quota", quota is None, found, remedy, needed=False)
+    governor = seen.governor or "not told, as in virtual machines"
+    well = seen.governor in (None, "performance")
+    remedy = "cpupower frequency-set --governor performance"
+    yield Finding("governor", well, governor, remedy, needed=False)
+    if seen.steal is not None:
+        found = f"{seen.steal:.1%} of the time of these CPUs goes to other virtual machines"
+        well = seen.steal <= Rule().stolen_most
+        yield Finding("steal", well, found, "a machine that is not shared", needed=False)
+    well = seen.load < seen.cpus
+    found = f"{seen.load:.1f} threads wanted a CPU in the last minute; there are {seen.cpus}"
+    yield Finding("load", well, found, "measure when nothing else runs", needed=False)
+
+
+def _quota() -> float | None:
+    """Return the CPUs that the quotas of this process's group and those around it leave it."""
+    try:
+        groups = find_cgroups()
+        told = Path("/proc/self/cgroup").read_text(encoding="utf-8")
+    except (LiveError, OSError):
+        return None
+    top = groups.folders["cpu"]
+    quotas = []
+    for line in told.splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers.split(",").count("cpu" if groups.version == 1 else ""):
+            folder = top / path.lstrip("/")
+            around = (one for one in (folder, *folder.parents) if one.is_relative_to(top))
+            quotas += [_limit(one) for one in around]
+    return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def _limit(folder: Path) -> float | None:
+    """Return the quota of one group, CPUs."""
+    with suppress(OSError, ValueError):
+        quota, period = (folder / "cpu.max").read_text().split()
+        return None if quota == "max" else int(quota) / int(period)
+    with suppress(OSError, ValueError):
+        quota_us = int((folder / "cpu.cfs_quota_us").read_text())
+        return None if quota_us < 0 else quota_us / int((folder / "cpu.cfs_period_us").read_text())
+    return None
+
+
+class _Timex(ctypes.Structure):
+    """The head of what adjtimex(2) fills in."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_byte * 512),
+    )
+
+
+def _synchronised() -> Finding:
+    """Ask the kernel whether something keeps its clock right; nothing is set."""
+    name, unsynchronised = "synchronised", 0x40
+    told = _Timex()
+    try:
+        failed = ctypes.CDLL(None).adjtimex(ctypes.byref(told)) < 0
+    except (AttributeError, OSError):
+        failed = True
+    if failed:
+        return Finding(name, True, "not told by this system")
+    if not told.status & unsynchronised:
+        return Finding(name, True, f"to within {told.maxerror / 1e3:.1f} ms, says the kernel")
+    found = "no; a cell with `clock: system` on several computers needs it, others do not"
+    return Finding(name, False, found, "apt-get install chrony", needed=False)
+
+
+def _clock_source() -> Finding:
+    file = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    source = "unknown source"
+    with suppress(OSError):
+        source = file.read_text(encoding="utf-8").strip()
+    found = f"{source}, {time.get_clock_info('monotonic').resolution * 1e9:.0f} ns"
+    well = source not in SLOW_CLOCKS
+    return Finding("resolution", well, found, "boot with clocksource=tsc", needed=False)
+
+
+# ------------------------------------------------------------------------- ports and keys
+
+
+def _ports(problem: Problem | None) -> Finding:
+    """Look at the ports of the nodes that are this computer, or at the first that cells take."""
+    try:
+        wanted = _ports_here(problem)
+    except LiveError as error:
+        return Finding("TCP", False, "; ".join(str(error).splitlines()), "mend live.hosts")
+    if not wanted:
+        return Finding("TCP", True, "no node of the cell is this computer")
+    taken = {port: inode for port, inode in _listening().items() if port in wanted}
+    span = f"{min(wanted)} to {max(wanted)}"
+    if not taken:
+        return Finding("TCP", True, f"{span} are free")
+    owners = _owners(set(taken.values()))
+    ports: dict[str, list[str]] = {}
+    for port, inode in sorted(taken.items()):
+        ports.setdefault(owners.get(inode, "another user's process"), []).append(str(port))
+    whom = "; ".join(f"{', '.join(some)} by {owner}" for owner, some in ports.items())
+    remedy = "end it, or give the nodes in live.hosts other ports"
+    return Finding("TCP", False, f"of {span} are taken: {whom}", remedy, needed=False)
+
+
+def _ports_here(problem: Problem | None) -> set[int]:
+    if problem is None or not problem.live.hosts:
+        first = Host().port
+        return set(range(first, first + DEFAULT_PORTS))
+    try:
+        from dwell.live.wiring import PORTS_PER_ROLE, wire
+    except ImportError:
+        return {host.port for host in problem.live.hosts.values() if _is_here(host.address)}
+    found: set[int] = set()
+    wiring = wire(problem)
+    for node, host in problem.live.hosts.items():
+        if _is_here(host.address):
+            count = PORTS_PER_ROLE * len(list(wiring.on(node)))
+            found.update(range(host.port, host.port + count))
+    return found
+
+
+def _is_here(address: str) -> bool:
+    with suppress(OSError):
+        kind, *_, place = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(kind) as one:
+            one.bind(place)
+            return True
+    return False
+
+
+def _listening() -> dict[int, str]:
+    """Return the ports that somebody listens on, with the inode of the socket (proc_net(5))."""
+    found = {}
+    for file in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with suppress(OSError):
+            for line in Path(file).read_text(encoding="utf-8").splitlines()[1:]:
+                words = line.split()
+                if words[3] == LISTENS:
+                    found[int(words[1].rpartition(":")[2], 16)] = words[9]
+    return found
+
+
+def _owners(inodes: set[str]) -> dict[str, str]:
+    """Return the process that has each socket, as far as this user may see it."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+            for file in (process / "fd").iterdir():
+                with suppress(OSError):
+                    inode = os.readlink(file).removeprefix("socket:[").removesuffix("]")
+                    if inode in inodes:
+                        line = " ".join([Path(words[0]).name, *words[1:]]).strip()
+                        found[inode] = f"{textwrap.shorten(line, 60)} (process {process.name})"
+    return found
+
+
+def _certificates(request: DoctorRequest) -> Iterator[Finding]:
+    """Look at a keyring, or at all in a folder."""
+    name = "keyring"
+    if request.keys is None:
+        yield Finding(name, True, "none is named, by --keys or DWELL_KEYS")
+        return
+    try:
+        from dwell.live.trust.keyring import Keyring
+    except ImportError:
+        found = f"{request.keys} cannot be read without cryptography"
+        yield Finding(name, False, found, installing("live"))
+        return
+    folders = [one.parent for one in sorted(request.keys.glob("*/cert.pem"))] or [request.keys]
+    cell = None if request.problem is None else request.problem.name
+    for folder in folders:
+        try:
+            keyring = Keyring.open(folder, cell=cell)
+        except TrustError as error:
+            yield Finding(name, False, str(error), "dwell keys issue")
+            continue
+        found = f"{keyring.own.common_name} in {folder} holds until {keyring.expires:%Y-%m-%d}"
+        warning = keyring.warning()
+        yield Finding(name, not warning, warning or found, "dwell keys issue", needed=False)
+
+
+# ------------------------------------------------------------------------- what runs here
+
+
+def _runs(extras: Sequence[Finding], testbed: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield what works on this computer, by what was found before."""
+    named = {one.name: replace(one, name=f"the extra {one.name}") for one in extras}
+    needs = {
+        **{EXTRAS[name]: [one] for name, one in named.items()},
+        "dwell testbed": [named["live"], *(one for one in testbed if one.needed)],
+    }
+    for commands, found in needs.items():
+        lacking = [one for one in found if not one.ok]
+        remedies = dict.fromkeys(one.remedy for one in lacking if one.remedy)
+        names = ", ".join(one.name for one in lacking)
+        said = f"not without {names}" if lacking else "yes"
+        yield Finding(commands, not lacking, said, "; ".join(remedies), needed=False)
