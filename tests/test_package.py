@@ -130,6 +130,26 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
 
 
+def test_the_doctor_and_completion_work_without_any_extra(
+    environment: Callable[[str], Path], tmp_path: Path
+) -> None:
+    python = environment("")
+    done = run(python, "-m", "dwell", "doctor", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)["findings"]
+    extras = {one["name"]: one for one in found if one["part"] == "extras"}
+    assert set(extras) == {"sim", "report", "live", "dask"}
+    assert not any(one["ok"] for one in extras.values())
+    assert extras["live"]["remedy"] == "pip install 'dwell-placement[live]'"
+    assert not [one for one in found if one["part"] == "runs here" and one["ok"]]
+    shutil.copy(ROOT / "examples" / "live" / "cell.yaml", tmp_path)
+    looked = run(python, "-m", "dwell", "doctor", "cell.yaml", cwd=tmp_path)
+    assert looked.returncode == 0, looked.stderr
+    line = "dwell live pin --cell cell.yaml H"
+    told = run(python, "-m", "dwell", cwd=tmp_path, DWELL_COMPLETE=line)
+    assert told.stdout == "HYB\n"
+
+
 def test_a_stranger_s_way_from_the_wheel_to_a_report_of_his_own_policy(
     environment: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

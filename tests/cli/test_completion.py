@@ -69,6 +69,8 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("new mine --from ", ["canonical", "live"]),
         ("completion ", list(Shell)),
         ("run hall.yaml --out ", [FILES]),
+        ("run ~/ha", [FILES]),
+        ("doctor ha", ["hall.yaml"]),
     ],
 )
 def test_a_line_is_offered_what_fits_there(line: str, wanted: list[str]) -> None:

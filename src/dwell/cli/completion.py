@@ -31,7 +31,7 @@ class Shell(StrEnum):
 #: Stands alone for: paths, as the shell completes them.
 FILES = ":files"
 #: How helps call values that are paths.
-PATHS = ("CELL", "FILE", "FILE...", "FOLDER", "RUN", "RUN...")
+PATHS = ("CELL", "CELL...", "[CELL]", "FILE", "FILE...", "FOLDER", "RUN", "RUN...")
 #: A cell, a study and a folder of results each have a mark in their first bytes, or a file.
 HEAD_BYTES = 10_000
 RESULTS = ("run.json", "study.json", "campaign.json")
@@ -235,10 +235,13 @@ def _values(line: _Line, parameter: Any, begun: str) -> list[tuple[str, str]]:
     """Return the values that a parameter may have."""
     if parameter.hidden:
         return []
+    is_path = parameter.metavar in PATHS
+    if is_path and begun.startswith("~"):
+        return [(FILES, "")]
     for name in (f"{line.command.name} {parameter.name}", parameter.name):
         if name in OFFERS:
             return _beginning(begun, [(one, "") for one in OFFERS[name](line, begun)])
-    return [(FILES, "")] if parameter.metavar in PATHS else []
+    return [(FILES, "")] if is_path else []
 
 
 def _cell(line: _Line) -> Mapping[str, Any]:
