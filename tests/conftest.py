@@ -31,6 +31,7 @@ ALONE = (
     "test_package.py",
     "testbed/test_netns_testbed.py",
     "testbed/test_real_campaign.py",
+    "testbed/test_run.py",
 )
 
 

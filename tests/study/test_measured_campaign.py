@@ -246,9 +246,8 @@ def test_a_campaign_is_read_without_the_files_that_its_cell_replays(tmp_path: Pa
     document["tasks"]["perception"]["on"]["R1"]["exec_ms"] = replayed
     problem = from_document(document, folder=file.parent)
     seconds = campaign(1).seconds
-    asked = Campaign(
-        problem, ("baseline",), (entrant(problem, "LOC"),), 1, seconds, beside=file.parent
-    )
+    problem = replace(problem, folder=str(file.parent))
+    asked = Campaign(problem, ("baseline",), (entrant(problem, "LOC"),), 1, seconds)
     found = tmp_path / "there"
     run_campaign(asked, found, SimulatedRuns(), tell=lambda line: None, wait=ALWAYS_IDLE)
     file.unlink()

@@ -30,7 +30,7 @@ def testbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetnsTestbed]:
         pytest.skip(why)
     folder = tmp_path_factory.mktemp("testbed")
     cell = write_cell(folder)
-    with NetnsTestbed(dwell.load(cell), folder / "out", name=own_name(), beside=folder) as one:
+    with NetnsTestbed(dwell.load(cell), folder / "out", name=own_name()) as one:
         yield one
 
 

@@ -161,7 +161,7 @@ def test_a_cell_that_is_written_elsewhere_still_finds_its_traces(tmp_path: Path)
     links = [dict(link) for link in document()["links"]]
     links[0]["delay_ms"] = {"trace": {"file": "delays.csv", "column": "delay", "by": "row"}}
     problem = from_document(document(links=links), folder=tmp_path)
-    processes = Processes([problem], tmp_path / "out", traces=tmp_path)
+    processes = Processes([replace(problem, folder=str(tmp_path))], tmp_path / "out")
     processes.write()
     link = dwell.load(tmp_path / "out" / "cell.yaml").fabric.links["R1->E"]
     assert link.delay_ms.expectation == 2.0

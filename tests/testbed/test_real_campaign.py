@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -50,7 +49,7 @@ def test_a_campaign_is_measured_and_reported(tmp_path: Path) -> None:
     state = run_campaign(
         asked,
         folder,
-        partial(run_once, beside=CELL.parent),
+        run_once,
         name=own_name(),
         quiet=QUIET,
         repeats=0,

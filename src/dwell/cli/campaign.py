@@ -97,7 +97,6 @@ def run_campaign_file(request: CampaignRequest, *, as_json: bool) -> bool:
         request.seconds,
         request.seed,
         where,
-        request.cell.resolve().parent,
     )
     state = _run(campaign, folder, play, request)
     if state.done:
@@ -125,7 +124,7 @@ def _player(
     from dwell.testbed.run import require_machine, run_once
 
     require_machine([problem])
-    return partial(run_once, beside=request.cell.resolve().parent), "testbed"
+    return run_once, "testbed"
 
 
 def _run(campaign: Campaign, folder: Path, play: Play, request: CampaignRequest) -> State:

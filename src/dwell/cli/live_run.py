@@ -96,10 +96,9 @@ def run_live(request: LiveRunRequest, *, as_json: bool) -> None:
     out = request.out or Path("live-out", problem.name)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
-    beside = request.cell.resolve().parent
-    told = _Told(problem, scenario, request.seed, timeline, beside=beside)
+    told = _Told(problem, scenario, request.seed, timeline)
     interrupted = False
-    cell = Loopback(problem, out.resolve(), _cpus(problem), seed=request.seed, beside=told.beside)
+    cell = Loopback(problem, out.resolve(), _cpus(problem), seed=request.seed)
     with interruptible():
         try:
             _watch_from_start(cell, seconds, told)
@@ -147,7 +146,6 @@ def _length_s(scenario: Scenario) -> float:
 class _Told(Played):
     """What is known of a run here, and not to its controller."""
 
-    beside: Path = Path()
     observer: CellObserver | None = None
 
     def planned(self) -> list[Disturbed]:
@@ -189,7 +187,7 @@ def _watch_from_start(cell: Loopback, seconds: float, told: _Told) -> None:
     cell.begun_ns = max(cell.begun_ns, earliest_ns)
     name = cell.problem.live.observer
     if name is not None:
-        told.observer = load_observer(name, told.beside, cell.folder, cell.begun_ns)
+        told.observer = load_observer(name, cell.problem, cell.folder, cell.begun_ns)
     try:
         with live_view(cell.problem, seconds, told.planned()) as view:
             _watch(cell, seconds, told, view)

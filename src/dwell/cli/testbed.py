@@ -70,7 +70,6 @@ def run(
         out=folder,
         name=name,
         jobs=jobs,
-        beside=cell.parent,
         tell=_say,
     )
     _sum_up(found, as_json=as_json)

@@ -21,7 +21,7 @@ from dwell.errors import DwellError
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
-__all__ = ["is_class_path", "make_user_class", "source_digest"]
+__all__ = ["import_user_module", "is_class_path", "make_user_class", "source_digest"]
 
 CLASS_PATH = re.compile(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*")
 
@@ -60,7 +60,7 @@ def make_user_class(
     """
     who = f"{what} {name!r}"
     module_name, _, attribute = name.partition(":")
-    module = _import(module_name, problem.folder, who, error)
+    module = import_user_module(module_name, problem.folder, who, error)
     kind = getattr(module, attribute, None)
     if kind is None:
         near = difflib.get_close_matches(attribute, dir(module), n=1)
@@ -97,7 +97,7 @@ def source_digest(name: str, folder: str | None) -> str | None:
     """
     module_name = name.partition(":")[0]
     try:
-        source = inspect.getsource(_import(module_name, folder, name, DwellError))
+        source = inspect.getsource(import_user_module(module_name, folder, name, DwellError))
     except (DwellError, OSError, TypeError):
         return None
     return hashlib.sha256(source.encode()).hexdigest()[:16]
@@ -113,7 +113,9 @@ def _arguments(kind: type) -> list[str]:
     return [one.name for one in parameters if one.default is one.empty and one.kind not in optional]
 
 
-def _import(name: str, folder: str | None, who: str, error: type[DwellError]) -> ModuleType:
+def import_user_module(
+    name: str, folder: str | None, who: str, error: type[DwellError]
+) -> ModuleType:
     """Import a module from a folder, or an installed one where the folder has none of that name."""
     beside = folder is not None and name.partition(".")[0] in _modules_in(folder)
     try:

@@ -236,7 +236,6 @@ def make_runs(
             out=folder / candidate,
             name=name,
             jobs=True,
-            beside=cell.parent,
             tell=tell,
         )
         pressure = dwell.open_run(run).meta.get("pressure") or {}

@@ -102,8 +102,6 @@ class Campaign:
         Of the order, and of what is drawn in the runs.
     where : str
         ``testbed``, or a digest of the inventory of real hosts.
-    beside : Path
-        Folder that the names of the cell's trace files are relative to.
 
     Raises
     ------
@@ -122,7 +120,6 @@ class Campaign:
     seconds: float
     seed: int = 1
     where: str = "testbed"
-    beside: Path = Path()
 
     def __post_init__(self) -> None:
         names = tuple(one.name for one in self.entrants)
@@ -164,7 +161,8 @@ class Campaign:
     @property
     def traces(self) -> dict[str, Path]:
         """Trace files of the cell, by the names under which a campaign's folder has them."""
-        return {kept: self.beside / name for name, kept in self._cell()[1].items()}
+        folder = Path(self.problem.folder or "")
+        return {kept: folder / name for name, kept in self._cell()[1].items()}
 
     def _cell(self) -> tuple[dict[str, Any], dict[str, str]]:
         """Return the cell as the folder has it, and its own names of the trace files there."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Protocol
 
 from dwell.errors import LiveError
+from dwell.model import Problem
+from dwell.model.user_classes import import_user_module
 
 __all__ = ["CellObserver", "load_observer"]
 
@@ -40,27 +40,26 @@ class CellObserver(Protocol):
         ...
 
 
-def load_observer(name: str, beside: Path, folder: Path, begin_ns: int) -> CellObserver:
+def load_observer(name: str, problem: Problem, folder: Path, begin_ns: int) -> CellObserver:
     """Make an observer.
 
     Parameters
     ----------
     name : str
         ``package.module:Name``.
-    beside : Path
-        Folder of the cell file, where its module may be.
+    problem : Problem
+        Its module may be in the folder of the cell file.
 
     Raises
     ------
     LiveError
         If it cannot be imported or made; the message says what it said.
     """
+    who = f"observer {name}"
     module, _, attribute = name.partition(":")
-    sys.path.insert(0, str(beside.resolve()))
+    found = import_user_module(module, problem.folder, who, LiveError)
     try:
-        made: CellObserver = getattr(import_module(module), attribute)(folder, begin_ns)
+        made: CellObserver = getattr(found, attribute)(folder, begin_ns)
     except Exception as error:
-        raise LiveError(f"observer {name}: {type(error).__name__}: {error}") from None
-    finally:
-        sys.path.remove(str(beside.resolve()))
+        raise LiveError(f"{who}: {type(error).__name__}: {error}") from None
     return made

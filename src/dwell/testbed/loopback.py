@@ -24,7 +24,7 @@ from dwell.testbed.conditions import Conditions
 from dwell.testbed.message_links import LinkFile
 from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, modules_beside, without_keys
+from dwell.testbed.processes import Processes, expected, without_keys
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, differing, usual_conditions
 
@@ -81,8 +81,6 @@ class Loopback(LocalTestbed):
         Of delays and losses.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
-    beside : Path, optional
-        Folder of the cell file: of its traces, and of the modules of its stages.
     clocks : Path, optional
         What is wrong with the nodes' clocks, of a `ClockFile`.
     more : sequence of str
@@ -106,7 +104,6 @@ class Loopback(LocalTestbed):
         *,
         seed: int = 0,
         environment: Mapping[str, str] | None = None,
-        beside: Path | None = None,
         clocks: Path | None = None,
         more: Sequence[str] = (),
     ) -> None:
@@ -117,14 +114,9 @@ class Loopback(LocalTestbed):
         self.processes = Processes(
             [problem],
             folder,
-            environment={
-                "DWELL_WORLD": str(self.world),
-                **modules_beside(beside),
-                **(environment or {}),
-            },
+            environment={"DWELL_WORLD": str(self.world), **(environment or {})},
             cpus=cpus,
             more=more,
-            traces=beside,
             program=program(links=folder / LINK_FILE, clocks=clocks),
         )
         links = problem.fabric.links.items()

@@ -32,7 +32,7 @@ from dwell.testbed.link import TunLink
 from dwell.testbed.message_links import LinkFile
 from dwell.testbed.playing import come_up, undisturbed
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, modules_beside
+from dwell.testbed.processes import Processes, expected
 from dwell.testbed.stress import Stress
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, differing, usual_conditions
@@ -123,8 +123,6 @@ class NetnsTestbed(LocalTestbed):
         Of this testbed, among others on this machine.
     seed : int
         Of delays and losses.
-    beside : Path, optional
-        Folder of the cell files: of the modules of their stages, and of their traces.
     more : sequence of str
         Further arguments of the controllers.
     cpus : sequence of int, optional
@@ -158,7 +156,6 @@ class NetnsTestbed(LocalTestbed):
         *,
         name: str,
         seed: int = 0,
-        beside: Path | None = None,
         more: Sequence[str] = (),
         cpus: Sequence[int] | None = None,
         environment: Mapping[str, str] | None = None,
@@ -174,7 +171,7 @@ class NetnsTestbed(LocalTestbed):
         self.watchers: tuple[Watcher, ...] = ()
         self.stress: dict[str, Stress] = {}
         self._usual = _links_of(self.problems)
-        self._beside, self._more = beside, tuple(more)
+        self._more = tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
         self._conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
         self._threads = dict.fromkeys(self.nodes, 0)
@@ -241,7 +238,6 @@ class NetnsTestbed(LocalTestbed):
             "DWELL_WORLD": str(self.folder / "world"),
             # Its hosts' addresses lead nowhere but to each other.
             INSECURE: "1",
-            **modules_beside(self._beside),
             **self._environment,
         }
         self.processes = Processes(
@@ -250,7 +246,6 @@ class NetnsTestbed(LocalTestbed):
             inside=self._inside,
             environment=environment,
             more=self._more,
-            traces=self._beside,
             program=program(links=self._losses.path, clocks=self._clocks),
         )
         self.processes.write()

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import TypeAlias
 
 import yaml
@@ -25,10 +24,9 @@ from dwell.live.trust import KEYS
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import to_document
-from dwell.model.user_classes import is_class_path
 from dwell.testbed.trace_names import move_traces
 
-__all__ = ["Inside", "Processes", "expected", "modules_beside", "outright", "without_keys"]
+__all__ = ["Inside", "Processes", "expected", "outright", "without_keys"]
 
 #: Takes a node and the words of a command; returns those that run it there, in the same process.
 Inside: TypeAlias = Callable[[str, Sequence[str]], Sequence[str]]
@@ -50,27 +48,13 @@ def without_keys() -> dict[str, str]:
 
 
 def _module_path(problems: Iterable[Problem]) -> dict[str, str]:
-    """Return the variable by which controllers find a user's own classes beside the cell files.
+    """Return the variable by which processes find modules beside the cell files.
 
     A testbed writes the cell files of its processes into a folder of its own.
     """
-    settings = [(problem.folder, problem.controller) for problem in problems]
-    folders = [
-        folder
-        for folder, one in settings
-        if folder is not None and (is_class_path(one.policy) or is_class_path(one.estimator))
-    ]
-    before = os.environ.get("PYTHONPATH")
-    path = [*dict.fromkeys(folders), *([before] if before else [])]
-    return {"PYTHONPATH": os.pathsep.join(path)} if folders else {}
-
-
-def modules_beside(beside: Path | None) -> dict[str, str]:
-    """Return the variable that makes the modules beside a cell file known to all processes."""
-    if beside is None:
-        return {}
-    paths = [str(beside.resolve()), os.environ.get("PYTHONPATH", "")]
-    return {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
+    folders = dict.fromkeys(one.folder for one in problems if one.folder is not None)
+    paths = [*folders, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return {"PYTHONPATH": os.pathsep.join(paths)} if folders else {}
 
 
 def expected(problem: Problem, node: str) -> list[str]:
@@ -97,8 +81,6 @@ class Processes:
         Of each node; one that is not there uses any.
     more : sequence of str
         Further arguments of the controllers.
-    traces : Path, optional
-        Folder where the names of trace files begin; this process's own if left out.
     program : sequence of str
         Module, and its first arguments, that runs agents and controllers.
     owner : str, optional
@@ -119,7 +101,6 @@ class Processes:
         environment: Mapping[str, str] | None = None,
         cpus: Mapping[str, int] | None = None,
         more: Sequence[str] = (),
-        traces: Path | None = None,
         program: Sequence[str] = ("dwell",),
         owner: str | None = None,
     ) -> None:
@@ -128,11 +109,10 @@ class Processes:
             raise LiveError(f"two cells have one name: {', '.join(sorted(names))}")
         self.problems, self.folder = tuple(problems), folder
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self.environment = dict(environment or {})
+        self.environment = {**_module_path(self.problems), **(environment or {})}
         self._program = tuple(program)
         self._owner = str(os.getpid()) if owner is None else owner
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
-        self._traces = Path() if traces is None else traces
         self._sweeper: subprocess.Popen[bytes] | None = None
 
     def folder_of(self, problem: Problem) -> Path:
@@ -149,7 +129,7 @@ class Processes:
             file = self.file_of(problem)
             file.parent.mkdir(parents=True, exist_ok=True)
             document = to_document(problem)
-            move_traces(document, self._traces.resolve())
+            move_traces(document, Path(problem.folder or "").resolve())
             text = yaml.safe_dump(document, sort_keys=False)
             file.write_text(text, encoding="utf-8")
 
@@ -182,7 +162,7 @@ class Processes:
         cells = [problem for problem in self.problems if problem.controller_node == node]
         runs = self.folder / "runs" if out is None else out
         words = ["controller", "--out", str(runs), *self._on_cpus(node), *self._more, *more]
-        self._start(f"controller@{node}", node, words, cells, _module_path(cells))
+        self._start(f"controller@{node}", node, words, cells)
 
     def _on_cpus(self, node: str) -> list[str]:
         return ["--cpus", str(self._cpus[node])] if node in self._cpus else []
@@ -197,7 +177,6 @@ class Processes:
         node: str,
         words: Sequence[str],
         problems: Sequence[Problem],
-        environment: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
@@ -210,7 +189,7 @@ class Processes:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env={**without_keys(), **self.environment, **environment},
+                env={**without_keys(), **self.environment},
                 process_group=0,
             )
 

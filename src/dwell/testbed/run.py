@@ -69,7 +69,6 @@ def run_once(
     out: Path,
     name: str,
     jobs: bool = False,
-    beside: Path | None = None,
     rule: Rule | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> Path:
@@ -91,8 +90,6 @@ def run_once(
         Of the testbed, among others on this machine.
     jobs : bool
         Whether the run keeps its jobs.
-    beside : Path, optional
-        Folder of the cell file: of the modules of its stages, and of its traces.
     rule : Rule, optional
         Of the machine's pressure.
     tell : callable
@@ -115,7 +112,7 @@ def run_once(
         estimators.by_name(problem.controller.estimator, problem)
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds, outages=True)
     arguments = ["--jobs"] if jobs else []
-    testbed = NetnsTestbed(problem, out, name=name, seed=seed, beside=beside, more=arguments)
+    testbed = NetnsTestbed(problem, out, name=name, seed=seed, more=arguments)
     require_machine([problem])
     rule = rule or Rule()
     played = Played(problem, scenario, seed, timeline)

@@ -74,12 +74,10 @@ def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
 
     def stage(number: int) -> tuple[LocalTestbed, str | None]:
         problem, folder, environment, home = _cell(cell, out, number, quotas=True)
-        beside = None if cell is None else cell.parent
         testbed = NetnsTestbed(
             *(problem, folder),
             name=f"chaos{os.getpid() % 10_000}",
             seed=seed,
-            beside=beside,
             environment=environment,
             clocks=folder / CLOCK_FILE,
         )
@@ -100,19 +98,17 @@ def _cell(
         written.write_text(yaml.safe_dump(light), encoding="utf-8")
         environment = environment_of(folder, exec_ms(LIGHT_HOME))
         return dwell.load(written), folder, environment, LIGHT_HOME
-    problem, environment = _witnessed(dwell.load(cell), folder, cell.resolve().parent)
+    problem, environment = _witnessed(dwell.load(cell), folder)
     return problem, folder, environment, None
 
 
-def _witnessed(problem: Problem, folder: Path, beside: Path) -> tuple[Problem, dict[str, str]]:
+def _witnessed(problem: Problem, folder: Path) -> tuple[Problem, dict[str, str]]:
     """Return a cell whose actuators are written down before they are called."""
     actuators = dict(problem.live.actuators)
     if len(actuators) != 1:
         raise LiveError("chaos needs a cell with one sink, whose actuator live.actuators names")
     witnessed = FrozenDict(dict.fromkeys(actuators, "dwell.testbed.chaos.stages:Witnessed"))
     environment = environment_of(folder, {}, actuators=actuators)
-    paths = [str(beside), os.environ.get("PYTHONPATH", "")]
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)
     return replace(problem, live=replace(problem.live, actuators=witnessed)), environment
 
 
