@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import pytest
 
 from dwell.errors import SimulationError
-from dwell.study import run_study
+from dwell.study import load_study, run_study
 from dwell.study.cluster import spread_on_dask
+from tests.cli.test_commands import SMALL
 from tests.study.test_runner_folder import assert_same_files, parts_in
 from tests.study.test_study import make_study
 
@@ -47,6 +49,33 @@ def test_a_cluster_ends_with_the_same_bytes(cluster: Any, tmp_path: Path) -> Non
     run_study(study, folder=out, dask=cluster.scheduler_address)
     assert parts_in(out).items() >= known.items(), "a finished item was repeated"
     assert_same_files(out, tmp_path / "local")
+
+
+def test_workers_make_policies_and_estimators_of_the_users_own(
+    cluster: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "hall_policy.py").write_text(
+        "from dwell.estimators import Profile\n\n\n"
+        "class Last:\n"
+        "    def decide(self, *, observed, estimates):\n"
+        "        return list(estimates)[-1]\n\n\n"
+        "class Mine(Profile):\n"
+        "    @classmethod\n"
+        "    def from_problem(cls, problem):\n"
+        "        return cls(problem, samples=100)\n"
+    )
+    (tmp_path / "small.yaml").write_text(SMALL)
+    (tmp_path / "study.yaml").write_text(
+        "dwell-study: 1\nname: own\ncell: small.yaml\nwindows: 5\nseeds: 3\npolicies:\n"
+        "  LOC: LOC\n  last: hall_policy:Last\n"
+        "  both: {policy: 'hall_policy:Last', estimator: 'hall_policy:Mine'}\n"
+    )
+    study = load_study(tmp_path / "study.yaml")
+    run_study(study, folder=tmp_path / "local", processes=1)
+    found = run_study(study, folder=tmp_path / "cluster", dask=cluster.scheduler_address)
+    assert_same_files(tmp_path / "cluster", tmp_path / "local")
+    moved = found.runs.group_by("policy").agg(pl.col("migrations").max())
+    assert dict(moved.iter_rows()) == {"LOC": 0, "last": 1, "both": 1}
 
 
 def test_work_is_spread_over_the_workers(cluster: Any) -> None:
