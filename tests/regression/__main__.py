@@ -11,6 +11,7 @@ from tests.regression import commands, paper, runs
 
 def _write_commands() -> None:
     commands.FILE.write_text(commands.surface(), encoding="utf-8")
+    commands.HELPS.write_text(commands.helps(), encoding="utf-8")
 
 
 def _write_runs() -> None:

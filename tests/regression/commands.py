@@ -14,13 +14,23 @@ from typer.testing import CliRunner
 from dwell.cli.commands import app
 from dwell.cli.exit_codes import ExitCode
 
-__all__ = ["FILE", "surface"]
+__all__ = ["FILE", "HELPS", "helps", "surface"]
 
 FILE = Path(__file__).parent / "data" / "commands.txt"
+HELPS = FILE.with_name("helps.txt")
+#: A terminal's.
+NARROW = 80
 #: So many that every option has one line of its help.
 COLUMNS = 2000
 #: An option, its help, and what holds of its value.
 OPTION = re.compile(r"^  (-.*?)  .*?( \[[^\]]*\])?$", re.MULTILINE)
+
+
+def helps() -> str:
+    """Return the helps of all commands, one after another, as a terminal shows them."""
+    root = cast(click.Group, typer.main.get_command(app))
+    shown = ((words, _help(words, NARROW)) for words in _commands(root, ()))
+    return "\n".join(f"$ {' '.join(('dwell', *words))} --help\n{text}" for words, text in shown)
 
 
 def surface() -> str:
@@ -39,17 +49,22 @@ def _commands(command: click.Command, words: tuple[str, ...]) -> Iterator[tuple[
 
 def _lines(words: tuple[str, ...]) -> Iterator[str]:
     """Yield the usage of a command, and its options, as its help says them."""
+    text = _help(words, COLUMNS)
+    usage = text.partition("\n")[0].removeprefix("Usage: ").replace(" [OPTIONS]", "")
+    yield from ("", usage)
+    for option, holds in OPTION.findall(text):
+        if option != "--help":
+            yield f"    {option}{holds}"
+
+
+def _help(words: tuple[str, ...], columns: int) -> str:
     found = CliRunner().invoke(
         app,
         [*words, "--help"],
         prog_name="dwell",
-        terminal_width=COLUMNS,
-        max_content_width=COLUMNS,
+        terminal_width=columns,
+        max_content_width=columns,
         color=False,
     )
     assert found.exit_code == 0, found.output
-    usage = found.stdout.partition("\n")[0].removeprefix("Usage: ").replace(" [OPTIONS]", "")
-    yield from ("", usage)
-    for option, holds in OPTION.findall(found.stdout):
-        if option != "--help":
-            yield f"    {option}{holds}"
+    return found.stdout

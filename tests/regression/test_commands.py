@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from tests.regression.commands import FILE, surface
+from tests.regression.commands import FILE, HELPS, helps, surface
 
 
 def test_the_command_line_is_the_one_that_was_written_down() -> None:
     """`python -m tests.regression commands` writes it again."""
     assert surface().splitlines() == FILE.read_text(encoding="utf-8").splitlines()
+
+
+def test_every_help_says_what_was_written_down() -> None:
+    assert helps().splitlines() == HELPS.read_text(encoding="utf-8").splitlines()
