@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -93,7 +94,8 @@ def test_what_is_applied_is_what_the_simulator_draws(
 ) -> None:
     problem = cell(*MIXED)
     testbed = Recording()
-    monkeypatch.setattr("dwell.testbed.playing.time.sleep", testbed.sleep)
+    # Of this module only: threads that other tests have left behind sleep on.
+    monkeypatch.setattr("dwell.testbed.playing.time", SimpleNamespace(sleep=testbed.sleep))
     timeline = timeline_of(problem, "some", seed=seed, seconds=SECONDS, outages=True)
     testbed.play(timeline, SECONDS)
     drawn = draw(problem, scenario="some", seed=seed, windows=40)
