@@ -27,10 +27,11 @@ ALONE = (
     "cli/test_live_run.py",
     "cli/test_testbed.py",
     "live/test_real_faults.py",
+    "live/test_security.py",
     "live/transport",
     "test_package.py",
+    "testbed/test_execution.py",
     "testbed/test_netns_testbed.py",
-    "testbed/test_real_campaign.py",
     "testbed/test_run.py",
 )
 

@@ -17,7 +17,7 @@ WITHOUT = {
         assembly columns entries structure study_entries trace_files
     """,
     "cli": """
-        campaign chaos check check_node demo examples exit_codes live_view report run schema
+        campaign check check_node demo examples exit_codes live_view run schema
     """,
     ".": """
         errors
@@ -29,11 +29,11 @@ WITHOUT = {
         advance cache_name cycles layout links nodes
     """,
     "live": """
-        agent control_group cycle_ledger failures loads log node operator_client permissions
-        role role_process run_rows security stamper
+        agent cycle_ledger failures log node operator_client permissions role role_process
+        run_rows stamper
     """,
     "live/transport": """
-        expressions transport
+        expressions
     """,
     "live/trust": """
         authority roster
@@ -45,8 +45,7 @@ WITHOUT = {
         protocol
     """,
     "report": """
-        answer charts phase_rows policy_blocks recovery run_header timeline topology
-        tracking
+        answer charts policy_blocks run_header timeline topology
     """,
     "sim": """
         arrays tables
@@ -56,7 +55,7 @@ WITHOUT = {
         measured_run parts player predicting qos_sample saved software validated_jobs
     """,
     "testbed": """
-        cell_observer cgroups child draws event_loop execution forwarder loopback measured
+        cell_observer cgroups child draws event_loop forwarder loopback measured
         message_costs node_loads orders realtime remote sampling task_costs testbed
         trace_names watcher
     """,

@@ -19,7 +19,7 @@ from dwell.live.security import INSECURE, Security
 from dwell.live.wiring import Role, wire
 from tests.cli.live_cell import EXAMPLE, PATIENCE_S, RealCell
 from tests.cli.test_live import invoke
-from tests.live.transport.test_secure import Intruder, tls
+from tests.live.test_security import Intruder, tls
 
 PIN = ("live", "pin", "SO")
 

@@ -17,6 +17,17 @@ PERIOD_NS = 33_000_000
 PLACED = ("LOC", "LOC", "SO", "LOC", "LOC", "LOC")
 
 
+#: Busy threads on the edge, about the third window.
+PLAYED = [{"node": "E", "stress_threads": 2, "at_s": 0.66, "for_s": 0.36}]
+#: What an arm has measured of its error.
+TRACKING = {
+    "begin_s": 0.0,
+    "step_s": 0.33,
+    "rms_mm": [None, 3.0, 4.0, 1.0, 1.0, 1.0],
+    "rms_px": [None, 6.0, 8.0, 2.0, 2.0, 2.0],
+}
+
+
 def live_run(**meta: Any) -> Run:
     """Return a run: a migration after the second window, a guard's move before the fourth."""
     rows: list[tuple[int, int, str, int, bool]] = []

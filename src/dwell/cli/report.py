@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import typer
 from dwell.cli.output import print_json, working, write_file, write_report
 from dwell.errors import RunError
 from dwell.record import open_run
-from dwell.report.recovery import recovery
+from dwell.report.formatting import listed
 from dwell.study.saved import is_study, open_study
 from dwell.testbed.execution import is_campaign
 
@@ -89,9 +90,40 @@ def _report_run(request: ReportRequest, *, as_json: bool) -> None:
     if request.trace is not None and events is not None:
         write_file(request.trace, json.dumps(events))
     recovered = run.meta.get("recovered", {})
-    lost = list(recovery(recovered))
+    lost = list(_what_was_lost(recovered))
     told = {"recovered": recovered, "lost": lost} if lost else {}
     _print(request, {"trace": request.trace, **told}, as_json=as_json)
+
+
+def _what_was_lost(told: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on what is not in a run because something was killed or damaged.
+
+    Parameters
+    ----------
+    told : mapping
+        What its meta say under ``recovered``.
+    """
+    opened = int(told.get("opened", 1))
+    if opened > 1:
+        yield f"The controller was started {opened} times while the run went on."
+    lost = [
+        text
+        for name, text in (
+            ("torn_bytes", "{} bytes at the journal's end were torn by a kill"),
+            ("damaged_bytes", "{} bytes within the journal were damaged"),
+        )
+        if told.get(name)
+        for text in [text.format(told[name])]
+    ]
+    if lost:
+        yield f"{listed(lost)}; what they said is not here."
+    if told.get("missing_windows"):
+        yield f"Windows missing from the run: {told['missing_windows']}."
+    if told and not told.get("sealed", True):
+        yield (
+            "The run was not closed: it goes on, or its controller was killed. This is what its "
+            "journal holds; what came after its last window is not here."
+        )
 
 
 def _print(request: ReportRequest, told: dict[str, Any], *, as_json: bool) -> None:

@@ -19,9 +19,9 @@ from dwell.live.keys import Keys
 from dwell.live.security import VISITORS_AT_ONCE
 from dwell.live.wiring import Session, longest_message_bytes, wire
 from dwell.model import Host, Problem
+from tests.live.test_security import issued, tls
 from tests.live.test_wiring import cell, housed
 from tests.live.transport.meshes import free_ports
-from tests.live.transport.test_secure import issued, tls
 
 PATIENCE_S = 30.0
 MB = 1 << 20

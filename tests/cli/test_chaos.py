@@ -1,3 +1,5 @@
+"""`dwell testbed chaos` from the command line: what it refuses, and its name of before."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -16,7 +18,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_cell_without_an_actuator_is_refused(tmp_path: Path) -> None:
-    cell = Path(__file__).parents[3] / "examples" / "live" / "cell.yaml"
+    cell = Path(__file__).parents[2] / "examples" / "live" / "cell.yaml"
     text = cell.read_text().replace("actuators:", "actuators: {}\n  # ", 1)
     (tmp_path / "cell.yaml").write_text(text)
     words = ["testbed", "chaos", str(tmp_path / "cell.yaml"), "--faults", "1"]
