@@ -16,12 +16,12 @@ from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Stamper, StamperState
 from dwell.live.supervision import Supervisor
-from dwell.live.transport.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles, wire
 from dwell.live.worker import Worker
 from dwell.model import Host, Problem
 from dwell.policies import MinimalPolicy
+from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 
 MS = 1_000_000
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import dwell
-from dwell.live.transport.memory_transport import Clock
 from dwell.model import Problem
+from tests.live.memory_transport import Clock
 from tests.live.small_world import MS, Counting, World
 
 EXEC_MS = {

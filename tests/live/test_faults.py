@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import dwell
 from dwell.live.messages import Order, State, encode
-from dwell.live.transport.memory_transport import Clock
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
+from tests.live.memory_transport import Clock
 from tests.live.small_world import MS, Counting, World
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}

@@ -9,8 +9,8 @@ import threading
 import pytest
 
 from dwell.live.hosting import Hosted, take_turns
-from dwell.live.transport.memory_transport import MemoryTransport, Network
 from dwell.live.transport.transport import Arrival
+from tests.live.memory_transport import MemoryTransport, Network
 
 FAR_NS = 1 << 62
 

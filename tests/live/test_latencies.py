@@ -10,8 +10,8 @@ import dwell
 from dwell.live.latencies import SPAN_NS, Intervals
 from dwell.live.messages import Beat, Completion, Heard, Stamp
 from dwell.live.run_rows import columns_of
-from dwell.live.transport.memory_transport import Clock, NetworkConditions
 from dwell.model import Problem
+from tests.live.memory_transport import Clock, NetworkConditions
 from tests.live.small_world import World
 from tests.live.test_controlled_cell import EXEC_MS, cell_of, columns
 

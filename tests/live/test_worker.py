@@ -24,11 +24,11 @@ from dwell.live.role import RIVAL_BEATS, Pulse, RolePlace
 from dwell.live.stage import Message
 from dwell.live.stamper import Stamper
 from dwell.live.supervision import Supervisor
-from dwell.live.transport.memory_transport import Network
 from dwell.live.transport.transport import Arrival, Receive
 from dwell.live.worker import Worker
 from dwell.model import Problem
 from dwell.model.document import fingerprint
+from tests.live.memory_transport import Network
 from tests.live.small_world import MS, Bench, Passing, World
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}

@@ -17,8 +17,6 @@ from dwell.model import TraceTable
 
 __all__ = ["Source", "Tables", "declared_traces", "read_traces"]
 
-Steps: TypeAlias = tuple[Step, ...]
-
 DEFAULT_TIME = "sent_ms"
 
 

@@ -48,7 +48,6 @@ PAPER, SHADE, BAD = "var(--paper)", "var(--shade)", "var(--bad)"
 RAMP = tuple(f"var(--ramp-{place})" for place in range(6))
 #: Where the time of a cycle goes: no placement's colours.
 PARTS = {part: f"var(--{part})" for part in ("compute", "queue", "network")}
-PURPLES = ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862")
 #: What a paper's figures have for the variables of a page.
 PRINTED = {
     INK: "#000000",

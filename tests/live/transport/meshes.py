@@ -11,10 +11,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from dwell.live.transport.memory_transport import Network
 from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
+from tests.live.memory_transport import Network
 
 ROOT = Path(__file__).resolve().parents[3]
 

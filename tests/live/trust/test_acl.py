@@ -15,13 +15,13 @@ import dwell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.permissions import senders, subjects
 from dwell.live.transport.expressions import matcher
-from dwell.live.transport.memory_transport import MemoryTransport
 from dwell.live.trust.acl import access_control
 from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.cells.generated import random_problem
+from tests.live.memory_transport import MemoryTransport
 from tests.live.small_world import Counting, World
 
 NOBODY = "nobody.1"

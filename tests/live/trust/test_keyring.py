@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,6 +34,18 @@ def keyring(authority: Authority, name: str = "R1") -> Keyring:
     return Keyring.open(authority.folder / name)
 
 
+def verifies(keys: Keyring, name: str, domain: bytes, data: bytes, signature: bytes) -> bool:
+    """Return whether a subject of the roster has signed data for a purpose."""
+    subject = keys.roster.subjects.get(name)
+    if subject is None:
+        return False
+    try:
+        subject.key.verify(signature, domain + b"\0" + data)
+    except InvalidSignature:
+        return False
+    return True
+
+
 def test_a_keyring_has_its_own_key_and_knows_everybody(authority: Authority) -> None:
     found = keyring(authority)
     assert found.own.name == "R1"
@@ -40,12 +53,12 @@ def test_a_keyring_has_its_own_key_and_knows_everybody(authority: Authority) -> 
     assert set(found.roster.subjects) == {"R1", "controller"}
     signature = found.sign(DOMAIN, b"data")
     other = keyring(authority, "controller")
-    assert other.verifies("R1", DOMAIN, b"data", signature)
-    assert not other.verifies("R1", DOMAIN, b"date", signature)
-    assert not other.verifies("R1", b"else", b"data", signature)
-    assert not other.verifies("controller", DOMAIN, b"data", signature)
-    assert not other.verifies("nobody", DOMAIN, b"data", signature)
-    assert not other.verifies("R1", DOMAIN, b"data", b"short")
+    assert verifies(other, "R1", DOMAIN, b"data", signature)
+    assert not verifies(other, "R1", DOMAIN, b"date", signature)
+    assert not verifies(other, "R1", b"else", b"data", signature)
+    assert not verifies(other, "controller", DOMAIN, b"data", signature)
+    assert not verifies(other, "nobody", DOMAIN, b"data", signature)
+    assert not verifies(other, "R1", DOMAIN, b"data", b"short")
 
 
 def test_only_the_owner_can_read(authority: Authority) -> None:
@@ -68,8 +81,8 @@ def test_one_issued_anew_revokes_the_one_before(authority: Authority, tmp_path: 
     found = keyring(authority)
     assert found.own.common_name == "R1.2"
     assert len(found.roster.revoked) == 1
-    assert found.verifies("R1", DOMAIN, b"data", found.sign(DOMAIN, b"data"))
-    assert not found.verifies("R1", DOMAIN, b"data", before.sign(DOMAIN, b"data"))
+    assert verifies(found, "R1", DOMAIN, b"data", found.sign(DOMAIN, b"data"))
+    assert not verifies(found, "R1", DOMAIN, b"data", before.sign(DOMAIN, b"data"))
     shutil.copy(authority.folder / "R1" / "roster.json", old / "roster.json")
     with pytest.raises(TrustError, match=r"the certificate of R1\.1 has been revoked"):
         Keyring.open(old)
@@ -78,7 +91,7 @@ def test_one_issued_anew_revokes_the_one_before(authority: Authority, tmp_path: 
 def test_the_revoked_are_no_subjects(authority: Authority) -> None:
     signature = keyring(authority).sign(DOMAIN, b"data")
     authority.revoke("R1")
-    assert not keyring(authority, "controller").verifies("R1", DOMAIN, b"data", signature)
+    assert not verifies(keyring(authority, "controller"), "R1", DOMAIN, b"data", signature)
     # Its own folder is left as it was; whoever has a newer roster refuses it.
     shutil.copy(authority.folder / "controller/roster.json", authority.folder / "R1/roster.json")
     with pytest.raises(TrustError, match="revoked"):

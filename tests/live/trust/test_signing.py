@@ -30,13 +30,13 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.live.role import SIGNATURE_BYTES, RolePlace
-from dwell.live.transport.memory_transport import MemoryTransport
 from dwell.live.transport.transport import Arrival
 from dwell.live.trust import signing
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.signing import Seals
 from dwell.model import Problem
+from tests.live.memory_transport import MemoryTransport
 from tests.live.small_world import Counting, World
 
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}

@@ -98,17 +98,6 @@ class Keyring:
         """Sign data for one purpose; 64 bytes."""
         return self._key.sign(domain + b"\0" + data)
 
-    def verifies(self, name: str, domain: bytes, data: bytes, signature: bytes) -> bool:
-        """Whether a subject of the roster has signed data for a purpose."""
-        subject = self.roster.subjects.get(name)
-        if subject is None:
-            return False
-        try:
-            subject.key.verify(signature, domain + b"\0" + data)
-        except InvalidSignature:
-            return False
-        return True
-
 
 def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519PrivateKey]:
     try:

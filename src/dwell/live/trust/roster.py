@@ -25,7 +25,6 @@ Role: TypeAlias = Literal["node", "controller", "operator", "observer"]
 ROLES: tuple[Role, ...] = ("node", "controller", "operator", "observer")
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,47}")
-KEY_BYTES = 32
 VERSION = 1
 MAX_BYTES = 1 << 20
 DOMAIN = b"dwell roster 1\0"

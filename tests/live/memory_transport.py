@@ -390,7 +390,7 @@ class Network:
         key = (source, target, lane)
         if key not in self._paths:
             seed = f"{self.seed}/{source}/{target}/{lane}"
-            self._paths[key] = _Path(Random(seed))  # noqa: S311 - repeatable, not secret
+            self._paths[key] = _Path(Random(seed))
         return self._paths[key]
 
     def _forward(self, path: _Path, message: _Message) -> None:

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
-from dwell.live.transport.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 from dwell.live.transport.transport import Arrival, Lane
+from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 
 MS = 1_000_000
 
