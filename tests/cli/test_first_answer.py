@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 import dwell
-from tests.cli.test_commands import ROOT, SMALL
+from tests.cli.small_cell import ROOT, SMALL
 
 FIND = "from dwell.cli.first_answer import find_kernels as f; k = f(); print(k.folder, k.suffix)"
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import dwell
-from tests.cli.test_commands import ROOT, call
+from tests.cli.small_cell import ROOT, call
 
 FILES = {"cell.yaml", "policy.py", "stages.py", "test_cell.py", "cell.schema.json"}
 CELLS = [

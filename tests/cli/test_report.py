@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 import dwell
 from dwell.cli.commands import app
 from tests.cells.small import make_problem
+from tests.cli.small_cell import call, read_json
 
 RECOVERED = {"sealed": False, "opened": 2, "torn_bytes": 17, "damaged_bytes": 0}
 
@@ -56,3 +57,32 @@ def test_a_trace_wants_jobs(tmp_path: Path) -> None:
     assert code == 2
     assert "--jobs" in errors
     assert not trace.exists()
+
+
+def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept", "--jobs")
+    result = call("report", "kept")
+    assert (result.exit_code, result.stdout) == (0, "report: kept/report.html\n")
+    assert Path("kept/report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    found = read_json(call("report", "kept", "--out", "r.html", "--trace", "t.json", "--json"))
+    assert found == {"report": "r.html", "trace": "t.json"}
+    assert Path("r.html").is_file()
+    assert json.loads(Path("t.json").read_text(encoding="utf-8"))["traceEvents"]
+
+
+def test_report_of_what_is_not_there(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    without_jobs = call("report", "kept", "--trace", "t.json")
+    assert (without_jobs.exit_code, without_jobs.stdout) == (2, "")
+    assert "dwell run --jobs" in without_jobs.stderr
+    assert {path.name for path in cell.parent.iterdir()} == {"small.yaml", "kept"}
+    assert not Path("kept/report.html").exists()
+    assert call("report", "nowhere").exit_code == 2
+    assert call("report", ".").exit_code == 2
+
+
+def test_a_page_that_cannot_be_written_is_a_failure(cell: Path) -> None:
+    call("run", cell, "--windows", "12", "--out", "kept")
+    result = call("report", "kept", "--out", "small.yaml/report.html")
+    assert result.exit_code == 1
+    assert "error: " in result.stderr

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from dwell.report.formatting import shown_policy
-from tests.cli.test_commands import SMALL, call
+from tests.cli.small_cell import SMALL, call
 from tests.cli.test_process import interrupt_at_first_sign
 
 STUDY = """\

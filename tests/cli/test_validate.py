@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import dwell
-from tests.cli.test_commands import SMALL, call, read_json
+from tests.cli.small_cell import SMALL, call, read_json
 
 CALIBRATED = "small.yaml"
 

@@ -37,7 +37,6 @@ from tests.live.small_world import Bench, Passing, World
 __all__ = ["KINDS", "NODES", "TARGETS", "FrozenError", "ReachedError", "seeds"]
 
 NODES = ("R1", "E", "R2")
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 KINDS: tuple[type[msgspec.Struct], ...] = tuple(
     found
     for name in messages.__all__
@@ -88,9 +87,7 @@ def _world(*, keys: bool) -> World:
     """A cell that has run for a while, and whose stages are not to be called any more."""
     problem = dwell.load("examples/canonical.yaml")
     stages: dict[str, Callable[[str], Passing]] = {}
-    found = World(
-        problem, exec_ms=EXEC_MS, policy="dtp", stages=stages, seals=_seals() if keys else None
-    )
+    found = World(problem, policy="dtp", stages=stages, seals=_seals() if keys else None)
     found.run(300)
     for role in found.roles.values():
         if isinstance(role, Bench):
@@ -239,7 +236,7 @@ def _deciding() -> World:
     """A cell whose controller closes a window every 10 cycles."""
     problem = dwell.load("examples/canonical.yaml")
     quick = replace(problem, window_cycles=10, warmup_windows=0)
-    found = World(quick, exec_ms=EXEC_MS, policy="SO")
+    found = World(quick, policy="SO")
     found.run(1_000)
     return found
 

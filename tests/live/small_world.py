@@ -24,6 +24,8 @@ from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 
 MS = 1_000_000
+#: What the stages of the canonical cell take.
+EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 
 
 class MemoryBook:
@@ -176,7 +178,7 @@ class World:
         self,
         problem: Problem,
         *,
-        exec_ms: Mapping[str, float],
+        exec_ms: Mapping[str, float] = EXEC_MS,
         delay_ms: float = 0.2,
         clocks: Mapping[str, Clock] | None = None,
         stages: Mapping[str, Callable[[str], Passing]] | None = None,

@@ -32,7 +32,6 @@ from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 MS, S = 1_000_000, 1_000_000_000
 PERIOD_NS = 33 * MS
 HUGE = 1 << 40
@@ -60,7 +59,7 @@ class Staying:
 
 @pytest.fixture
 def world(problem: Problem) -> World:
-    made = World(problem, exec_ms=EXEC_MS, policy=Staying())
+    made = World(problem, policy=Staying())
     made.run(1_500)
     assert windows(made) >= 2
     return made
@@ -226,7 +225,7 @@ def test_a_stamper_that_was_away_for_an_hour_is_believed_at_once(problem: Proble
     # 1,800 cycles an hour: more than a restart leaves out, which comes on top.
     pipeline = replace(problem.pipeline, period_ms=2_000.0)
     slow = replace(problem, pipeline=pipeline, servo=None)
-    world = World(slow, exec_ms=EXEC_MS, policy=Staying())
+    world = World(slow, policy=Staying())
     world.run(60_000)
     first = world.stamper.cycle
     cut = world.network.cut("*", "controller@E")

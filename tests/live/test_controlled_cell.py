@@ -19,9 +19,8 @@ from dwell.live.messages import Answer, Ask, Order, decode, encode
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
-from tests.live.small_world import World
+from tests.live.small_world import EXEC_MS, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 CONTROLLER = "controller@E"
 
 
@@ -44,7 +43,7 @@ class Alternating:
 
 
 def alternating(problem: Problem) -> World:
-    return World(problem, exec_ms=EXEC_MS, policy=Alternating("LOC", "SO"))
+    return World(problem, policy=Alternating("LOC", "SO"))
 
 
 def cell_of(world: World) -> ControlledCell:
@@ -106,7 +105,7 @@ def test_windows_begin_with_the_first_cycle_of_a_new_placement(problem: Problem)
 
 
 def test_what_is_not_moved_has_no_lead(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC")
+    world = World(problem, policy="LOC")
     world.run(8_000)
     assert {lead for (lead,) in columns(world, "windows", "lead")} == {0}
 
@@ -256,7 +255,7 @@ def test_a_controller_cut_off_holds(problem: Problem) -> None:
 
 
 def test_a_controller_that_hears_no_sink_goes_by_what_the_stamper_hears(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="dtp", delay_ms=0.2)
+    world = World(problem, policy="dtp", delay_ms=0.2)
     world.run(6_000)
     term, placement = world.stamper.term, world.stamper.placement
     before = len(columns(world, "cycles", "cycle"))
@@ -327,7 +326,7 @@ def test_an_order_that_nobody_answers_is_no_migration(problem: Problem) -> None:
 
 
 def test_a_drained_node_is_left_and_not_returned_to(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy=Alternating("SO", "HYB"))
+    world = World(problem, policy=Alternating("SO", "HYB"))
     world.run(2_000)
     assert not ask(world, "drain", "E")
     world.run(300)
@@ -350,7 +349,7 @@ def test_a_drained_node_is_left_and_not_returned_to(problem: Problem) -> None:
     ],
 )
 def test_what_cannot_be_done_is_refused(problem: Problem, what: str, about: str, said: str) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC")
+    world = World(problem, policy="LOC")
     world.run(1_000)
     assert ask(world, what, about).startswith(said)
 

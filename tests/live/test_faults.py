@@ -19,7 +19,6 @@ from dwell.model import Problem
 from tests.live.memory_transport import Clock
 from tests.live.small_world import MS, Counting, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 EDGE = ("perception@E", "perception@E.shadow", "planning@E", "planning@E.shadow", "agent@E")
 
 
@@ -46,7 +45,7 @@ def lost(world: World) -> int:
 
 def running(problem: Problem, candidate: str, ms: float = 1_000) -> World:
     """A cell that has run on a candidate for a while, with nobody who gives orders."""
-    world = World(on(problem, candidate), exec_ms=EXEC_MS)
+    world = World(on(problem, candidate))
     world.run(ms)
     return world
 
@@ -312,7 +311,7 @@ def test_rule_7_an_old_command_is_never_applied(problem: Problem) -> None:
 @pytest.mark.parametrize("offset_s", [0, 3_600, -86_400 * 365])
 def test_rule_11_ages_hold_whatever_the_clocks_show(problem: Problem, offset_s: int) -> None:
     clocks = {"R2": Clock(offset_s * 1_000 * MS, 80.0), "E": Clock(5 * MS, -50.0)}
-    world = World(on(problem, "SO"), exec_ms=EXEC_MS, clocks=clocks)
+    world = World(on(problem, "SO"), clocks=clocks)
     world.run(3_000)
     assert longest_gap(world.cycles[3:], world.stamper.cycle - 2) == 0
     assert max(age_ms for _, age_ms in world.arm.applied[10:]) < 30
@@ -326,7 +325,7 @@ def test_rule_12_a_standby_takes_over(problem: Problem, who: str) -> None:
     tasks[task] = replace(tasks[task], on=on_nodes)
     cell = on(replace(problem, pipeline=replace(problem.pipeline, tasks=tasks)), "LOC")
     cell = replace(cell, controller=replace(cell.controller, fallbacks=()))
-    world = World(cell, exec_ms=EXEC_MS)
+    world = World(cell)
     world.run(1_000)
     assert not world.worker(f"{who}.1").active
     world.network.freeze(who)
@@ -355,7 +354,7 @@ def test_rule_2_an_order_moves_nothing_after_a_later_one(problem: Problem) -> No
 def counting(problem: Problem, candidate: str, **more: Any) -> World:
     """A world whose planning counts its cycles, and whose cell file says that it has a state."""
     cell = on(stateful(problem, "planning", 100), candidate)
-    return World(cell, exec_ms=EXEC_MS, stages={"planning": Counting}, policy=candidate, **more)
+    return World(cell, stages={"planning": Counting}, policy=candidate, **more)
 
 
 def far_apart(problem: Problem, delay_ms: float) -> World:
@@ -436,7 +435,7 @@ def test_rule_8_a_state_finds_its_way_beside_images(
     problem: Problem, here: str, there: str, state_bytes: int
 ) -> None:
     cell = on(stateful(problem, "perception", state_bytes), here)
-    world = World(cell, exec_ms=EXEC_MS, stages={"perception": Counting}, policy=here)
+    world = World(cell, stages={"perception": Counting}, policy=here)
     world.run(2_000)
     world.pin(there)
     world.run(3_000)

@@ -19,8 +19,8 @@ from dwell.live.role import MAX_COMPLAINTS
 from dwell.live.transport.transport import Arrival
 from dwell.live.worker import MAX_JOINS
 from dwell.model import Problem
-from tests.fuzz.targets import EXEC_MS, seeds
-from tests.live.small_world import Bench, World
+from tests.fuzz.targets import seeds
+from tests.live.small_world import EXEC_MS, Bench, World
 
 MS = 1_000_000
 KB = 1 << 10
@@ -75,7 +75,7 @@ KEYS = (
 
 
 def test_a_flood_of_junk_costs_the_loop_no_cycle_and_takes_no_memory() -> None:
-    quiet, flooded = (World(cell(), exec_ms=EXEC_MS, policy="dtp") for _ in range(2))
+    quiet, flooded = (World(cell(), policy="dtp") for _ in range(2))
     for world in (quiet, flooded):
         world.run(500)
     flood = Flood(flooded, every_ms=4.0)
@@ -123,7 +123,7 @@ def relay_of(world: World) -> Agent:
     ],
 )
 def test_who_floods_the_relay_does_not_silence_the_detour(key: str, payload: bytes) -> None:
-    world = World(cell(), exec_ms=EXEC_MS)
+    world = World(cell())
     world.run(100)
     relay, network = relay_of(world), world.network
     bundles: list[tuple[str, bytes]] = []
@@ -177,7 +177,7 @@ def test_processes_that_a_node_makes_up_are_not_remembered() -> None:
 
 
 def test_the_controller_believes_no_placement_that_is_no_candidate() -> None:
-    world = World(cell(), exec_ms=EXEC_MS, policy="dtp")
+    world = World(cell(), policy="dtp")
     world.run(500)
     controller: Any = next(r for who, r in world.roles.items() if who.startswith("controller"))
     held = controller.held

@@ -16,8 +16,6 @@ from dwell.live.wiring import roles
 from dwell.model import Problem
 from tests.live.small_world import MS, Passing, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
-
 
 class Raising(Passing):
     """A stage that sees nothing."""
@@ -34,7 +32,7 @@ def problem() -> Problem:
 
 
 def running(problem: Problem, **more: Any) -> World:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC", **more)
+    world = World(problem, policy="LOC", **more)
     world.run(5_000)
     return world
 
@@ -74,7 +72,7 @@ def test_without_the_relay_the_controller_says_that_it_hears_nobody(problem: Pro
 
 
 def test_what_was_never_heard_counts_from_the_controllers_beginning(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC")
+    world = World(problem, policy="LOC")
     for role in roles(world.problem):
         if role.kind != "controller":
             world.kill(role.who)
@@ -121,7 +119,6 @@ def test_without_a_stamper_there_is_no_window(problem: Problem) -> None:
 def test_windows_that_stop_are_told_though_everybody_is_heard(problem: Problem) -> None:
     world = World(
         replace(problem, live=replace(problem.live, release="frames")),
-        exec_ms=EXEC_MS,
         policy="LOC",
     )
     # No frame ever comes.
@@ -133,7 +130,7 @@ def test_windows_that_stop_are_told_though_everybody_is_heard(problem: Problem) 
 
 
 def test_windows_without_a_completed_cycle_are_told_with_a_reason(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC", stages={"control": Raising})
+    world = World(problem, policy="LOC", stages={"control": Raising})
     world.run(8_000)
     found = status(world)
     assert found["health"] == "stalled"

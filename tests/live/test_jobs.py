@@ -19,9 +19,8 @@ from dwell.live.run_rows import columns_of
 from dwell.live.sink import Sink
 from dwell.model import Problem
 from dwell.record import column_types
-from tests.live.small_world import MS, MemoryRecorder, World
+from tests.live.small_world import EXEC_MS, MS, MemoryRecorder, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 CPU_NS = 1_234_567
 OTHERS_NS = 70_000
 
@@ -64,7 +63,7 @@ def world_of(problem: Problem, policy: str, **more: object) -> World:
                 self.recorder = JobRecorder()
             super().start(who)
 
-    return Small(problem, exec_ms=EXEC_MS, policy=policy, **more)  # type: ignore[arg-type]
+    return Small(problem, policy=policy, **more)  # type: ignore[arg-type]
 
 
 def frames(problem: Problem, rows: Rows | dict[str, list[tuple[object, ...]]]) -> pl.DataFrame:
@@ -213,7 +212,7 @@ def test_jobs_survive_in_the_folder(problem: Problem, tmp_path: Path) -> None:
                 self.recorder = self.kept  # type: ignore[assignment]
             super().start(who)
 
-    world = Kept(problem, exec_ms=EXEC_MS, policy="LOC")
+    world = Kept(problem, policy="LOC")
     world.run(4_000)
     cell = cell_of(world)
     assert cell.windows is not None

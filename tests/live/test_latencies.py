@@ -13,7 +13,7 @@ from dwell.live.run_rows import columns_of
 from dwell.model import Problem
 from tests.live.memory_transport import Clock, NetworkConditions
 from tests.live.small_world import World
-from tests.live.test_controlled_cell import EXEC_MS, cell_of, columns
+from tests.live.test_controlled_cell import cell_of, columns
 
 MS, S = 1_000_000, 1_000_000_000
 CLOCKS = {"R1": Clock(7 * S), "E": Clock(50 * S, 80.0), "R2": Clock(900 * S, -60.0)}
@@ -36,7 +36,7 @@ def measured(world: World) -> list[tuple[int | None, int]]:
 
 
 def test_it_is_the_latency_where_both_ways_are_alike(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
+    world = World(problem, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
     world.run(6_000)
     # LOC: three messages on one node, or to the next, and the command.
     found = measured(world)[20:]
@@ -50,7 +50,7 @@ def test_it_is_the_latency_where_both_ways_are_alike(problem: Problem) -> None:
 
 
 def test_a_late_completion_is_part_of_it_and_a_longer_way_is_not(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
+    world = World(problem, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
     longer = NetworkConditions(delay_ns=4 * MS)
     for source, target in (("R1", "R2"), ("R2", "R1")):
         world.network.impair(longer, source, target, key="dwell/*/beat/**")
@@ -64,7 +64,7 @@ def test_a_late_completion_is_part_of_it_and_a_longer_way_is_not(problem: Proble
 
 
 def test_of_what_came_over_the_detour_nothing_is_said(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
+    world = World(problem, policy="LOC", delay_ms=WAY_MS, clocks=CLOCKS)
     world.network.cut("sink.control@R2", "stamper@R1", key="dwell/*/done/*")
     world.run(4_000)
     found = measured(world)

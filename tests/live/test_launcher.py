@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -14,6 +13,7 @@ import pytest
 
 from dwell.live.launcher import UNKNOWN_CODE, ForkServer, Running
 from dwell.live.supervision import SupervisedProcess, Supervisor
+from tests.waiting import wait_until
 
 PATIENCE_S = 30.0
 
@@ -32,7 +32,7 @@ if words is not None:
 @pytest.fixture
 def server() -> Iterator[ForkServer]:
     made = ForkServer([sys.executable, "-c", PROGRAM], {**os.environ, "OF_THE_NODE": "7"})
-    until(made.ready)
+    wait_until(made.ready)
     yield made
     made.stop()
 
@@ -40,13 +40,6 @@ def server() -> Iterator[ForkServer]:
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     return tmp_path / "log"
-
-
-def until(done: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < end, "it has not happened"
-        time.sleep(0.005)
 
 
 def start(server: ForkServer, log: Path, code: str) -> Running:
@@ -99,13 +92,13 @@ def test_what_was_forked_outlives_its_server_and_another_one_starts(
     (parent,) = [psutil.Process(process.pid).parent()]
     assert parent is not None
     parent.kill()
-    until(lambda: not server.ready())
+    wait_until(lambda: not server.ready())
     assert process.poll() is None
-    until(server.ready)
+    wait_until(server.ready)
     assert start(server, log, "raise SystemExit(4)").wait() == 4
     assert process.poll() is None
     os.kill(process.pid, signal.SIGKILL)
-    until(lambda: process.poll() is not None)
+    wait_until(lambda: process.poll() is not None)
     assert process.poll() == UNKNOWN_CODE
 
 
@@ -125,7 +118,7 @@ def test_a_server_ends_with_its_agent_and_leaves_what_it_has_forked(tmp_path: Pa
     process = psutil.Process(int(told))
     try:
         server = process.parent()
-        until(lambda: process.parent() != server or server is None or server.pid == 1)
+        wait_until(lambda: process.parent() != server or server is None or server.pid == 1)
         assert process.is_running()
     finally:
         process.kill()
@@ -140,11 +133,11 @@ def test_a_killed_worker_is_forked_again(server: ForkServer, tmp_path: Path) -> 
         supervisor.step()
         return child.starts == count
 
-    until(lambda: started(1))
+    wait_until(lambda: started(1))
     first = child.pid
     assert first is not None
     os.kill(first, signal.SIGKILL)
-    until(lambda: started(2))
+    wait_until(lambda: started(2))
     assert said == ["worker@E was killed by SIGKILL"]
     assert child.pid not in (None, first)
     supervisor.stop()

@@ -38,9 +38,8 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.worker import MAX_JOINS
 from dwell.model import Problem
 from dwell.model.document import fingerprint
-from tests.live.small_world import Bench, Counting, Passing, World
+from tests.live.small_world import EXEC_MS, Bench, Counting, Passing, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 KINDS: tuple[type[msgspec.Struct], ...] = tuple(
     found for name in messages.__all__ if isinstance(found := getattr(messages, name), type)
 )
@@ -82,7 +81,7 @@ def problem() -> Problem:
 def world() -> World:
     """A cell whose stamper has begun, and whose cycles are all through."""
     stages: dict[str, Callable[[str], Passing]] = dict.fromkeys(EXEC_MS, Watched)
-    made = World(problem(), exec_ms=EXEC_MS, stages=stages | {"planning": Stateful}, policy="dtp")
+    made = World(problem(), stages=stages | {"planning": Stateful}, policy="dtp")
     made.run(1_000)
     return made
 
@@ -261,7 +260,7 @@ def test_a_flood_of_nonsense_takes_no_memory(world: World) -> None:
 
 def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
     """All that the protocol lets anybody say, from somebody who says everything."""
-    world = World(problem(), exec_ms=EXEC_MS, policy="dtp")
+    world = World(problem(), policy="dtp")
     world.run(500)
     now_ns = world.network.now_ns
     keys, digest = world.stamper.place.keys, fingerprint(world.problem)

@@ -15,9 +15,7 @@ from dwell.live.messages import Ask, encode
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 from dwell.model import Problem
-from tests.live.small_world import World
-
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+from tests.live.small_world import EXEC_MS, World
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +66,7 @@ def test_advice_is_recorded_and_not_followed(problem: Problem) -> None:
 
 def test_a_pin_holds_against_the_policy_even_where_it_only_advises(problem: Problem) -> None:
     advised = replace(problem, live=replace(problem.live, mode="advise"))
-    world = World(advised, exec_ms=EXEC_MS, policy="dtp")
+    world = World(advised, policy="dtp")
     world.run(2_000)
     assert not ask(world, "pin", "HYB")
     world.run(8_000)
@@ -78,7 +76,7 @@ def test_a_pin_holds_against_the_policy_even_where_it_only_advises(problem: Prob
 
 
 def test_code_is_changed_by_draining_at_no_cycle_lost(problem: Problem) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="SO")
+    world = World(problem, policy="SO")
     world.run(2_000)
     assert world.stamper.placement == "SO"
     assert not ask(world, "drain", "E")
@@ -118,7 +116,7 @@ def test_code_is_changed_by_draining_at_no_cycle_lost(problem: Problem) -> None:
 def test_what_cannot_be_is_refused(
     problem: Problem, questions: list[tuple[str, str]], refused: str
 ) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="SO")
+    world = World(problem, policy="SO")
     world.run(1_000)
     *before, last = questions
     for question in before:

@@ -18,7 +18,6 @@ from dwell.model import Problem
 from tests.live.small_world import World
 
 MODELS = {"gate": gate, "orders": orders, "states": states}
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 WALKS = 6
 STEPS = 24
 
@@ -74,7 +73,7 @@ class Mirror:
     """Does to a real cell what happens in the model."""
 
     def __init__(self, problem: Problem) -> None:
-        self.world = World(problem, exec_ms=EXEC_MS)
+        self.world = World(problem)
         self.period_ms = problem.pipeline.period_ms
         self.guard_cycles = problem.controller.guard_cycles
         self.world.run(30 * self.period_ms)

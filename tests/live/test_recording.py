@@ -69,16 +69,13 @@ WITHOUT_POLARS = (
 )
 
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
-
-
 class Recorded(World):
     """A cell in memory whose controller keeps its runs in a folder."""
 
     def __init__(self, problem: Problem, out: Path, *, most_waiting: int = 50_000) -> None:
         self.out, self.most_waiting = out, most_waiting
         self.log: list[str] = []
-        super().__init__(problem, exec_ms=EXEC_MS, policy="LOC")
+        super().__init__(problem, policy="LOC")
 
     def start(self, who: str) -> None:
         if who.startswith("controller"):

@@ -17,7 +17,6 @@ from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 PERIOD_MS = 100.0
 
 
@@ -88,7 +87,7 @@ def cycles_until(world: World, placement: str, most: int) -> int:
 
 def on_fallback(problem: Problem, policy: Any = None, *, ended: str = "perception@E") -> World:
     """A cell whose guard has left SO, where all is well again."""
-    world = World(problem, exec_ms=EXEC_MS, policy=policy or Staying())
+    world = World(problem, policy=policy or Staying())
     world.run(3_000)
     world.kill(ended)
     world.run(8 * PERIOD_MS)

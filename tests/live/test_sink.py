@@ -9,14 +9,13 @@ from dwell.live.hosting import Hosted
 from dwell.live.sink import Sink
 from tests.live.small_world import MS, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 HOUR_NS = 3_600_000 * MS
 
 
 @pytest.fixture
 def world() -> World:
     cell = dwell.load("examples/canonical.yaml")
-    made = World(cell, exec_ms=EXEC_MS)
+    made = World(cell)
     made.run(1_000)
     return made
 

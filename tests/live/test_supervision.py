@@ -18,6 +18,7 @@ from dwell.live import supervision
 from dwell.live.state_files import InFlight
 from dwell.live.supervision import SupervisedProcess, Supervisor
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
+from tests.waiting import wait_until
 
 PATIENCE_S = 20.0
 
@@ -243,3 +244,48 @@ def test_an_agent_outlives_a_full_disk(tmp_path: Path) -> None:
             assert json.loads(child.mark.read_text())["pid"] == child.pid
         finally:
             supervisor.stop()
+
+
+LEAK = (
+    "import time\nkept = []\nwhile True:\n    kept.append(bytearray(1 << 20)); time.sleep(0.01)\n"
+)
+
+SPEAK = "while True: print('x' * 1000, flush=True)"
+
+
+def test_memory_that_grows_is_reported(tmp_path: Path) -> None:
+    said: list[str] = []
+    supervisor = Supervisor(tmp_path, said.append, warm_s=0.2, growth_bytes=8 << 20)
+    supervisor.keep("perception@E", [sys.executable, "-c", LEAK])
+    try:
+        supervisor.step()
+
+        def grown() -> bool:
+            supervisor.tend()
+            return bool(supervisor.notes())
+
+        wait_until(grown)
+    finally:
+        supervisor.stop()
+    assert supervisor.notes().startswith("perception@E: its memory has grown from ")
+    assert supervisor.notes() in said
+
+
+def test_a_log_does_not_grow_for_ever(tmp_path: Path) -> None:
+    supervisor = Supervisor(tmp_path, print, log_bytes=100_000)
+    child = supervisor.keep("perception@E", [sys.executable, "-c", SPEAK])
+    older = tmp_path / "perception@E.log.1"
+    try:
+        supervisor.step()
+
+        def began_anew() -> bool:
+            supervisor.tend()
+            return older.exists()
+
+        wait_until(began_anew)
+        wait_until(lambda: child.log.stat().st_size > 0)
+    finally:
+        supervisor.stop()
+    assert older.stat().st_size > 100_000
+    # What is appended after the cut follows no hole.
+    assert child.log.read_bytes()[:1] != b"\0"

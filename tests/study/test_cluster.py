@@ -13,7 +13,7 @@ import pytest
 from dwell.errors import SimulationError
 from dwell.study import load_study, run_study
 from dwell.study.cluster import spread_on_dask
-from tests.cli.test_commands import SMALL
+from tests.cli.small_cell import SMALL
 from tests.study.test_runner_folder import assert_same_files, parts_in
 from tests.study.test_study import make_study
 

@@ -15,11 +15,10 @@ from polars.testing import assert_frame_equal
 import dwell.sim
 from dwell import draw, simulate, simulate_realisation
 from dwell.cellfile.study_paths import with_settings
-from dwell.errors import MetricError, SimulationError
-from dwell.model import FrozenDict, Problem
-from dwell.study import Contender, Point, Study, StudyResult, compare, run_study
-from dwell.study.judging import judged_cost, judged_costs
-from dwell.study.player import Player
+from dwell.errors import MetricError
+from dwell.model import Problem
+from dwell.study import Contender, Point, StudyResult, compare, run_study
+from dwell.study.judging import judged_cost
 from dwell.study.reference import references
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem
@@ -166,36 +165,6 @@ def test_settings_change_the_controller_and_not_what_happens(result: StudyResult
     assert found["u_robot"] == summarise(run, problem, {}).row["u_robot"]
 
 
-@pytest.mark.parametrize("policy", ["dtp", "latency-first", "SO"])
-@pytest.mark.parametrize("scenario", ["baseline", "network-impairment"])
-def test_judging_by_the_own_objective_changes_no_bit(policy: str, scenario: str) -> None:
-    run = simulate(PROBLEM, scenario=scenario, policy=policy, seed=3, windows=40)
-    assert judged_costs(run, PROBLEM).tolist() == run.windows["cost"].to_list()
-
-
-def test_judging_by_another_objective_is_what_its_controller_would_see() -> None:
-    weights = replace(PROBLEM.objective.weights, switching=3.0, edge=0.7)
-    other = replace(PROBLEM, objective=replace(PROBLEM.objective, weights=weights))
-    realisation = draw(PROBLEM, scenario="network-impairment", seed=3, windows=40)
-    # Latency-first looks at no weight: both controllers decide the same.
-    one, two = (
-        simulate_realisation(problem, realisation, policy="latency-first")
-        for problem in (PROBLEM, other)
-    )
-    assert one.decisions["migrated"].any()
-    assert judged_costs(one, other).tolist() == two.windows["cost"].to_list()
-
-
-def test_windows_that_the_controller_did_not_see_are_not_judged() -> None:
-    down = dwell.model.NodeDisturbance("E", at_s=3.0, for_s=2.0, down=True)
-    problem = replace(PROBLEM, scenarios=FrozenDict({**PROBLEM.scenarios, "crash": (down,)}))
-    run = simulate(problem, scenario="crash", policy="dtp", seed=1, windows=40)
-    unseen = run.windows["cost"].is_null()
-    assert unseen.any()
-    assert np.isnan(judged_costs(run, problem)).tolist() == unseen.to_list()
-    assert judged_cost(run, problem) == pytest.approx(summarise(run, problem, {}).row["cost"])
-
-
 # ------------------------------------------------------------------------------- references
 
 
@@ -221,21 +190,6 @@ def test_a_candidate_among_the_references_shows_what_it_shows_alone(result: Stud
 
 
 # --------------------------------------------------------------------------------- failures
-
-
-def test_a_worker_with_other_software_refuses() -> None:
-    study = make_study()
-    player = Player(study, software={**Player(study).software, "numpy": "1.0"})
-    with pytest.raises(SimulationError, match=r"numpy \d.*, not numpy 1\.0"):
-        player(study.items()[0])
-
-
-def test_an_unknown_policy_is_found_before_the_work_begins() -> None:
-    seen: list[int] = []
-    study: Study = make_study(contenders=(Contender("LOC", "LOC"), Contender("dpt", "dpt")))
-    with pytest.raises(dwell.errors.PolicyError, match="did you mean 'dtp'"):
-        run_study(study, processes=1, progress=lambda done, _: seen.append(done))
-    assert seen == []
 
 
 def test_a_point_is_where_its_values_say() -> None:

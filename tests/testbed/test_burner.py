@@ -15,7 +15,7 @@ import pytest
 
 from dwell.errors import LiveError, ProblemError
 from dwell.testbed.burner import Burner
-from tests.testbed.waiting import PATIENCE_S, wait_until
+from tests.waiting import PATIENCE_S, wait_until
 
 CPU = max(os.sched_getaffinity(0))
 

@@ -24,7 +24,6 @@ from dwell.model import (
     Uniform,
 )
 from dwell.testbed.conditions import Conditions, changed, delays_ns, to_json
-from dwell.testbed.draws import Draws
 
 PROCESSES = [
     Constant(3.0),
@@ -50,20 +49,6 @@ def test_added_delays_arrive_with_their_shares() -> None:
     for shares in ((1.0,), (1.0, 1.5), (1.0, math.nan)):
         with pytest.raises(ProblemError, match="shares"):
             changed(arrived, {"shares": list(shares)})
-
-
-def test_a_stream_goes_on_while_its_share_changes() -> None:
-    process = AR1(20.0, 0.2, 0.9)
-    plain, changing = Draws((1, 0)), Draws((1, 0))
-    for draws in (plain, changing):
-        draws.apply(to_json({"add_delays_ms": (Constant(2.0), process), "shares": (0.0, 1.0)}))
-    whole = [plain.delay_ns() for _ in range(9)]
-    found = []
-    for share in (1.0, 0.0, 0.5):
-        changing.apply(to_json({"shares": (1.0, share)}))
-        found += [(changing.delay_ns() - 2_000_000, share) for _ in range(3)]
-    expected = [delay * share for delay, (_, share) in zip(whole, found, strict=True)]
-    assert [delay for delay, _ in found] == pytest.approx(expected, abs=1)
 
 
 @pytest.mark.parametrize("process", PROCESSES, ids=lambda process: type(process).__name__)

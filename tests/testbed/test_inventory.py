@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 import yaml
 
@@ -19,9 +14,9 @@ from dwell.errors import LiveError, ProblemError
 from dwell.model import LinkDisturbance, Normal
 from dwell.testbed.inventory import Inventory, LinkCommands, RealHost, load_inventory
 from dwell.testbed.real_hosts import RealHosts, require_commands
-from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.timeline import Change, NodeState, usual_conditions
 from tests.cells.small import make_problem
+from tests.waiting import wait_until
 
 PROBLEM = make_problem()
 SHELL = ("sh", "-c")
@@ -44,14 +39,6 @@ def written(folder: Path, document: object) -> Path:
 
 def hosts() -> dict[str, Any]:
     return {node: {"run": "ssh host", "address": "10.0.0.1"} for node in PROBLEM.fabric.nodes}
-
-
-def until(done: Callable[[], bool]) -> None:
-    for _ in range(1000):
-        if done():
-            return
-        time.sleep(0.01)
-    pytest.fail("it did not happen")
 
 
 # -------------------------------------------------------------------------------- the file
@@ -110,42 +97,6 @@ def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 
 # --------------------------------------------------------------------- commands over there
-
-
-def test_a_command_ends_when_it_is_told_to(tmp_path: Path) -> None:
-    code = "import signal, sys; signal.signal(15, lambda *_: sys.exit(7)); print('up', flush=True)"
-    code += "; signal.pause(); signal.pause()"
-    script = script_of([sys.executable, "-c", code], str(tmp_path), {"DWELL_X": "it's"})
-    with subprocess.Popen(local_words(SHELL, script), stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"up\n"
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 7
-
-
-def test_a_command_has_its_variables_and_its_code(tmp_path: Path) -> None:
-    code = "import os, sys; print(os.environ['DWELL_X'], sys.argv[1], os.getppid(), os.getcwd())"
-    script = script_of(
-        [sys.executable, "-c", f"{code}; sys.exit(3)", SHELL_ID], str(tmp_path), {"DWELL_X": "it's"}
-    )
-    done = subprocess.run(local_words(SHELL, script), capture_output=True, text=True, check=False)
-    assert done.returncode == 3
-    value, owner, shell, folder = done.stdout.split()
-    assert value == "it's"
-    assert owner == shell
-    assert Path(folder) == tmp_path
-
-
-def test_what_it_started_ends_with_it_where_its_caller_is_killed(tmp_path: Path) -> None:
-    line = "sleep 1000 & echo $! > child; sleep 1000"
-    script = script_of(["sh", "-c", line], str(tmp_path), {"DWELL_X": "1"}, whole=True)
-    process = subprocess.Popen(local_words(SHELL, script))
-    child = tmp_path / "child"
-    until(lambda: child.is_file() and child.read_text().strip() != "")
-    pid = int(child.read_text())
-    process.kill()
-    process.wait()
-    until(lambda: not psutil.pid_exists(pid) or psutil.Process(pid).status() == "zombie")
 
 
 # ------------------------------------------------------------------------------- the hosts
@@ -209,7 +160,7 @@ def test_stress_runs_until_it_ends(tmp_path: Path) -> None:
     cell = RealHosts(PROBLEM, over_there, tmp_path, name="one")
     Path(cell.there("E")).mkdir(parents=True)
     cell.apply(Change(0, "E", NodeState(3)))
-    until(lambda: threads.is_file() and threads.read_text() == "3\n")
+    wait_until(lambda: threads.is_file() and threads.read_text() == "3\n")
     process = next(iter(cell.stress.values()))
     cell.apply(Change(1, "E", NodeState(0)))
     assert process.poll() is not None

@@ -15,7 +15,7 @@ from dwell.model import Constant, Normal
 from dwell.testbed.linked_transport import LinkedTransport, target_of, without_source
 from dwell.testbed.message_links import LinkEnds, LinkFile
 from tests.live.transport.meshes import ZenohMesh, introduce
-from tests.testbed.waiting import wait_until
+from tests.waiting import wait_until
 
 NODES = "R1", "E", "R2"
 KEYS = Keys("cell")

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from dwell.live.wiring import Role
 from dwell.model import Problem
 from dwell.testbed.processes import Processes, expected, without_keys
 from tests.cells.light import document, write_cell
+from tests.waiting import wait_until
 
 # Notes its words and a variable, and stays; it takes SIGTERM as it comes.
 STAYS = (
@@ -56,14 +57,6 @@ def problem() -> Problem:
 def stays(node: str, words: Sequence[str]) -> Sequence[str]:
     """Run something else with the words."""
     return [sys.executable, "-c", STAYS, node, *words]
-
-
-def until(holds: Callable[[], bool]) -> None:
-    """Wait for something that other processes do."""
-    limit_s = time.monotonic() + 60
-    while not holds():
-        assert time.monotonic() < limit_s
-        time.sleep(0.02)
 
 
 def logged(file: Path) -> str:
@@ -100,11 +93,11 @@ def test_none_is_left_when_the_process_that_started_them_is_killed(tmp_path: Pat
         assert owner.stdout is not None
         agent = int(owner.stdout.readline())
         marks = [out / "R1" / f"{who}.pid" for who in ("stamper@R1", "sensing@R1")]
-        until(lambda: all(mark.exists() for mark in marks))
+        wait_until(lambda: all(mark.exists() for mark in marks))
         pids = [agent, *(json.loads(mark.read_text())["pid"] for mark in marks)]
         assert all(psutil.pid_exists(pid) for pid in pids)
         owner.send_signal(signal.SIGKILL)
-    until(lambda: not any(psutil.pid_exists(pid) for pid in pids))
+    wait_until(lambda: not any(psutil.pid_exists(pid) for pid in pids))
 
 
 def test_the_keys_of_another_cell_are_not_theirs(

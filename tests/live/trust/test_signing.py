@@ -37,9 +37,8 @@ from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.signing import Seals
 from dwell.model import Problem
 from tests.live.memory_transport import MemoryTransport
-from tests.live.small_world import Counting, World
+from tests.live.small_world import EXEC_MS, Counting, World
 
-EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 NODES = ("R1", "E", "R2")
 
 
@@ -103,7 +102,7 @@ def give(world: World, *samples: Arrival) -> int:
 def test_a_cell_with_keys_runs_as_one_without(problem: Problem, seals: dict[str, Seals]) -> None:
     runs = []
     for used in (seals, None):
-        world = World(problem, exec_ms=EXEC_MS, policy="LOC", seals=used)
+        world = World(problem, policy="LOC", seals=used)
         world.run(2_000)
         world.pin("HYB")
         world.run(1_000)
@@ -129,7 +128,7 @@ def test_every_small_message_that_matters_is_signed(
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MemoryTransport, "put", note)
-        world = World(problem, exec_ms=EXEC_MS, policy="LOC", seals=seals)
+        world = World(problem, policy="LOC", seals=seals)
         world.run(1_000)
     kinds: dict[str, type[msgspec.Struct]] = {
         "order": Order,
@@ -232,7 +231,7 @@ def test_replayed_settings_do_not_come_back(world: World, seals: dict[str, Seals
 def test_a_controller_whose_clock_is_behind_learns_the_numbers(
     problem: Problem, seals: dict[str, Seals]
 ) -> None:
-    world = World(problem, exec_ms=EXEC_MS, policy="SO", seals=seals)
+    world = World(problem, policy="SO", seals=seals)
     world.run(1_000)
     far = order_of(world, "", 1 << 61, shadow_fraction=0.5)
     assert give(world, ordered(world, far, seals[CONTROLLER])) == 0
@@ -246,7 +245,7 @@ def test_a_controller_whose_clock_is_behind_learns_the_numbers(
 def test_orders_in_any_order_end_where_the_last_says(
     problem: Problem, seals: dict[str, Seals]
 ) -> None:
-    world = World(problem, exec_ms=EXEC_MS, seals=seals)
+    world = World(problem, seals=seals)
     world.run(1_000)
     fractions = [0.1, 0.2, 0.3, 0.4]
     sealed = [
@@ -463,7 +462,7 @@ def test_copies_cost_no_second_look(
 
     monkeypatch.setattr(Seals, "_verifies", count)
     fresh = {name: Seals(one._keyring) for name, one in seals.items()}
-    world = World(problem, exec_ms=EXEC_MS, policy="LOC", seals=fresh)
+    world = World(problem, policy="LOC", seals=fresh)
     world.run(2_000)
     cycles = len(world.cycles)
     for name in ("R1", CONTROLLER):

@@ -14,7 +14,7 @@ import pytest
 import dwell
 from dwell.cellfile import load_without_traces
 from dwell.control import Controller
-from tests.cli.test_commands import SMALL, call, read_json
+from tests.cli.small_cell import SMALL, call, read_json
 
 POLICY = """\
 class Fastest:

@@ -1,0 +1,151 @@
+"""`dwell run`: what it prints, saves and refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import dwell
+from dwell.errors import RunError
+from dwell.record import Run
+from tests.cli.small_cell import SMALL, call, read_json
+
+# --------------------------------------------------------------------------------- general
+
+
+# ----------------------------------------------------------------------------------- check
+
+
+def test_cycles_on_their_way_when_a_run_ends_are_told_apart_from_lost_ones(cell: Path) -> None:
+    """A task that takes more than a period: the queue before it grows to the end."""
+    cell.write_text(SMALL.replace("{R: {exec_ms: 8}", "{R: {exec_ms: 130}"), encoding="utf-8")
+    arguments = ("run", cell, "--policy", "LOC", "--windows", "10")
+    row = read_json(call(*arguments, "--out", "one", "--json"))["summary"]
+    assert row["lost"] == 0
+    assert row["in_flight"] > row["cycles"] / 2
+    text = call(*arguments, "--out", "two").stdout
+    assert f"{row['in_flight']} of {row['cycles']}" in text
+    assert "unfinished at the end" in text
+    assert "inf" not in text
+    assert "unfinished" not in call("run", cell, "--policy", "OFF", "--out", "three").stdout
+
+
+# ------------------------------------------------------------------------------------- run
+
+
+def test_run_saves_and_sums_up(cell: Path) -> None:
+    result = call("run", cell, "--scenario", "stress", "--policy", "OFF", "--windows", "12")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "small, stress, OFF, seed 1: 12 windows of 10 cycles" in result.stdout
+    assert "saved to runs/small-stress-OFF-1" in result.stdout
+    run = dwell.open_run("runs/small-stress-OFF-1")
+    assert run.windows.height == 12
+    assert run.meta["scenario"] == "stress"
+    assert not run.has_jobs
+
+
+def test_run_as_json_says_what_the_tables_say(cell: Path) -> None:
+    found = read_json(
+        call("run", cell, "--seed", "7", "--windows", "12", "--out", "here", "--jobs", "--json")
+    )
+    run = dwell.open_run("here")
+    assert (found["run"], found["seed"], found["policy"]) == ("here", 7, "dtp")
+    assert found["summary"]["cost"] == pytest.approx(run.windows["cost"].mean())
+    assert found["summary"]["migrations"] == run.decisions["migrated"].sum()
+    assert run.has_jobs
+
+
+def test_a_run_that_is_all_warm_up(cell: Path) -> None:
+    cell.write_text(SMALL + "warmup_windows: 5\n", encoding="utf-8")
+    result = call("run", cell, "--windows", "5", "--out", "here")
+    assert result.exit_code == 0
+    assert "none after the 5 of warm-up" in result.stdout
+    assert dwell.open_run("here").windows.height == 5
+    assert read_json(call("run", cell, "--windows", "5", "--json"))["summary"] is None
+
+
+def test_what_never_ends_is_null_in_json(cell: Path) -> None:
+    cell.write_text(SMALL.replace("delay_ms: 1}", "delay_ms: 1, loss: 0.9}"), encoding="utf-8")
+    found = read_json(call("run", cell, "--policy", "OFF", "--windows", "5", "--json"))
+    assert found["summary"]["p95_ms"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--scenario", "stres"), ("unknown scenario", "did you mean 'stress'?")),
+        (("--policy", "dpt"), ("unknown policy", "did you mean 'dtp'?", "LOC, OFF")),
+        (("--estimator", "profil"), ("unknown estimator", "profile")),
+        (("--windows", "0"), ("--windows",)),
+        (("--seed", "-1"), ("--seed",)),
+        (("--seed", "one"), ("--seed",)),
+        (("--out", "small.yaml"), ("is not a run",)),
+    ],
+)
+def test_a_wrong_argument_changes_nothing(
+    cell: Path, arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
+    result = call("run", cell, *arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    for word in words:
+        assert word in result.stderr
+    assert [path.name for path in cell.parent.iterdir()] == ["small.yaml"]
+
+
+def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
+    words = ("run", cell, "--windows", "5", "--out", "kept")
+    assert call(*words).exit_code == 0
+    assert call(*words).exit_code == 0, "the same run again"
+    other = call(*words, "--seed", "2")
+    assert (other.exit_code, other.stdout) == (2, "")
+    assert "kept holds another run" in other.stderr
+    assert dwell.open_run("kept").meta["seed"] == 1
+    # So many windows can not be drawn: the folder is looked at before.
+    more = call("run", cell, "--windows", str(1 << 32), "--out", "kept")
+    assert (more.exit_code, more.stdout) == (2, "")
+    assert "kept holds another run" in more.stderr
+    assert call(*words, "--seed", "2", "--force").exit_code == 0
+    assert dwell.open_run("kept").meta["seed"] == 2
+
+
+def test_a_study_given_to_run_is_called_one(cell: Path) -> None:
+    Path("study.yaml").write_text("dwell-study: 1\ncell: small.yaml\n", encoding="utf-8")
+    result = call("run", "study.yaml")
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert "dwell study" in result.stderr
+
+
+def test_unknown_names_are_listed_once(cell: Path) -> None:
+    result = call("run", cell, "--scenario", "xyzzy")
+    assert result.exit_code == 2
+    assert result.stderr.count("baseline") == 1
+
+
+def test_a_folder_that_cannot_be_written_is_a_failure(
+    cell: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> Path:
+        raise RunError("here: cannot be written (No space left on device)")
+
+    monkeypatch.setattr(Run, "save", full)
+    result = call("run", cell, "--windows", "2")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "No space left" in result.stderr
+
+
+def test_names_that_are_no_file_names(cell: Path) -> None:
+    cell.write_text(SMALL.replace("name: small", "name: ../a b/c"), encoding="utf-8")
+    assert read_json(call("run", cell, "--windows", "2", "--json"))["run"] == (
+        "runs/.._a_b_c-baseline-dtp-1"
+    )
+
+
+# ---------------------------------------------------------------------------------- report
+
+
+# ---------------------------------------------------------------------------------- schema
+
+
+# ------------------------------------------------------------------------------------ demo

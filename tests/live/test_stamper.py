@@ -1,0 +1,56 @@
+"""The stamper: its beats, and cycles that frames begin."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+import dwell
+from dwell.live.stamper import Stamper
+from dwell.live.transport.transport import Arrival
+from dwell.model import Problem
+from tests.live.small_world import MS, World
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    cell = dwell.load("examples/canonical.yaml")
+    return replace(cell, controller=replace(cell.controller, fallbacks=("LOC",)))
+
+
+def test_the_stamper_beats_between_two_releases(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = World(problem)
+    stamper, period_ns = world.stamper, problem.pipeline.period_ms * MS
+    beats: list[int] = []
+    send = stamper.pulse.send
+
+    def noted(now_ns: int) -> None:
+        beats.append(now_ns)
+        send(now_ns)
+
+    monkeypatch.setattr(stamper.pulse, "send", noted)
+    world.run(3_000)
+    assert stamper.cycle > 50
+    since = [(at_ns - stamper._next_ns) % period_ns / period_ns for at_ns in beats[10:]]
+    assert since == pytest.approx([0.5] * len(since), abs=0.01)
+    assert max(b - a for a, b in pairwise(beats)) <= 1.5 * period_ns
+
+
+def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:
+    cell = replace(problem, live=replace(problem.live, release="frames"))
+    world = World(cell)
+    world.run(500)
+    stamper = world.stamper
+    assert isinstance(stamper, Stamper)
+    assert stamper.cycle == 0
+    period_ms = problem.pipeline.period_ms
+    key = stamper.place.keys.frame()
+    for _ in range(1_000):
+        stamper.receive(Arrival(key, b""), world.network.now_ns)
+        world.run(period_ms / 100)
+    assert 19 <= stamper.cycle <= 20
+    assert stamper.skipped == 1_000 - stamper.cycle
