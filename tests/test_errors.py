@@ -1,0 +1,60 @@
+"""Errors: what their texts name, how they cross processes, and what they say is to be installed."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from dwell import errors
+from dwell.errors import DwellError, Fault, ProblemError, TraceError, missing_package
+
+ROOT = Path(__file__).parents[1]
+KINDS = [
+    kind for _, kind in inspect.getmembers(errors, inspect.isclass) if issubclass(kind, Exception)
+]
+
+
+def test_every_error_is_a_dwell_error_that_can_be_imported() -> None:
+    assert all(issubclass(kind, DwellError) for kind in KINDS)
+    assert {kind.__name__ for kind in KINDS} <= set(errors.__all__)
+
+
+@pytest.mark.parametrize(
+    ("source", "line", "text"),
+    [
+        (None, None, "nodes.R: no"),
+        (None, 7, "line 7: nodes.R: no"),
+        ("cell.yaml", None, "cell.yaml: nodes.R: no"),
+        ("cell.yaml", 7, "cell.yaml:7: nodes.R: no"),
+    ],
+)
+def test_a_fault_is_written_as_compilers_write_it(
+    source: str | None, line: int | None, text: str
+) -> None:
+    faults = [Fault("nodes.R", "no", line), Fault("", "all of it")]
+    assert str(ProblemError(faults, source)).splitlines()[0] == text
+
+
+@pytest.mark.parametrize("kind", [ProblemError, TraceError])
+def test_faults_cross_the_borders_of_processes(kind: type[ProblemError]) -> None:
+    error = kind([Fault("a", "b", 3)], "cell.yaml")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is kind
+    assert (again.faults, again.source, str(again)) == (error.faults, "cell.yaml", str(error))
+
+
+def test_what_is_missing_is_named_with_an_extra_that_brings_it() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for module, (package, extra) in errors.OPTIONAL.items():
+        told = missing_package(ModuleNotFoundError(name=f"{module}.part"))
+        line = f"{package} is not installed; pip install '{project['name']}[{extra}]'"
+        assert str(told) == line
+        brought = " ".join(project["optional-dependencies"][extra]).replace("_", "-")
+        assert module.replace("_", "-") in brought
+    told = missing_package(ModuleNotFoundError(name="cv2"))
+    assert str(told) == "cv2 is not installed; pip install opencv-python-headless"
+    assert missing_package(ModuleNotFoundError(name="stages")) is None

@@ -1,0 +1,61 @@
+"""Faults: which there are, and what a cell promises for each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+import dwell
+from dwell.model import Problem
+from dwell.testbed.chaos.faults import Fault, Means, bound_of, faults_of
+from dwell.testbed.chaos.light_cell import document
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    file: Path = tmp_path_factory.mktemp("cell") / "cell.yaml"
+    file.write_text(yaml.safe_dump(document("SO")))
+    return dwell.load(file)
+
+
+def of(problem: Problem, name: str) -> Fault:
+    (found,) = [fault for fault in faults_of(problem, Means()) if fault.name == name]
+    return found
+
+
+def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
+    left = list(faults_of(problem, Means(clocks=False, disks=False)))
+    assert not [fault for fault in left if fault.how in ("jump", "drift")]
+    assert [fault.whom for fault in left if fault.how == "fill"] == [("runs",)]
+
+
+@pytest.mark.parametrize(
+    ("name", "at_so", "at_loc"),
+    [
+        ("kill perception@E", 4, 4),
+        ("kill agent@R1", 4, 4),
+        ("kill sensing@R1", 4, 4),  # has a standby
+        ("kill sensing@R1 and its standby", None, None),
+        ("freeze stamper@R1", None, None),
+        ("freeze sink.control@R2", None, None),
+        ("kill all of E", 4, 4),
+        ("kill all of R2", None, None),
+        ("cut R1->E", 4, 4),
+        ("cut R1-R2", 4, 4),
+        ("lose relay agent@E", 4, 4),
+        ("jump +5000 ms E", 4, 4),
+        ("jump +5000 ms R2", None, None),
+        ("drift +80 ppm R1", 4, 4),
+        ("drift +2000 ppm R1", None, None),
+        ("starve E", 4, 4),
+        ("starve R1", None, None),
+        ("fill the disk of R1", 4, 4),
+        ("fill the disk of the runs", 4, 4),
+        ("write to the same disk", 4, 4),
+    ],
+)
+def test_bounds(problem: Problem, name: str, at_so: int | None, at_loc: int | None) -> None:
+    assert bound_of(problem, of(problem, name), "SO") == at_so
+    assert bound_of(problem, of(problem, name), "LOC") == at_loc
