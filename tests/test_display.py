@@ -29,11 +29,11 @@ from dwell.policies import by_name as policy_by_name
 from dwell.record import Journal
 from dwell.study import (
     Hindsight,
-    SavedStudy,
     StudyResult,
     compare,
     load_study,
     mean_interval,
+    open_study,
     run_study,
     validate,
 )
@@ -93,9 +93,9 @@ def run(canonical: Problem) -> dwell.Run:
 
 
 @pytest.fixture(scope="module")
-def study() -> StudyResult:
-    declared = load_study(EXAMPLES / "studies" / "tenants.yaml")
-    return run_study(replace(declared, seeds=(1, 2), windows=10), processes=1)
+def study(tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
+    declared = replace(load_study(EXAMPLES / "studies" / "tenants.yaml"), seeds=(1, 2), windows=10)
+    return run_study(declared, folder=tmp_path_factory.mktemp("study"), processes=1)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def shown(canonical: Problem, run: dwell.Run, study: StudyResult) -> dict[str, D
         "run": run,
         "comparison": comparison,
         "study": study,
-        "saved study": SavedStudy.of(study),
+        "saved study": open_study(str(study.folder)),
         "validation": validate({"one": run}, canonical, seeds=2),
     }
 

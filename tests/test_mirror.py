@@ -38,7 +38,7 @@ WITHOUT = {
         arrays tables
     """,
     "study": """
-        job_times parts predicting qos_sample saved validated_jobs
+        job_times predicting qos_sample validated_jobs
     """,
     "testbed/chaos": """
         actuator_observer harness light_cell stages strike wiretap

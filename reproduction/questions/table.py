@@ -11,7 +11,7 @@ from dataclasses import replace
 import polars as pl
 
 from dwell.model import Problem
-from dwell.study import Comparison, over_seeds, paper_predictions
+from dwell.study import over_seeds, paper_predictions
 from reproduction.cell import PAPERS_DTP
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale
@@ -55,7 +55,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             study,
         ),
     ]
-    predictions = paper_predictions(Comparison.of_study(result), ADAPTIVE)
+    predictions = paper_predictions(result, ADAPTIVE)
     of_policies = pl.col("policy").is_in(ADAPTIVE)
     return Answer(
         pl.concat(verdicts),

@@ -172,6 +172,7 @@ def make_comparison(
         for policy in policies
     )
     return Comparison(
+        name=problem.name,
         problem=problem,
         scenarios=tuple(scenarios),
         policies=tuple(policies),

@@ -14,8 +14,8 @@ from dwell.errors import SimulationError
 from dwell.study import load_study, run_study
 from dwell.study.cluster import spread_on_dask
 from tests.cli.small_cell import SMALL
-from tests.study.test_runner_folder import assert_same_files, parts_in
 from tests.study.test_study import make_study
+from tests.study.test_study_folder import assert_same_files, parts_in
 
 distributed: Any = pytest.importorskip("distributed")
 

@@ -10,10 +10,9 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from dwell import simulate
-from dwell.errors import DwellError, MetricError, PolicyError, ProblemError, SimulationError
+from dwell.errors import DwellError, PolicyError, ProblemError, SimulationError
 from dwell.policies import Static
 from dwell.study import Comparison, compare
-from dwell.study.intervals import mean_interval, share_limits
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem
 
@@ -94,34 +93,6 @@ def test_all_policies_play_the_same_realisation() -> None:
     assert found.difference("network-impairment", ("SO", "mine"), "cost") == (0.0, 0.0, 0.0)
 
 
-def test_the_table_has_every_column_with_its_interval(comparison: Comparison) -> None:
-    table = comparison.table()
-    assert table.height == 2 * len(POLICIES)
-    row = table.filter((pl.col("scenario") == "baseline") & (pl.col("policy") == "dtp"))
-    costs = comparison.values("baseline", "dtp", "cost")
-    over = mean_interval(costs)
-    assert row.select("cost", "cost_low", "cost_high").row(0) == over
-    rates = comparison.values("baseline", "dtp", "violation_rate")
-    limits = row.select("violation_rate_at_least", "violation_rate_at_most").row(0)
-    assert limits == share_limits(rates)
-    for name in ("l95_ms", "u_robot", "u_edge", "migrations", "share_LOC", "share_HYB"):
-        assert {name, f"{name}_low", f"{name}_high"} <= set(table.columns)
-
-
-def test_differences_are_those_of_pairs(comparison: Comparison) -> None:
-    found = comparison.difference("baseline", ("dtp", "LOC"), "l95_ms")
-    gaps = comparison.values("baseline", "dtp", "l95_ms") - comparison.values(
-        "baseline", "LOC", "l95_ms"
-    )
-    assert found == mean_interval(gaps)
-
-
-def test_one_seed_gives_no_interval() -> None:
-    table = small(seeds=(1,)).table()
-    assert table["cost"].null_count() == 0
-    assert table["cost_low"].null_count() == table.height
-
-
 def test_distributions_never_fall_and_end_at_what_finished(comparison: Comparison) -> None:
     for scenario in comparison.scenarios:
         for policy in POLICIES:
@@ -168,30 +139,3 @@ def test_wrong_requests_are_refused(
     right = {"scenarios": ("baseline",), "policies": ("LOC",), "seeds": (1,), "windows": 4}
     with pytest.raises(error, match=message):
         compare(PROBLEM, **{**right, **wrong}, processes=1)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("asked", "error", "message"),
-    [
-        (("baseline", "LOC", "violaton_rate"), MetricError, "metric 'violaton_rate'; did you mean"),
-        (
-            ("baselin", "LOC", "cost"),
-            SimulationError,
-            "scenario 'baselin'; did you mean 'baseline'",
-        ),
-        (("baseline", "LOK", "cost"), PolicyError, "policy 'LOK'; did you mean 'LOC'"),
-        (("baseline", "LOC", "policy"), MetricError, "unknown metric 'policy'; "),
-    ],
-)
-def test_what_is_misspelt_gets_the_nearest_name_once(
-    comparison: Comparison, asked: tuple[str, str, str], error: type[DwellError], message: str
-) -> None:
-    scenario, policy, column = asked
-    for ask in (
-        lambda: comparison.values(*asked),
-        lambda: comparison.interval(*asked),
-        lambda: comparison.difference(scenario, (policy, "SO"), column),
-    ):
-        with pytest.raises(error, match=message) as caught:
-            ask()
-        assert str(caught.value).count("violation_rate") <= 1

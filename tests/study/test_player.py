@@ -1,14 +1,67 @@
-"""Player: with whose software it plays, and what it tries beforehand."""
+"""What a player does of an item: one realisation, played by all, each judged by the point's J."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import pytest
+from polars.testing import assert_frame_equal
 
 import dwell.sim
+from dwell import draw, simulate, simulate_realisation
 from dwell.errors import SimulationError
+from dwell.model import FrozenDict, Problem
 from dwell.study import Contender, Study, run_study
-from dwell.study.player import Player
-from tests.study.test_study import make_study
+from dwell.study.player import Player, judged_cost, judged_costs
+from dwell.study.summary import summarise
+from tests.cells.small import make_problem
+from tests.study.test_study import grid, make_study
+
+PROBLEM = make_problem()
+
+
+def test_an_item_is_a_run_of_every_contender_at_every_point() -> None:
+    study = make_study(points=grid(dwells=range(2), delays=range(1, 2)))
+    played = Player(study, kept=(2,))(study.items()[2])
+    labels = [(point, one.row["policy"], one.row["seed"]) for point, one in played.summaries]
+    assert labels == [(0, "LOC", 2), (0, "dtp", 2), (1, "LOC", 2), (1, "dtp", 2)]
+    # Runs of a seed that is kept are kept whole.
+    assert list(played.examples) == [(0, "LOC"), (0, "dtp"), (1, "LOC"), (1, "dtp")]
+    run = simulate(study.points[1].problem, policy="dtp", seed=2, windows=6)
+    assert_frame_equal(played.examples[1, "dtp"].decisions, run.decisions)
+    assert Player(study, kept=(2,))(study.items()[0]).examples == {}
+
+
+@pytest.mark.parametrize("policy", ["dtp", "latency-first", "SO"])
+@pytest.mark.parametrize("scenario", ["baseline", "network-impairment"])
+def test_judging_by_the_own_objective_changes_no_bit(policy: str, scenario: str) -> None:
+    run = simulate(PROBLEM, scenario=scenario, policy=policy, seed=3, windows=40)
+    assert judged_costs(run, PROBLEM).tolist() == run.windows["cost"].to_list()
+
+
+def test_judging_by_another_objective_is_what_its_controller_would_see() -> None:
+    weights = replace(PROBLEM.objective.weights, switching=3.0, edge=0.7)
+    other = replace(PROBLEM, objective=replace(PROBLEM.objective, weights=weights))
+    realisation = draw(PROBLEM, scenario="network-impairment", seed=3, windows=40)
+    # Latency-first looks at no weight: both controllers decide the same.
+    one, two = (
+        simulate_realisation(problem, realisation, policy="latency-first")
+        for problem in (PROBLEM, other)
+    )
+    assert one.decisions["migrated"].any()
+    assert judged_costs(one, other).tolist() == two.windows["cost"].to_list()
+
+
+def test_windows_that_the_controller_did_not_see_are_not_judged() -> None:
+    down = dwell.model.NodeDisturbance("E", at_s=3.0, for_s=2.0, down=True)
+    problem = replace(PROBLEM, scenarios=FrozenDict({**PROBLEM.scenarios, "crash": (down,)}))
+    run = simulate(problem, scenario="crash", policy="dtp", seed=1, windows=40)
+    unseen = run.windows["cost"].is_null()
+    assert unseen.any()
+    assert np.isnan(judged_costs(run, problem)).tolist() == unseen.to_list()
+    assert judged_cost(run, problem) == pytest.approx(summarise(run, problem, {}).row["cost"])
 
 
 def test_a_worker_with_other_software_refuses() -> None:
@@ -24,3 +77,21 @@ def test_an_unknown_policy_is_found_before_the_work_begins() -> None:
     with pytest.raises(dwell.errors.PolicyError, match="did you mean 'dtp'"):
         run_study(study, processes=1, progress=lambda done, _: seen.append(done))
     assert seen == []
+
+
+def test_a_realisation_is_drawn_once_for_all_that_share_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = []
+
+    def counting(problem: Problem, **request: Any) -> object:
+        drawn.append((request["scenario"], request["seed"], request["windows"]))
+        return draw(problem, **request)
+
+    monkeypatch.setattr(dwell.sim, "draw", counting)
+    study = make_study(points=grid(dwells=range(1, 4), delays=range(1, 2)), seeds=(1, 2))
+    run_study(study, processes=1)
+    whole = [request for request in drawn if request[2] == study.windows]
+    assert sorted(whole) == sorted(
+        (scenario, seed, 6) for scenario in study.scenarios for seed in (1, 2)
+    )

@@ -12,13 +12,11 @@ import polars as pl
 import pytest
 from polars.testing import assert_frame_equal
 
-import dwell.sim
 from dwell import draw, simulate, simulate_realisation
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import MetricError
-from dwell.model import Problem
 from dwell.study import Contender, Point, StudyResult, compare, run_study
-from dwell.study.judging import judged_cost
+from dwell.study.player import judged_cost
 from dwell.study.reference import references
 from dwell.study.summary import summarise
 from tests.cells.small import make_problem
@@ -87,24 +85,6 @@ def test_distributions_are_those_of_all_seeds(result: StudyResult) -> None:
     )
     assert first["share"].to_list() == (within / cycles).tolist()
     assert result.latencies.height == 4 * 2 * 5 * len(first)
-
-
-def test_a_realisation_is_drawn_once_for_all_that_share_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    drawn = []
-
-    def counting(problem: Problem, **request: Any) -> object:
-        drawn.append((request["scenario"], request["seed"], request["windows"]))
-        return draw(problem, **request)
-
-    monkeypatch.setattr(dwell.sim, "draw", counting)
-    study = make_study(points=grid(dwells=range(1, 4), delays=range(1, 2)), seeds=(1, 2))
-    run_study(study, processes=1)
-    whole = [request for request in drawn if request[2] == study.windows]
-    assert sorted(whole) == sorted(
-        (scenario, seed, 6) for scenario in study.scenarios for seed in (1, 2)
-    )
 
 
 def test_a_comparison_is_a_study_of_one_point() -> None:

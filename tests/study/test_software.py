@@ -5,15 +5,19 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import pytest
 
 import dwell
 from dwell.errors import SimulationError
 from dwell.model.qos import QoS
-from dwell.study import Contender
+from dwell.study import Contender, Point
 from dwell.study.software import PACKAGES, describe, software, versions
-from tests.study.test_study import make_study
+from tests.cells.small import make_problem
+from tests.study.test_study import make_study, with_delay
+
+PROBLEM = make_problem()
 
 
 @dataclass
@@ -49,3 +53,20 @@ def test_what_cannot_be_known_again_is_refused() -> None:
     locked = Patient(threading.Lock())  # type: ignore[arg-type]
     with pytest.raises(SimulationError, match="mine does not pickle"):
         known_as(locked)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seeds": (1, 2)},
+        {"windows": 7},
+        {"references": True},
+        {"scenarios": ("baseline",)},
+        {"contenders": (Contender("LOC", "LOC"), Contender("dtp", "atp"))},
+        {"contenders": (Contender("LOC", "LOC"), Contender("dtp", "dtp", "profile"))},
+        {"points": (Point({}, with_delay(PROBLEM, 3)),)},
+    ],
+)
+def test_another_study_has_another_description(change: dict[str, Any]) -> None:
+    assert describe(make_study()) == describe(make_study())
+    assert describe(make_study(**change)) != describe(make_study())

@@ -15,7 +15,6 @@ from dwell.errors import DwellError, ProblemError, SimulationError
 from dwell.model import Constant, Problem
 from dwell.policies import Static
 from dwell.study import Contender, Point, Study
-from dwell.study.software import describe
 from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
@@ -151,39 +150,3 @@ def test_values_of_arrays_become_plain() -> None:
 def test_a_study_pickles() -> None:
     study = make_study(points=grid(dwells=range(2), delays=range(1, 2)))
     assert pickle.loads(pickle.dumps(study)) == study
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"seeds": (1, 2)},
-        {"windows": 7},
-        {"references": True},
-        {"scenarios": ("baseline",)},
-        {"contenders": (Contender("LOC", "LOC"), Contender("dtp", "atp"))},
-        {"contenders": (Contender("LOC", "LOC"), Contender("dtp", "dtp", "profile"))},
-        {"points": (Point({}, with_delay(PROBLEM, 3)),)},
-    ],
-)
-def test_another_study_has_another_description(change: dict[str, Any]) -> None:
-    assert describe(make_study()) == describe(make_study())
-    assert describe(make_study(**change)) != describe(make_study())
-
-
-def test_a_policy_is_described_by_its_class_and_state() -> None:
-    def described(initial: str) -> Any:
-        own = Static(candidates=PROBLEM.candidates, initial=initial)
-        return describe(make_study(contenders=(Contender("own", own),)))["policies"]
-
-    assert described("LOC") == described("LOC")
-    assert described("LOC") != described("SO")
-    assert described("LOC")["own"]["policy"].startswith("dwell.policies.static.Static ")
-
-
-def test_a_policy_that_cannot_be_known_again_is_refused() -> None:
-    class Local(Static):
-        pass
-
-    own = Local(candidates=PROBLEM.candidates, initial="LOC")
-    with pytest.raises(SimulationError, match="own does not pickle"):
-        describe(make_study(contenders=(Contender("own", own),)))

@@ -14,7 +14,7 @@ from dwell.cli.output import print_json, working, write_file, write_report
 from dwell.errors import RunError
 from dwell.record import open_run
 from dwell.report.formatting import listed
-from dwell.study.saved import is_study, open_study
+from dwell.study.study_folder import is_study, open_study
 from dwell.testbed.execution import is_campaign
 
 __all__ = ["ReportRequest", "report_folder"]

@@ -66,16 +66,14 @@ def _answer(shown: object) -> Page:
     from dwell.report.run_page import run_page
     from dwell.report.study_page import study_page
     from dwell.report.validation_page import validation_page
-    from dwell.study import Comparison, SavedStudy, StudyResult, Validation
+    from dwell.study import Comparison, StudyRuns, Validation
 
     match shown:
         case Run():
             return run_page(shown, sections=1)
         case Comparison():
             return comparison_page(shown, sections=1)
-        case StudyResult():
-            return study_page(SavedStudy.of(shown), sections=1)
-        case SavedStudy():
+        case StudyRuns():
             return study_page(shown, sections=1)
         case Validation():
             return validation_page(shown, sections=1)

@@ -14,7 +14,7 @@ from dwell.report.method import method_blocks, ranges
 from dwell.report.page import Definitions, Page, Section, page_html
 from dwell.report.policy_blocks import COST, L95, RATE, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
-from dwell.study import AIM, SavedStudy, over_seeds
+from dwell.study import AIM, StudyRuns, over_seeds
 
 if TYPE_CHECKING:
     import polars as pl
@@ -25,20 +25,20 @@ REGRET = Measure("regret", "regret", "%", 100.0)
 MIGRATIONS = Measure("migrations", "migrations")
 
 
-def study_html(study: SavedStudy, *, static: bool = False) -> str:
+def study_html(study: StudyRuns, *, static: bool = False) -> str:
     """Return a page about a study; see `dwell.report.page.page_html`.
 
     Parameters
     ----------
-    study : SavedStudy
-        Of `dwell.study.open_study`.
+    study : StudyRuns
+        Of `dwell.study.open_study` or `dwell.study.run_study`.
     static : bool
         Whether scripts are left out.
     """
     return page_html(study_page(study), static=static)
 
 
-def study_page(study: SavedStudy, *, sections: int | None = None) -> Page:
+def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
     """Return what there is to show of a study; see `study_html`.
 
     Parameters
@@ -59,7 +59,7 @@ def study_page(study: SavedStudy, *, sections: int | None = None) -> Page:
     )
 
 
-def _sections(study: SavedStudy, blocks: PolicyBlocks) -> Iterator[Section]:
+def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
         for place, parameter in enumerate(study.parameters):
             shown = parameter.partition(".")[2]
@@ -90,11 +90,11 @@ def _sections(study: SavedStudy, blocks: PolicyBlocks) -> Iterator[Section]:
     yield Section("How it was made", [*method, Definitions(about)])
 
 
-def _regret(study: SavedStudy) -> list[Measure]:
+def _regret(study: StudyRuns) -> list[Measure]:
     return [REGRET] if "regret" in study.runs.columns else []
 
 
-def _means(study: SavedStudy, parameter: str, measure: Measure) -> pl.DataFrame:
+def _means(study: StudyRuns, parameter: str, measure: Measure) -> pl.DataFrame:
     """Return a measure by a parameter's values: means over the others, a run a seed."""
     import polars as pl
 
@@ -106,7 +106,7 @@ def _means(study: SavedStudy, parameter: str, measure: Measure) -> pl.DataFrame:
 
 
 def _curve(
-    study: SavedStudy, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
+    study: StudyRuns, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
 ) -> Figure:
     import polars as pl
 
@@ -130,7 +130,7 @@ def _curve(
 
 
 def _pivot(
-    study: SavedStudy, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
+    study: StudyRuns, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
 ) -> Table:
     """Return a measure, a row a policy and scenario and a column a value of the parameter."""
     table = _means(study, parameter, measure)
@@ -152,7 +152,7 @@ def _pivot(
     )
 
 
-def _points(study: SavedStudy, blocks: PolicyBlocks) -> Table:
+def _points(study: StudyRuns, blocks: PolicyBlocks) -> Table:
     """Return every point, scenario and policy."""
     measures = [RATE, L95, COST, MIGRATIONS, *_regret(study)]
     keys = (*study.parameters, "scenario", "policy")

@@ -8,9 +8,10 @@ from dwell.study.intervals import Interval, mean_interval, median_interval, shar
 from dwell.study.over_seeds import over_seeds
 from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
 from dwell.study.predictions import paper_predictions
+from dwell.study.results import StudyRuns
 from dwell.study.runner import StudyResult, run_study
-from dwell.study.saved import SavedStudy, open_study
 from dwell.study.study import Contender, Point, Study, load_study
+from dwell.study.study_folder import open_study
 from dwell.study.validation import Validation, validate
 
 __all__ = [
@@ -24,9 +25,9 @@ __all__ = [
     "PairedDifference",
     "PairedMedian",
     "Point",
-    "SavedStudy",
     "Study",
     "StudyResult",
+    "StudyRuns",
     "Validation",
     "canonical_demo",
     "compare",

@@ -130,6 +130,7 @@ def read_measured(folder: Path) -> MeasuredCampaign:
     described = {**described, "policies": policies}
     runs = _in_order(pl.DataFrame(rows, infer_schema_length=None).sort("seed"), described)
     comparison = Comparison(
+        name=problem.name,
         problem=problem,
         scenarios=tuple(one for one in described["scenarios"] if one in set(runs["scenario"])),
         policies=tuple(one for one in described["policies"] if one in set(runs["policy"])),

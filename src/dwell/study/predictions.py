@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.study.comparison import AIM, Comparison
+from dwell.study.comparison import AIM
 from dwell.study.intervals import (
     Interval,
     mean_interval,
@@ -25,6 +25,7 @@ from dwell.study.intervals import (
     share_limits,
 )
 from dwell.study.over_seeds import difference_of
+from dwell.study.results import StudyRuns
 
 if TYPE_CHECKING:
     import polars as pl
@@ -52,7 +53,7 @@ DTP = "dtp"
 class PaperEvidence:
     """A comparison, seen from one scenario; tests answer None where the runs do not tell."""
 
-    comparison: Comparison
+    comparison: StudyRuns
     scenario: str
 
     def under_aim(self, policy: str) -> bool | None:
@@ -271,7 +272,7 @@ class Judgement:
     lead: Interval
 
 
-def applies(comparison: Comparison) -> bool:
+def applies(comparison: StudyRuns) -> bool:
     """Whether the paper's predictions are about this cell at all: its candidates, its words."""
     names = {prediction.scenario for prediction in PAPER}
     return tuple(sorted(comparison.problem.candidates)) == tuple(sorted(CANDIDATES)) and bool(
@@ -279,12 +280,12 @@ def applies(comparison: Comparison) -> bool:
     )
 
 
-def judge_placement(comparison: Comparison, prediction: Prediction, policy: str = DTP) -> Judgement:
+def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str = DTP) -> Judgement:
     """Hold the predicted dominant placement against the shares of windows.
 
     Parameters
     ----------
-    comparison : Comparison
+    comparison : StudyRuns
         With the prediction's scenario and `policy`, of a cell to which the paper applies.
     policy : str
         The one that is called DTP.
@@ -313,19 +314,20 @@ def judge_placement(comparison: Comparison, prediction: Prediction, policy: str 
     return Judgement(prediction, answer, leader, share, lead)
 
 
-def judge_claim(comparison: Comparison, scenario: str, claim: PaperClaim) -> Answer:
+def judge_claim(comparison: StudyRuns, scenario: str, claim: PaperClaim) -> Answer:
     """Hold the words on a static placement against its runs."""
     holds = claim.holds(PaperEvidence(comparison, scenario))
     return "open" if holds is None else "agrees" if holds else "differs"
 
 
-def paper_predictions(comparison: Comparison, policies: Sequence[str] = (DTP,)) -> pl.DataFrame:
+def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -> pl.DataFrame:
     """Hold every prediction of the paper's table against runs of its cell.
 
     Parameters
     ----------
-    comparison : Comparison
-        Compares the candidates LOC, SO and HYB, in some of the paper's scenarios.
+    comparison : StudyRuns
+        Of a single point; compares the candidates LOC, SO and HYB, in some of the paper's
+        scenarios.
     policies : sequence of str
         Those that the predictions about DTP are held against.
 

@@ -8,104 +8,46 @@ attempts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from dwell.display import Displayed
 from dwell.errors import SimulationError
-from dwell.study.over_seeds import over_seeds
-from dwell.study.parts import opened
 from dwell.study.player import Example, PlayedItem, Player
+from dwell.study.results import PARAMETER, StudyRuns
 from dwell.study.software import describe, versions
 from dwell.study.study import Item, Study
+from dwell.study.study_folder import TABLES, opened
 from dwell.study.summary import latency_grid_ms
 from dwell.study.workers import available_processes, spread
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = [
-    "PARAMETER",
-    "Progress",
-    "StudyResult",
-    "StudyTables",
-    "as_frame",
-    "assemble",
-    "play",
-    "play_in_memory",
-    "run_study",
-]
+__all__ = ["Progress", "StudyResult", "play_in_memory", "run_study"]
 
 Progress: TypeAlias = Callable[[int, int], None]
+#: By their names, see `TABLES`.
+Tables: TypeAlias = "dict[str, pl.DataFrame]"
 
-#: Begin of the columns that hold the values of parameters.
-PARAMETER = "parameter."
-
-TABLES = ("runs", "costs", "latencies")
 LABELS = ("scenario", "policy", "seed")
 
 
-@dataclass(frozen=True, slots=True)
-class StudyTables:
-    """The tables of a study (see `StudyResult`)."""
-
-    runs: pl.DataFrame
-    costs: pl.DataFrame
-    latencies: pl.DataFrame
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StudyResult(Displayed):
-    """All runs of a study in numbers.
+@dataclass(frozen=True, slots=True, eq=False, repr=False, kw_only=True)
+class StudyResult(StudyRuns):
+    """All runs of a study in numbers, and the study.
 
     Parameters
     ----------
-    runs : DataFrame
-        One row a point, scenario, policy and seed: the values of the point's parameters in columns
-        that begin with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and what
-        `dwell.study.summary` makes of the run. ``cost`` is J by the objective of the point,
-        whatever the settings of the contender. With references, also ``reference_cost``,
-        ``best_static``, ``regret``, and ``share_kept`` (see `dwell.study.reference.kept`).
-    costs : DataFrame
-        One row a run and candidate: mean J ``estimated`` while it was not active, mean J
-        ``measured`` while it was, both by the contender's own objective.
-    latencies : DataFrame
-        Distribution of final latencies over all seeds: ``share`` of the cycles that finished
-        within ``latency_ms``, by point, scenario and policy.
-    versions : mapping of str to str
-        Versions of the software that made the runs, by package.
     folder : Path or None
         Where the tables are.
     """
 
     study: Study
-    runs: pl.DataFrame
-    costs: pl.DataFrame
-    latencies: pl.DataFrame
-    versions: Mapping[str, str]
     folder: Path | None
-
-    def __repr__(self) -> str:
-        return f"<StudyResult of {self.study!r}>"
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Columns that hold the values of parameters."""
-        return tuple(PARAMETER + name for name in self.study.parameters)
-
-    def table(self, columns: Sequence[str] | None = None) -> pl.DataFrame:
-        """Return one row a point, scenario and policy: columns over seeds with their intervals.
-
-        Parameters
-        ----------
-        columns : sequence of str, optional
-            Of `runs`; all that hold numbers where None.
-        """
-        return over_seeds(self.runs, (*self.parameters, "scenario", "policy"), columns)
 
 
 def run_study(
@@ -148,11 +90,15 @@ def run_study(
     else:
         tables = _play_in_folder(player, folder, processes, dask, progress)
     return StudyResult(
-        study=study,
-        runs=tables.runs,
-        costs=tables.costs,
-        latencies=tables.latencies,
+        name=study.name,
+        problem=study.points[0].problem,
+        scenarios=study.scenarios,
+        policies=study.policies,
+        seeds=study.seeds,
+        windows=study.windows,
+        **tables,
         versions=versions(),
+        study=study,
         folder=folder,
     )
 
@@ -163,7 +109,7 @@ def play_in_memory(
     processes: int | None = None,
     dask: str | None = None,
     progress: Progress | None = None,
-) -> tuple[StudyTables, dict[tuple[Item, int, str], Example]]:
+) -> tuple[Tables, dict[tuple[Item, int, str], Example]]:
     """Simulate a study and write nothing.
 
     Parameters
@@ -173,24 +119,24 @@ def play_in_memory(
 
     Returns
     -------
-    tables : StudyTables
+    tables : dict of str to DataFrame
+        See `StudyRuns`.
     examples : dict of (Item, point, policy) to Example
         The runs of the seeds that the player keeps.
     """
     import polars as pl
 
-    items = player.study.items()
-    count = _Count(player.study, progress)
-    frames: dict[Item, pl.DataFrame] = {}
+    count = _counter(player.study, progress)
+    frames: list[pl.DataFrame] = []
     examples: dict[tuple[Item, int, str], Example] = {}
 
     def take(item: Item, played: PlayedItem) -> None:
-        frames[item] = as_frame(played)
+        frames.append(_frame(played))
         examples.update({(item, *key): one for key, one in played.examples.items()})
         count([item])
 
-    play(player, items, processes=processes, dask=dask, take=take)
-    return assemble(player.study, pl.concat(frames.values())), examples
+    _play(player, player.study.items(), processes, dask, take)
+    return _assembled(player.study, pl.concat(frames)), examples
 
 
 def _play_in_folder(
@@ -199,28 +145,29 @@ def _play_in_folder(
     processes: int | None,
     dask: str | None,
     progress: Progress | None,
-) -> StudyTables:
+) -> Tables:
     """Do the items whose parts are missing in a folder, and write the tables of all."""
     study = player.study
     items = study.items()
-    count = _Count(study, progress)
-    with opened(folder, describe(study), [item.name for item in items]) as parts:
+    names = [item.name for item in items]
+    count = _counter(study, progress)
+    with opened(folder, describe(study), names) as there:
 
         def take(item: Item, played: PlayedItem) -> None:
-            parts.write(item.name, as_frame(played))
+            there.write_part(item.name, _frame(played))
             count([item])
 
-        finished = parts.finished()
+        finished = there.finished()
         count([item for item in items if item.name in finished])
         missing = [item for item in items if item.name not in finished]
         try:
-            play(player, missing, processes=processes, dask=dask, take=take)
+            _play(player, missing, processes, dask, take)
             # From the files in any case: a study that was stopped makes its tables of the same.
-            tables = assemble(study, parts.read([item.name for item in items]))
-            for name in TABLES:
-                parts.write_table(name, getattr(tables, name))
+            tables = _assembled(study, there.read_parts(names))
+            for name, table in tables.items():
+                there.write_table(name, table)
         except SimulationError as error:
-            done = len(parts.finished())
+            done = len(there.finished())
             if not done:
                 raise
             raise SimulationError(
@@ -230,38 +177,27 @@ def _play_in_folder(
     return tables
 
 
-@dataclass(slots=True)
-class _Count:
-    """Counts runs as items are done, and tells whoever wants to know."""
+def _counter(study: Study, progress: Progress | None) -> Callable[[Sequence[Item]], None]:
+    """Return what counts the runs of items as they are done, and tells `progress`."""
+    done = 0
 
-    study: Study
-    progress: Progress | None
-    done: int = 0
+    def count(items: Sequence[Item]) -> None:
+        nonlocal done
+        done += sum(len(item.points) for item in items) * len(study.contenders)
+        if progress is not None:
+            progress(done, study.runs)
 
-    def __call__(self, items: Sequence[Item]) -> None:
-        self.done += sum(len(item.points) for item in items) * len(self.study.contenders)
-        if self.progress is not None:
-            self.progress(self.done, self.study.runs)
+    return count
 
 
-def play(
+def _play(
     player: Player,
     items: Sequence[Item],
-    *,
-    processes: int | None = None,
-    dask: str | None = None,
+    processes: int | None,
+    dask: str | None,
     take: Callable[[Item, PlayedItem], None],
 ) -> None:
-    """Do items, and hand over what came of each.
-
-    Parameters
-    ----------
-    items : sequence of Item
-    processes, dask
-        See `run_study`.
-    take : callable
-        Called in this process with each item and what came of it, as soon as that is ready.
-    """
+    """Do items, and hand over what came of each as soon as it is ready."""
     if not items:
         return
     player.rehearse()
@@ -274,7 +210,7 @@ def play(
         spread_on_dask(player, items, address=dask, take=take)
 
 
-def as_frame(played: PlayedItem) -> pl.DataFrame:
+def _frame(played: PlayedItem) -> pl.DataFrame:
     """Return what came of an item as one row a run.
 
     Returns
@@ -301,35 +237,25 @@ def as_frame(played: PlayedItem) -> pl.DataFrame:
     return frame.with_columns(pl.Series("within", within).arr.to_list())
 
 
-def assemble(study: Study, frame: pl.DataFrame) -> StudyTables:
-    """Put the tables of a study together.
-
-    Parameters
-    ----------
-    frame : DataFrame
-        Those of all items (see `as_frame`), one below the other in any order.
-    """
+def _assembled(study: Study, frame: pl.DataFrame) -> Tables:
+    """Return the tables of a study, of the rows of all items in any order (see `_frame`)."""
     import polars as pl
 
-    places = {
-        "scenario": study.scenarios,
-        "policy": study.policies,
-        "seed": study.seeds,
-    }
+    places = zip(LABELS, (study.scenarios, study.policies, study.seeds), strict=True)
     ordered = frame.sort(
         "point",
         *(
             pl.col(column).replace_strict(list(names), list(range(len(names))))
-            for column, names in places.items()
+            for column, names in places
         ),
     )
-    runs = _with_values(study, ordered.drop("costs", "within"))
     costs = ordered.select("point", *LABELS, "costs").explode("costs").unnest("costs")
-    return StudyTables(
-        runs=runs,
-        costs=_with_values(study, costs).with_columns(pl.selectors.float().fill_nan(None)),
-        latencies=_with_values(study, _latencies(study, ordered)),
+    tables = (
+        _with_values(study, ordered.drop("costs", "within")),
+        _with_values(study, costs).with_columns(pl.selectors.float().fill_nan(None)),
+        _with_values(study, _latencies(study, ordered)),
     )
+    return dict(zip(TABLES, tables, strict=True))
 
 
 def _with_values(study: Study, frame: pl.DataFrame) -> pl.DataFrame:

@@ -25,7 +25,7 @@ PACKAGES = ("numpy", "numba", "polars")
 #: Parts of this package that make numbers.
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
-    *(f"study/{name}.py" for name in ("clairvoyant", "hindsight", "judging", "player")),
+    *(f"study/{name}.py" for name in ("clairvoyant", "hindsight", "player")),
     *(f"study/{name}.py" for name in ("quality", "reference", "runner", "script", "summary")),
 )
 

@@ -1,0 +1,137 @@
+"""Results: the runs of a study in numbers, one row a run, and the statistics over their seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.display import Displayed
+from dwell.errors import PolicyError, SimulationError
+from dwell.model import Problem
+from dwell.model.semantics import nearest
+from dwell.study.intervals import Interval
+from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
+
+if TYPE_CHECKING:
+    import polars as pl
+
+__all__ = ["PARAMETER", "StudyRuns"]
+
+Floats: TypeAlias = NDArray[np.float64]
+
+#: Begin of the columns that hold the values of parameters.
+PARAMETER = "parameter."
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class StudyRuns(Displayed):
+    """All runs of a study in numbers.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the first point.
+    scenarios, policies : tuple of str
+        In the order of tables and figures; a policy that has a candidate's name never moves.
+    seeds : tuple of int
+    windows : int
+        Length of every run, the warm-up included.
+    runs : DataFrame
+        One row a point, scenario, policy and seed: the values of the point's parameters in columns
+        that begin with `PARAMETER`, ``scenario``, ``policy``, ``seed``, and what
+        `dwell.study.summary` makes of the run. ``cost`` is J by the objective of the point,
+        whatever the settings of the contender. With references, also ``reference_cost``,
+        ``best_static``, ``regret``, and ``share_kept`` (see `dwell.study.reference.kept`).
+    costs : DataFrame
+        One row a run and candidate: mean J ``estimated`` while it was not active (against the
+        incumbent, switching term included), mean J ``measured`` while it was, both by the
+        contender's own objective.
+    latencies : DataFrame
+        Distribution of final latencies over all seeds: ``share`` of the cycles that finished
+        within ``latency_ms``, by point, scenario and policy. It stays below 1 where cycles were
+        lost.
+    versions : mapping of str to str
+        Versions of the software that made the runs, by package.
+    """
+
+    name: str
+    problem: Problem
+    scenarios: tuple[str, ...]
+    policies: tuple[str, ...]
+    seeds: tuple[int, ...]
+    windows: int
+    runs: pl.DataFrame
+    costs: pl.DataFrame
+    latencies: pl.DataFrame
+    versions: Mapping[str, str]
+
+    def __repr__(self) -> str:
+        return (
+            f"<{type(self).__name__} {self.name}: {self.runs.height} runs, "
+            f"{len(self.scenarios)} scenarios, {len(self.policies)} policies, "
+            f"{len(self.seeds)} seeds, {self.windows} windows>"
+        )
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Columns that hold the values of parameters."""
+        return tuple(name for name in self.runs.columns if name.startswith(PARAMETER))
+
+    @property
+    def statics(self) -> tuple[str, ...]:
+        """Policies that are a candidate's placement and never move."""
+        return tuple(name for name in self.policies if name in self.problem.candidates)
+
+    def values(self, scenario: str, policy: str, column: str) -> Floats:
+        """Return one number a seed, in the order of the seeds.
+
+        Raises
+        ------
+        SimulationError, PolicyError, MetricError
+            If there is no such scenario, policy or column of `runs`, or there are several points.
+        """
+        if self.parameters:
+            raise SimulationError(
+                f"study {self.name} has parameters, and so no single number a seed; filter its runs"
+            )
+        for kind, what, name, known in (
+            (SimulationError, "scenario", scenario, self.scenarios),
+            (PolicyError, "policy", policy, self.policies),
+        ):
+            if name not in known:
+                raise kind(f"unknown {what} {name!r}; {nearest(name, known)}")
+        return metric_values(self.runs.filter(scenario=scenario, policy=policy), column)
+
+    def interval(self, scenario: str, policy: str, column: str) -> Interval:
+        """Return a column over seeds: its mean, or its median where it may be infinite."""
+        return interval_of(column)(self.values(scenario, policy, column))
+
+    def difference(self, scenario: str, policies: tuple[str, str], column: str) -> Interval:
+        """Return the mean over seeds of what the first policy shows less what the second does.
+
+        Its interval is that of pairs of runs, and for shares (the violation rate, say) no narrower
+        than what either policy's own leaves open (see `share_difference_interval`).
+        """
+        first, second = (self.values(scenario, policy, column) for policy in policies)
+        return difference_of(column)(first, second)
+
+    def table(self, columns: Sequence[str] | None = None) -> pl.DataFrame:
+        """Return one row a point, scenario and policy: columns over seeds with their intervals.
+
+        Parameters
+        ----------
+        columns : sequence of str, optional
+            Of `runs`; all that hold numbers where None.
+
+        Returns
+        -------
+        DataFrame
+            For each column x: ``x``, ``x_low`` and ``x_high`` (see `interval`; null ends where one
+            seed gives none), and for the violation rate also its one-sided limits
+            ``violation_rate_at_least`` and ``violation_rate_at_most``.
+        """
+        return over_seeds(self.runs, (*self.parameters, "scenario", "policy"), columns)
