@@ -44,7 +44,7 @@ demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real
 # Most tests run side by side; those that need the machine to themselves follow, one after another.
 # pytest ends with 5 where ARGS leave nothing to run.
 test: env ## Run the tests (ARGS="-k name" passes options to pytest)
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not alone" $(ARGS) || [ $$? -eq 5 ]
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not alone" $(ARGS) || [ $$? -eq 5 ]
 	$(BIN)/python -m pytest -m alone $(ARGS) || [ $$? -eq 5 ]
 
 check: env ## Lint, formatting, types and the borders between packages

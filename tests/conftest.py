@@ -6,8 +6,8 @@ themselves: real processes whose faults and deadlines are counted, and ports tha
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -29,15 +29,35 @@ ALONE = (
     "live/test_real_faults.py",
     "live/test_security.py",
     "live/transport",
-    "test_package.py",
     "testbed/test_execution.py",
     "testbed/test_netns_testbed.py",
     "testbed/test_run.py",
 )
 
 
-def pytest_collection_modifyitems(items: Iterable[pytest.Item]) -> None:
-    """Mark the tests that need the machine to themselves."""
+#: Files that take longest: side by side, they begin first, so that none is left over at the end.
+LONGEST = (
+    "reference/test_against.py",
+    "live/test_protocol_model.py",
+    "reproduction/test_questions.py",
+    "live/test_continuity.py",
+    "cli/test_first_answer.py",
+    "test_package.py",
+    "cli/test_doctor.py",
+    "cli/test_new.py",
+)
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Return how many processes test side by side: tests wait for a third of their time."""
+    cpus = len(os.sched_getaffinity(0))
+    return cpus + (cpus + 1) // 2
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that need the machine to themselves; the longest files come first."""
+    first = {HERE / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: first.get(item.path, len(first)))
     for item in items:
         if any(item.path.is_relative_to(HERE / name) for name in ALONE):
             item.add_marker(pytest.mark.alone)
