@@ -8,10 +8,12 @@ burst. Within a flow nothing overtakes; flows do.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import gc
 import os
 import select
+import struct
 import time
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -21,12 +23,10 @@ from typing import TypedDict, cast
 
 from dwell.errors import DwellError
 from dwell.testbed.child import Json, Parent
-from dwell.testbed.conditions import Conditions
+from dwell.testbed.conditions import Conditions, Scheduling, changed
 from dwell.testbed.draws import Draws
 from dwell.testbed.event_loop import Loop
-from dwell.testbed.orders import Orders, Set
 from dwell.testbed.packets import kind_of
-from dwell.testbed.realtime import come_first
 
 __all__ = ["LATE_MS", "main"]
 
@@ -41,12 +41,24 @@ AT_ONCE = 5
 WAITING_BYTES = 64 << 20
 # Flows remembered; those that have nothing on its way are forgotten where there are more.
 FLOWS = 1_024
+# Linux lets timers of ordinary processes be 50 µs late to save power.
+TIMER_SLACK = "/proc/self/timerslack_ns"
+# The shortest time slice that Linux grants; the shorter it is, the sooner a process gets the CPU.
+SLICE_NS = 100_000
+SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
+
+
+class _Set(TypedDict):
+    """A change of the direction from a node, as `to_json` has written it."""
+
+    source: str
+    changes: dict[str, object]
 
 
 class _Settings(TypedDict):
     nodes: list[str]
     descriptors: list[int]
-    sets: list[Set]
+    sets: list[_Set]
     retransmit_ns: dict[str, int]
     gap_ns: int
     longest_ns: int
@@ -202,7 +214,7 @@ class _Link:
         """Those of the direction from a node."""
         return self._directions[source].draws.conditions
 
-    def apply(self, sets: Sequence[Set]) -> None:
+    def apply(self, sets: Sequence[_Set]) -> None:
         """Change conditions."""
         for item in sets:
             self._directions[item["source"]].draws.apply(item["changes"])
@@ -220,6 +232,58 @@ class _Link:
         return counted
 
 
+class _Orders:
+    """Carries out the parent's requests as they come in a loop."""
+
+    served_ns = 0
+
+    def __init__(self, parent: Parent, link: _Link) -> None:
+        self._parent, self._link = parent, link
+        link.loop.watch(parent.fileno(), select.EPOLLIN, self)
+
+    def ready(self, _events: int) -> None:
+        """Carry out a request; an `EOFError` ends the process."""
+        request = self._parent.receive()
+        try:
+            self._parent.answer(self._answer(request))
+        except DwellError as error:
+            self._parent.answer({"error": str(error)})
+
+    def _answer(self, request: Json) -> Json:
+        link = self._link
+        if request["do"] == "stats":
+            return {"stats": link.stats(reset=bool(request["reset"]))}
+        sets = cast("list[_Set]", request["sets"])
+        for item in sets:  # all faults before anything has changed
+            changed(link.conditions_from(item["source"]), item["changes"])
+        at_ns = cast("int | None", request["at_ns"]) or 0
+        now_ns = time.monotonic_ns()
+        if at_ns <= now_ns:
+            link.apply(sets)
+            return {"at_ns": now_ns}
+        link.loop.at(at_ns, lambda _: link.apply(sets))
+        return {"at_ns": at_ns}
+
+
+def _come_first() -> Scheduling:
+    """Get the CPU as soon as something is due, as far as the system lets this process.
+
+    A real link does not wait for the CPU of a node that it connects; and foreign work is there to
+    slow nodes, not links. Real-time priority does it, where the process may have it. Anybody may
+    ask for short time slices (Linux 6.12), which halve the lateness beside busy threads.
+    """
+    with contextlib.suppress(OSError), open(TIMER_SLACK, "w") as slack:
+        slack.write("1")
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        return "fifo"
+    number = SCHED_SETATTR.get(os.uname().machine)
+    # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period.
+    usual = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, 0, 0, 0, SLICE_NS, 0, 0)
+    done = number is not None and ctypes.CDLL(None).syscall(number, 0, usual, 0) == 0
+    return "short slices" if done else "usual"
+
+
 def main() -> None:
     """Forward until the parent ends, or wants it to."""
     parent = Parent()
@@ -232,8 +296,8 @@ def main() -> None:
         except (DwellError, OSError) as error:
             parent.answer({"error": str(error)})
             return
-        Orders(parent, link)
-        parent.answer({"scheduling": come_first()})
+        _Orders(parent, link)
+        parent.answer({"scheduling": _come_first()})
         gc.freeze()
         while parent.alive:
             link.loop.turn()

@@ -1,0 +1,151 @@
+"""What follows from the messages of one cycle: latency and its parts, jobs, evidence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.live.cycle_ledger import UNKNOWN, Ledger, LiveCycle
+from dwell.live.messages import Completion, Hop, Stamp
+from dwell.live.offsets import Offsets
+from dwell.model import Problem
+from dwell.model.instants import NEVER_NS
+
+MS = 1_000_000
+RELEASE_NS = 50 * MS
+#: What a cycle under SO does: begin and end of its jobs, ms after the release.
+JOBS = {
+    "sensing": ("R1", 0.0, 0.0, 3.0),
+    "perception": ("E", 6.0, 8.0, 18.0),
+    "planning": ("E", 18.5, 18.5, 24.0),
+    "control": ("R2", 25.0, 25.0, 25.5),
+}
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return dwell.load("examples/canonical.yaml")
+
+
+@pytest.fixture
+def ledger(problem: Problem) -> Ledger:
+    return Ledger(problem, Offsets("E", problem.stamper_node, system_bound_ns=0))
+
+
+def stamp(number: int, placement: str = "SO", shadow: str = "") -> Stamp:
+    return Stamp(1, number, 1, placement, RELEASE_NS, shadow)
+
+
+def cycle(number: int = 0, *, placement: str = "SO", shadow: str = "") -> LiveCycle:
+    return LiveCycle.of(stamp(number, placement, shadow), 0)
+
+
+def hop(task: str, *, source: str = "", ended: bool = True) -> Hop:
+    node, ready, begin, end = JOBS[task]
+    at = [RELEASE_NS + round(ms * MS) for ms in (ready, begin, end)]
+    inputs = ((source, at[0]),) if source else ()
+    return Hop(task, node, at[0], at[1], at[2] if ended else UNKNOWN, inputs)
+
+
+def hops() -> tuple[Hop, ...]:
+    names = list(JOBS)
+    return tuple(
+        hop(name, source=before) for before, name in zip(["", *names], names, strict=False)
+    )
+
+
+def completion(one: LiveCycle, outcome: str = "actuated") -> Completion:
+    done_ns = RELEASE_NS + round(25.5 * MS)
+    return Completion(stamp(one.number), "control", done_ns, outcome, hops(), "R2")
+
+
+def test_a_latency_is_parted_along_its_critical_path(ledger: Ledger) -> None:
+    one = cycle()
+    ledger.settle(one)
+    assert (one.latency_ns, one.parts_ns) == (NEVER_NS, None)
+    assert one.take(completion(one), RELEASE_NS + 27 * MS)
+    ledger.settle(one)
+    assert one.latency_ns == round(25.5 * MS)
+    compute, network = 3.0 + 10.0 + 5.5 + 0.5, 3.0 + 1.0
+    expected = (compute, 25.5 - compute - network, network)
+    assert one.parts_ns == tuple(round(ms * MS) for ms in expected)
+    assert one.actuated
+    assert not one.missed(26 * MS)
+    assert one.missed(25 * MS)
+
+
+def test_a_copy_of_a_completion_changes_nothing(ledger: Ledger) -> None:
+    one = cycle()
+    assert one.take(completion(one), 1)
+    assert not one.take(completion(one, "stale"), 2)
+    assert one.heard_ns == {"control": 1}
+    assert one.actuated
+
+
+def test_what_the_stamper_heard_counts_until_the_sink_says_so_itself(ledger: Ledger) -> None:
+    one = cycle()
+    one.stamper_interval_ns = 30 * MS
+    ledger.settle(one)
+    assert (one.latency_ns, one.told) == (30 * MS, True)
+    one.take(completion(one), None)
+    ledger.settle(one)
+    assert (one.latency_ns, one.told) == (round(25.5 * MS), False)
+
+
+def test_jobs_have_their_instants_and_one_that_was_replaced_only_its_readiness(
+    ledger: Ledger, problem: Problem
+) -> None:
+    one = cycle()
+    one.row = 7
+    one.take(completion(one), None)
+    rows = ledger.jobs(one)
+    assert [(row["task"], row["node"]) for row in rows] == [(t, of[0]) for t, of in JOBS.items()]
+    for row, (_, *instants) in zip(rows, JOBS.values(), strict=True):
+        at = [round(ms * MS) + RELEASE_NS for ms in instants]
+        assert [row["ready_ns"], row["start_ns"], row["end_ns"]] == at
+        assert (row["cycle"], row["outcome"], row["shadow"]) == (7, "done", False)
+    gone = cycle(1)
+    replaced = (hop("sensing"), hop("perception", source="sensing", ended=False))
+    gone.take(Completion(stamp(1), "perception", RELEASE_NS, "replaced", replaced, "E"), None)
+    assert [(row["task"], row["outcome"]) for row in ledger.jobs(gone)] == [
+        ("sensing", "done"),
+        ("perception", "replaced"),
+    ]
+    assert [row["end_ns"] is None for row in ledger.jobs(gone)] == [False, True]
+
+
+def test_evidence_is_what_had_happened_at_the_close(ledger: Ledger, problem: Problem) -> None:
+    done, silent = cycle(), cycle(1)
+    done.take(completion(done), None)
+    close_ns = RELEASE_NS + 20 * MS
+    release_ns = np.array([RELEASE_NS, RELEASE_NS])
+    found = ledger.evidence([done, silent], release_ns, close_ns, shadows=False)
+    tasks = list(problem.pipeline.tasks)
+    ended = dict(zip(tasks, found.cycles.end_ns[0].tolist(), strict=True))
+    assert ended == {
+        "sensing": RELEASE_NS + 3 * MS,
+        "perception": RELEASE_NS + 18 * MS,
+        "planning": UNKNOWN,
+        "control": UNKNOWN,
+    }
+    assert found.placement.tolist() == [list(problem.candidates).index("SO")] * 2
+    assert found.shadows is None
+    # Of one that never came, the first message to another node is taken to have been lost.
+    assert found.cycles.end_ns[1, tasks.index("sensing")] == RELEASE_NS
+    assert (found.cycles.arrived_ns[1] == UNKNOWN).all()
+
+
+def test_of_a_shadow_what_it_did_not_share_is_told_apart(ledger: Ledger, problem: Problem) -> None:
+    one = cycle(placement="LOC", shadow="SO")
+    through = (*hops()[:3], hop("control", source="planning", ended=False))
+    shadow = Completion(stamp(0), "control", RELEASE_NS + 25 * MS, "shadow", through, "R2")
+    assert one.take(shadow, None)
+    assert not one.take(shadow, None)
+    rows = ledger.jobs(one)
+    told = {row["task"]: row["shadow"] for row in rows}
+    assert told == {"sensing": False, "perception": True, "planning": True}
+    sent, bytes_ = ledger.shadow_bytes([one, cycle(1)])
+    flows = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
+    assert sent == 1
+    assert bytes_ == flows["sensing", "perception"] + flows["planning", "control"]
