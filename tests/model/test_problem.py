@@ -75,25 +75,6 @@ PLACED = {"a": "R", "b": "R"}
 @pytest.mark.parametrize(
     ("make", "path", "words"),
     [
-        (lambda: Fabric({}), "nodes", "at least one"),
-        (lambda: Fabric({"R": Node("E", "edge")}), "nodes.R", "named as its key, 'R'"),
-        (
-            lambda: Fabric({"R": Node("R", "edge")}, {"x": Link("R", "E", Constant(1))}),
-            "links.x",
-            "'R->E' is not allowed",
-        ),
-        (lambda: Node("R", "rover"), "tier", "robot, edge, cloud"),  # type: ignore[arg-type]
-        (lambda: Node("R", "robot", cores=1.5), "cores", "a whole number"),  # type: ignore[arg-type]
-        (lambda: Node("R", "robot", bursts=BURSTS), "bursts.add_delay_ms", "only a link"),
-        (lambda: Link("R", "E", Constant(1), bursts=BURSTS), "bursts.threads", "only a node"),
-        (lambda: Link("R", "R", Constant(1)), "to", "another node"),
-        (lambda: Link("R", "E", Constant(1), rate_mbps=1e-9), "rate_mbps", "at least 0.0001"),
-        (lambda: Bursts(Constant(0), Constant(1)), "every_ms", "0 is not allowed"),
-        (lambda: Task("a", {}), "on", "at least one node"),
-        (lambda: Task("a", {"R": EXECUTION}, depth=-1), "input", "a whole number from 0"),
-        (lambda: Flow("a", "b", -1), "bytes", "from 0 to 1e12"),
-        (lambda: Pipeline({"b": Task("a", {"R": EXECUTION})}, (), 1, 1), "tasks.b", "its key"),
-        (lambda: Pipeline({}, (), 1, 2), "deadline_ms", "at most period_ms = 1"),
         (lambda: NodeDisturbance("R", for_s=0), "for_s", "above 0"),
         (lambda: LinkDisturbance("R", "E", loss=2), "loss", "from 0 to 1"),
         (lambda: NodeDisturbance("R", ramp_s=-1), "ramp_s", "from 0 to 1e9"),
