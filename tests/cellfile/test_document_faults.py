@@ -2,52 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import pickle
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from dwell.cellfile import from_document, load
-from dwell.cellfile.document_faults import Faults
-from dwell.cellfile.yaml_text import read_yaml
-from dwell.errors import Fault, ProblemError
-from tests.cellfile.test_cell import EXAMPLE, LEAST
-
-Document = dict[str, Any]
-
-
-def _example() -> Document:
-    document = read_yaml(str(EXAMPLE), Faults())
-    assert isinstance(document, dict)
-    return document
-
-
-DOCUMENT = _example()
-
-
-def _put(document: Any, value: object, *steps: str | int) -> None:
-    for step in steps[:-1]:
-        document = document[step]
-    document[steps[-1]] = value
-
-
-def _faults(document: object) -> list[Fault]:
-    with pytest.raises(ProblemError) as caught:
-        from_document(document)  # type: ignore[arg-type]
-    return list(caught.value.faults)
-
-
-def _one(value: object, *steps: str | int) -> Fault:
-    """Return the only fault that a value put into the example makes."""
-    document = copy.deepcopy(DOCUMENT)
-    _put(document, value, *steps)
-    (fault,) = _faults(document)
-    return fault
-
+from dwell.cellfile import load
+from dwell.errors import ProblemError
+from tests.cellfile.faulty import DOCUMENT, faults_of_document, one_fault
 
 TARGET = {"amplitude_mm": 50, "period_s": 2}
 
@@ -412,92 +376,10 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
 def test_a_value_at_fault(
     steps: tuple[str | int, ...], value: object, path: str, words: tuple[str, ...]
 ) -> None:
-    fault = _one(value, *steps)
+    fault = one_fault(value, *steps)
     assert fault.path == path
     for word in words:
         assert word in fault.message
-
-
-@pytest.mark.parametrize("key", ["dwell", "period_ms", "nodes", "tasks", "candidates"])
-def test_a_section_that_is_missing_is_the_only_fault(key: str) -> None:
-    document = {name: value for name, value in DOCUMENT.items() if name != key}
-    (fault,) = _faults(document)
-    assert fault.path == key
-    assert fault.message.startswith("missing; add it:")
-
-
-@pytest.mark.parametrize(
-    ("section", "steps"),
-    [
-        ("nodes.E.tier", ("nodes", "E", "tier")),
-        ("links[0].delay_ms", ("links", 0, "delay_ms")),
-        ("links[0].to", ("links", 0, "to")),
-        ("tasks.planning.on", ("tasks", "planning", "on")),
-        ("tasks.planning.on.E.exec_ms", ("tasks", "planning", "on", "E", "exec_ms")),
-        ("flows[0].from", ("flows", 0, "from")),
-    ],
-)
-def test_a_key_that_is_missing_is_the_only_fault(
-    section: str, steps: tuple[str | int, ...]
-) -> None:
-    document = copy.deepcopy(DOCUMENT)
-    parent: Any = document
-    for step in steps[:-1]:
-        parent = parent[step]
-    del parent[steps[-1]]
-    (fault,) = _faults(document)
-    assert fault.path == section
-    assert fault.message.startswith("missing; add it:")
-
-
-@pytest.mark.parametrize("section", ["nodes", "tasks", "candidates"])
-def test_a_section_that_is_empty_is_at_fault(section: str) -> None:
-    faults = _faults({**LEAST, section: {}})
-    assert any(f.path == section and "none is declared" in f.message for f in faults)
-
-
-def test_a_link_stands_once() -> None:
-    document = copy.deepcopy(DOCUMENT)
-    document["links"].append({"from": "E", "to": "R1", "delay_ms": 2})
-    (fault,) = _faults(document)
-    assert fault.path == "links[3]"
-    assert "E->R1 is declared again (first at links[0])" in fault.message
-
-
-def test_a_candidate_needs_its_links() -> None:
-    document = copy.deepcopy(DOCUMENT)
-    del document["links"][1]
-    faults = _faults(document)
-    assert [fault.path for fault in faults] == ["candidates.SO", "candidates.HYB"]
-    assert "E->R2 for planning -> actuation" in faults[0].message
-
-
-@pytest.mark.parametrize("estimator", ["shadow", "corrected"])
-def test_shadows_of_all_alternatives_are_at_most_all_cycles(estimator: str) -> None:
-    document = copy.deepcopy(DOCUMENT)
-    document["controller"] |= {"estimator": estimator, "shadow_fraction": 0.6}
-    (fault,) = _faults(document)
-    assert fault.path == "controller.shadow_fraction"
-    assert "each of 2 alternatives is more than all cycles; at most 0.5" in fault.message
-    document["controller"] |= {"shadow_fraction": 0.5}
-    assert from_document(document)
-    # An estimator without shadows asks for none.
-    for other in ("profile", "scaling"):
-        document["controller"] |= {"estimator": other, "shadow_fraction": 1.0}
-        assert from_document(document)
-
-
-def test_state_needs_a_link_to_be_carried_over() -> None:
-    document = copy.deepcopy(DOCUMENT)
-    document["controller"]["migration"] = "cold"
-    document["tasks"]["planning"]["state_bytes"] = 1000
-    assert from_document(document)
-    document["links"] = [
-        link for link in document["links"] if {link["from"], link["to"]} != {"R2", "E"}
-    ]
-    faults = {fault.path: fault.message for fault in _faults(document)}
-    assert "E->R2" in faults["tasks.planning.state_bytes"]
-    assert "R2->E" in faults["tasks.planning.state_bytes"]
 
 
 FIVE = """\
@@ -551,47 +433,6 @@ def test_structure_and_meaning_are_reported_in_one_pass(tmp_path: Path) -> None:
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_what_refers_to_a_part_at_fault_is_not_at_fault() -> None:
-    document = copy.deepcopy(DOCUMENT)
-    document["nodes"]["E"] = {"tier": "edge", "accelerators": 7}
-    document["tasks"]["perception"]["on"]["E"] = {"exec_ms": 6, "accelerator": "gpu"}
-    document["tasks"]["planning"]["on"]["R2"] = "fast"
-    document["candidates"]["SO"]["planning"] = 5
-    document["controller"]["fallbacks"] = ["SO"]
-    assert {fault.path for fault in _faults(document)} == {
-        "nodes.E.accelerators",
-        "tasks.planning.on.R2",
-        "candidates.SO.planning",
-    }
-
-
-def test_a_newer_version_is_the_only_complaint() -> None:
-    document = {**copy.deepcopy(DOCUMENT), "dwell": 3, "swarms": [1, None]}
-    (fault,) = _faults(document)
-    assert fault.path == "dwell"
-    assert "3" in fault.message
-
-
-@pytest.mark.parametrize("document", [[], "text", 5, None])
-def test_a_document_is_a_mapping(document: object) -> None:
-    (fault,) = _faults(document)
-    assert "`dwell: 1`" in fault.message
-
-
-def test_values_that_no_file_holds_are_refused() -> None:
-    document: Document = {**DOCUMENT, "name": {1, 2}, 7: "x", "flows": ({1: 2},)}  # type: ignore[dict-item]
-    paths = {fault.path for fault in _faults(document)}
-    assert {"name", "7", "flows[0].1"} <= paths
-
-
-def test_a_document_is_not_changed_by_reading_it() -> None:
-    document = copy.deepcopy(DOCUMENT)
-    _put(document, -1, "tasks", "sensing", "on", "R1", "exec_ms")
-    before = copy.deepcopy(document)
-    _faults(document)
-    assert document == before
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -622,17 +463,6 @@ def test_an_impossible_path_is_no_cell() -> None:
 
 def test_faults_stay_on_one_line_and_can_be_printed() -> None:
     document = {**DOCUMENT, "a\nb\ud800": 1}
-    (fault,) = _faults(document)
+    (fault,) = faults_of_document(document)
     assert "\n" not in str(fault)
     assert str(fault).encode()
-
-
-def test_a_fault_in_episodes_is_no_difference_to_what_shares_their_name() -> None:
-    good = {"name": "a", "every_s": 1, "for_s": {"exponential": {"mean": 2}}}
-    bad = {**good, "for_s": {"exponential": {"mean": -2}}}
-    document = copy.deepcopy(DOCUMENT)
-    document["scenarios"]["x"] = [{"node": "E", "episodes": each} for each in (good, bad, good)]
-    with pytest.raises(ProblemError) as caught:
-        from_document(document)
-    (fault,) = caught.value.faults
-    assert fault.path == "scenarios.x[1].episodes.for_s.exponential.mean"

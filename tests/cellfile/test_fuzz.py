@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from dwell.cellfile import from_document, load
 from dwell.errors import ProblemError
 from dwell.model import Problem
+from tests.cellfile.faulty import DOCUMENT
 from tests.cellfile.test_cell import EXAMPLE
-from tests.cellfile.test_document_faults import DOCUMENT
 
 RICH: dict[str, Any] = {
     **copy.deepcopy(DOCUMENT),

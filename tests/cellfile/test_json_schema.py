@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from dwell.cellfile import schema
 from dwell.model import Problem
 from dwell.model.document import to_document
+from tests.cellfile.faulty import DOCUMENT
 from tests.cellfile.test_cell import LEAST
-from tests.cellfile.test_document_faults import DOCUMENT
 from tests.model.cells import problems
 
 jsonschema = pytest.importorskip("jsonschema", reason="validates documents against the schema")

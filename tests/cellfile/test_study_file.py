@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 from dwell.cellfile import load
 from dwell.cellfile.study_file import DeclaredStudy, read_study
-from dwell.cellfile.study_paths import put, steps_of, with_settings
 from dwell.errors import ProblemError, TraceError
-from dwell.model import Constant, LogNormal, NodeDisturbance, Problem, Trace
+from dwell.model import Constant, LogNormal, NodeDisturbance, Trace
 from tests.cellfile.test_cell import EXAMPLE
 
 LEAST = """\
@@ -158,33 +157,6 @@ def test_everything_that_a_study_may_say(folder: Path) -> None:
     for problem in (first, last):
         assert problem.scenarios["step"] == (NodeDisturbance("R1", 10, 20, stress_threads=4),)
         assert problem.scenarios["edge-crash"] == (NodeDisturbance("E", 5, down=True),)
-
-
-@pytest.mark.parametrize(
-    ("given", "seeds"),
-    [
-        ("3", (1, 2, 3)),
-        ("[7, 5]", (7, 5)),
-        ("{from: 0, count: 2}", (0, 1)),
-        ("2e0", (1, 2)),
-    ],
-)
-def test_seeds_are_a_number_a_list_or_a_stretch(
-    folder: Path, given: str, seeds: tuple[int, ...]
-) -> None:
-    assert read(folder, f"{LEAST}seeds: {given}\n").seeds == seeds
-
-
-@pytest.mark.parametrize(
-    ("values", "kinds"),
-    [("[1, 2]", [int, int]), ("[1, 2.5]", [float, float]), ("[1, {constant: 2}]", [str, str])],
-)
-def test_the_values_of_a_parameter_are_of_one_kind(
-    folder: Path, values: str, kinds: list[type]
-) -> None:
-    text = f"{LEAST}parameters: {{'links[0].delay_ms': {values}}}\n"
-    points = read(folder, text).points
-    assert [type(point.values["links[0].delay_ms"]) for point in points] == kinds
 
 
 def test_parameters_may_be_in_the_studys_own_scenarios(folder: Path) -> None:
@@ -451,82 +423,3 @@ def test_whatever_stands_there_ends_in_a_study_or_in_faults(
 
 
 # ----------------------------------------------------------------------------- dotted paths
-
-DOCUMENT = {
-    "nodes": {"R1": {"cores": 4}, "R1.5": {"cores": 2}, "big one": {"cores": 9}},
-    "links": [{"delay_ms": 1}, {"delay_ms": {"lognormal": {"mean": 1, "cv": 1}}}],
-}
-
-
-@pytest.mark.parametrize(
-    ("path", "steps"),
-    [
-        ("nodes.R1.cores", ("nodes", "R1", "cores")),
-        ("nodes.R1.5.cores", ("nodes", "R1.5", "cores")),
-        ("nodes.big one.cores", ("nodes", "big one", "cores")),
-        ("links[1].delay_ms.lognormal.cv", ("links", 1, "delay_ms", "lognormal", "cv")),
-        ("links[0]", ("links", 0)),
-        ("objective.caps.latency_ms", ("objective", "caps", "latency_ms")),
-    ],
-)
-def test_paths_are_split_by_what_is_there(path: str, steps: tuple[str | int, ...]) -> None:
-    assert steps_of(path, DOCUMENT) == steps
-
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
-        ("", "not a path"),
-        (".", "not a path"),
-        ("nodes.", "not a path"),
-        ("links[x]", "not a path"),
-        ("links[0]delay_ms", "not a path"),
-        ("links.delay_ms", r"links is a list; take one of its items, as `links\[0\]`"),
-        ("links[2].delay_ms", r"there is no links\[2\]; links has 2 items, from \[0\]"),
-        ("nodes[0].cores", r"nodes is no list; it has no item \[0\]"),
-        ("links[0].delay_ms.lognormal", r"links\[0\].delay_ms is 1; it has no key 'lognormal'"),
-        ("nodes.R2.cores", "the cell's nodes have no 'R2'; known: R1, R1.5, big one"),
-    ],
-)
-def test_paths_that_lead_nowhere_are_refused(path: str, message: str) -> None:
-    with pytest.raises(ProblemError, match=message):
-        steps_of(path, DOCUMENT)
-
-
-def test_what_is_put_changes_nothing_else() -> None:
-    before = yaml.safe_dump(DOCUMENT)
-    found = put(DOCUMENT, ("links", 1, "delay_ms"), 5)
-    assert found["links"] == [{"delay_ms": 1}, {"delay_ms": 5}]
-    assert found["nodes"] == DOCUMENT["nodes"]
-    assert put(DOCUMENT, ("objective", "caps", "edge"), 1)["objective"] == {"caps": {"edge": 1}}
-    assert yaml.safe_dump(DOCUMENT) == before
-
-
-@pytest.fixture(scope="module")
-def problem() -> Problem:
-    return load(EXAMPLE)
-
-
-def test_settings_leave_all_that_is_drawn(problem: Problem) -> None:
-    found = with_settings(problem, {"controller.min_dwell": 7, "objective.caps.utilisation": 0.5})
-    assert found.controller.min_dwell == 7
-    assert found.objective.caps.utilisation == 0.5
-    assert found.objective.weights == problem.objective.weights
-    for part in ("name", "pipeline", "fabric", "candidates", "scenarios", "window_cycles"):
-        assert getattr(found, part) == getattr(problem, part)
-
-
-def test_settings_that_are_wrong_are_told_at_once(problem: Problem) -> None:
-    with pytest.raises(ProblemError) as caught:
-        with_settings(problem, {"nodes.E.cores": 3, "period_ms": 3, "controller..x": 1})
-    assert [fault.path for fault in caught.value.faults] == [
-        "nodes.E.cores",
-        "period_ms",
-        "controller..x",
-    ]
-    with pytest.raises(ProblemError) as caught:
-        with_settings(problem, {"controller.min_dwell": -1, "objective.weights.egde": 3})
-    assert {fault.path for fault in caught.value.faults} == {
-        "controller.min_dwell",
-        "objective.weights.egde",
-    }
