@@ -11,7 +11,7 @@ PACKAGE = TESTS.parent / "src" / "dwell"
 #: through the module that uses them, or they only declare. The list may only become shorter.
 WITHOUT = {
     "cellfile": """
-        assembly entries structure study_entries
+        entries
     """,
     "cli": """
         campaign check_node
@@ -23,10 +23,10 @@ WITHOUT = {
         advance cycles layout links nodes
     """,
     "live": """
-        cycle_ledger node operator_client role_process run_rows
+        node operator_client role_process run_rows
     """,
     "model": """
-        fabric instants pipeline
+        instants
     """,
     "policies": """
         protocol
@@ -41,11 +41,10 @@ WITHOUT = {
         job_times predicting qos_sample validated_jobs
     """,
     "testbed/chaos": """
-        actuator_observer harness light_cell stages strike wiretap
+        actuator_observer harness
     """,
     "testbed": """
-        forwarder loopback measured message_costs node_loads orders realtime task_costs testbed
-        watcher
+        loopback testbed watcher
     """,
 }
 

@@ -7,6 +7,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from tests.cellfile.test_cell import EXAMPLE
+
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Path:
@@ -24,4 +26,11 @@ def recorded(tmp_path: Path) -> Path:
     )
     frame.write_parquet(tmp_path / "t.parquet")
     frame.write_csv(tmp_path / "t.csv")
+    return tmp_path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder with a cell."""
+    (tmp_path / "cell.yaml").write_text(EXAMPLE.read_text(encoding="utf-8"), encoding="utf-8")
     return tmp_path

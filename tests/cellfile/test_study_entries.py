@@ -2,46 +2,11 @@
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from dwell.cellfile.study_file import DeclaredStudy, read_study
-from dwell.errors import ProblemError
-from tests.cellfile.test_cell import EXAMPLE
-
-LEAST = """\
-dwell-study: 1
-cell: cell.yaml
-policies: [LOC]
-"""
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """Return a folder with a cell."""
-    (tmp_path / "cell.yaml").write_text(EXAMPLE.read_text(encoding="utf-8"), encoding="utf-8")
-    return tmp_path
-
-
-def write(folder: Path, text: str) -> Path:
-    path = folder / "study.yaml"
-    path.write_text(textwrap.dedent(text), encoding="utf-8")
-    return path
-
-
-def read(folder: Path, text: str, **options: Any) -> DeclaredStudy:
-    return read_study(write(folder, text), **options)
-
-
-def faults(folder: Path, text: str, **options: Any) -> dict[str, str]:
-    """Return the messages of a study file that is wrong, by their paths."""
-    with pytest.raises(ProblemError) as caught:
-        read(folder, text, **options)
-    assert caught.value.source == str(folder / "study.yaml")
-    return {fault.path: fault.message for fault in caught.value.faults}
+from tests.cellfile.small_study import LEAST, read
 
 
 @pytest.mark.parametrize(

@@ -9,22 +9,9 @@ import pytest
 import dwell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.permissions import senders, subjects
-from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles
 from dwell.model import Problem
-
-PEOPLE = {"operator": "operator", "observer": "observer"}
-
-
-def roster_of(problem: Problem, *, without: str = "", generation: int = 1) -> Roster:
-    """A roster with every node, the controller, and people."""
-    known = {**dict.fromkeys(problem.fabric.nodes, "node"), CONTROLLER: "controller", **PEOPLE}
-    made = {
-        name: Subject(name, role, generation, serial, "", "2030-01-01")  # type: ignore[arg-type]
-        for serial, (name, role) in enumerate(known.items(), 1)
-        if name != without
-    }
-    return Roster(problem.name, 1, made)
+from tests.live.trust.rosters import roster_of
 
 
 @pytest.fixture(scope="module")

@@ -23,20 +23,9 @@ from dwell.model.qos import QoS
 from tests.cells.generated import random_problem
 from tests.live.memory_transport import MemoryTransport
 from tests.live.small_world import Counting, World
+from tests.live.trust.rosters import roster_of
 
 NOBODY = "nobody.1"
-PEOPLE = {"operator": "operator", "observer": "observer"}
-
-
-def roster_of(problem: Problem, *, without: str = "", generation: int = 1) -> Roster:
-    """A roster with every node, the controller, and people."""
-    known = {**dict.fromkeys(problem.fabric.nodes, "node"), CONTROLLER: "controller", **PEOPLE}
-    made = {
-        name: Subject(name, role, generation, serial, "", "2030-01-01")  # type: ignore[arg-type]
-        for serial, (name, role) in enumerate(known.items(), 1)
-        if name != without
-    }
-    return Roster(problem.name, 1, made)
 
 
 class Wall:

@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from cryptography import x509
 
 from dwell.errors import TrustError
 from dwell.live.trust.authority import Authority
-
-
-@pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    made = Authority.create(tmp_path / "keys", "cell")
-    made.issue("R1", "node", ["127.0.0.1", "robot.local"])
-    made.issue("controller", "controller", ["127.0.0.1"])
-    return made
 
 
 def test_certificates_name_addresses_and_uses(authority: Authority) -> None:

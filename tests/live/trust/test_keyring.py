@@ -16,14 +16,6 @@ from dwell.live.trust.keyring import Keyring
 DOMAIN = b"test"
 
 
-@pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    made = Authority.create(tmp_path / "keys", "cell")
-    made.issue("R1", "node", ["127.0.0.1", "robot.local"])
-    made.issue("controller", "controller", ["127.0.0.1"])
-    return made
-
-
 def keyring(authority: Authority, name: str = "R1") -> Keyring:
     return Keyring.open(authority.folder / name)
 

@@ -1,0 +1,20 @@
+"""A roster with everybody who takes part in a cell, and people."""
+
+from __future__ import annotations
+
+from dwell.live.keys import CONTROLLER
+from dwell.live.trust.roster import Roster, Subject
+from dwell.model import Problem
+
+PEOPLE = {"operator": "operator", "observer": "observer"}
+
+
+def roster_of(problem: Problem, *, without: str = "", generation: int = 1) -> Roster:
+    """A roster with every node, the controller, and people."""
+    known = {**dict.fromkeys(problem.fabric.nodes, "node"), CONTROLLER: "controller", **PEOPLE}
+    made = {
+        name: Subject(name, role, generation, serial, "", "2030-01-01")  # type: ignore[arg-type]
+        for serial, (name, role) in enumerate(known.items(), 1)
+        if name != without
+    }
+    return Roster(problem.name, 1, made)
