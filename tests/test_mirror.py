@@ -37,9 +37,6 @@ WITHOUT = {
     "sim": """
         arrays tables
     """,
-    "study": """
-        job_times predicting qos_sample validated_jobs
-    """,
     "testbed/chaos": """
         actuator_observer harness
     """,

@@ -115,33 +115,6 @@ def test_excluded_windows_leave_with_their_cycles() -> None:
     assert row["cycles"] == (7 - PROBLEM.warmup_windows) * PROBLEM.window_cycles
 
 
-def test_profiles_are_of_the_baseline_and_links_of_every_scenario(
-    measured: MeasuredCampaign,
-) -> None:
-    profiles = measured.profiles
-    assert set(zip(profiles["task"], profiles["node"], strict=True)) >= {
-        (task, node)
-        for task, tasks in PROBLEM.pipeline.tasks.items()
-        for node in {placement[task] for placement in PROBLEM.candidates.values()}
-        if node in tasks.on
-    }
-    assert (profiles["wall_ms_p5"] <= profiles["wall_ms_p95"]).all()
-    assert profiles["cpu_ms"].is_null().all()
-    links = measured.links
-    assert links["scenario"].unique(maintain_order=True).to_list() == list(SCENARIOS)
-    rows = {(row["scenario"], row["link"]): row for row in links.to_dicts()}
-    impaired = [link for name, link in rows if name == "network-impairment" and "E" in link]
-    assert impaired
-    for link in impaired:
-        if ("baseline", link) in rows:
-            usual = rows["baseline", link]["mean_ms"]
-            assert rows["network-impairment", link]["mean_ms"] > usual + 5
-    shares = measured.delays.filter(pl.col("scenario") == "baseline")
-    for _, mine in shares.group_by("link"):
-        assert mine["share"].is_sorted()
-        assert mine["delay_ms"].is_sorted()
-
-
 def test_latencies_are_shares_of_all_cycles(measured: MeasuredCampaign) -> None:
     runs, latencies = measured.comparison.runs, measured.comparison.latencies
     deadline_ms = PROBLEM.pipeline.deadline_ms

@@ -16,17 +16,9 @@ from dwell.report.method import cell_definitions
 from dwell.report.page import Definitions, Page, Section, page_html
 from dwell.report.palette import DASHES, INK, MUTED, SHADE, Palette, Style
 from dwell.report.table import Columns, Row, Table, Text, interval_row, table_text
-from dwell.study.judged_prediction import ORDER, Judged
+from dwell.study.judged_prediction import L95_ALLOWED, ORDER, POINTS_ALLOWED, USE_ALLOWED, Judged
 from dwell.study.resampling import DRAWS
-from dwell.study.validation import (
-    GOALS,
-    L95_ALLOWED,
-    LEAST_MINUTES,
-    POINTS_ALLOWED,
-    USE_ALLOWED,
-    Group,
-    Validation,
-)
+from dwell.study.validation import GOALS, LEAST_MINUTES, Group, Validation
 
 if TYPE_CHECKING:
     import polars as pl

@@ -71,6 +71,10 @@ class Interval(NamedTuple):
         """Whether there is an interval at all (one seed gives none)."""
         return not math.isnan(self.low)
 
+    def columns(self, name: str) -> dict[str, float]:
+        """Return it as columns of a table: ``name``, ``name_low`` and ``name_high``."""
+        return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
+
 
 def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
     """Mean with its two-sided interval by the studentised bootstrap.

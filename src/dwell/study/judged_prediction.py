@@ -1,4 +1,4 @@
-"""Judged predictions: a predicted figure beside a measured one, and whether it was good enough.
+"""Judged predictions: predicted figures beside measured ones, and whether they are good enough.
 
 A goal is `met` where the whole 95 % interval of the prediction's error lies within what is
 allowed, `missed` where the whole of it lies beyond, and `open` elsewhere: more runs would tell.
@@ -9,22 +9,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.study.intervals import CONFIDENCE, Interval
-from dwell.study.resampling import ends
+from dwell.model import Problem
+from dwell.study.intervals import CONFIDENCE, Interval, rule_of_three
+from dwell.study.qos_sample import QosSample
+from dwell.study.resampling import ends, resample_units, resample_windows
 
-__all__ = ["Judged", "Outcome", "chance", "judge", "relative", "within", "worst"]
+__all__ = [
+    "L95_ALLOWED",
+    "POINTS_ALLOWED",
+    "USE_ALLOWED",
+    "Judge",
+    "Judged",
+    "Outcome",
+    "chance",
+    "judge",
+    "relative",
+    "within",
+    "worst",
+]
 
 Floats: TypeAlias = NDArray[np.float64]
 Outcome: TypeAlias = Literal["met", "explained", "open", "missed", ""]
 
+L95_ALLOWED = 0.10
+POINTS_ALLOWED = 0.02
+USE_ALLOWED = 0.05
 #: From what is fine to what is not.
 ORDER: tuple[Outcome, ...] = ("", "met", "explained", "open", "missed")
+UNKNOWN = Interval(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +70,7 @@ class Judged:
     metric: str
     measured: Interval
     predicted: Interval
-    error: Interval
+    error: Interval = UNKNOWN
     allowed: float = math.nan
     verdict: Outcome = ""
     baseline: float = math.nan
@@ -75,12 +93,12 @@ def within(value: float, resampled: Floats) -> Interval:
     return Interval(value, min(low, value), max(high, value))
 
 
-def relative(predicted: Floats, measured: Floats) -> Floats:
+def relative(predicted: Floats | float, measured: Floats | float) -> Floats:
     """Relative error of predictions; 0 where both are infinite."""
-    same = predicted == measured
     with np.errstate(invalid="ignore", divide="ignore"):
-        error: Floats = np.where(same, 0.0, predicted / measured - 1)
-    return error
+        error = np.divide(predicted, measured) - 1
+    found: Floats = np.where(np.equal(predicted, measured), 0.0, error)
+    return found
 
 
 def chance(held: NDArray[np.bool_]) -> Outcome:
@@ -93,3 +111,181 @@ def chance(held: NDArray[np.bool_]) -> Outcome:
 def worst(verdicts: Sequence[Outcome]) -> Outcome:
     """Return the verdict of several together."""
     return max(verdicts, key=ORDER.index, default="")
+
+
+class Both(NamedTuple):
+    """A figure as it was measured and predicted, and both in every resample."""
+
+    value: float
+    guess: float
+    seen: Floats
+    said: Floats
+
+    @property
+    def relative_error(self) -> Interval:
+        """Of the prediction, as a share of what was measured."""
+        return within(float(relative(self.guess, self.value)), relative(self.said, self.seen))
+
+
+class Judge:
+    """Judges the figures of a group, all from the same resamples.
+
+    Parameters
+    ----------
+    sum_ms, sum_rate : float
+        L95 and V_D of the sum-of-means predictor.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        measured: QosSample,
+        predicted: QosSample,
+        sum_ms: float,
+        sum_rate: float,
+    ) -> None:
+        self.problem, self.measured, self.predicted = problem, measured, predicted
+        self.sum_ms, self.sum_rate = sum_ms, sum_rate
+        self._measured = resample_windows(measured.lengths)
+        # Another seed: the two are resampled independently.
+        self._predicted = resample_units(predicted.units, seed=2)
+        self.allowed_rates = (
+            predicted.rate_if(1 - L95_ALLOWED),
+            predicted.rate_if(1 + L95_ALLOWED),
+        )
+        self.dominant = (measured.dominant, predicted.dominant)
+        self._known: dict[str, Both] = {}
+
+    def figures(self) -> dict[str, Judged]:
+        """Return every figure of the group (see `dwell.study.validation.Group`)."""
+        l95 = self._l95()
+        found = [
+            l95,
+            self._difference("window_l95_ms"),
+            self._violations(l95.verdict),
+            *(self._use(f"u_{node}") for node in self.problem.fabric.nodes),
+            self._placed(),
+            self._better(),
+            *(self._difference(f"share_{name}") for name in self.problem.candidates),
+            self._migrations(),
+        ]
+        return {one.metric: one for one in found}
+
+    def _both(self, name: str) -> Both:
+        if name not in self._known:
+            self._known[name] = Both(
+                self.measured.figure(name),
+                self.predicted.figure(name),
+                self.measured.resampled(name, self._measured),
+                self.predicted.resampled(name, self._predicted),
+            )
+        return self._known[name]
+
+    def _l95(self) -> Judged:
+        both, note = self._both("l95_ms"), ""
+        error = both.relative_error
+        if math.isinf(both.value) and math.isinf(both.guess):
+            # More than 5 % are lost, as predicted: what is left to judge is what windows showed.
+            error = self._both("window_l95_ms").relative_error
+            note = "more than 5 % of the cycles are lost: judged by the mean of windows"
+        return Judged(
+            "l95_ms",
+            within(both.value, both.seen),
+            within(both.guess, both.said),
+            error,
+            L95_ALLOWED,
+            judge(error, L95_ALLOWED),
+            self.sum_ms,
+            note,
+        )
+
+    def _difference(self, name: str) -> Judged:
+        value, guess, seen, said = self._both(name)
+        error = within(guess - value, said - seen)
+        return Judged(name, within(value, seen), within(guess, said), error)
+
+    def _migrations(self) -> Judged:
+        judged = self._difference("migrations")
+        if len(self.measured.lengths) > 1:
+            return judged
+        # One run has one number of migrations: its windows say nothing of another run's.
+        measured, error = judged.measured, judged.error
+        return replace(
+            judged,
+            measured=Interval(measured.value, math.nan, math.nan),
+            error=Interval(error.value, math.nan, math.nan),
+        )
+
+    def _use(self, name: str) -> Judged:
+        judged = self._difference(name)
+        return replace(judged, allowed=USE_ALLOWED, verdict=judge(judged.error, USE_ALLOWED))
+
+    def _violations(self, l95: Outcome) -> Judged:
+        judged = self._difference("violation_rate")
+        measured, error = judged.measured, judged.error
+        # What was not seen is not impossible.
+        most = rule_of_three(self.measured.windows)
+        if measured.value == 0:
+            measured = measured._replace(high=most)
+            error = error._replace(low=error.low - most)
+        elif measured.value == 1:
+            measured = measured._replace(low=1 - most)
+            error = error._replace(high=error.high + most)
+        verdict = judge(error, POINTS_ALLOWED)
+        low, high = self.allowed_rates
+        note = ""
+        if verdict != "met" and low <= measured.low and measured.high <= high:
+            if l95 in ("met", "open"):
+                verdict = "explained" if l95 == "met" else "open"
+                note = (
+                    "latencies 10 % shorter or longer, as L95 may be off, give "
+                    f"{100 * low:.1f} to {100 * high:.1f} %"
+                )
+        elif verdict == "missed" and measured.low <= high and low <= measured.high:
+            verdict = verdict if l95 == "missed" else "open"
+        return replace(
+            judged,
+            measured=measured,
+            error=error,
+            allowed=POINTS_ALLOWED,
+            verdict=verdict,
+            baseline=self.sum_rate,
+            note=note,
+        )
+
+    def _placed(self) -> Judged:
+        """Judge whether the same placement has the most windows."""
+        both = [self._both(f"share_{name}") for name in self.problem.candidates]
+        seen, said = ([one.seen for one in both], [one.said for one in both])
+        same = np.argmax(seen, axis=0) == np.argmax(said, axis=0)
+        verdict = chance(same)
+        # What most resamples show is not against what the runs themselves show.
+        agree = self.dominant[0] == self.dominant[1]
+        if verdict == ("missed" if agree else "met"):
+            verdict = "open"
+        shares = [self._difference(f"share_{name}") for name in self.dominant]
+        return Judged(
+            "dominant",
+            shares[0].measured,
+            shares[1].predicted,
+            verdict=verdict,
+            note=f"{self.dominant[0]} measured, {self.dominant[1]} predicted",
+        )
+
+    def _better(self) -> Judged:
+        """Judge whether the prediction is nearer to what was measured than the sum of means."""
+        value, guess, seen, said = self._both("l95_ms")
+        sums = np.full_like(seen, self.sum_ms)
+        ours, theirs = np.abs(relative(said, seen)), np.abs(relative(sums, seen))
+        rates = self._both("violation_rate")
+        off, off_sum = np.abs(rates.said - rates.seen), np.abs(self.sum_rate - rates.seen)
+        not_worse = (off <= off_sum) | (np.maximum(off, off_sum) <= POINTS_ALLOWED)
+        return Judged(
+            "sum_of_means",
+            within(value, seen),
+            within(guess, said),
+            within(float(relative(self.sum_ms, value)), relative(sums, seen)),
+            math.nan,
+            chance((ours < theirs) & not_worse),
+            self.sum_ms,
+        )

@@ -1,4 +1,4 @@
-"""A run that was measured, read for validation: what it is a run of, and which of it counts.
+"""A run that was measured, read for validation, and the simulations of what it should have shown.
 
 A run may be compared with a cell if it is a run of that cell: what calibration changes (execution
 times, delays, rates, payloads) may differ, what the cell is made of may not.
@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -21,7 +21,8 @@ from dwell.model import Problem
 from dwell.model.document import disturbance_document, relocated, to_document
 from dwell.model.scenario import Disturbance, Scenario
 from dwell.policies.registry import by_name, name_of_class
-from dwell.study.predicting import Asked
+from dwell.study.job_times import finished_jobs
+from dwell.study.qos_sample import Piece, piece_of
 from dwell.testbed.speeds import Usual, at_speed_of
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["MeasuredRun", "excluded_windows", "read_measured"]
+__all__ = ["MeasuredRun", "Simulated", "Simulator", "Unit", "excluded_windows", "read_measured"]
 
 Document: TypeAlias = Mapping[str, Any]
 
@@ -38,7 +39,7 @@ NODE_FIELDS = ("tier", "cores", "scheduler", "accelerators", "quota")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredRun:
-    """A run, and the problem that says what it should show.
+    """What a run is a run of, which of it counts, and so what is to be simulated for it.
 
     Parameters
     ----------
@@ -49,45 +50,32 @@ class MeasuredRun:
         never moved, its placement.
     policy : str
         A policy's name, or a candidate's for the placement that never moves.
+    windows : int
+        Length of the run.
     guard : bool
         Whether the cell's guard could act.
+    jobs : bool
+        Whether the run kept its jobs.
     excluded : mapping of int to str
         Windows that are left out, and why: those of its record and, of a policy that moves, those
         after them in which what was decided on them holds.
     """
 
     name: str
-    run: Run
     problem: Problem
     scenario: str
     policy: str
     estimator: str
+    windows: int
     guard: bool
+    jobs: bool
     excluded: Mapping[int, str]
-
-    @property
-    def moves(self) -> bool:
-        """Whether its policy may move."""
-        return self.policy not in self.problem.candidates
 
     @property
     def contender(self) -> str:
         """The policy with its estimator, ``dtp+corrected``; a candidate's name alone."""
-        return f"{self.policy}+{self.estimator}" if self.moves else self.policy
-
-    @property
-    def asked(self) -> Asked:
-        """What is to be simulated for it."""
-        return Asked(
-            self.problem,
-            self.scenario,
-            self.policy,
-            self.estimator,
-            self.run.windows.height,
-            self.guard,
-            self.run.has_jobs,
-            frozenset(self.excluded),
-        )
+        moves = self.policy not in self.problem.candidates
+        return f"{self.policy}+{self.estimator}" if moves else self.policy
 
 
 def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = None) -> MeasuredRun:
@@ -146,12 +134,13 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
     guard = bool(problem.controller.fallbacks) if live else bool(meta.get("guard", False))
     return MeasuredRun(
         name=name,
-        run=run,
         problem=problem,
         scenario=scenario,
         policy=policy,
         estimator=estimator,
+        windows=run.windows.height,
         guard=guard,
+        jobs=run.has_jobs,
         excluded=excluded,
     )
 
@@ -342,3 +331,62 @@ def _timeless(item: Disturbance) -> dict[str, Any]:
 def _end_s(cycles: pl.DataFrame) -> float:
     """When the last cycle was released, less what two clocks' roundings may differ by."""
     return float(np.max(cycles["release_ns"].to_numpy(), initial=0)) / 1e9 - 0.1
+
+
+# ----------------------------------------------------------------------------- the simulations
+
+
+class Unit(NamedTuple):
+    """One simulation: the group, the run in it, and how many of that run went before."""
+
+    group: int
+    run: int
+    step: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """What counts of a simulation, and its jobs where they were asked for."""
+
+    piece: Piece
+    jobs: pl.DataFrame | None
+
+
+@dataclass(frozen=True, slots=True)
+class Simulator:
+    """Simulates the runs of groups, each `seeds` times, in whatever process."""
+
+    groups: tuple[tuple[MeasuredRun, ...], ...]
+    seeds: int
+
+    @property
+    def units(self) -> list[Unit]:
+        """All simulations."""
+        return [
+            Unit(group, run, step)
+            for group, mine in enumerate(self.groups)
+            for run in range(len(mine))
+            for step in range(self.seeds)
+        ]
+
+    def __call__(self, unit: Unit) -> Simulated:
+        """Simulate once."""
+        from dwell.sim import simulate
+
+        one = self.groups[unit.group][unit.run]
+        # The first of a run keeps its jobs: they are many.
+        jobs = one.jobs and unit.step == 0
+        run = simulate(
+            one.problem,
+            scenario=one.scenario,
+            policy=one.policy,
+            estimator=one.estimator,
+            # No two simulations of a group are the same, so that they are independent.
+            seed=unit.run * self.seeds + unit.step + 1,
+            windows=one.windows,
+            jobs=jobs,
+            guard=one.guard,
+        )
+        # Where orders take time a simulation may be some windows shorter than what it is of.
+        piece = piece_of(run, one.problem, one.excluded)
+        return Simulated(piece, finished_jobs(run, one.problem.window_cycles) if jobs else None)

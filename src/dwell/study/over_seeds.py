@@ -67,8 +67,7 @@ def over_seeds(
     for labels, mine in runs.group_by(keys, maintain_order=True):
         row: Row = {**dict(zip(keys, labels, strict=True)), "seeds": mine.height}
         for column in columns:
-            over = interval_of(column)(metric_values(mine, column))
-            row |= {column: over.value, f"{column}_low": over.low, f"{column}_high": over.high}
+            row |= interval_of(column)(metric_values(mine, column)).columns(column)
         if "violation_rate" in columns:
             at_least, at_most = share_limits(metric_values(mine, "violation_rate"))
             row["violation_rate_at_least"] = at_least

@@ -182,8 +182,16 @@ class QosSample:
         """How many units there are."""
         return sum(self.lengths)
 
+    @property
+    def dominant(self) -> str:
+        """The placement of most windows."""
+        names = [name for name in self.sums if name.startswith("share_")]
+        return max(names, key=self.figure).removeprefix("share_")
+
     def figure(self, name: str) -> float:
-        """Return the mean of a figure of `sums`; NaN where there is none."""
+        """Return ``l95_ms``, or the mean of a figure of `sums`; NaN where there is none."""
+        if name == "l95_ms":
+            return self.l95_ms
         total, count = self.sums[name].sum(axis=0)
         return float(total / count) if count else math.nan
 

@@ -18,34 +18,21 @@ What a prediction has to reach was set before anything was measured:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.display import Displayed
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem
-from dwell.study.intervals import Interval, rule_of_three
-from dwell.study.judged_prediction import (
-    Judged,
-    Outcome,
-    chance,
-    judge,
-    relative,
-    within,
-    worst,
-)
-from dwell.study.measured_run import MeasuredRun, read_measured
-from dwell.study.predicting import Simulated, Simulator, Unit
+from dwell.study.job_times import finished_jobs, job_times
+from dwell.study.judged_prediction import Judge, Judged, Outcome, worst
+from dwell.study.measured_run import MeasuredRun, Simulated, Simulator, Unit, read_measured
 from dwell.study.qos_sample import Piece, QosSample, piece_of
-from dwell.study.resampling import resample_units, resample_windows
 from dwell.study.software import versions
 from dwell.study.sum_of_means import sum_of_means, sums_of_shares
-from dwell.study.validated_jobs import finished_jobs, job_times
 from dwell.study.workers import available_processes, spread
 
 if TYPE_CHECKING:
@@ -54,24 +41,10 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.testbed.speeds import Usual
 
-__all__ = [
-    "GOALS",
-    "L95_ALLOWED",
-    "LEAST_MINUTES",
-    "POINTS_ALLOWED",
-    "SEEDS",
-    "USE_ALLOWED",
-    "Group",
-    "Validation",
-    "validate",
-]
+__all__ = ["GOALS", "LEAST_MINUTES", "SEEDS", "Group", "Validation", "validate"]
 
-Floats: TypeAlias = NDArray[np.float64]
 Progress: TypeAlias = Callable[[int, int], None]
 
-L95_ALLOWED = 0.10
-POINTS_ALLOWED = 0.02
-USE_ALLOWED = 0.05
 #: Measured time of a group below which its verdicts say little.
 LEAST_MINUTES = 5.0
 #: Number of simulations of each run.
@@ -223,7 +196,13 @@ def validate(
         If a run is of another cell, or of a scenario or policy that the cell does not have, was
         used for calibration, or has no window that counts; all faults at once.
     """
-    named = dict(runs) if isinstance(runs, Mapping) else _numbered(runs)
+    import polars as pl
+
+    named = (
+        dict(runs)
+        if isinstance(runs, Mapping)
+        else {f"run {number}": run for number, run in enumerate(runs, 1)}
+    )
     if not named:
         raise RunError("no runs: name at least one")
     if seeds < 2:
@@ -232,7 +211,7 @@ def validate(
     groups = list(_grouped(measured, problem))
     found: dict[int, tuple[Group, pl.DataFrame]] = {}
     waiting: dict[int, dict[Unit, Simulated]] = {place: {} for place in range(len(groups))}
-    simulator = Simulator(tuple(tuple(one.asked for one in mine) for mine in groups), seeds)
+    simulator = Simulator(tuple(map(tuple, groups)), seeds)
     units = simulator.units
     done = 0
 
@@ -244,7 +223,7 @@ def validate(
         mine[unit] = simulated
         if len(mine) == seeds * len(groups[unit.group]):
             ordered = [mine[known] for known in sorted(mine)]
-            found[unit.group] = _group(groups[unit.group], ordered)
+            found[unit.group] = _group(groups[unit.group], named, ordered)
             mine.clear()
         if progress is not None:
             progress(done, len(units))
@@ -252,21 +231,15 @@ def validate(
     if processes is None:
         processes = available_processes() if len(units) >= WORTH_SPREADING else 1
     spread(simulator, units, processes=processes, take=take)
-    import polars as pl
-
-    judged = [found[place] for place in range(len(groups))]
+    judged, jobs = zip(*(found[place] for place in range(len(groups))), strict=True)
     return Validation(
         problem=problem,
-        groups=tuple(group for group, _ in judged),
+        groups=judged,
         seeds=seeds,
-        table=pl.DataFrame(list(_rows([group for group, _ in judged])), infer_schema_length=None),
-        jobs=pl.concat([jobs for _, jobs in judged]),
+        table=pl.DataFrame(list(_rows(judged)), infer_schema_length=None),
+        jobs=pl.concat(jobs),
         versions=versions(),
     )
-
-
-def _numbered(runs: Sequence[Run]) -> dict[str, Run]:
-    return {f"run {number}": run for number, run in enumerate(runs, 1)}
 
 
 def _read(
@@ -296,15 +269,10 @@ def _read(
 
 
 def _grouped(measured: Sequence[MeasuredRun], problem: Problem) -> Iterator[list[MeasuredRun]]:
-    """Yield the runs of each scenario and policy."""
+    """Yield the runs of each scenario and policy; placements first, in the order of the cell."""
+    places = {name: place for place, name in enumerate(problem.candidates)}
     policies = list(dict.fromkeys(one.contender for one in measured))
-    policies.sort(
-        key=lambda name: (
-            list(problem.candidates).index(name)
-            if name in problem.candidates
-            else len(problem.candidates)
-        )
-    )
+    policies.sort(key=lambda name: places.get(name, len(places)))
     for scenario in problem.scenarios:
         for policy in policies:
             mine = [one for one in measured if (one.scenario, one.contender) == (scenario, policy)]
@@ -312,19 +280,16 @@ def _grouped(measured: Sequence[MeasuredRun], problem: Problem) -> Iterator[list
                 yield mine
 
 
-# -------------------------------------------------------------------------------------- a group
-
-
 def _group(
-    mine: Sequence[MeasuredRun], simulated: Sequence[Simulated]
+    mine: Sequence[MeasuredRun], runs: Mapping[str, Run], simulated: Sequence[Simulated]
 ) -> tuple[Group, pl.DataFrame]:
     """Judge a group."""
-    own = [piece_of(one.run, one.problem, one.excluded) for one in mine]
+    own = [piece_of(runs[one.name], one.problem, one.excluded) for one in mine]
     problem = mine[0].problem
     measured = QosSample.of(own, problem, by_window=True)
     predicted = QosSample.of([one.piece for one in simulated], problem, by_window=False)
-    judged = _Judge(problem, measured, predicted, *_sums(mine, own, problem))
-    figures = judged.figures()
+    judge = Judge(problem, measured, predicted, *_sums(mine, own, problem))
+    figures = judge.figures()
     cycles = sum(piece.cycles.height for piece in own)
     group = Group(
         scenario=mine[0].scenario,
@@ -335,15 +300,15 @@ def _group(
         measured=measured,
         predicted=predicted,
         figures=figures,
-        dominant=judged.dominant,
-        allowed_rates=judged.allowed_rates,
+        dominant=judge.dominant,
+        allowed_rates=judge.allowed_rates,
         factor=predicted.factor_for(figures["violation_rate"].measured.value),
     )
     jobs = job_times(
         group.scenario,
         group.policy,
         problem,
-        [finished_jobs(one.run, problem.window_cycles) for one in mine if one.run.has_jobs],
+        [finished_jobs(runs[one.name], problem.window_cycles) for one in mine if one.jobs],
         [one.jobs for one in simulated if one.jobs is not None],
     )
     return group, jobs
@@ -368,195 +333,6 @@ def _sums(
     return sums_of_shares(means, cycles, problem.pipeline.deadline_ms)
 
 
-class _Judge:
-    """Judges the figures of a group, all from the same resamples."""
-
-    def __init__(
-        self,
-        problem: Problem,
-        measured: QosSample,
-        predicted: QosSample,
-        sum_ms: float,
-        sum_rate: float,
-    ) -> None:
-        self.problem, self.measured, self.predicted = problem, measured, predicted
-        self.sum_ms, self.sum_rate = sum_ms, sum_rate
-        self._measured = resample_windows(measured.lengths)
-        # Another seed: the two are resampled independently.
-        self._predicted = resample_units(predicted.units, seed=2)
-        self.allowed_rates = (
-            predicted.rate_if(1 - L95_ALLOWED),
-            predicted.rate_if(1 + L95_ALLOWED),
-        )
-        self.dominant = (self._dominant(measured), self._dominant(predicted))
-        self._known: dict[str, tuple[Floats, Floats]] = {}
-
-    def figures(self) -> dict[str, Judged]:
-        """Return every figure of the group (see `Group`)."""
-        l95 = self._l95()
-        found = [
-            l95,
-            self._difference("window_l95_ms"),
-            self._violations(l95.verdict),
-            *(self._use(f"u_{node}") for node in self.problem.fabric.nodes),
-            self._placed(),
-            self._better(),
-            *(self._difference(f"share_{name}") for name in self.problem.candidates),
-            self._migrations(),
-        ]
-        return {one.metric: one for one in found}
-
-    def _both(self, name: str) -> tuple[Floats, Floats]:
-        """Return a figure in every resample: measured, and predicted."""
-        if name not in self._known:
-            self._known[name] = (
-                self.measured.resampled(name, self._measured),
-                self.predicted.resampled(name, self._predicted),
-            )
-        return self._known[name]
-
-    def _values(self, name: str) -> tuple[float, float]:
-        if name == "l95_ms":
-            return self.measured.l95_ms, self.predicted.l95_ms
-        return self.measured.figure(name), self.predicted.figure(name)
-
-    def _l95(self) -> Judged:
-        value, guess = self._values("l95_ms")
-        seen, said = self._both("l95_ms")
-        error = within(_relative(guess, value), relative(said, seen))
-        judged = Judged(
-            "l95_ms",
-            within(value, seen),
-            within(guess, said),
-            error,
-            L95_ALLOWED,
-            judge(error, L95_ALLOWED),
-            self.sum_ms,
-        )
-        if math.isinf(value) and math.isinf(guess):
-            # More than 5 % are lost, as predicted: what is left to judge is what windows showed.
-            value, guess = self._values("window_l95_ms")
-            seen, said = self._both("window_l95_ms")
-            error = within(_relative(guess, value), relative(said, seen))
-            return replace(
-                judged,
-                error=error,
-                verdict=judge(error, L95_ALLOWED),
-                note="more than 5 % of the cycles are lost: judged by the mean of windows",
-            )
-        return judged
-
-    def _difference(self, name: str) -> Judged:
-        (value, guess), (seen, said) = self._values(name), self._both(name)
-        error = within(guess - value, said - seen)
-        return Judged(name, within(value, seen), within(guess, said), error)
-
-    def _migrations(self) -> Judged:
-        judged = self._difference("migrations")
-        if len(self.measured.lengths) > 1:
-            return judged
-        # One run has one number of migrations: its windows say nothing of another run's.
-        measured, error = judged.measured, judged.error
-        return replace(
-            judged,
-            measured=Interval(measured.value, math.nan, math.nan),
-            error=Interval(error.value, math.nan, math.nan),
-        )
-
-    def _use(self, name: str) -> Judged:
-        judged = self._difference(name)
-        return replace(judged, allowed=USE_ALLOWED, verdict=judge(judged.error, USE_ALLOWED))
-
-    def _violations(self, l95: Outcome) -> Judged:
-        judged = self._difference("violation_rate")
-        measured, error = judged.measured, judged.error
-        # What was not seen is not impossible.
-        most = rule_of_three(self.measured.windows)
-        if measured.value == 0:
-            measured = measured._replace(high=most)
-            error = error._replace(low=error.low - most)
-        elif measured.value == 1:
-            measured = measured._replace(low=1 - most)
-            error = error._replace(high=error.high + most)
-        verdict = judge(error, POINTS_ALLOWED)
-        low, high = self.allowed_rates
-        note = ""
-        if verdict != "met" and low <= measured.low and measured.high <= high:
-            if l95 in ("met", "open"):
-                verdict = "explained" if l95 == "met" else "open"
-                note = (
-                    "latencies 10 % shorter or longer, as L95 may be off, give "
-                    f"{100 * low:.1f} to {100 * high:.1f} %"
-                )
-        elif verdict == "missed" and measured.low <= high and low <= measured.high:
-            verdict = verdict if l95 == "missed" else "open"
-        return replace(
-            judged,
-            measured=measured,
-            error=error,
-            allowed=POINTS_ALLOWED,
-            verdict=verdict,
-            baseline=self.sum_rate,
-            note=note,
-        )
-
-    @staticmethod
-    def _dominant(sample: QosSample) -> str:
-        shares = {
-            name.removeprefix("share_"): sample.figure(name)
-            for name in sample.sums
-            if name.startswith("share_")
-        }
-        return max(shares, key=lambda name: shares[name])
-
-    def _placed(self) -> Judged:
-        """Judge whether the same placement has the most windows."""
-        names = [f"share_{name}" for name in self.problem.candidates]
-        seen, said = zip(*map(self._both, names), strict=True)
-        same = np.argmax(seen, axis=0) == np.argmax(said, axis=0)
-        verdict = chance(same)
-        # What most resamples show is not against what the runs themselves show.
-        agree = self.dominant[0] == self.dominant[1]
-        if verdict == ("missed" if agree else "met"):
-            verdict = "open"
-        shares = [self._difference(f"share_{name}") for name in self.dominant]
-        return Judged(
-            "dominant",
-            shares[0].measured,
-            shares[1].predicted,
-            _NONE,
-            verdict=verdict,
-            note=f"{self.dominant[0]} measured, {self.dominant[1]} predicted",
-        )
-
-    def _better(self) -> Judged:
-        """Judge whether the prediction is nearer to what was measured than the sum of means."""
-        value, guess = self._values("l95_ms")
-        seen, said = self._both("l95_ms")
-        sums = np.full_like(seen, self.sum_ms)
-        ours, theirs = np.abs(relative(said, seen)), np.abs(relative(sums, seen))
-        rates, rates_said = self._both("violation_rate")
-        off, off_sum = np.abs(rates_said - rates), np.abs(self.sum_rate - rates)
-        not_worse = (off <= off_sum) | (np.maximum(off, off_sum) <= POINTS_ALLOWED)
-        error = _relative(self.sum_ms, value)
-        return Judged(
-            "sum_of_means",
-            within(value, seen),
-            within(guess, said),
-            within(error, relative(sums, seen)),
-            math.nan,
-            chance((ours < theirs) & not_worse),
-            self.sum_ms,
-        )
-
-
-_NONE = Interval(math.nan, math.nan, math.nan)
-
-
-def _relative(guess: float, value: float) -> float:
-    return float(relative(np.array([guess]), np.array([value]))[0])
-
-
 def _rows(groups: Sequence[Group]) -> Iterator[dict[str, str | float]]:
     """Yield the rows of the table."""
     for group in groups:
@@ -565,15 +341,11 @@ def _rows(groups: Sequence[Group]) -> Iterator[dict[str, str | float]]:
                 "scenario": group.scenario,
                 "policy": group.policy,
                 "metric": one.metric,
-                **_ended("measured", one.measured),
-                **_ended("predicted", one.predicted),
-                **_ended("error", one.error),
+                **one.measured.columns("measured"),
+                **one.predicted.columns("predicted"),
+                **one.error.columns("error"),
                 "allowed": one.allowed,
                 "sum_of_means": one.baseline,
                 "verdict": one.verdict,
                 "note": one.note,
             }
-
-
-def _ended(name: str, interval: Interval) -> dict[str, float]:
-    return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
