@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,46 +26,40 @@ from dwell.testbed.execution import Play, State, run_campaign
 from dwell.testbed.playing import interruptible
 from dwell.testbed.timeline import require_playable_scenario
 
-__all__ = ["CampaignRequest", "report_campaign", "run_campaign_file"]
+__all__ = ["report_campaign", "run_campaign_file"]
 
 PAGE = "report.html"
 
 
-@dataclass(frozen=True, slots=True)
-class CampaignRequest:
-    """What was asked for; None is the default.
+def run_campaign_file(
+    cell: Path,
+    *,
+    scenarios: Sequence[str],
+    policies: Sequence[str],
+    repetitions: int,
+    seconds: float,
+    seed: int,
+    out: Path | None,
+    name: str,
+    minutes: float | None,
+    inventory: Path | None,
+    report: bool,
+    as_json: bool,
+) -> bool:
+    """Measure, write the report, and print what it comes to; None is the default.
 
     Parameters
     ----------
-    scenarios, policies : tuple of str
+    scenarios, policies : sequence of str
         Empty for the default ones.
     seconds : float
         Of each run.
-    out : Path or None
     name : str
         Of the testbed.
-    minutes : float or None
     inventory : Path or None
         Of real hosts, in place of the testbed.
     report : bool
         Whether nothing is measured: only the report of what is there is written.
-    """
-
-    cell: Path
-    scenarios: tuple[str, ...]
-    policies: tuple[str, ...]
-    repetitions: int
-    seconds: float
-    seed: int
-    out: Path | None
-    name: str
-    minutes: float | None = None
-    inventory: Path | None = None
-    report: bool = False
-
-
-def run_campaign_file(request: CampaignRequest, *, as_json: bool) -> bool:
-    """Measure, write the report, and print what it comes to.
 
     Returns
     -------
@@ -81,24 +74,24 @@ def run_campaign_file(request: CampaignRequest, *, as_json: bool) -> bool:
     typer.Exit
         If it was interrupted.
     """
-    problem = dwell.load(request.cell)
-    folder = request.out or Path("campaigns", re.sub(r"[^\w.-]", "_", problem.name))
-    if request.report:
+    problem = dwell.load(cell)
+    folder = out or Path("campaigns", re.sub(r"[^\w.-]", "_", problem.name))
+    if report:
         report_campaign(folder, folder / PAGE, as_json=as_json)
         return True
-    scenarios = request.scenarios or default_scenarios(problem)
-    entrants = tuple(entrant(problem, name) for name in request.policies)
-    play, where = _player(request, problem, scenarios)
+    scenarios = tuple(scenarios) or default_scenarios(problem)
+    entrants = tuple(entrant(problem, policy) for policy in policies)
+    play, where = _player(inventory, problem, scenarios)
     campaign = Campaign(
         problem,
         scenarios,
         entrants or default_entrants(problem),
-        request.repetitions,
-        request.seconds,
-        request.seed,
+        repetitions,
+        seconds,
+        seed,
         where,
     )
-    state = _run(campaign, folder, play, request)
+    state = _run(campaign, folder, play, name, minutes)
     if state.done:
         measured = _write_page(folder, folder / PAGE)
         _print(measured, folder, folder / PAGE, state, as_json=as_json)
@@ -107,18 +100,16 @@ def run_campaign_file(request: CampaignRequest, *, as_json: bool) -> bool:
     return not state.given_up and bool(state.done or state.left)
 
 
-def _player(
-    request: CampaignRequest, problem: Problem, scenarios: Sequence[str]
-) -> tuple[Play, str]:
+def _player(hosts: Path | None, problem: Problem, scenarios: Sequence[str]) -> tuple[Play, str]:
     """Return what makes a run, and where; refuse what can be played in no run."""
-    outages = request.inventory is None
+    outages = hosts is None
     for name in scenarios:
         require_playable_scenario(problem, name, outages=outages)
-    if request.inventory is not None:
+    if hosts is not None:
         from dwell.testbed.inventory import load_inventory
         from dwell.testbed.real_hosts import require_commands, run_on_hosts
 
-        inventory = load_inventory(request.inventory, problem)
+        inventory = load_inventory(hosts, problem)
         require_commands(inventory, [item for name in scenarios for item in problem.scenario(name)])
         return partial(run_on_hosts, inventory), inventory.digest
     from dwell.testbed.run import require_machine, run_once
@@ -127,15 +118,15 @@ def _player(
     return run_once, "testbed"
 
 
-def _run(campaign: Campaign, folder: Path, play: Play, request: CampaignRequest) -> State:
+def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float | None) -> State:
     try:
         with interruptible():
             return run_campaign(
                 campaign,
                 folder,
                 play,
-                name=request.name,
-                minutes=request.minutes,
+                name=name,
+                minutes=minutes,
                 tell=partial(typer.echo, err=True),
             )
     except KeyboardInterrupt:

@@ -190,12 +190,23 @@ def run(
     windows = windows or 300
     how = prepare(windows * problem.window_cycles)
     # Imports the kernels.
-    from dwell.cli.run import RunRequest, run_cell
+    from dwell.cli.run import run_cell
 
-    request = RunRequest(
-        problem, scenario, policy, estimator, seed, windows, out, jobs, guard, force, how
+    saved = run_cell(
+        problem,
+        scenario=scenario,
+        policy=policy,
+        estimator=estimator,
+        seed=seed,
+        windows=windows,
+        out=out,
+        jobs=jobs,
+        guard=guard,
+        force=force,
+        how=how,
+        as_json=as_json,
     )
-    if not run_cell(request, as_json=as_json):
+    if not saved:
         raise typer.Exit(ExitCode.FAILED)
 
 
@@ -241,11 +252,19 @@ def study(
             "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
             "(reproduction/README.md)"
         )
-    from dwell.cli.study import StudyRequest, run_study_file
+    from dwell.cli.study import run_study_file
 
     require_one_length(windows, seconds)
-    asked = StudyRequest(file, out, processes, dask, seeds, windows, seconds)
-    run_study_file(asked, as_json=as_json)
+    run_study_file(
+        file,
+        out=out,
+        processes=processes,
+        dask=dask,
+        seeds=seeds,
+        windows=windows,
+        seconds=seconds,
+        as_json=as_json,
+    )
 
 
 @app.command()
@@ -278,11 +297,10 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write the report of a run, a study or a campaign: one HTML file that needs nothing else."""
-    from dwell.cli.report import ReportRequest, report_folder
+    from dwell.cli.report import report_folder
 
     page = out or folder / "report.html"
-    request = ReportRequest(folder, page, trace, figures, static)
-    report_folder(request, as_json=as_json)
+    report_folder(folder, page, trace=trace, figures=figures, static=static, as_json=as_json)
 
 
 @app.command()
@@ -311,11 +329,18 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
-    from dwell.cli.validate import ValidationRequest, validate_runs
+    from dwell.cli.validate import validate_runs
 
-    used = tuple(calibrated_from or ())
-    request = ValidationRequest(tuple(runs), cell, out, seeds, traces, used, processes)
-    validate_runs(request, as_json=as_json)
+    validate_runs(
+        runs,
+        cell,
+        out=out,
+        seeds=seeds,
+        traces=traces,
+        calibrated_from=calibrated_from or (),
+        processes=processes,
+        as_json=as_json,
+    )
 
 
 @app.command()
@@ -411,10 +436,10 @@ def doctor(
     an extra that is not installed is not.
     """
     import dwell
-    from dwell.cli.doctor import DoctorRequest, consult
+    from dwell.cli.doctor import consult
 
     problem = None if cell is None else dwell.load(cell)
-    if not consult(DoctorRequest(problem, keys, clear_cache), as_json=as_json):
+    if not consult(problem, keys=keys, clear_cache=clear_cache, as_json=as_json):
         raise typer.Exit(ExitCode.FAILED)
 
 

@@ -13,7 +13,7 @@ import textwrap
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
@@ -30,7 +30,7 @@ from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.doctor import Finding
 from dwell.testbed.pressure import Rule
 
-__all__ = ["DoctorRequest", "consult", "print_findings"]
+__all__ = ["consult", "print_findings"]
 
 #: What each extra is for.
 EXTRAS = {
@@ -48,9 +48,10 @@ CACHED = ("*.nbi", "*.nbc", "compiling.*.lock")
 LISTENS = "0A"
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorRequest:
-    """What is asked of the doctor.
+def consult(
+    problem: Problem | None, *, keys: Path | None, clear_cache: bool, as_json: bool
+) -> bool:
+    """Look at everything and print it.
 
     Parameters
     ----------
@@ -58,15 +59,6 @@ class DoctorRequest:
         A keyring, or a folder of keyrings.
     clear_cache : bool
         Whether all compiled kernels are removed, not only those of older versions.
-    """
-
-    problem: Problem | None
-    keys: Path | None
-    clear_cache: bool
-
-
-def consult(request: DoctorRequest, *, as_json: bool) -> bool:
-    """Look at everything and print it.
 
     Returns
     -------
@@ -75,15 +67,15 @@ def consult(request: DoctorRequest, *, as_json: bool) -> bool:
     """
     counters = MachineCounters(os.sched_getaffinity(0))
     extras = [_extra(name) for name in EXTRAS]
-    problems = [] if request.problem is None else [request.problem]
+    problems = [] if problem is None else [problem]
     testbed = testbed_doctor.examine(problems)
     parts = {
         "extras": extras,
-        "cache": list(_cache(clear=request.clear_cache)),
+        "cache": list(_cache(clear=clear_cache)),
         "CPU": list(_cpu(counters)),
         "clocks": [_synchronised(), _clock_source()],
-        "ports": [_ports(request.problem)],
-        "certificates": list(_certificates(request)),
+        "ports": [_ports(problem)],
+        "certificates": list(_certificates(keys, problem)),
         "testbed": [replace(one, needed=False) for one in testbed],
         "runs here": list(_runs(extras, testbed)),
     }
@@ -377,20 +369,20 @@ def _owners(inodes: set[str]) -> dict[str, str]:
     return found
 
 
-def _certificates(request: DoctorRequest) -> Iterator[Finding]:
+def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Finding]:
     """Look at a keyring, or at all in a folder."""
     name = "keyring"
-    if request.keys is None:
+    if keys is None:
         yield Finding(name, True, "none is named, by --keys or DWELL_KEYS")
         return
     try:
         from dwell.live.trust.keyring import Keyring
     except ImportError:
-        found = f"{request.keys} cannot be read without cryptography"
+        found = f"{keys} cannot be read without cryptography"
         yield Finding(name, False, found, installing("live"))
         return
-    folders = [one.parent for one in sorted(request.keys.glob("*/cert.pem"))] or [request.keys]
-    cell = None if request.problem is None else request.problem.name
+    folders = [one.parent for one in sorted(keys.glob("*/cert.pem"))] or [keys]
+    cell = None if problem is None else problem.name
     for folder in folders:
         try:
             keyring = Keyring.open(folder, cell=cell)

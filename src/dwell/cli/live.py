@@ -305,10 +305,18 @@ def run(
     as_json: Json = False,
 ) -> None:
     """Run a cell on this machine, without root: its stages, links and disturbances; and report."""
-    from dwell.cli.live_run import LiveRunRequest, run_live
+    from dwell.cli.live_run import run_live
 
-    request = LiveRunRequest(cell, scenario, seconds, policy, estimator, seed, out)
-    run_live(request, as_json=as_json)
+    run_live(
+        cell,
+        scenario=scenario,
+        seconds=seconds,
+        policy=policy,
+        estimator=estimator,
+        seed=seed,
+        out=out,
+        as_json=as_json,
+    )
 
 
 @live.command("demo", hidden=True, context_settings={"ignore_unknown_options": True})

@@ -38,7 +38,7 @@ from dwell.testbed.playing import (
 )
 from dwell.testbed.timeline import timeline_of
 
-__all__ = ["LiveRunRequest", "run_live"]
+__all__ = ["run_live"]
 
 #: A folder with this file is a live run's, and may be replaced by the next.
 MARK = ".dwell-live-run"
@@ -48,9 +48,20 @@ MOST_BEFORE_S = 4.0
 USUAL_S, AFTER_S = 60.0, 16.0
 
 
-@dataclass(frozen=True, slots=True)
-class LiveRunRequest:
-    """What was asked for.
+def run_live(
+    file: Path,
+    *,
+    scenario: str | None,
+    seconds: float | None,
+    policy: str | None,
+    estimator: str | None,
+    seed: int,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Run the cell, save the run, write its report, print what happened.
+
+    Interrupted, it ends everything and reports on what there is.
 
     Parameters
     ----------
@@ -64,41 +75,26 @@ class LiveRunRequest:
         Of delays and losses.
     out : Path or None
         For logs, the run and its report.
-    """
-
-    cell: Path
-    scenario: str | None
-    seconds: float | None
-    policy: str | None
-    estimator: str | None
-    seed: int
-    out: Path | None
-
-
-def run_live(request: LiveRunRequest, *, as_json: bool) -> None:
-    """Run the cell, save the run, write its report, print what happened.
-
-    Interrupted, it ends everything and reports on what there is.
 
     Raises
     ------
     DwellError
         If the cell has tasks without a stage, does not come up, or the folder holds something else.
     """
-    problem = dwell.load(request.cell)
-    _require_stages(problem, request.cell)
-    if request.policy is not None or request.estimator is not None:
-        names = (request.policy or problem.controller.policy, request.estimator)
+    problem = dwell.load(file)
+    _require_stages(problem, file)
+    if policy is not None or estimator is not None:
+        names = (policy or problem.controller.policy, estimator)
         problem = problem.under("+".join(name for name in names if name is not None))
-    scenario = request.scenario or _first_that_disturbs(problem)
-    seconds = request.seconds or _length_s(problem.scenario(scenario))
-    timeline = timeline_of(problem, scenario, seed=request.seed, seconds=seconds)
-    out = request.out or Path("live-out", problem.name)
+    scenario = scenario or _first_that_disturbs(problem)
+    seconds = seconds or _length_s(problem.scenario(scenario))
+    timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
+    out = out or Path("live-out", problem.name)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
-    told = _Told(problem, scenario, request.seed, timeline)
+    told = _Told(problem, scenario, seed, timeline)
     interrupted = False
-    cell = Loopback(problem, out.resolve(), _cpus(problem), seed=request.seed)
+    cell = Loopback(problem, out.resolve(), _cpus(problem), seed=seed)
     with interruptible():
         try:
             _watch_from_start(cell, seconds, told)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +19,30 @@ from dwell.record import require_free
 from dwell.sim import describe
 from dwell.study.summary import STRETCHES, Row, summarise
 
-__all__ = ["RunRequest", "run_cell"]
+__all__ = ["run_cell"]
 
 
-@dataclass(frozen=True, slots=True)
-class RunRequest:
-    """What a run was asked to be; None is what the cell says, or the default folder.
+def run_cell(
+    problem: Problem,
+    *,
+    scenario: str,
+    policy: str | None,
+    estimator: str | None,
+    seed: int,
+    windows: int,
+    out: Path | None,
+    jobs: bool,
+    guard: bool,
+    force: bool,
+    how: str | None,
+    as_json: bool,
+) -> bool:
+    """Simulate, save and print; None is what the cell says, or the default folder.
 
-    `how` says how it is played, where that is worth a word (see `dwell.cli.first_answer`).
-    """
-
-    problem: Problem
-    scenario: str
-    policy: str | None
-    estimator: str | None
-    seed: int
-    windows: int
-    out: Path | None
-    jobs: bool
-    guard: bool = False
-    force: bool = False
-    how: str | None = None
-
-
-def run_cell(request: RunRequest, *, as_json: bool) -> bool:
-    """Simulate, save and print.
+    Parameters
+    ----------
+    how : str or None
+        How it is played, where that is worth a word (see `dwell.cli.first_answer`).
 
     Returns
     -------
@@ -56,34 +54,28 @@ def run_cell(request: RunRequest, *, as_json: bool) -> bool:
     DwellError
         If anything named is unknown, or the folder holds something else than a run.
     """
-    problem = request.problem
-    policy = request.policy or problem.controller.policy
-    folder = request.out or _folder(problem, request.scenario, policy, request.seed)
+    policy = policy or problem.controller.policy
+    folder = out or _folder(problem, scenario, policy, seed)
     require_free(folder)
-    if not request.force:
-        _require_same(folder, problem, request, policy)
-    how = f" ({request.how})" if request.how else ""
-    with working(f"simulating {request.windows} windows{how}"):
-        result = dwell.simulate(
-            problem,
-            scenario=request.scenario,
-            policy=policy,
-            estimator=request.estimator,
-            seed=request.seed,
-            windows=request.windows,
-            jobs=request.jobs,
-            guard=request.guard,
-        )
+    asked: dict[str, Any] = {
+        "scenario": scenario,
+        "policy": policy,
+        "estimator": estimator,
+        "seed": seed,
+        "windows": windows,
+        "guard": guard,
+    }
+    if not force:
+        _require_same(folder, describe(problem, **asked))
+    said = f" ({how})" if how else ""
+    with working(f"simulating {windows} windows{said}"):
+        result = dwell.simulate(problem, **asked, jobs=jobs)
         try:
             result.save(folder)
         except RunError as error:
             typer.echo(f"error: {error}", err=True)
             return False
-    labels: dict[str, str | int] = {
-        "scenario": request.scenario,
-        "policy": policy,
-        "seed": request.seed,
-    }
+    labels: dict[str, str | int] = {"scenario": scenario, "policy": policy, "seed": seed}
     measured = None
     if not result.windows["warmup"].all():
         measured = summarise(result, problem, labels).row
@@ -91,24 +83,15 @@ def run_cell(request: RunRequest, *, as_json: bool) -> bool:
         head: dict[str, Any] = {"cell": problem.name, **labels, "run": folder}
         print_json({**head, "summary": measured})
     else:
-        typer.echo(_summary(problem, request, policy, measured))
+        typer.echo(_summary(problem, labels, windows, measured))
         typer.echo(f"\nsaved to {folder}")
     return True
 
 
-def _require_same(folder: Path, problem: Problem, request: RunRequest, policy: str) -> None:
+def _require_same(folder: Path, asked: Mapping[str, Any]) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
-    asked = describe(
-        problem,
-        scenario=request.scenario,
-        policy=policy,
-        estimator=request.estimator,
-        seed=request.seed,
-        windows=request.windows,
-        guard=request.guard,
-    )
     kept = dwell.open_run(folder).meta
     # Versions of software make no other run.
     if {**kept, "versions": None} != {**json.loads(json.dumps(asked)), "versions": None}:
@@ -123,11 +106,13 @@ def _folder(problem: Problem, scenario: str, policy: str, seed: int) -> Path:
     return Path("runs", re.sub(r"[^\w.+-]", "_", name))
 
 
-def _summary(problem: Problem, request: RunRequest, policy: str, row: Row | None) -> str:
+def _summary(
+    problem: Problem, labels: Mapping[str, str | int], windows: int, row: Row | None
+) -> str:
     warmup = problem.warmup_windows
     title = (
-        f"{problem.name}, {request.scenario}, {policy}, seed {request.seed}: "
-        f"{request.windows} windows of {problem.window_cycles} cycles"
+        f"{problem.name}, {labels['scenario']}, {labels['policy']}, seed {labels['seed']}: "
+        f"{windows} windows of {problem.window_cycles} cycles"
     )
     if row is None:
         return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from dwell.report.formatting import Measure, shown_policy, shown_scenario, write
 from dwell.study import Interval, Study, StudyResult, load_study, run_study
 from dwell.study.over_seeds import over_seeds
 
-__all__ = ["StudyRequest", "run_study_file", "study_text"]
+__all__ = ["run_study_file", "study_text"]
 
 # Groups of a point and a scenario that the terminal shows; the tables have all.
 SHOWN = 40
@@ -30,21 +30,20 @@ MIGRATIONS = Measure("migrations", "migrations")
 REGRET = Measure("regret", "regret", "%", 100.0)
 
 
-@dataclass(frozen=True, slots=True)
-class StudyRequest:
-    """What was asked for; None is what the study file says, or the default."""
-
-    file: Path
-    out: Path | None
-    processes: int | None
-    dask: str | None
-    seeds: int | None
-    windows: int | None
-    seconds: float | None
-
-
-def run_study_file(request: StudyRequest, *, as_json: bool) -> None:
+def run_study_file(
+    file: Path,
+    *,
+    out: Path | None,
+    processes: int | None,
+    dask: str | None,
+    seeds: int | None,
+    windows: int | None,
+    seconds: float | None,
+    as_json: bool,
+) -> None:
     """Run a study, or go on with it, and print what it comes to.
+
+    None is what the study file says, or the default.
 
     Raises
     ------
@@ -54,23 +53,22 @@ def run_study_file(request: StudyRequest, *, as_json: bool) -> None:
     typer.Exit
         If it was interrupted.
     """
-    study = load_study(request.file)
-    if request.seeds is not None:
-        study = replace(study, seeds=tuple(range(1, request.seeds + 1)))
-    windows = request.windows
-    if request.seconds is not None:
-        windows = windows_of(request.seconds, *(point.problem for point in study.points))
+    study = load_study(file)
+    if seeds is not None:
+        study = replace(study, seeds=tuple(range(1, seeds + 1)))
+    if seconds is not None:
+        windows = windows_of(seconds, *(point.problem for point in study.points))
     if windows is not None:
         study = replace(study, windows=windows)
-    folder = request.out or Path("studies", re.sub(r"[^\w.-]", "_", study.name))
-    if request.dask is None:
+    folder = out or Path("studies", re.sub(r"[^\w.-]", "_", study.name))
+    if dask is None:
         compile_first()
     with _interruptible(folder, study) as shown:
         result = run_study(
             study,
             folder=folder,
-            processes=request.processes,
-            dask=request.dask,
+            processes=processes,
+            dask=dask,
             progress=shown,
         )
     if as_json:

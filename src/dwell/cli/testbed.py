@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -191,15 +191,23 @@ def campaign(
     What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
     120 s, if neither --windows nor --seconds is given.
     """
-    from dwell.cli.campaign import CampaignRequest, run_campaign_file
+    from dwell.cli.campaign import run_campaign_file
 
-    length = _run_s(cell, windows, seconds)
-
-    request = CampaignRequest(
-        cell, _names(scenarios), _names(policies), repetitions, length, seed, out, name
+    done = run_campaign_file(
+        cell,
+        scenarios=_names(scenarios),
+        policies=_names(policies),
+        repetitions=repetitions,
+        seconds=_run_s(cell, windows, seconds),
+        seed=seed,
+        out=out,
+        name=name,
+        minutes=minutes,
+        inventory=inventory,
+        report=report,
+        as_json=as_json,
     )
-    request = replace(request, minutes=minutes, inventory=inventory, report=report)
-    if not run_campaign_file(request, as_json=as_json):
+    if not done:
         raise typer.Exit(ExitCode.FAILED)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +18,20 @@ from dwell.report.validation_page import validation_html, validation_text
 from dwell.study.validation import GOALS, Validation, validate
 from dwell.testbed.speeds import Usual
 
-__all__ = ["ValidationRequest", "sidecar_of", "validate_runs"]
+__all__ = ["sidecar_of", "validate_runs"]
 
 
-@dataclass(frozen=True, slots=True)
-class ValidationRequest:
-    """What is to be validated; None is the default folder."""
-
-    runs: Sequence[Path]
-    cell: Path
-    out: Path | None
-    seeds: int
-    traces: Path | None
-    calibrated_from: Sequence[Path]
-    processes: int | None
-
-
-def validate_runs(request: ValidationRequest, *, as_json: bool) -> None:
+def validate_runs(
+    runs: Sequence[Path],
+    cell: Path,
+    *,
+    out: Path | None,
+    seeds: int,
+    traces: Path | None,
+    calibrated_from: Sequence[Path],
+    processes: int | None,
+    as_json: bool,
+) -> None:
     """Simulate, write the page and the table, and print.
 
     Raises
@@ -43,22 +39,22 @@ def validate_runs(request: ValidationRequest, *, as_json: bool) -> None:
     DwellError
         If a folder is not a run, or a run is not one that the cell can be validated on.
     """
-    problem = dwell.load(request.cell, traces=request.traces)
-    runs = _open(request.runs)
-    ids, usual = _sidecar(request.cell)
-    used = [*ids, *(path.resolve().name for path in request.calibrated_from)]
+    problem = dwell.load(cell, traces=traces)
+    opened = _open(runs)
+    ids, usual = _sidecar(cell)
+    used = [*ids, *(path.resolve().name for path in calibrated_from)]
     compile_first()
     with progress("simulating") as show:
         validation = validate(
-            runs,
+            opened,
             problem,
-            seeds=request.seeds,
+            seeds=seeds,
             calibrated_from=used,
             usual=usual,
-            processes=request.processes,
+            processes=processes,
             progress=show,
         )
-    out = request.out or Path("validations", problem.name)
+    out = out or Path("validations", problem.name)
     page, table = out / "report.html", out / "validation.json"
     told = _told(validation)
     write_file(page, validation_html(validation))
