@@ -31,9 +31,6 @@ WITHOUT = {
     "policies": """
         protocol
     """,
-    "report": """
-        policy_blocks
-    """,
     "sim": """
         arrays tables
     """,

@@ -1,4 +1,4 @@
-"""Phases of a run, from what was done to it."""
+"""Phases of a run, from what was done to it, and what each has shown."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from dwell.model import (
     Normal,
     Scenario,
 )
-from dwell.report.phases import CALM, Disturbed, disturbed, phases
+from dwell.report.phases import CALM, Disturbed, disturbed, phase_rows, phases
+from dwell.report.run_header import RunHeader
+from tests.report.live_runs import PLAYED, TRACKING, live_run
 
 FABRIC = Fabric({"R1": Node("R1", "robot"), "E": Node("E", "edge")}, {})
 DELAY = Normal(25.0, 5.0)
@@ -83,3 +85,14 @@ def test_phases_cover_the_run_without_gaps(happened: list[Disturbed], end_s: flo
     for before, after in itertools.pairwise(found):
         assert before.end_s == after.begin_s
         assert before.name != after.name
+
+
+def test_a_phase_has_its_moves_shares_losses_and_error() -> None:
+    run = live_run(scenario="demo", seed=1, played=PLAYED, tracking=TRACKING)
+    calm, stress, after = phase_rows(run, RunHeader.of(run))
+    assert (calm.migrations, calm.guard_moves) == (0, 0)
+    assert (stress.migrations, stress.guard_moves) == (1, 1)
+    assert stress.shares == {"SO": 10 / 11, "LOC": 1 / 11}
+    assert calm.rms_mm == 3.0
+    assert stress.rms_px == 8.0
+    assert (calm.lost, after.lost) == (0, 1)

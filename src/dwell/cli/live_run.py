@@ -21,8 +21,7 @@ from dwell.model import Problem, Scenario
 from dwell.record import Run, open_run, seal_run
 from dwell.report import run_html
 from dwell.report.formatting import listed, percent, write_number
-from dwell.report.phase_rows import PhaseRow, phase_rows
-from dwell.report.phases import Disturbed, disturbed
+from dwell.report.phases import Disturbed, PhaseRow, disturbed, phase_rows
 from dwell.report.run_header import RunHeader
 from dwell.testbed.cell_observer import CellObserver, load_observer
 from dwell.testbed.loopback import Loopback, on_this_machine

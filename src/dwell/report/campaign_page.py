@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.charts import cumulative
+from dwell.report.charts import NO_LIMIT, Limit, cumulative
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, percent, shown_contender, write_number
 from dwell.report.method import method_blocks
@@ -18,9 +17,6 @@ from dwell.report.policy_blocks import RATE, PolicyBlocks, named
 from dwell.report.table import Columns, Table, Text, table_text
 from dwell.study.campaign_questions import CampaignQuestion, questions
 from dwell.study.measured_campaign import MeasuredCampaign
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["campaign_html", "campaign_page", "campaign_text"]
 
@@ -51,7 +47,7 @@ def campaign_html(measured: MeasuredCampaign, *, static: bool = False) -> str:
 def campaign_page(measured: MeasuredCampaign) -> Page:
     """Return what there is to show of a campaign; see `campaign_html`."""
     comparison = measured.comparison
-    blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies)
+    blocks = PolicyBlocks(comparison)
     return Page(
         title=f"Campaign on {comparison.problem.name}",
         subtitle=f"{len(comparison.scenarios)} scenarios, {len(comparison.policies)} policies, "
@@ -170,8 +166,7 @@ def _windows(measured: MeasuredCampaign, blocks: PolicyBlocks, name: str) -> Fig
         named(pl.concat(parts)),
         blocks.styles,
         (f"{measure.name} of a window ({measure.unit})", "windows at or below"),
-        limit=deadline_ms if latency else float("inf"),
-        limit_name="deadline",
+        limit=Limit(deadline_ms, "deadline") if latency else NO_LIMIT,
         title=f"Windows by their {measure.name}",
     )
 
@@ -275,7 +270,7 @@ def campaign_text(measured: MeasuredCampaign, *, width: int | None = None) -> st
         Columns of the terminal; as wide as it takes where None.
     """
     comparison = measured.comparison
-    blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies)
+    blocks = PolicyBlocks(comparison)
     parts = [blocks.results(compact=True), blocks.counts()]
     parts += [
         _question_table(asked, blocks, place) for place, asked in enumerate(questions(measured))

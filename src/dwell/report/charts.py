@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from dwell.report.formatting import Measure
 
 __all__ = [
+    "NO_LIMIT",
     "PARTS_SHOWN",
     "PART_COLOURS",
+    "Limit",
     "cumulative",
     "curves",
     "distributions",
@@ -36,8 +38,9 @@ __all__ = [
     "thinned",
 ]
 
-#: Names of the parts of a latency.
+#: Names of the parts of a latency, and their colours by these.
 PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
+PART_COLOURS = {PARTS_SHOWN[part]: colour for part, colour in PARTS.items()}
 #: Factor between numbers above which an axis is logarithmic.
 WIDE = 30.0
 #: Least width of a panel, and what a panel of named rows has beside it, pixels.
@@ -47,6 +50,16 @@ ROW_PX = 17
 SYMBOL_PX, LETTER_PX = 34, 6.2
 #: Share of cycles below which a distribution is not drawn.
 LEAST_SHARE = 1e-4
+
+
+class Limit(NamedTuple):
+    """A line on an axis, in the unit that is shown, and its name; none where it is infinite."""
+
+    value: float
+    name: str
+
+
+NO_LIMIT = Limit(math.inf, "")
 
 
 def quantity(field: str, title: str | None, **more: Any) -> Spec:
@@ -150,8 +163,7 @@ def intervals(
     measure: Measure,
     styles: Mapping[str, Style],
     *,
-    limit: float = math.inf,
-    limit_name: str = "",
+    limit: Limit = NO_LIMIT,
     title: str = "",
     caption: str = "",
 ) -> Figure:
@@ -164,10 +176,7 @@ def intervals(
         measure's shown unit: a row a policy without a seed, and a row a seed without a mean.
     styles : mapping of str to Style
         By policy, in the order of the rows.
-    limit : float
-        In the shown unit.
     """
-    facets, policies = _facets(frame), list(styles)
     shown = [frame[name].drop_nulls().to_list() for name in ("value", "mean", "low")]
     scale: Spec = {"nice": True}
     ticks = {"tickCount": 4, "labelOverlap": "greedy", "labelSeparation": 4}
@@ -177,12 +186,12 @@ def intervals(
         zero = min(itertools.chain(*shown)) <= 0
         scale = {"type": "symlog", "constant": 1} if zero else {"type": "log"}
     across = quantity("mean", measure.heading, scale=scale, axis=ticks)
-    down = name_of("policy", sort=policies)
+    down = name_of("policy", sort=list(styles))
     colours = styled(styles)
     about = [name_of("policy", title="policy"), name_of("scenario", title="scenario")]
     faded = {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22}
     layers: list[Spec] = [
-        *limit_rule("x", limit, limit_name),
+        *limit_rule("x", *limit),
         {
             "transform": [SHOWN, {"filter": "isValid(datum.value)"}],
             "mark": {"type": "tick", "thickness": 1.2, "size": 9},
@@ -221,11 +230,7 @@ def intervals(
             },
         },
     ]
-
-    def draw(width: float) -> Spec:
-        return {**_rows(layers, facets, policies, width), "params": chosen(policies, seeds=True)}
-
-    return Figure(slug, title, {"rows": frame}, draw, caption)
+    return _rows(slug, frame, layers, list(styles), title, caption, seeds=True)
 
 
 def stacked(
@@ -235,8 +240,7 @@ def stacked(
     parts: Mapping[str, str],
     heading: str,
     *,
-    limit: float = math.inf,
-    limit_name: str = "",
+    limit: Limit = NO_LIMIT,
     title: str = "",
     caption: str = "",
 ) -> Figure:
@@ -253,7 +257,7 @@ def stacked(
     heading : str
         Of the axis, with its unit.
     """
-    facets, names = _facets(frame), list(parts)
+    names = list(parts)
     order = {"calculate": f"indexof({names!r}, datum.part)", "as": "place"}
     bars: Spec = {
         "transform": [SHOWN, order],
@@ -274,12 +278,7 @@ def stacked(
             ],
         },
     }
-
-    def draw(width: float) -> Spec:
-        layers = [bars, *limit_rule("x", limit, limit_name)]
-        return {**_rows(layers, facets, policies, width), "params": chosen(policies)}
-
-    return Figure(slug, title, {"rows": frame}, draw, caption)
+    return _rows(slug, frame, [bars, *limit_rule("x", *limit)], policies, title, caption)
 
 
 def distributions(
@@ -299,42 +298,24 @@ def distributions(
         ``scenario``, ``policy``, ``latency_ms``, ``longer``: share of the cycles, above 0.
     styles : mapping of str to Style
     """
-    facets = _facets(frame)
+    five = {
+        "data": {"values": [{}]},
+        "mark": {"type": "rule", "color": MUTED, "strokeDash": [1, 3], "tooltip": "5 %"},
+        "encoding": {"y": {"datum": 0.05}},
+    }
+    across = quantity("latency_ms", "latency (ms)", axis={"tickCount": 5})
+    up = quantity(
+        "longer",
+        "cycles that took longer",
+        scale={"type": "log", "domain": [LEAST_SHARE, 1], "clamp": True},
+        axis={"values": [1, 0.1, 0.01, 0.001, LEAST_SHARE], "format": "~%"},
+    )
 
-    def draw(width: float) -> Spec:
-        encoded = styled(styles, width)
-        lines: Spec = {
-            "transform": [SHOWN],
-            "mark": {"type": "line", "interpolate": "step-after", "strokeWidth": 1.5, "clip": True},
-            "encoding": {
-                "x": quantity("latency_ms", "latency (ms)", axis={"tickCount": 5}),
-                "y": quantity(
-                    "longer",
-                    "cycles that took longer",
-                    scale={"type": "log", "domain": [LEAST_SHARE, 1], "clamp": True},
-                    axis={"values": [1, 0.1, 0.01, 0.001, LEAST_SHARE], "format": "~%"},
-                ),
-                "color": encoded["color"],
-                "strokeDash": encoded["strokeDash"],
-                "tooltip": [
-                    name_of("policy", title="policy"),
-                    quantity("latency_ms", "latency (ms)"),
-                    quantity("longer", "longer", format=".3~%"),
-                ],
-            },
-        }
-        layers = [
-            lines,
-            *limit_rule("x", deadline_ms, "deadline"),
-            {
-                "data": {"values": [{}]},
-                "mark": {"type": "rule", "color": MUTED, "strokeDash": [1, 3], "tooltip": "5 %"},
-                "encoding": {"y": {"datum": 0.05}},
-            },
-        ]
-        return {**_plots(layers, facets, 180, width), "params": chosen(list(styles))}
+    def layers(encoded: Mapping[str, Spec]) -> list[Spec]:
+        deadline = limit_rule("x", deadline_ms, "deadline")
+        return [_steps(across, up, encoded, "policy"), *deadline, five]
 
-    return Figure(slug, title, {"rows": frame}, draw, caption)
+    return _plots(slug, frame, styles, layers, 180, title, caption)
 
 
 def cumulative(
@@ -343,8 +324,7 @@ def cumulative(
     styles: Mapping[str, Style],
     headings: tuple[str, str],
     *,
-    limit: float = math.inf,
-    limit_name: str = "",
+    limit: Limit = NO_LIMIT,
     title: str = "",
     caption: str = "",
 ) -> Figure:
@@ -358,28 +338,31 @@ def cumulative(
     headings : (str, str)
         Of the axes: values, shares.
     """
-    facets = _facets(frame)
+    across = quantity("value", headings[0], axis={"tickCount": 4})
+    up = quantity("share", headings[1], axis={"format": "~%", "tickCount": 4})
 
-    def draw(width: float) -> Spec:
-        encoded = styled(styles, width)
-        lines: Spec = {
-            "transform": [SHOWN],
-            "mark": {"type": "line", "interpolate": "step-after", "strokeWidth": 1.4, "clip": True},
-            "encoding": {
-                "x": quantity("value", headings[0], axis={"tickCount": 4}),
-                "y": quantity("share", headings[1], axis={"format": "~%", "tickCount": 4}),
-                **_of(encoded, "color", "strokeDash"),
-                "tooltip": [
-                    name_of("policy", title="line"),
-                    quantity("value", headings[0]),
-                    quantity("share", "share", format=".3~%"),
-                ],
-            },
-        }
-        layers = [lines, *limit_rule("x", limit, limit_name)]
-        return {**_plots(layers, facets, 150, width), "params": chosen(list(styles))}
+    def layers(encoded: Mapping[str, Spec]) -> list[Spec]:
+        return [_steps(across, up, encoded, "line"), *limit_rule("x", *limit)]
 
-    return Figure(slug, title, {"rows": frame}, draw, caption)
+    return _plots(slug, frame, styles, layers, 150, title, caption)
+
+
+def _steps(across: Spec, up: Spec, encoded: Mapping[str, Spec], what: str) -> Spec:
+    """Return the lines of distributions, a step at each value; `what` a line stands for."""
+    return {
+        "transform": [SHOWN],
+        "mark": {"type": "line", "interpolate": "step-after", "strokeWidth": 1.5, "clip": True},
+        "encoding": {
+            "x": across,
+            "y": up,
+            **_of(encoded, "color", "strokeDash"),
+            "tooltip": [
+                name_of("policy", title=what),
+                quantity(across["field"], across["title"]),
+                quantity(up["field"], up["field"], format=".3~%"),
+            ],
+        },
+    }
 
 
 def curves(
@@ -389,8 +372,7 @@ def curves(
     styles: Mapping[str, Style],
     heading: str,
     *,
-    limit: float = math.inf,
-    limit_name: str = "",
+    limit: Limit = NO_LIMIT,
     title: str = "",
     caption: str = "",
 ) -> Figure:
@@ -404,29 +386,25 @@ def curves(
     styles : mapping of str to Style
     heading : str
         Of the parameter.
-    limit : float
-        In the shown unit.
     """
-    facets = _facets(frame)
+    numeric = frame["at"].dtype.is_numeric()
+    values = frame["at"].unique(maintain_order=True).to_list()
+    across: Spec = {
+        "field": "at",
+        "type": "quantitative" if numeric else "ordinal",
+        "title": heading,
+        "axis": {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric},
+        "sort": None,
+    }
+    if numeric:
+        across["scale"] = {"type": "log" if min(values) > 0 and is_wide(values) else "linear"}
+        across["scale"]["zero"] = False
+        across["axis"]["format"] = ".6~g"
+    up = quantity("mean", measure.heading, axis={"tickCount": 5})
 
-    def draw(width: float) -> Spec:
-        encoded = styled(styles, width)
-        numeric = frame["at"].dtype.is_numeric()
-        values = frame["at"].unique(maintain_order=True).to_list()
-        across: Spec = {
-            "field": "at",
-            "type": "quantitative" if numeric else "ordinal",
-            "title": heading,
-            "axis": {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric},
-            "sort": None,
-        }
-        if numeric:
-            across["scale"] = {"type": "log" if min(values) > 0 and is_wide(values) else "linear"}
-            across["scale"]["zero"] = False
-            across["axis"]["format"] = ".6~g"
-        up = quantity("mean", measure.heading, axis={"tickCount": 5})
-        layers: list[Spec] = [
-            *limit_rule("y", limit, limit_name),
+    def layers(encoded: Mapping[str, Spec]) -> list[Spec]:
+        return [
+            *limit_rule("y", *limit),
             {
                 "transform": [SHOWN, {"filter": "isValid(datum.low) && isValid(datum.high)"}],
                 "mark": {"type": "rule", "strokeWidth": 1.3},
@@ -459,28 +437,52 @@ def curves(
                 },
             },
         ]
-        drawn = _plots(layers, facets, 170, width, most=3)
-        return {**drawn, "params": chosen(list(styles))}
+
+    return _plots(slug, frame, styles, layers, 170, title, caption, most=3)
+
+
+def _rows(
+    slug: str,
+    frame: pl.DataFrame,
+    layers: Sequence[Spec],
+    policies: Sequence[str],
+    title: str,
+    caption: str,
+    *,
+    seeds: bool = False,
+) -> Figure:
+    """Return a figure with a row for each policy, a panel a scenario."""
+    facets = _facets(frame)
+
+    def draw(width: float) -> Spec:
+        columns, across_px = panels(width, len(facets))
+        size = {"width": across_px, "height": ROW_PX * max(len(policies), 1)}
+        return {**faceted(layers, facets, columns, size), "params": chosen(policies, seeds)}
 
     return Figure(slug, title, {"rows": frame}, draw, caption)
 
 
-def _rows(
-    layers: Sequence[Spec], facets: Sequence[str], policies: Sequence[str], width: float
-) -> Spec:
-    """Return layers with a row for each policy, a panel a scenario."""
-    columns, across_px = panels(width, len(facets))
-    size = {"width": across_px, "height": ROW_PX * max(len(policies), 1)}
-    return faceted(layers, facets, columns, size)
-
-
 def _plots(
-    layers: Sequence[Spec], facets: Sequence[str], tallest_px: int, width: float, most: int = 4
-) -> Spec:
-    """Return layers over two numbers, a panel a scenario."""
-    columns, across_px = panels(width, len(facets), beside=60, most=most)
-    size = {"width": across_px, "height": min(tallest_px, round(0.6 * across_px))}
-    return faceted(layers, facets, columns, size)
+    slug: str,
+    frame: pl.DataFrame,
+    styles: Mapping[str, Style],
+    layers: Callable[[Mapping[str, Spec]], list[Spec]],
+    tallest_px: int,
+    title: str,
+    caption: str,
+    *,
+    most: int = 4,
+) -> Figure:
+    """Return a figure of layers over two numbers, made of encodings; a panel a scenario."""
+    facets = _facets(frame)
+
+    def draw(width: float) -> Spec:
+        columns, across_px = panels(width, len(facets), beside=60, most=most)
+        size = {"width": across_px, "height": min(tallest_px, round(0.6 * across_px))}
+        drawn = faceted(layers(styled(styles, width)), facets, columns, size)
+        return {**drawn, "params": chosen(list(styles))}
+
+    return Figure(slug, title, {"rows": frame}, draw, caption)
 
 
 def _of(encoded: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:
@@ -489,7 +491,3 @@ def _of(encoded: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:
 
 def _facets(frame: pl.DataFrame) -> list[str]:
     return [str(name) for name in frame["scenario"].unique(maintain_order=True)]
-
-
-#: Colours of the parts of a latency by their names.
-PART_COLOURS = {PARTS_SHOWN[part]: colour for part, colour in PARTS.items()}

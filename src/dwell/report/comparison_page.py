@@ -14,10 +14,10 @@ from dwell.report.method import method_blocks, ranges
 from dwell.report.page import Definitions, Page, Section, page_html
 from dwell.report.palette import Palette
 from dwell.report.phases import disturbed
-from dwell.report.policy_blocks import COST, RATE, PolicyBlocks, named, scaled
+from dwell.report.policy_blocks import COST, RATE, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Columns, Table, Text, table_text
 from dwell.report.timeline import begins_by_number, run_timeline
-from dwell.study import AIM, Comparison, StudyResult, paper_predictions
+from dwell.study import Comparison, StudyResult, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def comparison_page(
     policies: dict[str, str] = {}
     for comparison in comparisons:
         prefix = f"{comparison.problem.name}-" if several else ""
-        blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies, prefix)
+        blocks = PolicyBlocks(comparison, prefix)
         policies |= {name: style.colour for name, style in blocks.styles.items()}
         for part in islice(_sections(comparison, blocks, tenants), sections):
             title = f"{comparison.problem.name}: {part.title}" if several else part.title
@@ -209,16 +209,13 @@ def _tenants(result: StudyResult) -> Figure:
     table = scaled(result.table([RATE.column]), RATE).with_columns(
         at=pl.col(column).cast(pl.String).replace_strict(shares, return_dtype=pl.Float64)
     )
-    problem = result.study.points[0].problem
-    blocks = PolicyBlocks(problem, result.runs, result.latencies)
     return curves(
         "tenants",
         named(table.select("scenario", "policy", "at", "mean", "low", "high")).sort("at"),
         RATE,
-        blocks.styles,
+        PolicyBlocks(result).styles,
         "share of the time (%)",
-        limit=100 * AIM,
-        limit_name="the aim, 5 %",
+        limit=THE_AIM,
         caption="Means over seeds with their 95 % intervals.",
     )
 
@@ -239,6 +236,6 @@ def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
     width : int, optional
         Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
     """
-    blocks = PolicyBlocks(comparison.problem, comparison.runs, comparison.latencies)
+    blocks = PolicyBlocks(comparison)
     tables = [blocks.results(compact=True), predictions_table(comparison), blocks.counts()]
     return "\n".join(table_text(one, width=width) for one in tables if one.rows)

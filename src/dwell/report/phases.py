@@ -1,11 +1,11 @@
-"""Phases: the stretches of a run in which the same disturbances were on."""
+"""Phases: the stretches of a run in which the same disturbances were on, and what each showed."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 from dwell.model import (
     AR1,
@@ -20,14 +20,21 @@ from dwell.model import (
     Normal,
     Process,
 )
+from dwell.study.summary import latency_ms, order_statistic
 
-__all__ = ["CALM", "Disturbed", "Phase", "disturbed", "phases"]
+if TYPE_CHECKING:
+    from dwell.record import Run
+    from dwell.report.run_header import RunHeader
+
+__all__ = ["CALM", "Disturbed", "Phase", "PhaseRow", "disturbed", "phase_rows", "phases"]
 
 CALM = "baseline"
 #: Who is disturbed, as it is called: by what the disturbance acts on.
 NETWORK = "network impairment"
 #: Decimals of seconds: what began and ended together did so within a tenth.
 DIGITS = 1
+#: Runs with more phases are not told phase by phase.
+MOST = 16
 
 
 class Disturbed(NamedTuple):
@@ -135,4 +142,107 @@ def phases(events: Sequence[Disturbed], end_s: float) -> list[Phase]:
             found[-1] = found[-1]._replace(end_s=until_s)
         else:
             found.append(Phase(name, begin_s, until_s))
+    return found
+
+
+class PhaseRow(NamedTuple):
+    """One phase.
+
+    Parameters
+    ----------
+    cycles : int
+        Released in it.
+    violation_rate, l95_ms : float
+        Of their final latencies; infinite L95 where more than 5 % never finished.
+    lost : int
+        Cycles that never finished.
+    shares : mapping of str to float
+        Of the cycles, by placement; the largest first.
+    migrations, guard_moves : int
+        By when the first cycle on the new placement was released.
+    rms_mm, rms_px : float
+        Tracking error; NaN where it is not known.
+    """
+
+    name: str
+    begin_s: float
+    end_s: float
+    cycles: int
+    violation_rate: float
+    l95_ms: float
+    lost: int
+    shares: Mapping[str, float]
+    migrations: int
+    guard_moves: int
+    rms_mm: float
+    rms_px: float
+
+
+def phase_rows(run: Run, facts: RunHeader) -> list[PhaseRow]:
+    """Return the phases of a run that have cycles; none where there are too many of them."""
+    import polars as pl
+
+    cycles = run.cycles
+    if cycles.is_empty():
+        return []
+    released_s = cycles["release_ns"].to_numpy() / 1e9
+    found = phases(facts.disturbed, float(released_s[-1]) + facts.period_ms / 1e3)
+    if len(found) > MOST:
+        return []
+    moved_s = _moves(run)
+    guard_s = _guarded(run, moved_s)
+    rows = []
+    for phase in found:
+        inside = (phase.begin_s <= released_s) & (released_s < phase.end_s)
+        mine = cycles.filter(pl.Series(inside))
+        if mine.is_empty():
+            continue
+        moves = sum(phase.begin_s <= at_s < phase.end_s for at_s, _ in moved_s)
+        guards = sum(phase.begin_s <= at_s < phase.end_s for at_s in guard_s)
+        counts = mine["placement"].cast(pl.String).value_counts(sort=True)
+        rms_mm, rms_px = (math.nan, math.nan)
+        if facts.tracking is not None:
+            rms_mm, rms_px = facts.tracking.rms(phase.begin_s, phase.end_s)
+        rows.append(
+            PhaseRow(
+                phase.name,
+                phase.begin_s,
+                phase.end_s,
+                mine.height,
+                float(mine["missed"].to_numpy().mean()),
+                float(order_statistic(latency_ms(mine), 95)),
+                int(mine["latency_ns"].is_null().sum()),
+                {name: count / mine.height for name, count in counts.rows()},
+                max(moves - guards, 0),
+                guards,
+                rms_mm,
+                rms_px,
+            )
+        )
+    return rows
+
+
+def _moves(run: Run) -> list[tuple[float, str]]:
+    """When the first cycle on another placement was released, and on which."""
+    import polars as pl
+
+    cycles = run.cycles.select("release_ns", pl.col("placement").cast(pl.String))
+    changed = cycles.filter(pl.col("placement") != pl.col("placement").shift(1))
+    return [(at_ns / 1e9, placement) for at_ns, placement in changed.rows()]
+
+
+def _guarded(run: Run, moved_s: Sequence[tuple[float, str]]) -> list[float]:
+    """When it was the guard: it is noted under the window that follows the move."""
+    import polars as pl
+
+    decisions = run.decisions
+    guard = decisions["migrated"] & (decisions["reason"].cast(pl.String) == "guard")
+    first = dict(zip(run.windows["window"], run.windows["first_cycle"], strict=True))
+    released_ns = dict(zip(run.cycles["cycle"], run.cycles["release_ns"], strict=True))
+    found = []
+    for window, target in decisions.filter(guard).select("window", "placement").rows():
+        # After the last window there is none that follows.
+        until_ns = released_ns.get(first.get(window, -1), math.inf)
+        mine = [at_s for at_s, name in moved_s if name == target and at_s * 1e9 <= until_ns + 1]
+        found += mine[-1:]
     return found

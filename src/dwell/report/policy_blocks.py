@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.model import Problem
-from dwell.report.charts import PART_COLOURS, PARTS_SHOWN, distributions, intervals, stacked
+from dwell.report.charts import (
+    NO_LIMIT,
+    PART_COLOURS,
+    PARTS_SHOWN,
+    Limit,
+    distributions,
+    intervals,
+    stacked,
+)
 from dwell.report.contenders import palette_of
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, shown_contender, shown_scenario
-from dwell.report.palette import Palette, Style
 from dwell.report.table import Columns, Table, Text
 from dwell.study import AIM, over_seeds, under
 
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["COST", "L95", "MEASURES", "RATE", "PolicyBlocks", "named", "scaled"]
+    from dwell.study import StudyRuns
+
+__all__ = ["COST", "KEYS", "L95", "MEASURES", "RATE", "THE_AIM", "PolicyBlocks", "named", "scaled"]
 
 RATE = Measure("violation_rate", "V_D", "%", 100.0)
 L95 = Measure("l95_ms", "L95", "ms")
@@ -48,92 +55,56 @@ MORE = (
     Measure("aoi_peak_ms", "largest age", "ms"),
     Measure("tracking_rms_mm", "tracking error", "mm"),
 )
+#: In the unit of `RATE`.
+THE_AIM = Limit(100 * AIM, "the aim, 5 %")
+KEYS = ("scenario", "policy")
 #: Lines of a distribution have so many points at most.
 POINTS = 60
 LEAST_SHARE = 1e-4
 
 
-@dataclass(frozen=True, slots=True)
 class PolicyBlocks:
     """Runs by scenario and policy, and how they are shown.
 
     Parameters
     ----------
-    runs : DataFrame
-        One row a run: ``scenario``, ``policy``, ``seed`` and numbers.
-    latencies : DataFrame
-        ``scenario``, ``policy``, ``latency_ms``, ``share`` of the cycles within it.
+    found : StudyRuns
+        Of a comparison, a study or a campaign.
     prefix : str
         Of the names of figures and tables, where a page has several of these.
     """
 
-    problem: Problem
-    runs: pl.DataFrame
-    latencies: pl.DataFrame
-    prefix: str = ""
-
-    @property
-    def scenarios(self) -> list[str]:
-        """Names, in the order of the runs."""
-        return [str(name) for name in self.runs["scenario"].unique(maintain_order=True)]
-
-    @property
-    def policies(self) -> list[str]:
-        """Names, in the order of the runs."""
-        return [str(name) for name in self.runs["policy"].unique(maintain_order=True)]
-
-    @property
-    def palette(self) -> Palette:
-        """Colours of the candidates, and styles of the policies by their names."""
-        return palette_of(self.problem, self.policies)
-
-    @property
-    def styles(self) -> dict[str, Style]:
-        """Styles of the policies, as they are called in figures."""
-        found = self.palette.policies
-        return {shown_contender(name): found[name] for name in self.policies}
+    def __init__(self, found: StudyRuns, prefix: str = "") -> None:
+        self.problem, self.runs, self.latencies = found.problem, found.runs, found.latencies
+        self.prefix = prefix
+        # References are no contenders, and have runs.
+        self.scenarios, self.policies = (
+            [str(name) for name in self.runs[column].unique(maintain_order=True)]
+            for column in ("scenario", "policy")
+        )
+        self.palette = palette_of(self.problem, self.policies)
+        #: By what the policies are called in figures.
+        self.styles = {shown_contender(name): self.palette.policies[name] for name in self.policies}
 
     # ------------------------------------------------------------------------------- figures
 
     def measure(
-        self,
-        measure: Measure,
-        *,
-        limit: float = math.inf,
-        limit_name: str = "",
-        title: str = "",
-        caption: str = "",
+        self, measure: Measure, *, limit: Limit = NO_LIMIT, title: str = "", caption: str = ""
     ) -> Figure:
-        """Draw a measure: means with intervals, and every seed.
-
-        Parameters
-        ----------
-        limit : float
-            In the column's unit.
-        """
+        """Draw a measure: means with intervals, and every seed; the limit in the shown unit."""
         import polars as pl
 
-        columns = ("scenario", "policy")
-        means = over_seeds(self.runs, columns, [measure.column])
-        keys = [pl.col(name).cast(pl.String) for name in columns]
-        seeds = self.runs.select(*keys, "seed", pl.col(measure.column).alias("value"))
-        found = means.select(
-            *keys,
-            pl.col(measure.column).alias("mean"),
-            pl.col(f"{measure.column}_low").alias("low"),
-            pl.col(f"{measure.column}_high").alias("high"),
+        seeds = self.runs.select(
+            *KEYS, "seed", value=pl.col(measure.column).cast(pl.Float64) * measure.factor
         )
-        numbers = ["mean", "low", "high", "value"]
-        rows = pl.concat([found, seeds], how="diagonal_relaxed").with_columns(
-            pl.col(name).cast(pl.Float64) * measure.factor for name in numbers
-        )
+        means = scaled(over_seeds(self.runs, KEYS, [measure.column]), measure)
+        rows = [means.select(*KEYS, "mean", "low", "high"), seeds]
         return intervals(
             f"{self.prefix}{measure.column}",
-            named(rows),
+            named(pl.concat(rows, how="diagonal_relaxed")),
             measure,
             self.styles,
-            limit=limit * measure.factor,
-            limit_name=limit_name,
+            limit=limit,
             title=title,
             caption=caption,
         )
@@ -142,8 +113,7 @@ class PolicyBlocks:
         """Draw V_D beside the aim."""
         return self.measure(
             RATE,
-            limit=AIM,
-            limit_name="the aim, 5 %",
+            limit=THE_AIM,
             title="V_D, the share of missed deadlines",
             caption=(
                 "Marks: means over seeds; bars: their 95 % intervals; ticks: single seeds. "
@@ -155,8 +125,7 @@ class PolicyBlocks:
         """Draw L95 beside the deadline."""
         return self.measure(
             L95,
-            limit=self.problem.pipeline.deadline_ms,
-            limit_name="deadline",
+            limit=Limit(self.problem.pipeline.deadline_ms, "deadline"),
             title="L95, the 95th percentile of a window’s latencies, mean over windows",
             caption=(
                 "As the controller sees it: a cycle that has not finished counts with its age. "
@@ -169,16 +138,12 @@ class PolicyBlocks:
         import polars as pl
 
         parts = []
-        for labels, mine in self.latencies.group_by("scenario", "policy", maintain_order=True):
+        for _, mine in self.latencies.group_by(KEYS, maintain_order=True):
             longer = 1 - mine["share"].to_numpy()
             bins = np.round(np.log10(np.maximum(longer, LEAST_SHARE)) * POINTS / 4)
             keep = np.flatnonzero(np.diff(bins, prepend=math.inf))
-            scenario, policy = map(str, labels)
-            line = mine[keep].select("latency_ms", longer=1 - pl.col("share"))
-            labelled = line.select(
-                pl.lit(scenario).alias("scenario"), pl.lit(policy).alias("policy"), pl.all()
-            )
-            parts.append(labelled.filter(pl.col("longer") > 0))
+            line = mine[keep].select(*KEYS, "latency_ms", longer=1 - pl.col("share"))
+            parts.append(line.filter(pl.col("longer") > 0))
         return distributions(
             f"{self.prefix}latencies",
             named(pl.concat(parts)),
@@ -218,8 +183,7 @@ class PolicyBlocks:
             [shown_contender(name) for name in self.policies],
             PART_COLOURS,
             "mean latency of finished cycles (ms)",
-            limit=self.problem.pipeline.deadline_ms,
-            limit_name="deadline",
+            limit=Limit(self.problem.pipeline.deadline_ms, "deadline"),
             title="Where the time goes along the critical path",
             caption="Lost cycles are not in it. Dashed: deadline.",
         )
@@ -232,18 +196,14 @@ class PolicyBlocks:
 
         means = (
             self.runs.filter(pl.col("policy").is_in(list(policies)))
-            .group_by("scenario", "policy", maintain_order=True)
+            .group_by(KEYS, maintain_order=True)
             .agg(
                 (pl.col(name).cast(pl.Float64).mean() * factor).alias(shown)
                 for name, (shown, factor) in columns.items()
             )
         )
         shown = [shown for shown, _ in columns.values()]
-        return named(
-            means.unpivot(
-                shown, index=["scenario", "policy"], variable_name="part", value_name="value"
-            )
-        )
+        return named(means.unpivot(shown, index=KEYS, variable_name="part", value_name="value"))
 
     # -------------------------------------------------------------------------------- tables
 
@@ -337,11 +297,10 @@ class PolicyBlocks:
         )
 
     def _table(self, measures: Sequence[Measure]) -> pl.DataFrame:
-        names = [one.column for one in measures if one.column in self.runs.columns]
-        return over_seeds(self.runs, ("scenario", "policy"), names)
+        return over_seeds(self.runs, KEYS, [one.column for one in measures])
 
 
-def named(frame: pl.DataFrame, columns: Sequence[str] = ("scenario", "policy")) -> pl.DataFrame:
+def named(frame: pl.DataFrame, columns: Sequence[str] = KEYS) -> pl.DataFrame:
     """Return rows in which scenarios and policies have the names that figures show."""
     import polars as pl
 

@@ -15,6 +15,7 @@ from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
 from dwell.report.charts import (
     PART_COLOURS,
     PARTS_SHOWN,
+    Limit,
     distributions,
     limit_rule,
     name_of,
@@ -32,7 +33,7 @@ from dwell.report.formatting import (
 )
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
 from dwell.report.palette import BAD, Palette
-from dwell.report.phase_rows import phase_rows
+from dwell.report.phases import phase_rows
 from dwell.report.run_header import RunHeader
 from dwell.report.table import Columns, Table, Text
 from dwell.report.timeline import begins_by_number, run_timeline
@@ -352,8 +353,7 @@ class _RunPage:
                 used,
                 PART_COLOURS,
                 "mean latency of finished cycles (ms)",
-                limit=deadline_ms,
-                limit_name="deadline",
+                limit=Limit(deadline_ms, "deadline"),
                 title="Where the time goes along the critical path",
                 caption="Dashed: deadline.",
             ),

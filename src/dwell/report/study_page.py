@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import curves
+from dwell.report.charts import NO_LIMIT, Limit, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
 from dwell.report.method import method_blocks, ranges
-from dwell.report.page import Definitions, Page, Section, page_html
-from dwell.report.policy_blocks import COST, L95, RATE, PolicyBlocks, named, scaled
+from dwell.report.page import Block, Definitions, Page, Section, page_html
+from dwell.report.policy_blocks import COST, L95, RATE, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
-from dwell.study import AIM, StudyRuns, over_seeds
+from dwell.study import StudyRuns, over_seeds
 
 if TYPE_CHECKING:
     import polars as pl
@@ -46,7 +45,7 @@ def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
     sections : int, optional
         How many are made, from the first, the answer; all if left out.
     """
-    blocks = PolicyBlocks(study.problem, study.runs, study.latencies)
+    blocks = PolicyBlocks(study)
     points = study.runs.select(study.parameters).unique().height if study.parameters else 1
     return Page(
         title=f"Study {study.name}",
@@ -63,9 +62,12 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
         for place, parameter in enumerate(study.parameters):
             shown = parameter.partition(".")[2]
-            measures = [RATE, L95, COST, MIGRATIONS, *_regret(study)]
-            figures = [_curve(study, blocks, parameter, one, place) for one in measures]
-            tables = [_pivot(study, blocks, parameter, one, place) for one in measures]
+            figures: list[Block] = []
+            tables: list[Block] = []
+            for measure in _measures(study):
+                means = _means(study, parameter, measure)
+                figures.append(_curve(means, blocks, parameter, measure, place))
+                tables.append(_pivot(means, blocks, parameter, measure, place))
             yield Section(
                 f"By {shown}",
                 [figures[0], tables[0]],
@@ -78,7 +80,8 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
         yield Section("", [blocks.rate(), blocks.counts()])
         yield Section("Results", [blocks.results()])
         figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
-        figures += [blocks.measure(one, title="Regret") for one in _regret(study)]
+        if REGRET in _measures(study):
+            figures.append(blocks.measure(REGRET, title="Regret"))
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
         yield Section("More numbers", [blocks.more()])
     about = {
@@ -90,8 +93,9 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     yield Section("How it was made", [*method, Definitions(about)])
 
 
-def _regret(study: StudyRuns) -> list[Measure]:
-    return [REGRET] if "regret" in study.runs.columns else []
+def _measures(study: StudyRuns) -> list[Measure]:
+    measures = (RATE, L95, COST, MIGRATIONS, REGRET)
+    return [one for one in measures if one.column in study.runs.columns]
 
 
 def _means(study: StudyRuns, parameter: str, measure: Measure) -> pl.DataFrame:
@@ -106,14 +110,13 @@ def _means(study: StudyRuns, parameter: str, measure: Measure) -> pl.DataFrame:
 
 
 def _curve(
-    study: StudyRuns, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
+    means: pl.DataFrame, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
 ) -> Figure:
     import polars as pl
 
-    limits = {"violation_rate": (100 * AIM, "the aim, 5 %")}
-    limits["l95_ms"] = (study.problem.pipeline.deadline_ms, "deadline")
-    limit, name = limits.get(measure.column, (math.inf, ""))
-    table = scaled(_means(study, parameter, measure), measure)
+    deadline = Limit(blocks.problem.pipeline.deadline_ms, "deadline")
+    limits = {RATE.column: THE_AIM, L95.column: deadline}
+    table = scaled(means, measure)
     at = table[parameter]
     frame = table.with_columns(at=at if at.dtype.is_numeric() else at.cast(pl.String))
     rows = frame.select("scenario", "policy", "at", "mean", "low", "high")
@@ -123,20 +126,18 @@ def _curve(
         measure,
         blocks.styles,
         parameter.partition(".")[2],
-        limit=limit,
-        limit_name=name,
+        limit=limits.get(measure.column, NO_LIMIT),
         title=f"{measure.name} by {parameter.partition('.')[2]}",
     )
 
 
 def _pivot(
-    study: StudyRuns, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
+    means: pl.DataFrame, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
 ) -> Table:
     """Return a measure, a row a policy and scenario and a column a value of the parameter."""
-    table = _means(study, parameter, measure)
-    values = [str(value) for value in table[parameter].unique(maintain_order=True)]
+    values = [str(value) for value in means[parameter].unique(maintain_order=True)]
     rows: dict[tuple[str, str], dict[str, object]] = {}
-    for row in table.iter_rows(named=True):
+    for row in means.iter_rows(named=True):
         key = row["scenario"], row["policy"]
         mine = rows.setdefault(key, {"scenario": key[0], "policy": key[1]})
         for end in ("", "_low", "_high"):
@@ -154,7 +155,7 @@ def _pivot(
 
 def _points(study: StudyRuns, blocks: PolicyBlocks) -> Table:
     """Return every point, scenario and policy."""
-    measures = [RATE, L95, COST, MIGRATIONS, *_regret(study)]
+    measures = _measures(study)
     keys = (*study.parameters, "scenario", "policy")
     table = over_seeds(study.runs, keys, [one.column for one in measures])
     return Table(

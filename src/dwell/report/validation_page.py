@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.charts import PART_COLOURS, PARTS_SHOWN, cumulative, name_of, quantity, stacked
+from dwell.report.charts import (
+    PART_COLOURS,
+    PARTS_SHOWN,
+    Limit,
+    cumulative,
+    name_of,
+    quantity,
+    stacked,
+)
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import Measure, percent, shown_contender, shown_scenario, write_number
 from dwell.report.method import cell_definitions
@@ -373,8 +381,7 @@ def _latencies(validation: Validation) -> Figure:
         pl.concat(parts),
         BOTH,
         ("latency (ms)", "cycles within"),
-        limit=deadline_ms,
-        limit_name="deadline",
+        limit=Limit(deadline_ms, "deadline"),
         title="Latencies of all cycles",
         caption="A line that stays below 100 % shows that cycles were lost. Dashed: deadline.",
     )
@@ -396,8 +403,7 @@ def _split(validation: Validation) -> Figure:
         [MEASURED, PREDICTED],
         PART_COLOURS,
         "mean (ms)",
-        limit=validation.problem.pipeline.deadline_ms,
-        limit_name="deadline",
+        limit=Limit(validation.problem.pipeline.deadline_ms, "deadline"),
         title="Time along the critical path of the cycles that finished",
         caption="Dashed: deadline.",
     )

@@ -1,0 +1,76 @@
+"""Figures and tables of runs by scenario and policy, and the words that stand in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import polars as pl
+import pytest
+
+from dwell.report.policy_blocks import RATE, PolicyBlocks, scaled
+from dwell.study import over_seeds
+from tests.cells.small import SEEDS, make_comparison
+from tests.report.pages import small_comparison
+
+NOISE = np.linspace(-0.01, 0.01, len(SEEDS))
+
+
+def rates(mean: float) -> dict[str, list[float]]:
+    return {"violation_rate": [mean + x for x in NOISE]}
+
+
+def test_a_rate_is_under_the_aim_only_where_its_limit_is() -> None:
+    shown: dict[tuple[str, str], Mapping[str, float | list[float]]] = {
+        ("baseline", "LOC"): rates(0.02),
+        ("baseline", "SO"): rates(0.047),
+        ("baseline", "HYB"): rates(0.08),
+        ("baseline", "dtp"): {"violation_rate": 0.0},
+    }
+    comparison = make_comparison(shown)
+    blocks = PolicyBlocks(comparison)
+    found = [blocks.standing("baseline", name) for name in comparison.policies]
+    # No miss in so few runs shows nothing.
+    assert found == ["under", "not shown", "over", "not shown"]
+    counts = {row["policy"]: row for row in blocks.counts().rows}
+    assert counts["LOC"]["under"] == 1
+    assert counts["HYB"]["over"] == 1
+
+
+def test_a_figure_shows_every_seed_and_the_interval() -> None:
+    found = small_comparison()
+    frame = PolicyBlocks(found).rate().frames["rows"]
+    mine = frame.filter(scenario="Robot CPU stress", policy="DTP")
+    seeds = mine.filter(pl.col("seed").is_not_null())
+    values = 100 * found.values("robot-cpu-stress", "dtp", "violation_rate")
+    assert seeds["value"].to_list() == pytest.approx(values.tolist())
+    known = found.interval("robot-cpu-stress", "dtp", "violation_rate")
+    (row,) = mine.filter(pl.col("seed").is_null()).to_dicts()
+    shown = [row[name] for name in ("mean", "low", "high")]
+    assert shown == pytest.approx([100 * end for end in known])
+
+
+def test_shares_of_a_whole_are_drawn_of_those_that_move() -> None:
+    found = small_comparison()
+    (figure,) = PolicyBlocks(found, "small-").placed()
+    assert figure.slug == "small-shares"
+    frame = figure.frames["rows"]
+    assert set(frame["policy"]) == {"ATP", "DTP"}
+    sums = frame.group_by("scenario", "policy").agg(pl.col("value").sum())
+    assert sums["value"].to_list() == pytest.approx([100.0] * 4)
+    assert PolicyBlocks(make_comparison({}, policies=("LOC", "SO"))).placed() == []
+
+
+def test_on_a_terminal_there_is_no_room_for_all_intervals() -> None:
+    blocks = PolicyBlocks(small_comparison())
+    page, terminal = (blocks.results(compact=compact).rows[0] for compact in (False, True))
+    assert set(page) - set(terminal) == {"u_robot_low", "u_edge_low"}
+    assert "share_LOC_low" not in page
+
+
+def test_numbers_are_shown_in_the_unit_of_their_measure() -> None:
+    runs = make_comparison({("baseline", "LOC"): rates(0.02)}, policies=("LOC",)).runs
+    table = scaled(over_seeds(runs, ("scenario", "policy"), ["violation_rate"]), RATE)
+    row = table.row(0, named=True)
+    assert row["mean"] == pytest.approx(2.0)
+    assert row["low"] == pytest.approx(100 * row["violation_rate_low"])
