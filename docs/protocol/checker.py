@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import gc
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 __all__ = ["Explored", "Rules", "Step", "ViolationError", "explore", "report", "stuck", "without"]
 
 State = TypeVar("State", bound=Hashable)
 
 
-@dataclass(frozen=True, slots=True)
-class Step(Generic[State]):
+class Step(NamedTuple, Generic[State]):
     """What may happen next.
 
     Parameters
@@ -73,6 +74,22 @@ class Explored(Generic[State]):
         return found[::-1]
 
 
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keep the garbage collector from looking through all states again and again.
+
+    They are tuples in no circles, and there is nothing in them to collect.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+@_uncollected()
 def explore(
     initial: State, successors: Callable[[State], Iterator[Step[State]]], *, most: int = 2_000_000
 ) -> Explored[State]:
@@ -114,6 +131,7 @@ def explore(
     return Explored(explored.steps, explored.came_from, depth)
 
 
+@_uncollected()
 def stuck(explored: Explored[State], good: Callable[[State], bool]) -> list[State]:
     """Return the states from which no way without a fault leads to a good one.
 

@@ -7,8 +7,8 @@ stamped once may reach the sink as a command at any time later, any number of ti
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 from docs.protocol.checker import Rules, Step, report
 
@@ -57,8 +57,7 @@ class Limits:
 ALL, LIMITS = Rules(), Limits()
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """Everything.
 
     Parameters
@@ -109,9 +108,9 @@ def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Ite
     if state.under_way == NONE:
         for number in set(state.stamped):
             if _passes(state, rules, limits, number):
-                seen = replace(state, under_way=number, newest=number)
+                seen = state._replace(under_way=number, newest=number)
                 if rules.holds("before"):
-                    seen = replace(seen, book=number)
+                    seen = seen._replace(book=number)
                 yield Step(f"the gate lets {number} through", seen)
     else:
         yield _apply(state, rules, limits)
@@ -120,20 +119,20 @@ def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Ite
 def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
     if state.crashes == limits.crashes:
         return
-    once = replace(state, crashes=state.crashes + 1)
+    once = state._replace(crashes=state.crashes + 1)
     # Without the reservation the book has the newest number only now and then.
     behind = max(state.cycle - 1, 0)
     cycle = state.reserved if rules.holds("reservation") else behind
-    yield Step("the stamper starts again", replace(once, cycle=cycle), fault=True)
+    yield Step("the stamper starts again", once._replace(cycle=cycle), fault=True)
     if state.losses < limits.losses:
         run = state.run + 1 if rules.holds("run") else state.run
-        fresh = replace(once, run=run, cycle=0, reserved=0, losses=state.losses + 1)
+        fresh = once._replace(run=run, cycle=0, reserved=0, losses=state.losses + 1)
         yield Step("the stamper starts again without its book", fresh, fault=True)
     known = state.book if rules.holds("memory") else NONE
-    reborn = replace(once, newest=known, under_way=NONE)
+    reborn = once._replace(newest=known, under_way=NONE)
     yield Step("the sink starts again", reborn, fault=True)
     if state.under_way != NONE and not rules.holds("before"):
-        applied = replace(reborn, actuated=state.under_way)
+        applied = reborn._replace(actuated=state.under_way)
         yield Step("the sink applies, and starts again", applied, fault=True)
 
 
@@ -145,8 +144,8 @@ def _stamp(state: State, limits: Limits) -> Iterator[Step[State]]:
         reserved = state.cycle + limits.block
     number = state.run, state.cycle
     wrong = "a number is used twice" if number in state.stamped else ""
-    after = replace(
-        state, cycle=state.cycle + 1, reserved=reserved, stamped=(*state.stamped, number)
+    after = state._replace(
+        cycle=state.cycle + 1, reserved=reserved, stamped=(*state.stamped, number)
     )
     yield Step(f"{number} is stamped", after, wrong=wrong)
 
@@ -170,7 +169,7 @@ def _apply(state: State, rules: Rules, limits: Limits) -> Step[State]:
         wrong = "a command is applied after a later one"
     elif not rules.holds("age") and _old(state, limits, number):
         wrong = "an old command is applied"
-    after = replace(state, under_way=NONE, book=max(state.book, number), actuated=number)
+    after = state._replace(under_way=NONE, book=max(state.book, number), actuated=number)
     return Step(f"{number} is applied", after, wrong=wrong)
 
 

@@ -21,9 +21,9 @@ a true message that is held back is one that was lost or came late, and such the
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from docs.protocol.checker import Rules, Step, report
 
@@ -80,8 +80,7 @@ class Limits:
     probes: int = 1
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Order:
+class Order(NamedTuple):
     """An order on its way; `fires` is how often the guard had moved when it was sent."""
 
     controller: str
@@ -90,8 +89,7 @@ class Order:
     fires: int
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Told:
+class Told(NamedTuple):
     """What the stamper has said of itself at some time, in answers and stamps."""
 
     term: int
@@ -109,8 +107,7 @@ CASES = (
 NOTHING = Told(0, "", False)
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """Everything.
 
     Parameters
@@ -123,7 +120,7 @@ class State:
         Terms in which enough probes have come through; word of it may arrive at any time.
     wish : bool
         Whether the stamper has been told to send probes.
-    count : int
+    counted : int
         Probes that have come through since then, while they are not enough.
     tried : int
         How many of them since the controller has last begun to want what it wants.
@@ -156,7 +153,7 @@ class State:
     whims: int = 0
     done: frozenset[Order] = frozenset()
     wish: bool = False
-    count: int = 0
+    counted: int = 0
     tried: int = 0
     spoken: bool = False
 
@@ -185,32 +182,32 @@ def _moved(state: State, rules: Rules, placement: str, *, fallback: bool) -> Sta
     term = state.now.term + 1 if rules.holds("new term") else state.now.term
     now = Told(term, placement, fallback)
     proof = frozenset[int]() if rules.holds("fresh proof") else state.proof
-    moved = replace(state, now=now, told=state.told | {now}, proof=proof)
+    moved = state._replace(now=now, told=state.told | {now}, proof=proof)
     return _forgets(moved)
 
 
 def _forgets(state: State) -> State:
     """The stamper has no wish, and has counted nothing."""
-    return replace(state, wish=False, count=0, tried=0, spoken=False)
+    return state._replace(wish=False, counted=0, tried=0, spoken=False)
 
 
 def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
     if state.fires < limits.fires:
         to = FALLBACK if state.now.placement != FALLBACK else OTHER
         fired = _moved(state, rules, to, fallback=True)
-        yield Step("the guard moves the cell", replace(fired, fires=state.fires + 1), fault=True)
+        yield Step("the guard moves the cell", fired._replace(fires=state.fires + 1), fault=True)
     if state.crashes < limits.crashes:
-        once = replace(state, crashes=state.crashes + 1)
-        reborn = _forgets(replace(once, charge="", proof=frozenset()))
+        once = state._replace(crashes=state.crashes + 1)
+        reborn = _forgets(once._replace(charge="", proof=frozenset()))
         if not rules.holds("book"):
             first = Told(1, WANTED, False)
-            reborn = replace(reborn, now=first)
+            reborn = reborn._replace(now=first)
         yield Step("the stamper starts again", reborn, fault=True)
         for index, name in enumerate(CONTROLLERS):
-            again = replace(once, views=_set(once.views, index, NOTHING))
+            again = once._replace(views=_set(once.views, index, NOTHING))
             yield Step(f"controller {name} starts again", again, fault=True)
     if state.lapses < limits.lapses and state.charge:
-        lapsed = replace(state, charge="", lapses=state.lapses + 1)
+        lapsed = state._replace(charge="", lapses=state.lapses + 1)
         yield Step(f"the lease of {state.charge} runs out", lapsed, fault=True)
 
 
@@ -225,22 +222,22 @@ def _stamper(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]
     term = state.now.term
     if state.now.fallback and term not in state.probed:
         if limits.probes == 1:
-            yield Step("a probe comes through", replace(state, probed=state.probed | {term}))
+            yield Step("a probe comes through", state._replace(probed=state.probed | {term}))
         elif state.wish and state.spoken:
             yield Step("a probe comes through", _probe(state, limits))
     for probed in state.probed - state.proof:
         if state.now.fallback and (probed == term or not rules.holds("fresh proof")):
-            heard = replace(state, proof=state.proof | {probed})
+            heard = state._replace(proof=state.proof | {probed})
             yield Step(f"a probe of term {probed} is heard of", heard)
     for order in state.orders:
         yield _arrives(state, rules, order)
 
 
 def _probe(state: State, limits: Limits) -> State:
-    count, tried = state.count + 1, min(state.tried + 1, PATIENCE)
+    count, tried = state.counted + 1, min(state.tried + 1, PATIENCE)
     if count == limits.probes:
-        return _forgets(replace(state, probed=state.probed | {state.now.term}))
-    return replace(state, count=count, tried=tried, spoken=False)
+        return _forgets(state._replace(probed=state.probed | {state.now.term}))
+    return state._replace(counted=count, tried=tried, spoken=False)
 
 
 def _speaks(state: State, rules: Rules) -> Iterator[Step[State]]:
@@ -250,7 +247,7 @@ def _speaks(state: State, rules: Rules) -> Iterator[Step[State]]:
     if state.tried == PATIENCE and not rules.holds("wish"):
         yield Step("the controller has given up, and says so", _forgets(state))
     elif not state.spoken:
-        told = replace(state, wish=True, spoken=True)
+        told = state._replace(wish=True, spoken=True)
         yield Step("the controller says that it wants to leave", told)
 
 
@@ -259,7 +256,7 @@ def _arrives(state: State, rules: Rules, order: Order) -> Step[State]:
     label = f"the order of {order.controller} in term {order.term} to {order.placement} arrives"
     if state.charge not in ("", order.controller) and rules.holds("charge"):
         return Step(label, state)
-    charged = replace(state, charge=order.controller)
+    charged = state._replace(charge=order.controller)
     here = order.placement == state.now.placement and not state.now.fallback
     stale = order.term != state.now.term and rules.holds("term")
     unproven = state.now.fallback and not state.proof and rules.holds("proof")
@@ -273,7 +270,7 @@ def _arrives(state: State, rules: Rules, order: Order) -> Step[State]:
     elif state.now.fallback and state.now.term not in state.probed:
         wrong = "the fallback is left without a proof"
     moved = _moved(charged, rules, order.placement, fallback=False)
-    return Step(label, replace(moved, done=state.done | {order}), wrong=wrong)
+    return Step(label, moved._replace(done=state.done | {order}), wrong=wrong)
 
 
 # ----------------------------------------------------------------------------- controllers
@@ -295,12 +292,12 @@ def _controller(
             continue
         yield Step(
             f"{name} orders {placement} in term {view.term}",
-            replace(state, orders=state.orders | {order}, whims=state.whims + whim),
+            state._replace(orders=state.orders | {order}, whims=state.whims + whim),
         )
     for told in state.told:
         for what, heard in _hearings(rules, view, told):
             views = _set(state.views, index, heard)
-            yield Step(f"{name} hears {what} of term {told.term}", replace(state, views=views))
+            yield Step(f"{name} hears {what} of term {told.term}", state._replace(views=views))
 
 
 def _hearings(rules: Rules, view: Told, told: Told) -> Iterator[tuple[str, Told]]:
@@ -309,7 +306,7 @@ def _hearings(rules: Rules, view: Told, told: Told) -> Iterator[tuple[str, Told]
         # A stamp of a move that it has ordered, and remembers, is as good.
         yield "an answer", told
         if not told.fallback:
-            yield "a stamp", replace(told, fallback=True)
+            yield "a stamp", told._replace(fallback=True)
     elif told.term == view.term and view.fallback and not told.fallback and rules.holds("answer"):
         yield "an answer", told
 

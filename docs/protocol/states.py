@@ -9,8 +9,9 @@ of them; where the guard moves it, or its worker dies, it goes on with what is t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from docs.protocol.checker import Rules, Step, report
 
@@ -63,8 +64,7 @@ class Limits:
     early: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Input:
+class Input(NamedTuple):
     """The input of a cycle on its way; `own` where the cycle is stamped with this node."""
 
     cycle: int
@@ -72,8 +72,7 @@ class Input:
     excused: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Worker:
+class Worker(NamedTuple):
     """A worker.
 
     Parameters
@@ -103,8 +102,7 @@ class Worker:
     excused: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """Something that was said.
 
     Parameters
@@ -134,8 +132,7 @@ class Message:
     held: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Move:
+class Move(NamedTuple):
     """A migration under way: what forks for it, and what moves the task, by their numbers."""
 
     number: int
@@ -144,8 +141,7 @@ class Move:
     order: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """Everything.
 
     Parameters
@@ -224,23 +220,23 @@ def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Ite
 def _faults(state: State, limits: Limits) -> Iterator[Step[State]]:
     if state.fires < limits.fires:
         other = NODES[1 - NODES.index(state.active)]
-        moved = replace(state, active=other, term=state.term + 1, fork="", early="-", by_guard=True)
-        yield Step("the guard moves the task", replace(moved, fires=state.fires + 1), fault=True)
+        moved = state._replace(active=other, term=state.term + 1, fork="", early="-", by_guard=True)
+        yield Step("the guard moves the task", moved._replace(fires=state.fires + 1), fault=True)
     if state.crashes < limits.crashes:
         for index, name in enumerate(NODES):
             reborn = _set(state, index, Worker(excused=True))
             gone = (*state.inputs[:index], (), *state.inputs[index + 1 :])
-            after = replace(reborn, inputs=gone, crashes=state.crashes + 1)
+            after = reborn._replace(inputs=gone, crashes=state.crashes + 1)
             yield Step(f"the worker on {name} starts again", after, fault=True)
 
 
 def _set(state: State, index: int, worker: Worker) -> State:
     workers = (*state.workers[:index], worker, *state.workers[index + 1 :])
-    return replace(state, workers=workers)
+    return state._replace(workers=workers)
 
 
 def _say(state: State, message: Message) -> State:
-    return replace(state, said=state.said | {message})
+    return state._replace(said=state.said | {message})
 
 
 def _newest(cycles: int) -> int:
@@ -255,7 +251,7 @@ def _stamper(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]
     if state.cycle <= limits.cycles:
         yield Step(f"cycle {state.cycle} is released", _release(state))
         if limits.early and state.early == "-":
-            drawn = replace(state, early=state.fork)
+            drawn = state._replace(early=state.fork)
             yield Step(f"cycle {state.cycle} is stamped early", drawn)
     for message in state.said:
         if message.kind == "order":
@@ -270,7 +266,7 @@ def _release(state: State) -> State:
             inputs[index] += (Input(state.cycle, own=True, excused=state.by_guard),)
         elif name == fork:
             inputs[index] += (Input(state.cycle, own=False),)
-    return replace(state, cycle=state.cycle + 1, inputs=tuple(inputs), by_guard=False, early="-")
+    return state._replace(cycle=state.cycle + 1, inputs=tuple(inputs), by_guard=False, early="-")
 
 
 def _ordered(state: State, rules: Rules, order: Message) -> Step[State]:
@@ -283,9 +279,9 @@ def _ordered(state: State, rules: Rules, order: Message) -> Step[State]:
         return Step(label, state)
     after = state
     if order.number > state.newest:
-        after = replace(after, newest=order.number, fork=order.to)
+        after = after._replace(newest=order.number, fork=order.to)
     if order.moves:
-        moved = replace(after, active=order.to, term=state.term + 1, early="-")
+        moved = after._replace(active=order.to, term=state.term + 1, early="-")
         return Step(label, moved)
     if order.to and after.fork == order.to:
         # The answer to it; who asked for it asks for the snapshot.
@@ -306,11 +302,11 @@ def _worker(state: State, rules: Rules, index: int) -> Iterator[Step[State]]:
     if state.inputs[index]:
         first, *rest = state.inputs[index]
         inputs = (*state.inputs[:index], tuple(rest), *state.inputs[index + 1 :])
-        yield _works(replace(state, inputs=inputs), rules, index, first)
+        yield _works(state._replace(inputs=inputs), rules, index, first)
     number, cycle = worker.asked
     if number and (_newest(worker.held) >= cycle - 1 or not rules.holds("wait")):
         other = NODES[1 - index]
-        told = _set(state, index, replace(worker, asked=(0, 0)))
+        told = _set(state, index, worker._replace(asked=(0, 0)))
         answer = Message("state", number, other, held=worker.held)
         yield Step(f"{name} hands its state out", _say(told, answer))
     for message in state.said:
@@ -318,7 +314,7 @@ def _worker(state: State, rules: Rules, index: int) -> Iterator[Step[State]]:
             continue
         answered = any(one.kind == "state" and one.number == message.number for one in state.said)
         if message.kind == "ask" and not answered:
-            asked = replace(worker, asked=(message.number, message.cycle))
+            asked = worker._replace(asked=(message.number, message.cycle))
             yield Step(f"{name} is asked for its state", _set(state, index, asked))
         elif message.kind == "state":
             yield _restores(state, rules, index, message)
@@ -333,23 +329,23 @@ def _works(state: State, rules: Rules, index: int, one: Input) -> Step[State]:
         keeps = rules.holds("log") or not worker.follows
         log = worker.log | bit if keeps else worker.log
         if not worker.follows or past:
-            return Step(f"{name} keeps {one.cycle}", _set(state, index, replace(worker, log=log)))
+            return Step(f"{name} keeps {one.cycle}", _set(state, index, worker._replace(log=log)))
         wrong = _muddled(worker, one.cycle)
         if not rules.holds("suppress"):
             wrong = "a cycle has two outputs"
-        followed = replace(worker, log=log, held=worker.held | bit)
+        followed = worker._replace(log=log, held=worker.held | bit)
         return Step(f"{name} follows {one.cycle}", _set(state, index, followed), wrong=wrong)
     label = f"{name} works on {one.cycle}"
     if past:
         return Step(f"{name} leaves {one.cycle} out", state)
     before = (bit - 1) & ~1
     if one.excused or worker.excused:
-        state = replace(state, lost=state.lost | (before & ~worker.held))
+        state = state._replace(lost=state.lost | (before & ~worker.held))
     wrong = _muddled(worker, one.cycle)
     if not wrong and before & ~worker.held & ~state.lost:
         wrong = "a state lacks an input"
-    done = replace(
-        worker, held=worker.held | bit, own=one.cycle, log=0, follows=False, excused=False
+    done = worker._replace(
+        held=worker.held | bit, own=one.cycle, log=0, follows=False, excused=False
     )
     return Step(label, _set(state, index, done), wrong=wrong)
 
@@ -371,7 +367,7 @@ def _restores(state: State, rules: Rules, index: int, message: Message) -> Step[
     held = message.held
     if rules.holds("replay"):
         held |= worker.log & ~((2 << _newest(held)) - 1)
-    restored = replace(worker, held=held, taken=_newest(message.held), follows=True)
+    restored = worker._replace(held=held, taken=_newest(message.held), follows=True)
     return Step(label, _say(_set(state, index, restored), ready))
 
 
@@ -383,24 +379,24 @@ def _controller(state: State, rules: Rules, limits: Limits) -> Iterator[Step[Sta
     if move is None:
         if state.moves < limits.moves:
             to = NODES[1 - NODES.index(state.active)]
-            begun = replace(
-                state, move=Move(number, to, state.term), number=number, moves=state.moves + 1
+            begun = state._replace(
+                move=Move(number, to, state.term), number=number, moves=state.moves + 1
             )
             order = Message("order", number, to, term=state.term)
             yield Step(f"the controller begins to move the task to {to}", _say(begun, order))
         return
-    ended = replace(state, move=None)
+    ended = state._replace(move=None)
     if state.term != move.term:
         yield Step("the controller hears of a new term", ended)
     if move.order and move.order < state.newest and rules.holds("newest"):
         yield Step("the controller hears that its order was late", ended)
     # It can do without, as long as nobody has died who was to hand the state out or take it over.
     end = Message("order", number, "", term=move.term)
-    given_up = _say(replace(ended, number=number), end)
+    given_up = _say(ended._replace(number=number), end)
     yield Step("the controller gives up", given_up, fault=not state.crashes)
     if state.hellos < limits.hellos:
         hello = Message("order", number, move.to if rules.holds("hello") else "", move.term)
-        there = replace(state, number=number, hellos=state.hellos + 1)
+        there = state._replace(number=number, hellos=state.hellos + 1)
         yield Step("the controller says that it is there", _say(there, hello))
     ready = any(
         one.kind == "ready" and (one.number == move.number or not rules.holds("number"))
@@ -408,7 +404,7 @@ def _controller(state: State, rules: Rules, limits: Limits) -> Iterator[Step[Sta
     )
     if not move.order and (ready or not rules.holds("ready")):
         order = Message("order", number, move.to, term=move.term, moves=True)
-        ordered = replace(state, move=replace(move, order=number), number=number)
+        ordered = state._replace(move=move._replace(order=number), number=number)
         yield Step(f"the controller orders {move.to}", _say(ordered, order))
 
 
