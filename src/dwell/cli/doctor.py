@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
@@ -120,6 +121,13 @@ def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) ->
 # ------------------------------------------------------------------------- extras and cache
 
 
+@cache
+def _modules() -> dict[str, str]:
+    """Return the module of every optional package, by the package; looks at all installed ones."""
+    packages = packages_distributions()
+    return {package: one for one in OPTIONAL for package in packages.get(one, ())}
+
+
 def _extra(name: str) -> Finding:
     """Import what an extra brings: installed is not enough."""
     try:
@@ -127,7 +135,7 @@ def _extra(name: str) -> Finding:
     except PackageNotFoundError:
         found = f"{DISTRIBUTION} itself is not installed, only its sources are there"
         return Finding(name, False, found, installing(name), needed=False)
-    modules = {dist: one for one in OPTIONAL for dist in packages_distributions().get(one, ())}
+    modules = _modules()
     wanted = [
         re.split(r"[^\w.-]", line)[0]
         for line in lines
