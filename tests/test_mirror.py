@@ -10,35 +10,23 @@ PACKAGE = TESTS.parent / "src" / "dwell"
 #: Modules without a test file of their name, by package: nothing runs them but what is tested
 #: through the module that uses them, or they only declare. The list may only become shorter.
 WITHOUT = {
-    "cellfile": """
-        entries
-    """,
-    "cli": """
-        campaign check_node
-    """,
-    "estimators": """
-        evidence protocol
-    """,
     "kernels": """
         advance cycles layout links nodes
     """,
     "live": """
-        node operator_client role_process run_rows
+        node role_process
     """,
     "model": """
         instants
-    """,
-    "policies": """
-        protocol
     """,
     "sim": """
         arrays tables
     """,
     "testbed/chaos": """
-        actuator_observer harness
+        harness
     """,
     "testbed": """
-        loopback testbed watcher
+        testbed
     """,
 }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +20,6 @@ from dwell.cli.commands import app
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import roles
-from dwell.model.document import to_document
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
 from tests.cli.live_cell import EXAMPLE, MOODY, PATIENCE_S, RealCell
 
@@ -276,68 +274,7 @@ def test_nobody_answers(tmp_path: Path) -> None:
     assert invoke("live", "status", "--cell", made.file) == (1, "", f"error: {words}\n")
 
 
-def test_asking_for_the_status_imports_nothing_heavy() -> None:
-    code = (
-        "import sys, dwell, dwell.cli.commands, dwell.live.operator_client\n"
-        f"dwell.load({str(EXAMPLE / 'cell.yaml')!r})\n"
-        "print(*{'numpy', 'numba', 'polars', 'psutil', 'rich'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert done.stdout.split() == []
-
-
 # ------------------------------------------------------------------------ before the start
-
-
-@pytest.mark.parametrize("node", ["R1", "E", "R2"])
-def test_a_node_that_has_all_it_needs(node: str) -> None:
-    code, stdout, stderr = invoke("check", "--node", node, EXAMPLE / "cell.yaml")
-    assert (code, stderr) == (0, "")
-    assert stdout.startswith(f"light-follower: {node} has all that it needs\n")
-    assert f"agent@{node}" in stdout
-
-
-def test_all_that_a_node_lacks_is_told_at_once(tmp_path: Path) -> None:
-    document = to_document(dwell.load(EXAMPLE / "cell.yaml"))
-    shutil.copy(EXAMPLE / "stages.py", tmp_path / "lacking_stages.py")
-    tasks = document["tasks"]
-    tasks["camera"]["run"] = "lacking_stages:Drive"
-    tasks["perception"]["run"] = "no_such_vision:Detect"
-    tasks["planning"]["run"] = "lacking_stages:Plna"
-    tasks["control"]["run"] = "lacking_stages:Plan"
-    document["live"] = {"hosts": {"R1": {"port": 7450}}, "release": "frames"}
-    file = tmp_path / "cell.yaml"
-    file.write_text(yaml.safe_dump(document, sort_keys=False))
-    code, stdout, stderr = invoke("check", "--node", "R1", file)
-    start = f"{file}: node R1: "
-    assert (code, stdout) == (2, "")
-    assert stderr.splitlines() == [
-        f"{start}live.hosts.E: missing; give its address and first port",
-        f"{start}live.hosts.R2: missing; give its address and first port",
-        f"{start}tasks.camera.run: lacking_stages:Drive is no stage: it has no method "
-        "process(inputs)",
-        f"{start}tasks.perception.run: importing no_such_vision failed (ModuleNotFoundError: No "
-        "module named 'no_such_vision')",
-    ]
-    code, stdout, _ = invoke("check", "--node", "R2", file, "--json")
-    found = {fault["path"]: fault["message"] for fault in json.loads(stdout)["faults"]}
-    assert code == 2
-    assert found["tasks.planning.run"] == "lacking_stages has no 'Plna'; did you mean 'Plan'?"
-    assert found["tasks.control.run"] == "its `inputs` name 'perception', but it gets planning"
-    assert found["tasks.control.state_bytes"].startswith("0, but lacking_stages:Plan has a state")
-    assert found["live.actuators.control"].startswith("missing; ")
-
-
-def test_frames_need_a_method_that_waits_for_them(tmp_path: Path) -> None:
-    document = to_document(dwell.load(EXAMPLE / "cell.yaml"))
-    document["tasks"]["camera"]["run"] = "waiting_stages:perceive"
-    document["live"]["release"] = "frames"
-    shutil.copy(EXAMPLE / "stages.py", tmp_path / "waiting_stages.py")
-    shutil.copy(EXAMPLE / "stages.py", tmp_path / "stages.py")
-    file = tmp_path / "cell.yaml"
-    file.write_text(yaml.safe_dump(document, sort_keys=False))
-    _, _, stderr = invoke("check", "--node", "R1", file)
-    assert "waiting_stages:perceive has no method wait(), and live.release is frames" in stderr
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ import yaml
 import dwell
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
-from dwell.testbed.chaos.actuator_observer import ActuatorObserver
 from dwell.testbed.chaos.disk import may_mount
 from dwell.testbed.chaos.fault_timeline import PlannedFault, planned
 from dwell.testbed.chaos.faults import Fault, Means, bound_of, faults_of
@@ -26,6 +25,7 @@ from dwell.testbed.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.testbed.chaos.stages import APPLY
 from dwell.testbed.chaos.stalls import StallDetector
 from dwell.testbed.chaos.strike import Outcome, beyond, strike
+from dwell.testbed.chaos.wiretap import ActuatorObserver
 from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.testbed import LocalTestbed

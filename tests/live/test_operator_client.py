@@ -1,0 +1,67 @@
+"""Who asks a cell's controller: what is told where nobody answers, and what it imports."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+import dwell
+from dwell.errors import LiveError
+from dwell.live.keys import Keys
+from dwell.live.messages import Answer, Ask, decode, encode
+from dwell.live.operator_client import OperatorClient
+from dwell.live.transport.transport import Arrival
+from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wiring import roles, wire
+from dwell.testbed.loopback import on_this_machine
+from tests.cli.live_cell import EXAMPLE
+
+
+def test_asking_for_the_status_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, dwell, dwell.cli.commands, dwell.live.operator_client\n"
+        f"dwell.load({str(EXAMPLE / 'cell.yaml')!r})\n"
+        "print(*{'numpy', 'numba', 'polars', 'psutil', 'rich'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == []
+
+
+def test_where_nobody_answers_it_says_so() -> None:
+    problem = on_this_machine(dwell.load(EXAMPLE / "cell.yaml"))
+    words = "no controller of cell 'light-follower' answers; is `dwell controller` running on E?"
+    with OperatorClient(problem) as client:
+        with pytest.raises(LiveError, match=re.escape(words)):
+            client.ask("status", patience_s=0.2)
+        found = client.look(patience_s=0.2)
+    assert (found["health"], found["headline"], found["answer_age_ms"]) == ("absent", words, None)
+
+
+def test_an_answer_is_shown_without_what_a_terminal_would_obey() -> None:
+    """Without keys anybody may be the controller."""
+    problem = on_this_machine(dwell.load(EXAMPLE / "cell.yaml"))
+    keys = Keys(problem.name)
+    role = next(role for role in roles(problem) if role.kind == "controller")
+    server = ZenohTransport(wire(problem).entry(role.who))
+
+    def answer(sample: Arrival) -> None:
+        ask = decode(sample.payload, Ask)
+        refused = "" if ask.what == "status" else "no\x1b[2Jbody"
+        status = {"health": "ok", "note": "\x1b]0;mine\x07", "list": ["a\nb", 3]}
+        server.put(keys.answer(ask.number), encode(Answer(ask.number, refused, status)))
+
+    for key in (keys.ask(), keys.look()):
+        server.subscribe(key, answer)
+    try:
+        with OperatorClient(problem) as client:
+            status = client.ask("status", patience_s=10.0)
+            assert status["note"] == "\\x1b]0;mine\\x07"
+            assert status["list"] == ["a\\nb", 3]
+            assert client.look()["answer_age_ms"] == 0.0
+            with pytest.raises(LiveError, match=re.escape("refused: no\\x1b[2Jbody")):
+                client.ask("pin", "SO")
+    finally:
+        server.close()

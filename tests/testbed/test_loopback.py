@@ -1,0 +1,58 @@
+"""A cell on this machine without root: it comes up, is disturbed, and leaves nothing."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import psutil
+import pytest
+
+import dwell
+from dwell.errors import LiveError
+from dwell.testbed import loopback
+from dwell.testbed.loopback import Loopback, on_this_machine
+from dwell.testbed.timeline import Change, timeline_of
+from tests.cells.light import write_cell
+from tests.waiting import wait_until
+
+
+def test_every_process_has_ports_of_its_own_that_are_free(tmp_path: Path) -> None:
+    problem = dwell.load(write_cell(tmp_path))
+    hosts = on_this_machine(problem).live.hosts
+    assert hosts.keys() == problem.fabric.nodes.keys()
+    taken = min(host.port for host in hosts.values())
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", taken))
+        others = on_this_machine(problem).live.hosts
+    assert taken not in {host.port for host in others.values()}
+    assert len({host.port for host in others.values()}) == len(hosts)
+
+
+def test_no_free_ports_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loopback, "PORTS", range(0))
+    with pytest.raises(LiveError, match="free ports in a row"):
+        on_this_machine(dwell.load(write_cell(tmp_path)))
+
+
+def test_it_comes_up_is_disturbed_and_leaves_nothing(tmp_path: Path) -> None:
+    problem = on_this_machine(dwell.load(write_cell(tmp_path / "cell")))
+    cell = Loopback(problem, tmp_path / "there", {})
+    with pytest.raises(LiveError, match="has not been started"):
+        _ = cell.links
+    with cell:
+        status = cell.sample(10.0)
+        assert status["placement"] == "SO"
+        assert status["silent"] == []
+        changes = timeline_of(problem, "impaired", seed=1, seconds=60).changes
+        links: list[Change] = [one for one in changes if one.place in problem.fabric.links]
+        assert links
+        for change in links:
+            cell.apply(change)
+        wait_until(lambda: bool(cell.sample(10.0)["window"]))
+        children = psutil.Process().children(recursive=True)
+        assert len(children) > len(problem.pipeline.tasks)
+    _, alive = psutil.wait_procs(children, timeout=20)
+    assert alive == []
+    (run,) = (tmp_path / "there" / "runs").iterdir()
+    assert dwell.open_run(run).cycles.height > 0
