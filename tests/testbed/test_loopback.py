@@ -41,6 +41,7 @@ def test_it_comes_up_is_disturbed_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(LiveError, match="has not been started"):
         _ = cell.links
     with cell:
+        wait_until(lambda: bool(cell.sample(10.0)["window"]))
         status = cell.sample(10.0)
         assert status["placement"] == "SO"
         assert status["silent"] == []
@@ -49,7 +50,6 @@ def test_it_comes_up_is_disturbed_and_leaves_nothing(tmp_path: Path) -> None:
         assert links
         for change in links:
             cell.apply(change)
-        wait_until(lambda: bool(cell.sample(10.0)["window"]))
         children = psutil.Process().children(recursive=True)
         assert len(children) > len(problem.pipeline.tasks)
     _, alive = psutil.wait_procs(children, timeout=20)
