@@ -34,13 +34,7 @@ WHERE = {"testbed": "the testbed"}
 
 
 def campaign_html(measured: MeasuredCampaign, *, static: bool = False) -> str:
-    """Return a page about a campaign, finished or not; see `dwell.report.page.page_html`.
-
-    Parameters
-    ----------
-    static : bool
-        Whether scripts are left out.
-    """
+    """Return a page about a campaign, finished or not; see `dwell.report.page.page_html`."""
     return page_html(campaign_page(measured), static=static)
 
 

@@ -25,15 +25,7 @@ MIGRATIONS = Measure("migrations", "migrations")
 
 
 def study_html(study: StudyRuns, *, static: bool = False) -> str:
-    """Return a page about a study; see `dwell.report.page.page_html`.
-
-    Parameters
-    ----------
-    study : StudyRuns
-        Of `dwell.study.open_study` or `dwell.study.run_study`.
-    static : bool
-        Whether scripts are left out.
-    """
+    """Return a page about a study; see `dwell.report.page.page_html`."""
     return page_html(study_page(study), static=static)
 
 

@@ -57,13 +57,7 @@ POLICY = Text("policy", "policy", "policy")
 
 
 def validation_html(validation: Validation, *, static: bool = False) -> str:
-    """Return a page about a validation; see `dwell.report.page.page_html`.
-
-    Parameters
-    ----------
-    static : bool
-        Whether scripts are left out.
-    """
+    """Return a page about a validation; see `dwell.report.page.page_html`."""
     return page_html(validation_page(validation), static=static)
 
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cost import hamming, price, tier_nodes
+from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.model import Problem
 from dwell.study.hindsight import Hindsight
-from dwell.study.reference import References, kept, play_alone, references, regret
+from dwell.study.reference import References, kept, play_alone, references, regret, tier_use
 from dwell.study.software import software
 from dwell.study.study import Contender, Item, Study
 from dwell.study.summary import Summary, summarise
@@ -251,11 +251,5 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
         windows[name].fill_null(np.nan).to_numpy()
         for name in ("seen_l95_ms", "seen_violation_rate")
     )
-    robot, edge, cloud = (
-        np.max([windows[f"u_{node}"].to_numpy() for node in nodes], axis=0, initial=0.0)
-        if nodes
-        else np.zeros(windows.height)
-        for nodes in tier_nodes(problem.objective)
-    )
     switching = np.array(moved[: windows.height])
-    return price(l95_ms, rate, robot, edge, cloud, switching, problem.objective)
+    return price(l95_ms, rate, *tier_use(windows, problem), switching, problem.objective)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.study.summary import count_in, latency_ms, order_statistic
+from dwell.study.summary import count_in, latency_ms, mean_of, order_statistic
 
 if TYPE_CHECKING:
     import polars as pl
@@ -167,7 +167,7 @@ class QosSample:
                 **_window_sums(windows, problem, of_window, units),
                 "migrations": _migrations(pieces, of_window, units),
             },
-            parts_ms={part: _mean(cycles[f"{part}_ns"]) / 1e6 for part in PARTS},
+            parts_ms={part: mean_of(cycles[f"{part}_ns"]) / 1e6 for part in PARTS},
             placed=dict(cycles["placement"].cast(pl.String).value_counts().rows()),
             windows=len(windows),
         )
@@ -304,8 +304,3 @@ def _migrations(pieces: Sequence[Piece], of_window: Ints, units: int) -> Floats:
         ],
         axis=1,
     )
-
-
-def _mean(values: pl.Series) -> float:
-    mean = values.mean()
-    return float(mean) if isinstance(mean, float) else math.nan

@@ -35,6 +35,8 @@ from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.script import Script
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from dwell.record import Run
     from dwell.sim import Realisation
 
@@ -47,6 +49,7 @@ __all__ = [
     "play_alone",
     "references",
     "regret",
+    "tier_use",
     "window_costs",
 ]
 
@@ -276,8 +279,6 @@ def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats
 
 def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats:
     """J of the windows that the controller did not see, in their order."""
-    import polars as pl
-
     windows = run.windows.filter(run.windows["cost"].is_null())
     first = windows["first_cycle"].to_numpy()
     rows = first[:, None] + np.arange(problem.window_cycles)
@@ -287,13 +288,20 @@ def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Float
     age_ns = close_ns[:, None] - realisation.release_ns[rows]
     l95_ms = seen_l95_ns(latency_ns, age_ns, round(problem.censor_ms * 1e6)) / 1e6
     rate = windows["violation_rate"].to_numpy()
-    used = [
+    return price(l95_ms, rate, *tier_use(windows, problem), 0.0, problem.objective)
+
+
+def tier_use(windows: pl.DataFrame, problem: Problem) -> tuple[Floats, Floats, Floats]:
+    """Utilisation of the busiest node of each tier, robot, edge and cloud, in every window."""
+    import polars as pl
+
+    robot, edge, cloud = (
         windows.select(pl.max_horizontal(0.0, *(f"u_{node}" for node in nodes)))
         .to_series()
         .to_numpy()
         for nodes in tier_nodes(problem.objective)
-    ]
-    return price(l95_ms, rate, used[0], used[1], used[2], 0.0, problem.objective)
+    )
+    return robot, edge, cloud
 
 
 def _in_time(problem: Problem) -> Problem:

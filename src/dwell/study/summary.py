@@ -53,6 +53,7 @@ __all__ = [
     "latency_grid_ms",
     "latency_ms",
     "longest_streak",
+    "mean_of",
     "order_statistic",
     "summarise",
 ]
@@ -160,20 +161,20 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         "windows": windows.height,
         "cycles": cycles.height,
         "violation_rate": float(missed.mean()),
-        "l95_ms": _mean(windows["seen_l95_ms"]),
+        "l95_ms": mean_of(windows["seen_l95_ms"]),
         **_percentiles(latency_ns),
         **_utilisation(windows, problem),
         **_migrations(decisions),
         **_shares(windows["placement"], tuple(problem.candidates)),
-        "cost": _mean(windows["cost"]),
+        "cost": mean_of(windows["cost"]),
         "lost": int((~cycles["outcome"].is_in(["done", "in_flight"])).sum()),
         "in_flight": int((cycles["outcome"] == "in_flight").sum()),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
         **_actuator(run.cycles, cycles, problem),
-        "compute_ms": _mean(cycles["compute_ns"]) / 1e6,
-        "queue_ms": _mean(cycles["queue_ns"]) / 1e6,
-        "network_ms": _mean(cycles["network_ns"]) / 1e6,
+        "compute_ms": mean_of(cycles["compute_ns"]) / 1e6,
+        "queue_ms": mean_of(cycles["queue_ns"]) / 1e6,
+        "network_ms": mean_of(cycles["network_ns"]) / 1e6,
     }
     within = count_within(latency_ns, problem.pipeline.deadline_ms)
     return Summary(row, _costs(windows, decisions, problem, labels), within)
@@ -248,8 +249,8 @@ def count_within(latency_ns: Ints, deadline_ms: float) -> Ints:
     return within
 
 
-def _mean(values: pl.Series) -> float:
-    """Mean of what is there; NaN where nothing is."""
+def mean_of(values: pl.Series) -> float:
+    """Return the mean of what is there; NaN where nothing is."""
     mean = values.mean()
     return float(mean) if isinstance(mean, float) else float("nan")
 
@@ -284,8 +285,8 @@ def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
     for tier in ("robot", "edge"):
         names = [f"u_{node}" for node in getattr(tiers, tier)]
         busiest = windows.select(pl.max_horizontal(names)).to_series() if names else None
-        used[f"u_{tier}"] = 0.0 if busiest is None else _mean(busiest)
-    return used | {f"node_{node}": _mean(windows[f"u_{node}"]) for node in problem.fabric.nodes}
+        used[f"u_{tier}"] = 0.0 if busiest is None else mean_of(busiest)
+    return used | {f"node_{node}": mean_of(windows[f"u_{node}"]) for node in problem.fabric.nodes}
 
 
 def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
@@ -300,7 +301,7 @@ def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
 
 def _shares(placements: pl.Series, candidates: tuple[str, ...]) -> dict[str, float]:
     """Share of windows that began under each candidate."""
-    return {f"share_{name}": _mean(placements == name) for name in candidates}
+    return {f"share_{name}": mean_of(placements == name) for name in candidates}
 
 
 def _costs(
@@ -318,8 +319,8 @@ def _costs(
             {
                 **labels,
                 "candidate": name,
-                "estimated": _mean(idle),
-                "measured": _mean(active),
+                "estimated": mean_of(idle),
+                "measured": mean_of(active),
                 "windows": active.len(),
             }
         )
