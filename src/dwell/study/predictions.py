@@ -22,7 +22,7 @@ from dwell.study.intervals import (
     median_interval,
     share_difference_interval,
     share_interval,
-    share_limits,
+    under,
 )
 from dwell.study.over_seeds import difference_of
 from dwell.study.results import StudyRuns
@@ -45,7 +45,7 @@ __all__ = [
 Answer: TypeAlias = Literal["agrees", "agrees in part", "differs", "open"]
 Test: TypeAlias = Callable[["PaperEvidence"], bool | None]
 
-CANDIDATES = ("LOC", "SO", "HYB")
+CANDIDATES = {"LOC", "SO", "HYB"}
 DTP = "dtp"
 
 
@@ -59,10 +59,8 @@ class PaperEvidence:
     def under_aim(self, policy: str) -> bool | None:
         """Whether the violation rate is under the aim."""
         values = self._values(policy, "violation_rate")
-        if values is None:
-            return None
-        at_least, at_most = share_limits(values)
-        return True if at_most < AIM else False if at_least > AIM else None
+        known = {"under": True, "over": False}
+        return None if values is None else known.get(under(values, AIM))
 
     def more(
         self, policy: str, column: str, other: str, *, scenario: str | None = None
@@ -261,21 +259,17 @@ class Judgement:
         Placement with the largest mean share of the windows.
     share : Interval
         Share of the predicted placements together.
-    lead : Interval
-        That, less the largest share of any other placement; seed by seed.
     """
 
-    prediction: Prediction
     answer: Answer
     leader: str
     share: Interval
-    lead: Interval
 
 
 def applies(comparison: StudyRuns) -> bool:
     """Whether the paper's predictions are about this cell at all: its candidates, its words."""
     names = {prediction.scenario for prediction in PAPER}
-    return tuple(sorted(comparison.problem.candidates)) == tuple(sorted(CANDIDATES)) and bool(
+    return comparison.problem.candidates.keys() == CANDIDATES and bool(
         names & set(comparison.scenarios)
     )
 
@@ -298,25 +292,22 @@ def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str =
     together = np.minimum(together, 1.0)
     others = [name for name in shares if name not in prediction.dominant]
     rival = max(others, key=lambda name: shares[name].mean())
-    lead = share_difference_interval(together, shares[rival])
     share = share_interval(together)
-    leads = _sign(lead)
-    answer: Answer
-    if leads is None:
-        answer = "open"
-    elif not leads:
-        answer = "differs"
-    else:
-        # Few seeds that all have the whole share leave an interval below it, which says nothing.
-        enough = share.low >= prediction.share or together.min() >= prediction.share
-        answer = "agrees" if enough else "agrees in part"
+    answer = _answer(_sign(share_difference_interval(together, shares[rival])))
+    # Few seeds that all have the whole share leave an interval below it, which says nothing.
+    enough = share.low >= prediction.share or together.min() >= prediction.share
+    if answer == "agrees" and not enough:
+        answer = "agrees in part"
     leader = max(shares, key=lambda name: shares[name].mean())
-    return Judgement(prediction, answer, leader, share, lead)
+    return Judgement(answer, leader, share)
 
 
 def judge_claim(comparison: StudyRuns, scenario: str, claim: PaperClaim) -> Answer:
     """Hold the words on a static placement against its runs."""
-    holds = claim.holds(PaperEvidence(comparison, scenario))
+    return _answer(claim.holds(PaperEvidence(comparison, scenario)))
+
+
+def _answer(holds: bool | None) -> Answer:
     return "open" if holds is None else "agrees" if holds else "differs"
 
 
@@ -346,17 +337,8 @@ def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -
     for one in mine if applies(comparison) else ():
         for policy in policies:
             found = judge_placement(comparison, one, policy)
-            rows.append(
-                (
-                    one.scenario,
-                    policy,
-                    one.dtp,
-                    one.reading,
-                    found.answer,
-                    found.leader,
-                    *found.share,
-                )
-            )
+            words = (one.scenario, policy, one.dtp, one.reading)
+            rows.append((*words, found.answer, found.leader, *found.share))
         for placement, claims in one.claims.items():
             for claim in claims:
                 answer = judge_claim(comparison, one.scenario, claim)
