@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dwell.model import Episodes, Exponential, FrozenDict, Placement, Problem, Scenario
-from dwell.study import Contender, load_study
+from dwell.study import Contender, Point, Study, load_study
 
 __all__ = [
     "DYNAMIC",
@@ -23,6 +23,7 @@ __all__ = [
     "paper_cell",
     "rules",
     "statics",
+    "study_of",
     "with_candidate",
     "with_candidates",
     "with_scenarios",
@@ -70,6 +71,21 @@ def by_length(
     timed = tuple(name for name in mine if name in TIMETABLE)
     yield from (("", usual, windows),) if usual else ()
     yield from (("-timetable", timed, timetable_windows),) if timed else ()
+
+
+def study_of(
+    name: str,
+    cell: Problem,
+    who: Iterable[Contender],
+    seeds: Sequence[int],
+    windows: int,
+    *,
+    scenarios: Iterable[str] | None = None,
+    references: bool = False,
+) -> Study:
+    """Return a study of one cell, in all of its scenarios unless some are named."""
+    mine = tuple(cell.scenarios if scenarios is None else scenarios)
+    return Study(name, (Point({}, cell),), mine, tuple(who), tuple(seeds), windows, references)
 
 
 # ------------------------------------------------------------------------------ contenders

@@ -7,18 +7,19 @@ and metric, and `p_least` is the smallest p value that so many seeds and compari
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import polars as pl
 
-from dwell.study import AIM, Family, Interval, Study, under
+from dwell.study import AIM, Family, Interval, Study, over_seeds, under
 
 __all__ = [
     "Answer",
     "Pairs",
     "between",
+    "by_policy",
     "compare",
     "counted",
     "judge",
@@ -74,6 +75,11 @@ def values(runs: pl.DataFrame, column: str, **labels: object) -> np.ndarray:
     return mine[column].cast(pl.Float64).to_numpy()
 
 
+def by_policy(runs: pl.DataFrame, columns: Sequence[str]) -> pl.DataFrame:
+    """Return columns of the runs over seeds, one row a scenario and policy."""
+    return over_seeds(runs, ("scenario", "policy"), columns)
+
+
 def between(
     scenario: str, first: str, second: str, **more: object
 ) -> tuple[dict[str, object], dict[str, object]]:
@@ -121,21 +127,8 @@ def judge(
     claim: str, scenario: str, policy: str, metric: str, known: Interval, word: str, *studies: Study
 ) -> pl.DataFrame:
     """Return the row of a verdict that is no comparison: a bound, and what its interval says."""
-    row = {
-        "claim": claim,
-        "design": design_of(*studies),
-        "scenario": scenario,
-        "first": policy,
-        "second": "",
-        "metric": metric,
-        "effect": known.value,
-        "low": known.low,
-        "high": known.high,
-        "p": None,
-        "p_least": None,
-        "word": word,
-    }
-    return pl.DataFrame([row], schema=SCHEMA).fill_nan(None)
+    row = (claim, design_of(*studies), scenario, policy, "", metric, *known, None, None, word)
+    return pl.DataFrame([row], schema=SCHEMA, orient="row").fill_nan(None)
 
 
 def under_aim(rows: pl.DataFrame, runs: pl.DataFrame, *studies: Study) -> pl.DataFrame:

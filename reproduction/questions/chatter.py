@@ -29,11 +29,11 @@ from itertools import combinations, product
 import polars as pl
 
 from dwell.model import Placement, Problem
-from dwell.study import Point, Study, StudyResult, over_seeds
-from reproduction.cell import RANDOM, believing, with_candidates
+from dwell.study import Study, StudyResult
+from reproduction.cell import RANDOM, believing, study_of, with_candidates
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, compare, policies
+from reproduction.verdicts import Answer, by_policy, compare, policies
 
 TITLE = "RQ3: Does the Hamming-distance penalty suppress chatter more finely than a threshold?"
 
@@ -51,12 +51,10 @@ PRICE = "objective.weights.switching"
 def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Compare the penalty to a threshold of the same mean; with two candidates, too."""
     strengths = FEW_STRENGTHS if scale.coarse else STRENGTHS
-    three = study_of("chatter", judging(cell), strengths, scale.all_seeds, scale)
+    three = ruled("chatter", judging(cell), strengths, scale.all_seeds, scale)
     # The two that are farthest apart, at one strength.
     far = max(combinations(cell.candidates, 2), key=lambda pair: distance(cell, *pair))
-    two = study_of(
-        "chatter-two", judging(with_candidates(cell, far)), (0.2,), scale.some_seeds, scale
-    )
+    two = ruled("chatter-two", judging(with_candidates(cell, far)), (0.2,), scale.some_seeds, scale)
     runs, check = (with_moves(run(study)) for study in (three, two))
     verdicts = [
         compare(table, claim, METRICS, policies(SCENARIOS, pairs_of(of)), study)
@@ -65,11 +63,10 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             ("With two candidates, the penalty differs from the threshold", check, (0.2,), two),
         )
     ]
-    keys = ("scenario", "policy")
     return Answer(
         pl.concat(verdicts),
         {
-            "Chatter and its price under both rules": over_seeds(runs, keys, METRICS),
+            "Chatter and its price under both rules": by_policy(runs, METRICS),
             "Two candidates: runs that are the same under both rules, number by number": (
                 identical(check)
             ),
@@ -89,7 +86,7 @@ def distance(cell: Problem, first: str, second: str) -> float:
     return len(one.moved(other)) / len(one)
 
 
-def study_of(
+def ruled(
     name: str, cell: Problem, strengths: Sequence[float], seeds: tuple[int, ...], scale: Scale
 ) -> Study:
     """Return both rules at every strength, dwell and estimator, and DTP with neither."""
@@ -98,11 +95,11 @@ def study_of(
     mean = sum(distance(cell, *pair) for pair in pairs) / len(pairs)
     who = []
     for estimator, dwell in product(ESTIMATORS, DWELLS):
-        ruled = [("neither", 0.0, 0.0, least)]
+        rules = [("neither", 0.0, 0.0, least)]
         for strength in strengths:
-            ruled.append((PENALTY, strength, strength, least))
-            ruled.append((THRESHOLD, strength, 0.0, least + strength * mean))
-        for rule, strength, switching, improvement in ruled:
+            rules.append((PENALTY, strength, strength, least))
+            rules.append((THRESHOLD, strength, 0.0, least + strength * mean))
+        for rule, strength, switching, improvement in rules:
             settings = {
                 "controller.min_dwell": dwell,
                 "controller.min_improvement": improvement,
@@ -110,7 +107,7 @@ def study_of(
             }
             called = named(estimator, dwell, rule, strength)
             who.append(believing("dtp", estimator, settings, name=called))
-    return Study(name, (Point({}, cell),), SCENARIOS, tuple(who), seeds, scale.windows)
+    return study_of(name, cell, who, seeds, scale.windows, scenarios=SCENARIOS)
 
 
 def named(estimator: str, dwell: int, rule: str, strength: float) -> str:

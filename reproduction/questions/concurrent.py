@@ -16,7 +16,7 @@ import polars as pl
 
 from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.policies import ATP
-from dwell.study import Contender, Point, Study, over_seeds
+from dwell.study import Contender, Point, Study
 from reproduction.cell import (
     PAPERS_DTP,
     RULES,
@@ -24,13 +24,14 @@ from reproduction.cell import (
     on_and_off,
     rules,
     statics,
+    study_of,
     with_candidates,
     with_scenarios,
 )
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
 from reproduction.tuning import best, scores
-from reproduction.verdicts import Answer, compare, policies
+from reproduction.verdicts import Answer, by_policy, compare, policies
 
 TITLE = "RQ1: Does placing T2 and T3 together reduce V_D further than moving one stage (ATP)?"
 
@@ -55,13 +56,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     tuning = run(tuning_study(stressed, scale))
     score = scores(tuning.runs, "violation_rate")
     who = tuning.study.contenders
-    overall = best([one for one in who if one.name not in cell.candidates], score)
+    adaptive = [one for one in who if one.name not in cell.candidates]
+    overall = best(adaptive, score)
     static = best([one for one in who if one.name in cell.candidates], score).name
     here = {
-        scenario: best(
-            [one for one in who if one.name not in cell.candidates],
-            scores(tuning.runs.filter(scenario=scenario), "violation_rate"),
-        )
+        scenario: best(adaptive, scores(tuning.runs.filter(scenario=scenario), "violation_rate"))
         for scenario in tuning.study.scenarios
     }
     favourites = {one.name: Contender(f"atp {one.name}", one.policy) for one in here.values()}
@@ -102,19 +101,13 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             ("Both stages beat either alone, under the same rule", single),
         )
     ]
-    settings = pl.DataFrame(
-        [
-            {"setting": name, "violation_rate": value}
-            for name, value in sorted(score.items(), key=lambda item: item[1])
-        ]
-    )
+    ordered = sorted(score.items(), key=lambda item: item[1])
+    settings = pl.DataFrame(ordered, schema=["setting", "violation_rate"], orient="row")
     columns = ("violation_rate", "l95_ms", "u_robot", "u_edge", "cost", "migrations")
     return Answer(
         pl.concat(verdicts),
         {
-            "Every policy under every stress": over_seeds(
-                everybody, ("scenario", "policy"), columns
-            ),
+            "Every policy under every stress": by_policy(everybody, columns),
             "ATP's settings on the held-out seeds: stage, L95 over D, U_r, U_e, N_min": settings,
         },
     )
@@ -144,13 +137,10 @@ def tuning_study(cell: Problem, scale: Scale) -> Study:
         for setting in product(*grids)
         for latency, robot, edge, dwell in (setting,)
     ]
-    return Study(
-        name="concurrent-tuning",
-        points=(Point({}, cell),),
-        scenarios=tuple(name for name in cell.scenarios if name != "baseline"),
-        contenders=(*statics(cell), *grid),
-        seeds=scale.held_out,
-        windows=scale.windows,
+    who = (*statics(cell), *grid)
+    scenarios = [name for name in cell.scenarios if name != "baseline"]
+    return study_of(
+        "concurrent-tuning", cell, who, scale.held_out, scale.windows, scenarios=scenarios
     )
 
 

@@ -23,11 +23,19 @@ from dwell.model import (
     Task,
     Uniform,
 )
-from dwell.study import Point, Study, over_seeds, paired_difference
-from reproduction.cell import RULES, STEADY, rules, statics, with_candidate, with_scenarios
+from dwell.study import Point, Study, paired_difference
+from reproduction.cell import (
+    RULES,
+    STEADY,
+    rules,
+    statics,
+    study_of,
+    with_candidate,
+    with_scenarios,
+)
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
-from reproduction.verdicts import Answer, compare, policies, values
+from reproduction.verdicts import Answer, by_policy, compare, policies, values
 
 TITLE = (
     "Which placement wins where, and does the one that the paper leaves out (T2 on R1, T3 on E) "
@@ -86,20 +94,19 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         ("steady", steady_cases(cell), scale.windows),
         ("dynamic", {one: cell.scenarios[one] for one in CHANGING}, scale.dynamic_windows),
     ):
-        three = with_scenarios(cell, scenarios)
-        shared = Study(
-            name=f"dominance-three-{name}",
-            points=(Point({}, three),),
-            scenarios=tuple(scenarios),
-            contenders=rules(),
-            seeds=scale.all_seeds,
-            windows=length,
-        )
-        more = replace(
-            shared,
-            name=f"dominance-four-{name}",
-            points=(Point({}, with_scenarios(four, scenarios)),),
-            contenders=(*statics(four), *rules()),
+        shared, more = (
+            study_of(
+                f"dominance-{many}-{name}",
+                with_scenarios(offered, scenarios),
+                who,
+                scale.all_seeds,
+                length,
+                scenarios=scenarios,
+            )
+            for many, offered, who in (
+                ("three", cell, rules()),
+                ("four", four, (*statics(four), *rules())),
+            )
         )
         without = {rule: f"{rule} without {FOURTH}" for rule in RULES}
         frames += [
@@ -130,7 +137,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             "Points at which a placement that the paper predicts is best, or leads under DTP": (
                 predicted(papers, led, tuple(cell.candidates))
             ),
-            "Every policy in every scenario": over_seeds(runs, ("scenario", "policy"), METRICS),
+            "Every policy in every scenario": by_policy(runs, METRICS),
             "The map": won,
         },
     )

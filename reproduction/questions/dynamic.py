@@ -23,19 +23,17 @@ from dwell.study import (
     Contender,
     Hindsight,
     Interval,
-    Point,
     Study,
     StudyResult,
     mean_interval,
-    over_seeds,
     share_interval,
     under,
 )
-from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, statics
+from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, statics, study_of
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale, thinned
 from reproduction.tuning import best, scores
-from reproduction.verdicts import Answer, compare, judge, policies, values
+from reproduction.verdicts import Answer, by_policy, compare, judge, policies, values
 
 TITLE = (
     "In dynamic scenarios, is the cost within 10 % of the reference, V_D under 5 % wherever the "
@@ -61,7 +59,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Measure regret, part it, and hold it against the aim."""
     tuning = run(tuning_study(cell, scale))
     chosen = tuned(tuning)
-    dynamic = study_of("dynamic", cell, contenders(cell, chosen), scale)
+    dynamic = regretted("dynamic", cell, contenders(cell, chosen), scale.all_seeds, scale)
     steady = replace(dynamic, name="dynamic-steady", scenarios=STEADY, windows=scale.windows)
     runs = pl.concat([run(study).runs for study in (dynamic, steady)])
     fractions = run(fractions_study(cell, scale))
@@ -74,6 +72,9 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         ],
         "Another rule lowers DTP's regret": [(other, DTP) for other in others],
     }
+    shadowed = [
+        (f"{name} shadows {share:g}", name) for name, share in product(cell.candidates, FRACTIONS)
+    ]
     verdicts = [
         *aims(runs, tuple(cell.candidates), studies),
         *(
@@ -84,29 +85,21 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             shadows.runs,
             "Shadow jobs raise V_D",
             ("violation_rate",),
-            policies(
-                shadows.study.scenarios,
-                [
-                    (f"{name} shadows {share:g}", name)
-                    for name in cell.candidates
-                    for share in FRACTIONS
-                ],
-            ),
+            policies(shadows.study.scenarios, shadowed),
             shadows.study,
         ),
     ]
-    keys = ("scenario", "policy")
     return Answer(
         pl.concat(verdicts),
         {
             "The parts of regret": parts(runs, tuple(cell.candidates)),
-            "Every contender in every scenario": over_seeds(runs, keys, METRICS),
-            "Settings on the held-out seeds": over_seeds(tuning.runs, keys, ("regret",)),
-            "Shares of cycles that are sent through each alternative": over_seeds(
-                fractions.runs, keys, ("regret",)
+            "Every contender in every scenario": by_policy(runs, METRICS),
+            "Settings on the held-out seeds": by_policy(tuning.runs, ("regret",)),
+            "Shares of cycles that are sent through each alternative": by_policy(
+                fractions.runs, ("regret",)
             ),
-            "Placements with shadow jobs": over_seeds(
-                shadows.runs, keys, ("violation_rate", *(f"node_{n}" for n in cell.fabric.nodes))
+            "Placements with shadow jobs": by_policy(
+                shadows.runs, ("violation_rate", *(f"node_{n}" for n in cell.fabric.nodes))
             ),
         },
     )
@@ -115,16 +108,12 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 # --------------------------------------------------------------------------------- studies
 
 
-def study_of(name: str, cell: Problem, who: Sequence[Contender], scale: Scale) -> Study:
+def regretted(
+    name: str, cell: Problem, who: Sequence[Contender], seeds: Sequence[int], scale: Scale
+) -> Study:
     """Return a study of the dynamic scenarios, with references."""
-    return Study(
-        name=name,
-        points=(Point({}, cell),),
-        scenarios=DYNAMIC,
-        contenders=tuple(who),
-        seeds=scale.all_seeds,
-        windows=scale.dynamic_windows,
-        references=True,
+    return study_of(
+        name, cell, who, seeds, scale.dynamic_windows, scenarios=DYNAMIC, references=True
     )
 
 
@@ -156,7 +145,7 @@ def tuning_study(cell: Problem, scale: Scale) -> Study:
         )
         for dwell, improvement in product(thinned((0, 1, 3), size), thinned((0.05, 0.2, 0.4), size))
     ]
-    return replace(study_of("dynamic-tuning", cell, who, scale), seeds=scale.held_out)
+    return regretted("dynamic-tuning", cell, who, scale.held_out, scale)
 
 
 def tuned(tuning: StudyResult) -> dict[str, Contender]:
@@ -198,7 +187,7 @@ def fractions_study(cell: Problem, scale: Scale) -> Study:
         )
         for policy, share in product(("dtp", "cusum"), (0.0, *FRACTIONS))
     ]
-    return replace(study_of("dynamic-fractions", cell, who, scale), seeds=scale.some_seeds)
+    return regretted("dynamic-fractions", cell, who, scale.some_seeds, scale)
 
 
 # ----------------------------------------------------------------------------------- aims
@@ -267,7 +256,6 @@ def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
             "best_static": static,
         }
         for column, sample in shown.items():
-            known = mean_interval(sample)
-            row |= {column: known.value, f"{column}_low": known.low, f"{column}_high": known.high}
+            row |= mean_interval(sample).columns(column)
         rows.append(row)
     return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)

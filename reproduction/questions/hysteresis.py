@@ -9,18 +9,17 @@ waits for its state and its start), which make every move dearer.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 
 import polars as pl
 
 from dwell.model import FrozenDict, Problem
-from dwell.study import Contender, Point, Study, over_seeds
-from reproduction.cell import PAPERS_DTP, believing, by_length
+from reproduction.cell import PAPERS_DTP, believing, by_length, study_of
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, Pairs, between, compare
+from reproduction.verdicts import Answer, by_policy, compare, policies
 
 TITLE = "Does hysteresis calm DTP without making it worse?"
 
@@ -100,31 +99,15 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             [(f"{one}, cold", f"{one}, warm") for one in MOVERS],
         ),
     ):
-        studies = studies_of(name, problem, scale, scenarios, who, seeds)
+        studies = [
+            study_of(name + suffix, problem, who, seeds, windows, scenarios=mine, references=True)
+            for suffix, mine, windows in by_length(scenarios, scale.windows, scale.dynamic_windows)
+        ]
         runs = pl.concat([run(study).runs for study in studies])
-        named: Pairs = {
-            (scenario, *pair): between(scenario, *pair)
-            for scenario, pair in product(scenarios, pairs)
-        }
-        verdicts.append(compare(runs, claim, METRICS, named, *studies))
+        verdicts.append(compare(runs, claim, METRICS, policies(scenarios, pairs), *studies))
         columns = ("migrations", "returns", "cost", "regret", "violation_rate", "l95_ms")
-        tables[f"{claim}: every setting"] = over_seeds(runs, ("scenario", "policy"), columns)
+        tables[f"{claim}: every setting"] = by_policy(runs, columns)
     return Answer(pl.concat(verdicts), tables)
-
-
-def studies_of(
-    name: str,
-    cell: Problem,
-    scale: Scale,
-    scenarios: Sequence[str],
-    who: Sequence[Contender],
-    seeds: tuple[int, ...],
-) -> list[Study]:
-    """Return one study for each length that runs have, with references."""
-    return [
-        Study(name + suffix, (Point({}, cell),), mine, tuple(who), seeds, windows, references=True)
-        for suffix, mine, windows in by_length(scenarios, scale.windows, scale.dynamic_windows)
-    ]
 
 
 def grid_name(dwell: int, threshold: float) -> str:

@@ -12,11 +12,11 @@ from pathlib import Path
 import polars as pl
 
 import dwell
-from dwell.study import Contender, Point, Study, longest_run, over_seeds
-from reproduction.cell import EXAMPLES, PAPERS_DTP, believing, rules, statics
+from dwell.study import Contender, longest_run
+from reproduction.cell import EXAMPLES, PAPERS_DTP, believing, rules, statics, study_of
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, compare, policies, under_aim
+from reproduction.verdicts import Answer, by_policy, compare, policies, under_aim
 
 TITLE = "Do the findings hold where recorded measurements are replayed?"
 
@@ -29,18 +29,12 @@ def answer(traces: Path, scale: Scale, run: Run) -> Answer:
     frames, studies = [], []
     for file in CELLS:
         cell = dwell.load(EXAMPLES / file, traces=traces)
-        study = Study(
-            name=f"real-{cell.name.removeprefix('real-')}",
-            points=(Point({}, cell),),
-            scenarios=tuple(cell.scenarios),
-            contenders=(
-                *statics(cell),
-                Contender("atp", "atp"),
-                believing("dtp", "profile"),
-                *rules(),
-            ),
-            seeds=scale.all_seeds,
-            windows=longest_run(cell, scale.windows),
+        study = study_of(
+            f"real-{cell.name.removeprefix('real-')}",
+            cell,
+            (*statics(cell), Contender("atp", "atp"), believing("dtp", "profile"), *rules()),
+            scale.all_seeds,
+            longest_run(cell, scale.windows),
         )
         # One frame for both: a scenario is called after its cell, too.
         called = pl.format("{}: {}", pl.lit(cell.name), pl.col("scenario"))
@@ -52,7 +46,7 @@ def answer(traces: Path, scale: Scale, run: Run) -> Answer:
     pairs = [(dtp, other) for other in (PAPERS_DTP, "atp", *candidates)]
     pairs += [(cusum, PAPERS_DTP), (cusum, dtp)]
     columns = ("violation_rate", "l95_ms", "u_robot", "cost", "migrations", "aoi_mean_ms")
-    main = over_seeds(runs, ("scenario", "policy"), columns)
+    main = by_policy(runs, columns)
     named = policies(dict.fromkeys(runs["scenario"]), pairs)
     verdicts = [
         under_aim(main, runs, *studies),

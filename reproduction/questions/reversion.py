@@ -15,11 +15,19 @@ from itertools import product
 import polars as pl
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Normal, Problem, Scenario
-from dwell.study import Contender, Point, Study, over_seeds
-from reproduction.cell import RULES, on_and_off, rules, statics, with_candidates, with_scenarios
+from dwell.study import Contender, Point, Study
+from reproduction.cell import (
+    RULES,
+    on_and_off,
+    rules,
+    statics,
+    study_of,
+    with_candidates,
+    with_scenarios,
+)
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
-from reproduction.verdicts import Answer, compare, policies
+from reproduction.verdicts import Answer, by_policy, compare, policies
 
 TITLE = "RQ2: Does routing T3 to R2 during network faults outperform binary R1/E reversion?"
 
@@ -65,21 +73,14 @@ STEADY, PARAMETERS = "fault", ("fault.place", "fault.mean_ms", "fault.loss")
 def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Compare the rules with HYB to the same without, and that to the same without a fault."""
     faulty = with_scenarios(cell, fault_scenarios(cell))
-    whole = Study(
-        name="reversion",
-        points=(Point({}, faulty),),
-        scenarios=tuple(name for name in faulty.scenarios if name != "baseline"),
-        contenders=(*statics(cell), Contender("atp", "atp"), *rules()),
-        seeds=scale.all_seeds,
-        windows=scale.windows,
-    )
-    binary = Study(
-        name="reversion-binary",
-        points=(Point({}, with_candidates(faulty, BINARY)),),
-        scenarios=whole.scenarios,
-        contenders=rules(),
-        seeds=whole.seeds,
-        windows=whole.windows,
+    who = (*statics(cell), Contender("atp", "atp"), *rules())
+    scenarios = [name for name in faulty.scenarios if name != "baseline"]
+    whole, binary = (
+        study_of(name, one, contenders, scale.all_seeds, scale.windows, scenarios=scenarios)
+        for name, one, contenders in (
+            ("reversion", faulty, who),
+            ("reversion-binary", with_candidates(faulty, BINARY), rules()),
+        )
     )
     without = {rule: f"{rule} {' or '.join(BINARY)}" for rule in RULES}
     reverting = run(binary).runs.with_columns(pl.col("policy").replace_strict(without))
@@ -107,11 +108,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     }
     claim = "Having HYB helps more with the fault than under the same stress without it"
     verdicts.append(compare(changes, claim, CHANGES, beyond, whole))
-    keys, columns = ("scenario", "policy"), ("violation_rate", "l95_ms", "cost", "migrations")
+    columns = ("violation_rate", "l95_ms", "cost", "migrations")
     return Answer(
         pl.concat(verdicts),
         {
-            "Every policy under every fault": over_seeds(runs, keys, columns),
+            "Every policy under every fault": by_policy(runs, columns),
             "Bytes that cross each link under each placement": crossed(cell),
             "Steady faults of every size": sweep.table(METRICS),
         },

@@ -11,11 +11,11 @@ from dataclasses import replace
 import polars as pl
 
 from dwell.model import Problem
-from dwell.study import over_seeds, paper_predictions
+from dwell.study import paper_predictions
 from reproduction.cell import PAPERS_DTP
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, compare, policies, under_aim
+from reproduction.verdicts import Answer, by_policy, compare, policies, under_aim
 
 TITLE = "Do the paper's predictions for the steady scenarios hold?"
 
@@ -42,9 +42,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     candidates = tuple(cell.candidates)
     pairs = [(PAPERS_DTP, other) for other in candidates]
     pairs += [(CORRECTED, other) for other in (*candidates, PAPERS_DTP)]
-    main = over_seeds(
-        result.runs, ("scenario", "policy"), [*MAIN, *(f"share_{name}" for name in candidates)]
-    )
+    main = by_policy(result.runs, [*MAIN, *(f"share_{name}" for name in candidates)])
     verdicts = [
         under_aim(main, result.runs, study),
         compare(
@@ -65,6 +63,6 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
                 "scenario", "policy", "words", "reading", "answer"
             ),
             "Every policy in every steady scenario": main,
-            "What the actuator got": over_seeds(result.runs, ("scenario", "policy"), ACTUATOR),
+            "What the actuator got": by_policy(result.runs, ACTUATOR),
         },
     )

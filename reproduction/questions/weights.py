@@ -24,8 +24,8 @@ from SALib.analyze import sobol as analysis
 from SALib.sample import sobol as sampling
 
 from dwell.model import Problem
-from dwell.study import Contender, Point, Study, StudyResult
-from reproduction.cell import DYNAMIC, STEADY, believing, by_length
+from dwell.study import Contender, StudyResult
+from reproduction.cell import DYNAMIC, STEADY, believing, by_length, study_of
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, compare, policies
@@ -57,21 +57,16 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     shares = sampling.sample(SALIB, scale.sobol_n, calc_second_order=False, scramble=True, seed=1)
     weights = np.array([getattr(cell.objective.weights, name) for name in WEIGHTS])
     rows = weights / FACTOR * (FACTOR * FACTOR) ** shares
+    seeds = range(1, scale.sobol_seeds + 1)
     together = [
-        Study(f"weights{suffix}", (Point({}, cell),), mine, weighing(rows), seeds, windows)
-        for seeds in (tuple(range(1, scale.sobol_seeds + 1)),)
+        study_of(f"weights{suffix}", cell, weighing(rows), seeds, windows, scenarios=mine)
         for suffix, mine, windows in by_length(
             (*STEADY, *DYNAMIC), scale.sobol_windows, scale.dynamic_windows
         )
     ]
     alone = [
-        Study(
-            f"weights-one{suffix}",
-            (Point({}, cell),),
-            mine,
-            stepping(cell),
-            scale.all_seeds,
-            windows,
+        study_of(
+            f"weights-one{suffix}", cell, stepping(cell), scale.all_seeds, windows, scenarios=mine
         )
         for suffix, mine, windows in by_length(ONE_AT_A_TIME, scale.windows, scale.dynamic_windows)
     ]
