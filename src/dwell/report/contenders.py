@@ -6,20 +6,11 @@ from collections.abc import Iterable
 
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
-from dwell.policies.registry import FAMILIES
 from dwell.report.formatting import OURS, shown_contender
-from dwell.report.palette import Palette, contended
+from dwell.report.palette import FAMILIES, Palette, contended
 
-__all__ = ["POLICIES", "describe_contenders", "palette_of"]
+__all__ = ["describe_contenders", "palette_of"]
 
-#: By the family of the policy.
-POLICIES = {
-    **{name: policy.sentence for name, policy in FAMILIES.items()},
-    "clairvoyant": "Clairvoyant is no policy but a reference: it knows what every placement, run "
-    "alone, costs in every window to come, and plays the cheapest sequence.",
-    "best static": "Best static is no policy either: of the placements that never move, the one "
-    "that turns out to be the cheapest on the same realisation.",
-}
 #: By what stands in brackets behind a policy.
 BELIEFS = {
     **{name: estimator.sentence for name, estimator in ESTIMATORS.items()},
@@ -73,9 +64,10 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
     if statics:
         found[", ".join(statics)] = "Placements; as policies these never move."
     known = [one for one in map(contended, names) if one is not None]
-    for family, text in POLICIES.items():
+    for family, policy in FAMILIES.items():
         if any(one.family == family for one in known):
-            found[shown_contender(family)] = f"{text} {OURS}" if family == "atp" else text
+            remark = f" {OURS}" if family == "atp" else ""
+            found[shown_contender(family)] = f"{policy.sentence}{remark}"
     said = {part for one in known for part in (one.variant, one.belief)}
     for name, text in (*BELIEFS.items(), *VARIANTS.items()):
         if name in said:

@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from dwell.policies.registry import FAMILIES
-from dwell.report.palette import contended
+from dwell.report.palette import FAMILIES, contended
 from dwell.study import Interval
 
 __all__ = [
@@ -26,12 +25,6 @@ __all__ = [
     "write_number",
 ]
 
-#: By the family of the policy.
-NAMES = {
-    **{name: policy.label for name, policy in FAMILIES.items()},
-    "clairvoyant": "Clairvoyant",
-    "best static": "Best static",
-}
 #: What has to stand beside everything that shows ATP.
 OURS = "ATP is our reconstruction."
 #: A symbol with its index: V_D, N_min, α_L.
@@ -174,7 +167,7 @@ def _shown(name: str, remark: str = "") -> str:
     known = contended(name)
     if known is None:
         return name
-    shown = NAMES[known.family]
+    shown = FAMILIES[known.family].label
     shown += f"-{known.variant}" if known.variant else ""
     brackets = "; ".join(filter(None, (remark, known.belief)))
     shown += f" ({brackets})" if brackets else ""

@@ -29,7 +29,6 @@ __all__ = [
     "RAMP",
     "RULE",
     "SHADE",
-    "VARIANTS",
     "Contended",
     "Palette",
     "Style",
@@ -67,18 +66,30 @@ CIRCLE = "circle"
 SOLID: Dashes = ()
 DASHES: tuple[Dashes, ...] = (SOLID, (7, 3), (2, 2), (7, 2, 2, 2), (11, 3, 3, 3))
 
-#: Hues of the policies that move, from the back of the placements'.
+#: Policies that move, by family, and the references that stand beside them: their labels, their
+#: hues, from the back of the placements', and a sentence each.
 FAMILIES = {
-    **{
-        name: {"ink": INK, "muted": MUTED}.get(policy.colour, policy.colour)
-        for name, policy in registry.FAMILIES.items()
-    },
-    "clairvoyant": MUTED,
-    "best static": MUTED,
+    **registry.FAMILIES,
+    "clairvoyant": registry.PolicyEntry(
+        "",
+        "Clairvoyant",
+        "muted",
+        "Clairvoyant is no policy but a reference: it knows what every placement, run "
+        "alone, costs in every window to come, and plays the cheapest sequence.",
+    ),
+    "best static": registry.PolicyEntry(
+        "",
+        "Best static",
+        "muted",
+        "Best static is no policy either: of the placements that never move, the one "
+        "that turns out to be the cheapest on the same realisation.",
+    ),
+}
+COLOURS = {
+    name: {"ink": INK, "muted": MUTED}.get(one.colour, one.colour) for name, one in FAMILIES.items()
 }
 #: Places of what a policy believes: each has its marker and dashes, whoever else is shown.
 BELIEFS = (*sorted(ESTIMATORS, key=lambda name: ESTIMATORS[name].style), "hindsight")
-VARIANTS = ("tuned", "escape", "dwell", "thresholds")
 
 
 class Contended(NamedTuple):
@@ -153,7 +164,7 @@ class Palette:
         moving = [name for name in policies if name not in placements]
         spare = [hue for hue in reversed(HUES) if hue not in placements.values()]
         # Hues that a family has by its name are not given to others while there are more.
-        spare.sort(key=lambda hue: hue in FAMILIES.values())
+        spare.sort(key=lambda hue: hue in COLOURS.values())
         styles: dict[str, Style] = {}
         variants: dict[str, int] = {}
         unknown = 0
@@ -165,7 +176,7 @@ class Palette:
                 styles[name] = _style(colour, place)
                 continue
             place = _place(known, variants)
-            colour = FAMILIES[known.family]
+            colour = COLOURS[known.family]
             if colour in placements.values():
                 colour = MUTED
             if known.belief in BELIEFS[2:] and colour == INK:
