@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import yaml
@@ -10,13 +11,16 @@ import dwell
 from dwell.live.wiring import wire
 from dwell.model import Problem
 from dwell.testbed.chaos.light_cell import document
-from dwell.testbed.chaos.wiretap import _HEAD, Records, entry_for
+from dwell.testbed.chaos.wiretap import Records, entry_for
 from dwell.testbed.loopback import on_this_machine
+
+#: Instant, and lengths of key, message and header.
+HEAD = struct.Struct("<QIII")
 
 
 def record(at_ns: int, key: str, payload: bytes, header: bytes) -> bytes:
     name = key.encode()
-    return _HEAD.pack(at_ns, len(name), len(payload), len(header)) + name + payload + header
+    return HEAD.pack(at_ns, len(name), len(payload), len(header)) + name + payload + header
 
 
 def test_records_are_read_as_they_grow_and_never_half_a_one(tmp_path: Path) -> None:
