@@ -6,6 +6,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import polars as pl
+
 from dwell.model import Episodes, Exponential, FrozenDict, Placement, Problem, Scenario
 from dwell.study import Contender, Point, Study, load_study
 
@@ -18,12 +20,14 @@ __all__ = [
     "STEADY",
     "TIMETABLE",
     "believing",
+    "best",
     "by_length",
+    "of_cell",
     "on_and_off",
     "paper_cell",
     "rules",
+    "scores",
     "statics",
-    "study_of",
     "with_candidate",
     "with_candidates",
     "with_scenarios",
@@ -59,13 +63,7 @@ def paper_cell() -> Problem:
 def by_length(
     names: Iterable[str], windows: int, timetable_windows: int
 ) -> Iterator[tuple[str, tuple[str, ...], int]]:
-    """Part scenarios by how long their runs have to be, as a study has one length.
-
-    Yields
-    ------
-    (str, tuple of str, int)
-        What to add to the name of a study, its scenarios and the windows of its runs.
-    """
+    """Part scenarios by the length of their runs; yield a suffix of names, scenarios, windows."""
     mine = tuple(names)
     usual = tuple(name for name in mine if name not in TIMETABLE)
     timed = tuple(name for name in mine if name in TIMETABLE)
@@ -73,19 +71,21 @@ def by_length(
     yield from (("-timetable", timed, timetable_windows),) if timed else ()
 
 
-def study_of(
+def of_cell(
     name: str,
     cell: Problem,
-    who: Iterable[Contender],
-    seeds: Sequence[int],
+    scenarios: Iterable[str],
+    contenders: Iterable[Contender],
+    seeds: tuple[int, ...],
     windows: int,
     *,
-    scenarios: Iterable[str] | None = None,
     references: bool = False,
 ) -> Study:
-    """Return a study of one cell, in all of its scenarios unless some are named."""
-    mine = tuple(cell.scenarios if scenarios is None else scenarios)
-    return Study(name, (Point({}, cell),), mine, tuple(who), tuple(seeds), windows, references)
+    """Return a study of one cell."""
+    point = (Point({}, cell),)
+    return Study(
+        name, point, tuple(scenarios), tuple(contenders), seeds, windows, references=references
+    )
 
 
 # ------------------------------------------------------------------------------ contenders
@@ -106,6 +106,19 @@ def statics(problem: Problem) -> tuple[Contender, ...]:
 def rules() -> tuple[Contender, ...]:
     """Return the contenders of `RULES`."""
     return tuple(believing(rule.removesuffix("+corrected"), "corrected") for rule in RULES)
+
+
+def scores(runs: pl.DataFrame, column: str) -> dict[str, float]:
+    """Return the mean over scenarios of the mean over seeds, by policy; less is better."""
+    # Every scenario counts alike, however many of its runs there are.
+    means = runs.group_by("policy", "scenario", maintain_order=True).agg(pl.col(column).mean())
+    found = means.group_by("policy", maintain_order=True).agg(pl.col(column).mean())
+    return dict(found.rows())
+
+
+def best(contenders: Iterable[Contender], score: Mapping[str, float]) -> Contender:
+    """Return the contender with the least score, the first of equals."""
+    return min(contenders, key=lambda one: score[one.name])
 
 
 # -------------------------------------------------------------------------------- variants
@@ -135,16 +148,6 @@ def with_scenarios(problem: Problem, scenarios: Mapping[str, Scenario]) -> Probl
 
 
 def on_and_off(scenario: Scenario, *, off_s: float, on_s: float, name: str) -> Scenario:
-    """Return a steady scenario that comes and goes instead.
-
-    Parameters
-    ----------
-    scenario : tuple of disturbances
-        All the time.
-    off_s, on_s : float
-        Mean lengths, seconds; exponential.
-    name : str
-        Of the episodes: disturbances with one name come and go together.
-    """
+    """Return a steady scenario that comes and goes, all of it together, for exponential times."""
     episodes = Episodes(name, every_s=Exponential(off_s), for_s=Exponential(on_s))
     return tuple(replace(item, episodes=episodes) for item in scenario)

@@ -20,6 +20,7 @@ __all__ = [
     "Pairs",
     "between",
     "by_policy",
+    "claims",
     "compare",
     "counted",
     "judge",
@@ -38,15 +39,7 @@ SCHEMA = {name: pl.String if name in TEXTS else pl.Float64 for name in COLUMNS}
 
 
 class Answer(NamedTuple):
-    """What came of a question.
-
-    Parameters
-    ----------
-    verdicts : DataFrame
-        One row a verdict; see `compare`.
-    tables : mapping of str to DataFrame
-        What else the runs show, by a title.
-    """
+    """What came of a question: a row a verdict, and what else the runs show, by a title."""
 
     verdicts: pl.DataFrame
     tables: Mapping[str, pl.DataFrame]
@@ -123,6 +116,20 @@ def compare(
     return pl.concat(found)
 
 
+def claims(
+    runs: pl.DataFrame,
+    metrics: Iterable[str],
+    scenarios: Iterable[str],
+    pairs: Mapping[str, Iterable[tuple[str, str]]],
+    *studies: Study,
+) -> list[pl.DataFrame]:
+    """Compare pairs of policies in every scenario, by claim."""
+    return [
+        compare(runs, claim, metrics, policies(scenarios, mine), *studies)
+        for claim, mine in pairs.items()
+    ]
+
+
 def judge(
     claim: str, scenario: str, policy: str, metric: str, known: Interval, word: str, *studies: Study
 ) -> pl.DataFrame:
@@ -132,16 +139,7 @@ def judge(
 
 
 def under_aim(rows: pl.DataFrame, runs: pl.DataFrame, *studies: Study) -> pl.DataFrame:
-    """Judge of every policy whether V_D is under 5 %, by its one-sided limits.
-
-    Parameters
-    ----------
-    rows : DataFrame
-        Of `dwell.study.over_seeds`, by scenario and policy, with the violation rate.
-    runs : DataFrame
-        What they were made of.
-    studies : Study
-    """
+    """Judge of every policy whether V_D is under 5 %: of `rows` over seeds, made of `runs`."""
     found = [pl.DataFrame(schema=SCHEMA)]
     for row in rows.iter_rows(named=True):
         mine = runs.filter(scenario=row["scenario"], policy=row["policy"])["violation_rate"]

@@ -1,23 +1,7 @@
 """RQ3: Hamming penalty against threshold hysteresis: which of them keeps DTP calmer.
 
-What the penalty can do follows from the rule. A move from π to π' asks for an improvement of more
-than Δ_min, and the estimate of π' carries α_S · S(π, π'). Let J stand for costs without switching.
-
-* **N_min ≥ 1.** The incumbent's own switching term, that of the move which led to it, is there in
-  the one window after that move, which lies within the dwell. So it never counts: DTP moves to the
-  π' with the least J(π') + α_S · S(π, π') where J(π) - J(π') > Δ_min + α_S · S(π, π'). The penalty
-  is a threshold of each pair. Where all pairs are equally far apart, as always with two
-  candidates, no run can tell it from a larger Δ_min.
-* **N_min = 0.** In the window after a move from ρ to π, staying at π costs α_S · S(π, ρ) more. The
-  improvement asked for then is not Δ_min + α_S · S(π, π') but the larger of α_S · S(π, π') and
-  Δ_min + α_S · (S(π, π') - S(π, ρ)). Right after a move, when chatter begins, the penalty is weaker
-  than the threshold of the same height, and may be no more than Δ_min.
-* **The choice.** With three placements or more, the penalty prefers a near placement to a far one
-  that is better by less than α_S times the difference of their distances.
-
-Experiments therefore match the mean threshold: α_S > 0 beside α_S = 0 with Δ_min raised by α_S
-times the mean distance of two candidates. Chatter is counted in migrations, in returns (moves that
-undo the one before) and in tasks moved; what calm costs, in V_D and in J without switching.
+Experiments match the mean threshold: α_S > 0 beside α_S = 0 with Δ_min raised by α_S times the mean
+distance of two candidates. What the penalty can do at most follows from the rule: see README.md.
 """
 
 from __future__ import annotations
@@ -30,7 +14,7 @@ import polars as pl
 
 from dwell.model import Placement, Problem
 from dwell.study import Study, StudyResult
-from reproduction.cell import RANDOM, believing, study_of, with_candidates
+from reproduction.cell import RANDOM, believing, of_cell, with_candidates
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, by_policy, compare, policies
@@ -51,10 +35,12 @@ PRICE = "objective.weights.switching"
 def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Compare the penalty to a threshold of the same mean; with two candidates, too."""
     strengths = FEW_STRENGTHS if scale.coarse else STRENGTHS
-    three = ruled("chatter", judging(cell), strengths, scale.all_seeds, scale)
+    three = study_of("chatter", judging(cell), strengths, scale.all_seeds, scale)
     # The two that are farthest apart, at one strength.
     far = max(combinations(cell.candidates, 2), key=lambda pair: distance(cell, *pair))
-    two = ruled("chatter-two", judging(with_candidates(cell, far)), (0.2,), scale.some_seeds, scale)
+    two = study_of(
+        "chatter-two", judging(with_candidates(cell, far)), (0.2,), scale.some_seeds, scale
+    )
     runs, check = (with_moves(run(study)) for study in (three, two))
     verdicts = [
         compare(table, claim, METRICS, policies(SCENARIOS, pairs_of(of)), study)
@@ -86,7 +72,7 @@ def distance(cell: Problem, first: str, second: str) -> float:
     return len(one.moved(other)) / len(one)
 
 
-def ruled(
+def study_of(
     name: str, cell: Problem, strengths: Sequence[float], seeds: tuple[int, ...], scale: Scale
 ) -> Study:
     """Return both rules at every strength, dwell and estimator, and DTP with neither."""
@@ -95,11 +81,11 @@ def ruled(
     mean = sum(distance(cell, *pair) for pair in pairs) / len(pairs)
     who = []
     for estimator, dwell in product(ESTIMATORS, DWELLS):
-        rules = [("neither", 0.0, 0.0, least)]
+        ruled = [("neither", 0.0, 0.0, least)]
         for strength in strengths:
-            rules.append((PENALTY, strength, strength, least))
-            rules.append((THRESHOLD, strength, 0.0, least + strength * mean))
-        for rule, strength, switching, improvement in rules:
+            ruled.append((PENALTY, strength, strength, least))
+            ruled.append((THRESHOLD, strength, 0.0, least + strength * mean))
+        for rule, strength, switching, improvement in ruled:
             settings = {
                 "controller.min_dwell": dwell,
                 "controller.min_improvement": improvement,
@@ -107,7 +93,7 @@ def ruled(
             }
             called = named(estimator, dwell, rule, strength)
             who.append(believing("dtp", estimator, settings, name=called))
-    return study_of(name, cell, who, seeds, scale.windows, scenarios=SCENARIOS)
+    return of_cell(name, cell, SCENARIOS, who, seeds, scale.windows)
 
 
 def named(estimator: str, dwell: int, rule: str, strength: float) -> str:

@@ -1,9 +1,7 @@
 """RQ1: placing T2 and T3 together against moving one stage, under CPU stress of the robots.
 
-Two comparisons, because the first mixes two things. Against ATP, whose stage, thresholds and dwell
-are tuned on seeds of their own, another rule with another estimator plays on more candidates. So
-the same rule with the same estimator also plays on the candidates between which one stage alone
-moves: what then differs is the other stage.
+Against ATP, whose stage, thresholds and dwell are tuned on seeds of their own, and against the same
+rule on the candidates between which one stage alone moves: what then differs is the other stage.
 """
 
 from __future__ import annotations
@@ -21,17 +19,18 @@ from reproduction.cell import (
     PAPERS_DTP,
     RULES,
     believing,
+    best,
+    of_cell,
     on_and_off,
     rules,
+    scores,
     statics,
-    study_of,
     with_candidates,
     with_scenarios,
 )
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
-from reproduction.tuning import best, scores
-from reproduction.verdicts import Answer, by_policy, compare, policies
+from reproduction.verdicts import Answer, by_policy, claims
 
 TITLE = "RQ1: Does placing T2 and T3 together reduce V_D further than moving one stage (ATP)?"
 
@@ -55,12 +54,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     stressed = with_scenarios(cell, stress_scenarios(cell))
     tuning = run(tuning_study(stressed, scale))
     score = scores(tuning.runs, "violation_rate")
-    who = tuning.study.contenders
-    adaptive = [one for one in who if one.name not in cell.candidates]
-    overall = best(adaptive, score)
-    static = best([one for one in who if one.name in cell.candidates], score).name
+    placed = statics(cell)
+    grid = tuning.study.contenders[len(placed) :]
+    overall, static = best(grid, score), best(placed, score).name
     here = {
-        scenario: best(adaptive, scores(tuning.runs.filter(scenario=scenario), "violation_rate"))
+        scenario: best(grid, scores(tuning.runs.filter(scenario=scenario), "violation_rate"))
         for scenario in tuning.study.scenarios
     }
     favourites = {one.name: Contender(f"atp {one.name}", one.policy) for one in here.values()}
@@ -68,7 +66,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         tuning.study,
         name="concurrent",
         contenders=(
-            *statics(cell),
+            *placed,
             Contender("atp", "atp"),
             Contender(TUNED, overall.policy),
             *favourites.values(),
@@ -94,20 +92,18 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     )
     against = [(rule, other) for rule in RULES for other in (TUNED, BEST_HERE, static)]
     single = [(rule, f"{rule} {stage} only") for rule in RULES for stage in STAGES]
-    verdicts = [
-        compare(everybody, claim, METRICS, policies(main.scenarios, pairs), main)
-        for claim, pairs in (
-            ("T2 and T3 together beat tuned ATP", against),
-            ("Both stages beat either alone, under the same rule", single),
-        )
-    ]
-    ordered = sorted(score.items(), key=lambda item: item[1])
-    settings = pl.DataFrame(ordered, schema=["setting", "violation_rate"], orient="row")
+    asked = {
+        "T2 and T3 together beat tuned ATP": against,
+        "Both stages beat either alone, under the same rule": single,
+    }
+    tried = sorted(score.items(), key=lambda item: item[1])
+    settings = pl.DataFrame(tried, schema=["setting", "violation_rate"], orient="row")
     columns = ("violation_rate", "l95_ms", "u_robot", "u_edge", "cost", "migrations")
+    every = by_policy(everybody, columns)
     return Answer(
-        pl.concat(verdicts),
+        pl.concat(claims(everybody, METRICS, main.scenarios, asked, main)),
         {
-            "Every policy under every stress": by_policy(everybody, columns),
+            "Every policy under every stress": every,
             "ATP's settings on the held-out seeds: stage, L95 over D, U_r, U_e, N_min": settings,
         },
     )
@@ -137,11 +133,9 @@ def tuning_study(cell: Problem, scale: Scale) -> Study:
         for setting in product(*grids)
         for latency, robot, edge, dwell in (setting,)
     ]
-    who = (*statics(cell), *grid)
     scenarios = [name for name in cell.scenarios if name != "baseline"]
-    return study_of(
-        "concurrent-tuning", cell, who, scale.held_out, scale.windows, scenarios=scenarios
-    )
+    who = (*statics(cell), *grid)
+    return of_cell("concurrent-tuning", cell, scenarios, who, scale.held_out, scale.windows)
 
 
 def atp(cell: Problem, names: tuple[str, str], setting: tuple[float, ...]) -> ATP:

@@ -27,15 +27,15 @@ from dwell.study import Point, Study, paired_difference
 from reproduction.cell import (
     RULES,
     STEADY,
+    of_cell,
     rules,
     statics,
-    study_of,
     with_candidate,
     with_scenarios,
 )
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
-from reproduction.verdicts import Answer, by_policy, compare, policies, values
+from reproduction.verdicts import Answer, by_policy, claims, values
 
 TITLE = (
     "Which placement wins where, and does the one that the paper leaves out (T2 on R1, T3 on E) "
@@ -72,59 +72,41 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     four = with_candidate(cell, FOURTH, FOURTH_MOVES)
     windows = max(min(MAP_WINDOWS, scale.windows), cell.warmup_windows + 2)
     seeds, half = scale.some_seeds[:MAP_SEEDS], max(2, (scale.grid + 1) // 2)
-    mapped = Study(
-        name="dominance-map",
-        points=map_points(four, thinned(SPEEDS, scale.grid), thinned(WIDTHS_MS, scale.grid)),
-        scenarios=(*PREDICTED, STRESSED_ARM),
-        contenders=statics(four),
-        seeds=seeds,
-        windows=windows,
+    maps, led = (
+        run(Study(name, map_points(base, size), scenarios, who, seeds, windows)).runs
+        for name, base, size, scenarios, who in (
+            ("dominance-map", four, scale.grid, (*PREDICTED, STRESSED_ARM), statics(four)),
+            ("dominance-dtp", cell, half, tuple(PREDICTED), rules()[:1]),
+        )
     )
-    settled = Study(
-        name="dominance-dtp",
-        points=map_points(cell, thinned(SPEEDS, half), thinned(WIDTHS_MS, half)),
-        scenarios=tuple(PREDICTED),
-        contenders=rules()[:1],
-        seeds=seeds,
-        windows=windows,
-    )
-    maps, led = run(mapped).runs, run(settled).runs
+    without = {rule: f"{rule} without {FOURTH}" for rule in RULES}
     frames, studies = [], []
     for name, scenarios, length in (
         ("steady", steady_cases(cell), scale.windows),
         ("dynamic", {one: cell.scenarios[one] for one in CHANGING}, scale.dynamic_windows),
     ):
-        shared, more = (
-            study_of(
-                f"dominance-{many}-{name}",
-                with_scenarios(offered, scenarios),
-                who,
+        three, more = (
+            of_cell(
+                f"dominance-{count}-{name}",
+                with_scenarios(base, scenarios),
+                scenarios,
+                (*placed, *rules()),
                 scale.all_seeds,
                 length,
-                scenarios=scenarios,
             )
-            for many, offered, who in (
-                ("three", cell, rules()),
-                ("four", four, (*statics(four), *rules())),
-            )
+            for count, base, placed in (("three", cell, ()), ("four", four, statics(four)))
         )
-        without = {rule: f"{rule} without {FOURTH}" for rule in RULES}
-        frames += [
-            run(more).runs,
-            run(shared).runs.with_columns(pl.col("policy").replace_strict(without)),
-        ]
+        frames.append(run(more).runs)
+        frames.append(run(three).runs.with_columns(pl.col("policy").replace_strict(without)))
         studies.append(more)
     runs = pl.concat(frames, how="diagonal")
     names = list(dict.fromkeys(runs["scenario"]))
     others = [(FOURTH, other) for other in cell.candidates]
-    offered = [(rule, f"{rule} without {FOURTH}") for rule in RULES]
-    verdicts = [
-        compare(runs, claim, METRICS, policies(names, pairs), *studies)
-        for claim, pairs in (
-            (f"{FOURTH} that never moves beats the paper's placements", others),
-            (f"A rule is better with {FOURTH} as a fourth candidate", offered),
-        )
-    ]
+    asked = {
+        f"{FOURTH} that never moves beats the paper's placements": others,
+        f"A rule is better with {FOURTH} as a fourth candidate": list(without.items()),
+    }
+    verdicts = claims(runs, METRICS, names, asked, *studies)
     won = pl.concat([winners(maps, metric, tuple(four.candidates)) for metric in METRICS])
     papers = pl.concat([winners(maps, metric, tuple(cell.candidates)) for metric in METRICS])
     counts = won.group_by("metric", "scenario", "winner", maintain_order=True).agg(
@@ -146,16 +128,14 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 # ------------------------------------------------------------------------------ the map
 
 
-def map_points(
-    cell: Problem, speeds: Sequence[float], widths_ms: Sequence[float]
-) -> tuple[Point, ...]:
-    """Return a point for every speed of E and width of the delays."""
+def map_points(cell: Problem, size: int) -> tuple[Point, ...]:
+    """Return a point for every speed of E and width of the delays, some of them along an axis."""
     return tuple(
         Point(
             dict(zip(PARAMETERS, (speed, width_ms), strict=True)),
             with_scenarios(with_speed(cell, speed), map_scenarios(cell, width_ms)),
         )
-        for speed, width_ms in product(speeds, widths_ms)
+        for speed, width_ms in product(thinned(SPEEDS, size), thinned(WIDTHS_MS, size))
     )
 
 
@@ -211,11 +191,8 @@ def steady_cases(cell: Problem) -> dict[str, Scenario]:
 def winners(runs: pl.DataFrame, metric: str, candidates: Sequence[str]) -> pl.DataFrame:
     """Find who wins each point of the map, and by how much over the second.
 
-    Returns
-    -------
-    DataFrame
-        One row a scenario and point: the candidate with the least mean and the next; ``margin``
-        with its 95 % interval, each point by itself; ``clear`` where that is above 0.
+    One row a scenario and point: the candidate with the least mean and the next; ``margin`` with
+    its 95 % interval, each point by itself; ``clear`` where that is above 0.
     """
     keys = [*(f"parameter.{name}" for name in PARAMETERS), "scenario"]
     rows = []
@@ -240,17 +217,7 @@ def winners(runs: pl.DataFrame, metric: str, candidates: Sequence[str]) -> pl.Da
 
 
 def predicted(papers: pl.DataFrame, led: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
-    """Count the points at which the paper's predictions hold.
-
-    Parameters
-    ----------
-    papers : DataFrame
-        Winners among the paper's candidates.
-    led : DataFrame
-        Runs of DTP.
-    candidates : sequence of str
-        The paper's.
-    """
+    """Count the points at which the paper's predictions hold: of its winners, and of DTP's runs."""
     keys = ["scenario", *(f"parameter.{name}" for name in PARAMETERS)]
     means = led.group_by(keys, maintain_order=True).agg(
         pl.col(f"share_{name}").mean().alias(name) for name in candidates

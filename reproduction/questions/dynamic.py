@@ -1,10 +1,7 @@
 """Dynamic scenarios: regret over the reference in hindsight, and which part of it costs what.
 
-The aim of an adaptive policy, scenario by scenario, with a real estimator paid for: its cost is at
-most 10 % over the reference; V_D is under 5 % wherever the reference's is; it migrates no more
-than DTP. Settings are tuned on seeds of their own. The same rules with `Hindsight` are told, one
-window late, what every candidate alone showed: their regret is what rule and lag cost, and the
-rest is the estimate's.
+Settings are tuned on seeds of their own. The same rules with `Hindsight` are told, one window late,
+what every candidate alone showed: their regret is what rule and lag cost, the rest the estimate's.
 """
 
 from __future__ import annotations
@@ -29,11 +26,10 @@ from dwell.study import (
     share_interval,
     under,
 )
-from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, statics, study_of
+from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, best, of_cell, scores, statics
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale, thinned
-from reproduction.tuning import best, scores
-from reproduction.verdicts import Answer, by_policy, compare, judge, policies, values
+from reproduction.verdicts import Answer, by_policy, claims, judge, values
 
 TITLE = (
     "In dynamic scenarios, is the cost within 10 % of the reference, V_D under 5 % wherever the "
@@ -59,36 +55,32 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Measure regret, part it, and hold it against the aim."""
     tuning = run(tuning_study(cell, scale))
     chosen = tuned(tuning)
-    dynamic = regretted("dynamic", cell, contenders(cell, chosen), scale.all_seeds, scale)
+    dynamic = study_of("dynamic", cell, contenders(cell, chosen), scale)
     steady = replace(dynamic, name="dynamic-steady", scenarios=STEADY, windows=scale.windows)
     runs = pl.concat([run(study).runs for study in (dynamic, steady)])
     fractions = run(fractions_study(cell, scale))
     shadows = run(replace(study_file("shadows"), seeds=scale.some_seeds, windows=scale.windows))
     studies, scenarios = (dynamic, steady), (*DYNAMIC, *STEADY)
     others = (CUSUM, TUNED_CUSUM, WORK, ESCAPE, TUNED_DTP)
-    pairs = {
+    asked = {
         "The estimator corrected lowers DTP's regret": [
             (DTP, f"dtp+{name}") for name in ("profile", "shadow", "scaling")
         ],
         "Another rule lowers DTP's regret": [(other, DTP) for other in others],
     }
-    shadowed = [
-        (f"{name} shadows {share:g}", name) for name, share in product(cell.candidates, FRACTIONS)
-    ]
+    loaded = {
+        "Shadow jobs raise V_D": [
+            (f"{name} shadows {share:g}", name)
+            for name, share in product(cell.candidates, FRACTIONS)
+        ]
+    }
+    shadowed = shadows.study
     verdicts = [
         *aims(runs, tuple(cell.candidates), studies),
-        *(
-            compare(runs, claim, ("regret",), policies(scenarios, mine), *studies)
-            for claim, mine in pairs.items()
-        ),
-        compare(
-            shadows.runs,
-            "Shadow jobs raise V_D",
-            ("violation_rate",),
-            policies(shadows.study.scenarios, shadowed),
-            shadows.study,
-        ),
+        *claims(runs, ("regret",), scenarios, asked, *studies),
+        *claims(shadows.runs, ("violation_rate",), shadowed.scenarios, loaded, shadowed),
     ]
+    nodes = [f"node_{name}" for name in cell.fabric.nodes]
     return Answer(
         pl.concat(verdicts),
         {
@@ -98,9 +90,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             "Shares of cycles that are sent through each alternative": by_policy(
                 fractions.runs, ("regret",)
             ),
-            "Placements with shadow jobs": by_policy(
-                shadows.runs, ("violation_rate", *(f"node_{n}" for n in cell.fabric.nodes))
-            ),
+            "Placements with shadow jobs": by_policy(shadows.runs, ("violation_rate", *nodes)),
         },
     )
 
@@ -108,13 +98,10 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 # --------------------------------------------------------------------------------- studies
 
 
-def regretted(
-    name: str, cell: Problem, who: Sequence[Contender], seeds: Sequence[int], scale: Scale
-) -> Study:
+def study_of(name: str, cell: Problem, who: Sequence[Contender], scale: Scale) -> Study:
     """Return a study of the dynamic scenarios, with references."""
-    return study_of(
-        name, cell, who, seeds, scale.dynamic_windows, scenarios=DYNAMIC, references=True
-    )
+    long = (scale.all_seeds, scale.dynamic_windows)
+    return of_cell(name, cell, DYNAMIC, who, *long, references=True)
 
 
 def tuning_study(cell: Problem, scale: Scale) -> Study:
@@ -145,7 +132,7 @@ def tuning_study(cell: Problem, scale: Scale) -> Study:
         )
         for dwell, improvement in product(thinned((0, 1, 3), size), thinned((0.05, 0.2, 0.4), size))
     ]
-    return regretted("dynamic-tuning", cell, who, scale.held_out, scale)
+    return replace(study_of("dynamic-tuning", cell, who, scale), seeds=scale.held_out)
 
 
 def tuned(tuning: StudyResult) -> dict[str, Contender]:
@@ -187,7 +174,7 @@ def fractions_study(cell: Problem, scale: Scale) -> Study:
         )
         for policy, share in product(("dtp", "cusum"), (0.0, *FRACTIONS))
     ]
-    return regretted("dynamic-fractions", cell, who, scale.some_seeds, scale)
+    return replace(study_of("dynamic-fractions", cell, who, scale), seeds=scale.some_seeds)
 
 
 # ----------------------------------------------------------------------------------- aims
@@ -195,13 +182,9 @@ def fractions_study(cell: Problem, scale: Scale) -> Study:
 
 def reference_rates(runs: pl.DataFrame, scenario: str, candidates: Sequence[str]) -> np.ndarray:
     """V_D of the reference, one a seed: of the cheapest candidate or clairvoyant sequence."""
+    known = (*candidates, *REFERENCES)
     costs, rates = (
-        np.stack(
-            [
-                values(runs, column, scenario=scenario, policy=name)
-                for name in (*candidates, *REFERENCES)
-            ]
-        )
+        np.stack([values(runs, column, scenario=scenario, policy=name) for name in known])
         for column in ("cost", "violation_rate")
     )
     found: np.ndarray = rates[costs.argmin(axis=0), np.arange(rates.shape[1])]
@@ -256,6 +239,7 @@ def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
             "best_static": static,
         }
         for column, sample in shown.items():
-            row |= mean_interval(sample).columns(column)
+            known = mean_interval(sample)
+            row |= {column: known.value, f"{column}_low": known.low, f"{column}_high": known.high}
         rows.append(row)
     return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)

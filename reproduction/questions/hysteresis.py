@@ -1,10 +1,7 @@
 """Dwell and threshold: what they buy in calm, and what they cost in reaction.
 
-N_min windows without a decision after each move bound the migrations of K windows by
-⌊K / (N_min + 1)⌋, whatever the metrics do: a property of the rule, and no finding. What it buys is
-one: a policy that may not move cannot chatter, and cannot react either. Two settings beside them
-are tried: `escape` (an incumbent over a cap may leave early) and cold migrations (a moved task
-waits for its state and its start), which make every move dearer.
+Two settings beside them are tried: `escape` (an incumbent over a cap may leave early) and cold
+migrations (a moved task waits for its state and its start), which make every move dearer.
 """
 
 from __future__ import annotations
@@ -16,10 +13,10 @@ from itertools import product
 import polars as pl
 
 from dwell.model import FrozenDict, Problem
-from reproduction.cell import PAPERS_DTP, believing, by_length, study_of
+from reproduction.cell import PAPERS_DTP, believing, by_length, of_cell
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, by_policy, compare, policies
+from reproduction.verdicts import Answer, by_policy, claims
 
 TITLE = "Does hysteresis calm DTP without making it worse?"
 
@@ -100,11 +97,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         ),
     ):
         studies = [
-            study_of(name + suffix, problem, who, seeds, windows, scenarios=mine, references=True)
+            of_cell(name + suffix, problem, mine, who, seeds, windows, references=True)
             for suffix, mine, windows in by_length(scenarios, scale.windows, scale.dynamic_windows)
         ]
         runs = pl.concat([run(study).runs for study in studies])
-        verdicts.append(compare(runs, claim, METRICS, policies(scenarios, pairs), *studies))
+        verdicts += claims(runs, METRICS, scenarios, {claim: pairs}, *studies)
         columns = ("migrations", "returns", "cost", "regret", "violation_rate", "l95_ms")
         tables[f"{claim}: every setting"] = by_policy(runs, columns)
     return Answer(pl.concat(verdicts), tables)

@@ -1,20 +1,7 @@
 """Jitter of the links as an axis: how much of it offloading bears.
 
-A message's delay is 0.7 ms (a round trip of 1.4 ms, within the paper's 1 to 2 ms) and an extra that
-is even on [0, w]: w is the *envelope*, the bound within which a network keeps its delays, which is
-what TSN is about. Jitter cannot make a delay shorter, so that a wider envelope is a longer mean as
-well; beside every point stands one whose extra is constant at w/2. What the two differ in is due
-to variation alone.
-
-References
-----------
-* TSN scheduled: below 1 µs is what industrial networks for motion aim for; with IEEE 802.1Qbv a
-  mean jitter of 63 ns was measured, best effort on the same switches 16 µs, at most 120 µs
-  (vernetzte-adaptive-produktion.de/en/Results/tsn.html).
-* LAN as in the cell, and the frames of other cameras that it queues behind: docs/canonical-cell.md.
-* Wi-Fi: EdgeDroid, uplink 6.1 ms (standard deviation 2.9), downlink 2.6 ms (docs/real-traces.md).
-* 5G: private standalone network, 95 % of the downlink delays within 4 to 10 ms (core.ac.uk,
-  work 150354694).
+A message's delay is 0.7 ms and an extra that is even on [0, w]: w is the envelope. Beside every
+point stands one whose extra is constant at w/2: what the two differ in is due to variation alone.
 """
 
 from __future__ import annotations
@@ -78,18 +65,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         .with_columns(spread=pl.lit(name))
         for name in ("jitter", "jitter-mean")
     )
+    rate, beyond = ("violation_rate",), "Variation raises V_D beyond its mean"
     verdicts = [
-        compare(runs, "Offloading pays", ("cost", "violation_rate"), offloading(widths), spread),
-        compare(
-            runs, "A wider envelope raises V_D", ("violation_rate",), wider(spread, widths), spread
-        ),
-        compare(
-            both,
-            "Variation raises V_D beyond its mean",
-            ("violation_rate",),
-            varying(mean, widths),
-            mean,
-        ),
+        compare(runs, "Offloading pays", ("cost", *rate), offloading(widths), spread),
+        compare(runs, "A wider envelope raises V_D", rate, wider(spread, widths), spread),
+        compare(both, beyond, rate, varying(mean, widths), mean),
         *(turning(runs, scenario, widths, spread) for scenario in SCENARIOS),
     ]
     return Answer(
@@ -156,47 +136,52 @@ def with_delay(cell: Problem, delay_ms: Process) -> Problem:
 def offloading(widths: Sequence[float]) -> Pairs:
     """Return offloading both stages beside none, at every envelope."""
     return {
-        (f"{scenario}, w = {width:g} ms", OFFLOADED, LOCAL): between(
-            scenario, OFFLOADED, LOCAL, **{AT: width}
-        )
+        (at(scenario, width), OFFLOADED, LOCAL): between(scenario, OFFLOADED, LOCAL, **{AT: width})
         for scenario, width in product(SCENARIOS, widths)
     }
 
 
 def wider(study: Study, widths: Sequence[float]) -> Pairs:
     """Return every envelope beside the narrowest."""
-    pairs: dict[tuple[str, str, str], tuple[dict[str, object], dict[str, object]]] = {}
-    for scenario, policy, width in product(SCENARIOS, study.policies, widths[1:]):
-        labels: dict[str, object] = {"scenario": scenario, "policy": policy}
-        names = (f"{scenario}, w = {width:g} ms", policy, f"{policy}, w = {widths[0]:g} ms")
-        pairs[names] = ({**labels, AT: width}, {**labels, AT: widths[0]})
-    return pairs
+    first = widths[0]
+    return {
+        (at(scenario, width), policy, f"{policy}, w = {first:g} ms"): (
+            {"scenario": scenario, "policy": policy, AT: width},
+            {"scenario": scenario, "policy": policy, AT: first},
+        )
+        for scenario, policy, width in product(SCENARIOS, study.policies, widths[1:])
+    }
 
 
 def varying(study: Study, widths: Sequence[float]) -> Pairs:
     """Return delays as they are beside all of them at their mean."""
-    pairs: dict[tuple[str, str, str], tuple[dict[str, object], dict[str, object]]] = {}
+    found: dict[tuple[str, str, str], tuple[dict[str, object], dict[str, object]]] = {}
     for scenario, policy, width in product(SCENARIOS, study.policies, widths):
         labels: dict[str, object] = {"scenario": scenario, "policy": policy, AT: width}
-        names = (f"{scenario}, w = {width:g} ms", policy, f"{policy}, delays at their mean")
-        pairs[names] = ({**labels, "spread": "jitter"}, {**labels, "spread": "jitter-mean"})
-    return pairs
+        names = (at(scenario, width), policy, f"{policy}, delays at their mean")
+        found[names] = ({**labels, "spread": "jitter"}, {**labels, "spread": "jitter-mean"})
+    return found
+
+
+def at(scenario: str, width: float) -> str:
+    """Name of a scenario at an envelope."""
+    return f"{scenario}, w = {width:g} ms"
 
 
 def turning(
     runs: pl.DataFrame, scenario: str, widths: Sequence[float], study: Study
 ) -> pl.DataFrame:
     """Judge up to which envelope offloading costs less by J: the median over seeds."""
-    offloaded, local = (
-        np.stack(
-            [
-                values(runs, "cost", scenario=scenario, policy=policy, **{AT: width})
-                for width in widths
-            ]
-        )
-        for policy in (OFFLOADED, LOCAL)
+    here = runs.filter(scenario=scenario)
+    excess = np.stack(
+        [
+            np.subtract(
+                *(values(here, "cost", policy=who, **{AT: w}) for who in (OFFLOADED, LOCAL))
+            )
+            for w in widths
+        ]
     )
-    known = median_interval([turning_point(widths, one) for one in (offloaded - local).T])
+    known = median_interval([turning_point(widths, one) for one in excess.T])
     word = "cannot tell"
     if known.known:
         within = known.low > 0 and np.isfinite(known.high)
@@ -207,20 +192,10 @@ def turning(
 
 
 def turning_point(widths: Sequence[float], excess: np.ndarray) -> float:
-    """Width at which an excess over zero begins and stays.
+    """Width at which an excess over zero begins and stays; widths ascend, above 0.
 
-    Parameters
-    ----------
-    widths : sequence of float
-        Ascending, above 0.
-    excess : float64 array
-        At each of them; at or above 0 offloading is worse.
-
-    Returns
-    -------
-    float
-        By linear interpolation over the logarithm between the last width with an excess below 0
-        and the next; 0 where there is none below, infinite where the last is below.
+    By linear interpolation over the logarithm between the last width with an excess below 0 and
+    the next; 0 where there is none below, infinite where the last is below.
     """
     last = max((index for index, value in enumerate(excess) if value < 0), default=None)
     if last is None:

@@ -13,7 +13,7 @@ import polars as pl
 
 import dwell
 from dwell.study import Contender, longest_run
-from reproduction.cell import EXAMPLES, PAPERS_DTP, believing, rules, statics, study_of
+from reproduction.cell import EXAMPLES, PAPERS_DTP, believing, of_cell, rules, statics
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, by_policy, compare, policies, under_aim
@@ -29,13 +29,10 @@ def answer(traces: Path, scale: Scale, run: Run) -> Answer:
     frames, studies = [], []
     for file in CELLS:
         cell = dwell.load(EXAMPLES / file, traces=traces)
-        study = study_of(
-            f"real-{cell.name.removeprefix('real-')}",
-            cell,
-            (*statics(cell), Contender("atp", "atp"), believing("dtp", "profile"), *rules()),
-            scale.all_seeds,
-            longest_run(cell, scale.windows),
-        )
+        who = (*statics(cell), Contender("atp", "atp"), believing("dtp", "profile"), *rules())
+        windows = longest_run(cell, scale.windows)
+        name = f"real-{cell.name.removeprefix('real-')}"
+        study = of_cell(name, cell, cell.scenarios, who, scale.all_seeds, windows)
         # One frame for both: a scenario is called after its cell, too.
         called = pl.format("{}: {}", pl.lit(cell.name), pl.col("scenario"))
         frames.append(run(study).runs.with_columns(scenario=called))

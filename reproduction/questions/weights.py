@@ -1,17 +1,6 @@
 """RQ4: the five weights of J: how much DTP's results depend on them, in every scenario.
 
-Two designs. A Sobol design varies all five together, each over a factor of four to either side of
-the cell's value, evenly in the logarithm: weights are exchange rates, of which factors and not
-differences mean something. The other design changes one weight at a time, to nothing, a half and
-the double. The rule is the same where all five weights *and* the threshold Δ_min are multiplied by
-one number; Δ_min is kept, so that five weights are four exchange rates and a scale against Δ_min.
-
-The variance of an output is parted among the weights (Sobol 2001, DOI
-10.1016/S0378-4754(00)00270-6), with Saltelli's design (2010, DOI 10.1016/j.cpc.2009.09.018), by
-SALib. What is analysed contains no weight that is varied: V_D, L95, migrations, the tracking error,
-and J by the cell's own weights, which says what it costs to weigh otherwise. A changed weight may
-turn one decision, after which everything differs: `luck` estimates the part of the variance over
-weights that is that of the few realisations that were played.
+All five together in a Sobol design, and one at a time: see README.md.
 """
 
 from __future__ import annotations
@@ -25,7 +14,7 @@ from SALib.sample import sobol as sampling
 
 from dwell.model import Problem
 from dwell.study import Contender, StudyResult
-from reproduction.cell import DYNAMIC, STEADY, believing, by_length, study_of
+from reproduction.cell import DYNAMIC, STEADY, believing, by_length, of_cell
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, compare, policies
@@ -57,17 +46,15 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     shares = sampling.sample(SALIB, scale.sobol_n, calc_second_order=False, scramble=True, seed=1)
     weights = np.array([getattr(cell.objective.weights, name) for name in WEIGHTS])
     rows = weights / FACTOR * (FACTOR * FACTOR) ** shares
-    seeds = range(1, scale.sobol_seeds + 1)
     together = [
-        study_of(f"weights{suffix}", cell, weighing(rows), seeds, windows, scenarios=mine)
+        of_cell(f"weights{suffix}", cell, mine, weighing(rows), seeds, windows)
+        for seeds in (tuple(range(1, scale.sobol_seeds + 1)),)
         for suffix, mine, windows in by_length(
             (*STEADY, *DYNAMIC), scale.sobol_windows, scale.dynamic_windows
         )
     ]
     alone = [
-        study_of(
-            f"weights-one{suffix}", cell, stepping(cell), scale.all_seeds, windows, scenarios=mine
-        )
+        of_cell(f"weights-one{suffix}", cell, mine, stepping(cell), scale.all_seeds, windows)
         for suffix, mine, windows in by_length(ONE_AT_A_TIME, scale.windows, scale.dynamic_windows)
     ]
     swept = pl.concat([indices(run(study), scale.sobol_n) for study in together])
@@ -155,18 +142,11 @@ def indices(result: StudyResult, n: int) -> pl.DataFrame:
 
 
 def luck(outputs: np.ndarray) -> float:
-    """Share of an output's variance over points that other seeds would not repeat.
+    """Share of an output's variance over points that other seeds would not repeat; at most 1.
 
-    Parameters
-    ----------
-    outputs : float64 array, shape (seeds, points)
-
-    Returns
-    -------
-    float
-        What seeds and points make only together, in a two-way table without replication, divided
-        by the number of seeds and by the variance of the mean over seeds; at most 1. NaN for one
-        seed, 0 where nothing varies.
+    `outputs` has a row a seed and a column a point. What the two make only together, in a two-way
+    table without replication, is divided by the number of seeds and by the variance of the mean
+    over seeds. NaN for one seed, 0 where nothing varies.
     """
     seeds, points = outputs.shape
     if seeds < 2:
