@@ -24,7 +24,7 @@ __all__ = [
     "L95_ALLOWED",
     "POINTS_ALLOWED",
     "USE_ALLOWED",
-    "Judge",
+    "GroupJudge",
     "Judged",
     "Outcome",
     "chance",
@@ -127,7 +127,7 @@ class Both(NamedTuple):
         return within(float(relative(self.guess, self.value)), relative(self.said, self.seen))
 
 
-class Judge:
+class GroupJudge:
     """Judges the figures of a group, all from the same resamples.
 
     Parameters

@@ -28,7 +28,7 @@ from dwell.display import Displayed
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem
 from dwell.study.job_times import finished_jobs, job_times
-from dwell.study.judged_prediction import Judge, Judged, Outcome, worst
+from dwell.study.judged_prediction import GroupJudge, Judged, Outcome, worst
 from dwell.study.measured_run import MeasuredRun, Simulated, Simulator, Unit, read_measured
 from dwell.study.qos_sample import Piece, QosSample, piece_of
 from dwell.study.software import versions
@@ -288,7 +288,7 @@ def _group(
     problem = mine[0].problem
     measured = QosSample.of(own, problem, by_window=True)
     predicted = QosSample.of([one.piece for one in simulated], problem, by_window=False)
-    judge = Judge(problem, measured, predicted, *_sums(mine, own, problem))
+    judge = GroupJudge(problem, measured, predicted, *_sums(mine, own, problem))
     figures = judge.figures()
     cycles = sum(piece.cycles.height for piece in own)
     group = Group(
