@@ -15,9 +15,9 @@ from dwell.study import Study, StudyResult, open_study, run_study
 from reproduction.cell import paper_cell
 from reproduction.page import Question, page
 from reproduction.questions import QUESTIONS, Run
-from reproduction.scale import FULL, QUICK, TINY, Scale
+from reproduction.scale import Scale, scale_of
 
-SCALES = {"full": FULL, "quick": QUICK, "tiny": TINY}
+SCALES = ("full", "quick", "tiny")
 REAL = "real"
 
 
@@ -29,7 +29,7 @@ def main(words: list[str]) -> int:
         parser.error(
             f"question {REAL!r} replays recorded traces; say where they are: --real FOLDER"
         )
-    scale = SCALES[asked.scale]
+    scale = scale_of(asked.scale)
     if asked.seeds is not None:
         scale = replace(scale, seeds=asked.seeds)
     out: Path = asked.out or Path("studies", f"paper-{asked.scale}")

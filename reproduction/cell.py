@@ -11,28 +11,6 @@ import polars as pl
 from dwell.model import Episodes, Exponential, FrozenDict, Placement, Problem, Scenario
 from dwell.study import Contender, Point, Study, load_study
 
-__all__ = [
-    "DYNAMIC",
-    "EXAMPLES",
-    "PAPERS_DTP",
-    "RANDOM",
-    "RULES",
-    "STEADY",
-    "TIMETABLE",
-    "believing",
-    "best",
-    "by_length",
-    "of_cell",
-    "on_and_off",
-    "paper_cell",
-    "rules",
-    "scores",
-    "statics",
-    "with_candidate",
-    "with_candidates",
-    "with_scenarios",
-]
-
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
 #: One placement is best from the first cycle to the last.
@@ -96,6 +74,11 @@ def believing(
 ) -> Contender:
     """Return a policy with an estimator, called ``dtp+corrected`` unless it is given a name."""
     return Contender(name or f"{policy}+{estimator}", policy, estimator, settings or {})
+
+
+def dtp(name: str, settings: Mapping[str, object]) -> Contender:
+    """Return DTP with the estimator corrected and other settings than the cell's."""
+    return Contender(name, "dtp", "corrected", settings)
 
 
 def statics(problem: Problem) -> tuple[Contender, ...]:

@@ -11,8 +11,6 @@ import polars as pl
 
 from reproduction.verdicts import Answer, counted
 
-__all__ = ["Question", "page"]
-
 #: Metrics that are written in per cent.
 SHARES = (
     "violation_rate",
@@ -35,32 +33,10 @@ class Question(NamedTuple):
     answer: Answer
 
 
-class _Column(NamedTuple):
-    name: str
-    number: bool
-
-
-class _Table(NamedTuple):
-    title: str
-    columns: list[_Column]
-    rows: list[list[str]]
-
-
 def page(
     questions: list[Question], *, scale: str, version: str, pictures: Sequence[str] = ()
 ) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    questions : list of Question
-    scale : str
-        Name of the scale, ``full`` or ``quick``.
-    version : str
-        Of Dwell.
-    pictures : sequence of str
-        Studies that have a page of figures, ``runs/STUDY/report.html``.
-    """
+    """Return the page; `pictures` are studies that have figures, ``runs/STUDY/report.html``."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -80,14 +56,14 @@ def page(
     return template.render(questions=shown, scale=scale, version=version, pictures=pictures)
 
 
-def _table(title: str, frame: pl.DataFrame) -> _Table:
+def _table(title: str, frame: pl.DataFrame) -> dict[str, object]:
     """Return a frame as texts; the ends of an interval stand behind its value."""
     ends = {f"{name}{end}" for name in frame.columns for end in ("_low", "_high")}
     ends |= {"low", "high"} if "effect" in frame.columns else set()
     names = [name for name in frame.columns if name not in ends]
-    columns = [_Column(name, frame[name].dtype.is_numeric()) for name in names]
+    columns = [{"name": name, "number": frame[name].dtype.is_numeric()} for name in names]
     rows = [[_cell(name, row) for name in names] for row in frame.iter_rows(named=True)]
-    return _Table(title, columns, rows)
+    return {"title": title, "columns": columns, "rows": rows}
 
 
 def _cell(name: str, row: Mapping[str, object]) -> str:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-
-__all__ = ["FULL", "QUICK", "TINY", "Scale", "thinned"]
+import yaml
 
 Value = TypeVar("Value")
+
+SCALES = Path(__file__).parent / "scales.yaml"
 
 #: Seeds that parameters are tuned on begin after this one; no comparison uses them.
 HELD_OUT = 1000
@@ -69,41 +71,9 @@ class Scale:
         return tuple(range(HELD_OUT + 1, HELD_OUT + 1 + min(self.tuning_seeds, 5)))
 
 
-FULL = Scale(
-    seeds=20,
-    windows=150,
-    dynamic_windows=300,
-    grid=9,
-    grid_seeds=12,
-    sobol_n=32,
-    sobol_seeds=3,
-    sobol_windows=60,
-    tuning_seeds=10,
-)
-#: Every question is asked, and hardly anything can be shown.
-QUICK = Scale(
-    seeds=3,
-    windows=20,
-    dynamic_windows=60,
-    grid=3,
-    grid_seeds=2,
-    sobol_n=2,
-    sobol_seeds=2,
-    sobol_windows=15,
-    tuning_seeds=2,
-)
-#: The least that every design works with; its numbers mean nothing.
-TINY = Scale(
-    seeds=2,
-    windows=7,
-    dynamic_windows=7,
-    grid=2,
-    grid_seeds=2,
-    sobol_n=2,
-    sobol_seeds=2,
-    sobol_windows=7,
-    tuning_seeds=2,
-)
+def scale_of(name: str) -> Scale:
+    """Return a scale of ``scales.yaml``."""
+    return Scale(**yaml.safe_load(SCALES.read_text(encoding="utf-8"))[name])
 
 
 def thinned(values: Sequence[Value], count: int) -> tuple[Value, ...]:

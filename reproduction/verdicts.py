@@ -15,20 +15,6 @@ import polars as pl
 
 from dwell.study import AIM, Family, Interval, Study, over_seeds, under
 
-__all__ = [
-    "Answer",
-    "Pairs",
-    "between",
-    "by_policy",
-    "claims",
-    "compare",
-    "counted",
-    "judge",
-    "policies",
-    "under_aim",
-    "values",
-]
-
 #: Groups of runs that are compared, by (scenario, first, second): what is in their columns.
 Pairs: TypeAlias = Mapping[tuple[str, str, str], tuple[Mapping[str, object], Mapping[str, object]]]
 

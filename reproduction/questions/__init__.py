@@ -11,8 +11,6 @@ from typing import TypeAlias
 
 from dwell.study import Study, StudyResult, load_study
 
-__all__ = ["QUESTIONS", "Run", "study_file"]
-
 QUESTIONS = (
     "table",
     "dynamic",

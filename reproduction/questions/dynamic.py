@@ -6,7 +6,7 @@ what every candidate alone showed: their regret is what rule and lag cost, the r
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -26,7 +26,17 @@ from dwell.study import (
     share_interval,
     under,
 )
-from reproduction.cell import DYNAMIC, PAPERS_DTP, STEADY, believing, best, of_cell, scores, statics
+from reproduction.cell import (
+    DYNAMIC,
+    PAPERS_DTP,
+    STEADY,
+    believing,
+    best,
+    dtp,
+    of_cell,
+    scores,
+    statics,
+)
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale, thinned
 from reproduction.verdicts import Answer, by_policy, claims, judge, values
@@ -55,7 +65,8 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Measure regret, part it, and hold it against the aim."""
     tuning = run(tuning_study(cell, scale))
     chosen = tuned(tuning)
-    dynamic = study_of("dynamic", cell, contenders(cell, chosen), scale)
+    who = contenders(cell, chosen)
+    dynamic = study_of("dynamic", cell, who, scale.all_seeds, scale.dynamic_windows)
     steady = replace(dynamic, name="dynamic-steady", scenarios=STEADY, windows=scale.windows)
     runs = pl.concat([run(study).runs for study in (dynamic, steady)])
     fractions = run(fractions_study(cell, scale))
@@ -98,10 +109,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 # --------------------------------------------------------------------------------- studies
 
 
-def study_of(name: str, cell: Problem, who: Sequence[Contender], scale: Scale) -> Study:
+def study_of(
+    name: str, cell: Problem, who: Iterable[Contender], seeds: tuple[int, ...], windows: int
+) -> Study:
     """Return a study of the dynamic scenarios, with references."""
-    long = (scale.all_seeds, scale.dynamic_windows)
-    return of_cell(name, cell, DYNAMIC, who, *long, references=True)
+    return of_cell(name, cell, DYNAMIC, who, seeds, windows, references=True)
 
 
 def tuning_study(cell: Problem, scale: Scale) -> Study:
@@ -124,15 +136,10 @@ def tuning_study(cell: Problem, scale: Scale) -> Study:
         for threshold, slack, memory in product(*(thinned(grid, size) for grid in grids))
     ]
     who += [
-        believing(
-            "dtp",
-            "corrected",
-            {"controller.min_dwell": dwell, "controller.min_improvement": improvement},
-            name=f"dtp {dwell} {improvement:g}",
-        )
-        for dwell, improvement in product(thinned((0, 1, 3), size), thinned((0.05, 0.2, 0.4), size))
+        dtp(f"dtp {n} {least:g}", {"controller.min_dwell": n, "controller.min_improvement": least})
+        for n, least in product(thinned((0, 1, 3), size), thinned((0.05, 0.2, 0.4), size))
     ]
-    return replace(study_of("dynamic-tuning", cell, who, scale), seeds=scale.held_out)
+    return study_of("dynamic-tuning", cell, who, scale.held_out, scale.dynamic_windows)
 
 
 def tuned(tuning: StudyResult) -> dict[str, Contender]:
@@ -166,15 +173,11 @@ def contenders(cell: Problem, chosen: Mapping[str, Contender]) -> tuple[Contende
 def fractions_study(cell: Problem, scale: Scale) -> Study:
     """Return what more or fewer shadow jobs are worth to a rule."""
     who = [
-        believing(
-            policy,
-            "corrected",
-            {"controller.shadow_fraction": share},
-            name=f"{policy}+corrected {share:g}",
-        )
+        Contender(name, policy, "corrected", {"controller.shadow_fraction": share})
         for policy, share in product(("dtp", "cusum"), (0.0, *FRACTIONS))
+        for name in (f"{policy}+corrected {share:g}",)
     ]
-    return replace(study_of("dynamic-fractions", cell, who, scale), seeds=scale.some_seeds)
+    return study_of("dynamic-fractions", cell, who, scale.some_seeds, scale.dynamic_windows)
 
 
 # ----------------------------------------------------------------------------------- aims
@@ -208,10 +211,8 @@ def aims(
         found.append(judge(*rate, share_interval(rates), word, *studies))
         for other in (PAPERS_DTP, DTP):
             if other != name:
-                moves = (
-                    values(runs, "migrations", scenario=scenario, policy=who)
-                    for who in (name, other)
-                )
+                here = runs.filter(scenario=scenario)
+                moves = (values(here, "migrations", policy=who) for who in (name, other))
                 more = mean_interval(np.subtract(*moves))
                 claim = (f"No more migrations than {other}", scenario, name, "migrations")
                 found.append(judge(*claim, more, within(more, 0.0), *studies))
@@ -232,13 +233,8 @@ def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
             [values(runs, "regret", scenario=scenario, policy=one) for one in candidates], axis=0
         )
         row: dict[str, object] = {"scenario": scenario, "policy": name}
-        shown = {
-            "regret": mine,
-            "rule_and_lag": rule,
-            "estimate": mine - rule,
-            "best_static": static,
-        }
-        for column, sample in shown.items():
+        shown = {"regret": mine, "rule_and_lag": rule, "estimate": mine - rule}
+        for column, sample in (shown | {"best_static": static}).items():
             known = mean_interval(sample)
             row |= {column: known.value, f"{column}_low": known.low, f"{column}_high": known.high}
         rows.append(row)

@@ -13,7 +13,8 @@ from itertools import product
 import polars as pl
 
 from dwell.model import FrozenDict, Problem
-from reproduction.cell import PAPERS_DTP, believing, by_length, of_cell
+from dwell.study import Contender
+from reproduction.cell import PAPERS_DTP, believing, by_length, dtp, of_cell
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, by_policy, claims
@@ -32,6 +33,7 @@ COLD = ("flapping", "mixture", "step")
 START_MS, STATE_BYTES = 500.0, 20_000_000
 
 METRICS = ("migrations", "cost", "violation_rate")
+COSTS = "A cold migration costs more than a warm one"
 #: Policies whose migrations are tried cold: the policy, its estimator and settings.
 MOVERS: Mapping[str, tuple[str, str, Mapping[str, object]]] = {
     PAPERS_DTP: ("dtp", "profile", {}),
@@ -48,56 +50,30 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     dwells = FEW_DWELLS if scale.coarse else DWELLS
     thresholds = FEW_THRESHOLDS if scale.coarse else THRESHOLDS
     grid = [
-        believing(
-            "dtp",
-            "corrected",
-            {"controller.min_dwell": dwell, "controller.min_improvement": threshold},
-            name=grid_name(dwell, threshold),
-        )
-        for dwell, threshold in product(dwells, thresholds)
+        dtp(grid_name(n, least), {"controller.min_dwell": n, "controller.min_improvement": least})
+        for n, least in product(dwells, thresholds)
     ]
     escaping = [
         believing("dtp", belief, {"controller.escape": on}, name=escape_name(belief, on))
         for belief, on in product(("profile", "corrected"), (False, True))
     ]
     moving = [
-        believing(
-            policy, belief, {**settings, "controller.migration": kind}, name=f"{name}, {kind}"
-        )
-        for (name, (policy, belief, settings)), kind in product(MOVERS.items(), ("warm", "cold"))
+        Contender(f"{name}, {kind}", policy, belief, {**more, "controller.migration": kind})
+        for (name, (policy, belief, more)), kind in product(MOVERS.items(), ("warm", "cold"))
     ]
+    calmer = [(grid_name(*one), grid_name(*NONE)) for one in SETTINGS]
+    freer = [(escape_name(one, True), escape_name(one, False)) for one in ("profile", "corrected")]
+    dearer = [(f"{one}, cold", f"{one}, warm") for one in MOVERS]
     verdicts, tables = [], {}
     for name, claim, problem, scenarios, who, seeds, pairs in (
-        (
-            "hysteresis",
-            "Hysteresis calms DTP, against none",
-            cell,
-            SCENARIOS,
-            grid,
-            scale.some_seeds,
-            [(grid_name(*one), grid_name(*NONE)) for one in SETTINGS],
-        ),
-        (
-            "hysteresis-escape",
-            "Escape helps DTP",
-            cell,
-            ESCAPES,
-            escaping,
-            scale.all_seeds,
-            [(escape_name(one, True), escape_name(one, False)) for one in ("profile", "corrected")],
-        ),
-        (
-            "hysteresis-cold",
-            "A cold migration costs more than a warm one",
-            heavy(cell),
-            COLD,
-            moving,
-            scale.all_seeds,
-            [(f"{one}, cold", f"{one}, warm") for one in MOVERS],
-        ),
+        ("", "Hysteresis calms DTP, against none", cell, SCENARIOS, grid, scale.some_seeds, calmer),
+        ("-escape", "Escape helps DTP", cell, ESCAPES, escaping, scale.all_seeds, freer),
+        ("-cold", COSTS, heavy(cell), COLD, moving, scale.all_seeds, dearer),
     ):
         studies = [
-            of_cell(name + suffix, problem, mine, who, seeds, windows, references=True)
+            of_cell(
+                f"hysteresis{name}{suffix}", problem, mine, who, seeds, windows, references=True
+            )
             for suffix, mine, windows in by_length(scenarios, scale.windows, scale.dynamic_windows)
         ]
         runs = pl.concat([run(study).runs for study in studies])

@@ -14,7 +14,7 @@ from SALib.sample import sobol as sampling
 
 from dwell.model import Problem
 from dwell.study import Contender, StudyResult
-from reproduction.cell import DYNAMIC, STEADY, believing, by_length, of_cell
+from reproduction.cell import DYNAMIC, STEADY, by_length, dtp, of_cell
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, compare, policies
@@ -22,13 +22,7 @@ from reproduction.verdicts import Answer, compare, policies
 TITLE = "RQ4: Does it matter how the five weights are chosen?"
 
 #: The weights of an objective, and what the paper calls them.
-WEIGHTS = {
-    "latency": "α_L",
-    "violations": "α_V",
-    "robot": "α_r",
-    "edge": "α_e",
-    "switching": "α_S",
-}
+WEIGHTS = {"latency": "α_L", "violations": "α_V", "robot": "α_r", "edge": "α_e", "switching": "α_S"}
 #: The cell's weights are multiplied, and divided, by at most this.
 FACTOR = 4.0
 OUTPUTS = ("violation_rate", "l95_ms", "migrations", "tracking_rms_mm", "cost")
@@ -69,16 +63,9 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 
 def weighing(rows: np.ndarray) -> tuple[Contender, ...]:
     """Return a DTP for every row of a design."""
+    paths = [f"objective.weights.{name}" for name in WEIGHTS]
     return tuple(
-        believing(
-            "dtp",
-            "corrected",
-            {
-                f"objective.weights.{name}": float(value)
-                for name, value in zip(WEIGHTS, row, strict=True)
-            },
-            name=f"{index:04d}",
-        )
+        dtp(f"{index:04d}", dict(zip(paths, map(float, row), strict=True)))
         for index, row in enumerate(rows)
     )
 
@@ -87,15 +74,10 @@ def stepping(cell: Problem) -> tuple[Contender, ...]:
     """Return a DTP with the cell's weights, and one for every step of one of them."""
     weights = cell.objective.weights
     changed = [
-        believing(
-            "dtp",
-            "corrected",
-            {f"objective.weights.{name}": getattr(weights, name) * factor},
-            name=f"{symbol} {step}",
-        )
+        dtp(f"{symbol} {step}", {f"objective.weights.{name}": getattr(weights, name) * factor})
         for (name, symbol), (step, factor) in product(WEIGHTS.items(), STEPS.items())
     ]
-    return (believing("dtp", "corrected", name=AS_IT_IS), *changed)
+    return (dtp(AS_IT_IS, {}), *changed)
 
 
 def indices(result: StudyResult, n: int) -> pl.DataFrame:
@@ -121,21 +103,13 @@ def indices(result: StudyResult, n: int) -> pl.DataFrame:
             )
         low, middle, high = np.quantile(mean, (0.05, 0.5, 0.95))
         for index, symbol in enumerate(WEIGHTS.values()):
-            row: dict[str, object] = {
-                "scenario": scenario,
-                "metric": output,
-                "weight": symbol,
-                "low": low,
-                "median": middle,
-                "high": high,
-                "luck": luck(outputs) if finite else None,
-            }
+            row: dict[str, object] = {"scenario": scenario, "metric": output, "weight": symbol}
+            row |= {"low": low, "median": middle, "high": high}
+            row["luck"] = luck(outputs) if finite else None
             for name in ("S1", "ST"):
-                value, half = (
-                    (float(found[name][index]), float(found[f"{name}_conf"][index]))
-                    if found is not None
-                    else (np.nan, np.nan)
-                )
+                value = half = np.nan
+                if found is not None:
+                    value, half = float(found[name][index]), float(found[f"{name}_conf"][index])
                 row |= {name: value, f"{name}_low": value - half, f"{name}_high": value + half}
             rows.append(row)
     return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
