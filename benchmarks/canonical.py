@@ -10,8 +10,6 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import ROOT, Stopwatch, Took, in_turns, shared_core
 from dwell.model import Problem
 
-__all__ = ["CELL", "PARTS", "length", "measure", "simulate_in_parts"]
-
 CELL = ROOT / "examples" / "canonical.yaml"
 SCENARIOS = ("baseline", "edge-cpu-stress")
 PARTS = ("draw", "play and decide", "tables")

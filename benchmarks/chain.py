@@ -20,8 +20,6 @@ from benchmarks.timing import Took, in_turns, ratios, run_program, shared_core
 from dwell import Run
 from dwell.model import Problem
 
-__all__ = ["measure"]
-
 HERE = Path(__file__).parent
 CELL = HERE / "peer-chain.yaml"
 CPP = ("g++", "-O3", "-march=native", "-std=c++17")

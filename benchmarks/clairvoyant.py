@@ -11,8 +11,6 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, shared_core, took
 from dwell.study.clairvoyant import clairvoyant
 
-__all__ = ["measure"]
-
 WINDOWS, CANDIDATES = 10_000, 3
 DWELLS = (0, 3, 10)
 GOAL = Goal(high=50)

@@ -17,8 +17,6 @@ from dwell.model import Problem
 from dwell.sim.arrays import lay_out
 from dwell.sim.engine import play
 
-__all__ = ["measure"]
-
 COUNTS = (1, 3, 6, 12, 24)
 
 

@@ -33,8 +33,6 @@ from dwell.model import (
     Weights,
 )
 
-__all__ = ["measure"]
-
 WINDOW_CYCLES = 100
 
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-__all__ = ["Figure", "Goal", "Section", "as_json", "print_sections"]
-
 
 @dataclass(frozen=True, slots=True)
 class Goal:

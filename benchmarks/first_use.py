@@ -17,8 +17,6 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.machine import available_cores
 from benchmarks.timing import ROOT, run_module
 
-__all__ = ["measure"]
-
 
 def measure(quick: bool) -> Section:
     """Seconds of the first simulation of a process, with an empty and with a filled cache."""

@@ -16,8 +16,6 @@ from dwell.model import Problem
 from dwell.sim.arrays import Arrays, lay_out
 from dwell.sim.engine import play
 
-__all__ = ["measure"]
-
 SIZES = (1, 8, 64)
 SHARED = "E"
 CANDIDATE = "SO"

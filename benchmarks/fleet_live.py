@@ -56,8 +56,6 @@ from dwell.record import open_run
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["measure"]
-
 SIZES = (1, 10, 20, 30, 40, 50, 75, 100)
 #: Cells whose windows all close at once.
 AT_ONCE = (10, 25, 50)

@@ -28,8 +28,6 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import wire
 
-__all__ = ["SIZES", "Hops", "hops"]
-
 #: Bytes, and messages of a burst of that size.
 SIZES = {1_000: 100, 100_000: 100, 1_000_000: 30}
 PAUSE_S = 0.003

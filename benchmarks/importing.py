@@ -11,8 +11,6 @@ from importlib.util import find_spec
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, run_program
 
-__all__ = ["measure"]
-
 GOAL = Goal(high=0.3)
 
 

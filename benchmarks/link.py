@@ -16,8 +16,6 @@ from dwell.model import Constant
 from dwell.testbed.linked_transport import LinkedTransport
 from dwell.testbed.message_links import LinkEnds, LinkFile
 
-__all__ = ["measure"]
-
 NODES = ("R1", "E")
 SIZES = {"200 bytes": 200, "300 kB": 300_000}
 #: Keys of a message that meets its link at the sender, and of one that meets it at the receiver.

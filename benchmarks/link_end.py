@@ -24,8 +24,6 @@ from dwell.live.wiring import SESSIONS, Locator, Role, Session, WiringEntry
 from dwell.testbed.linked_transport import LinkedTransport
 from dwell.testbed.message_links import LinkEnds
 
-__all__ = ["Specification", "paced"]
-
 STAMP_BYTES = 8
 # What comes later than that after the last was sent has been lost.
 PATIENCE_S = 1.5

@@ -23,8 +23,6 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import ARRIVED, NUMBER, LightCell, document
 from dwell.record import open_run
 
-__all__ = ["decision", "moves", "share"]
-
 PERIOD_MS = 40.0
 DELAY_MS = 5.0
 #: Controllers of one cell at 25 Hz are meant to take less of a core.

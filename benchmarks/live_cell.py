@@ -27,8 +27,6 @@ from dwell.live.worker import Worker
 from dwell.model import Problem
 from dwell.testbed.loopback import Loopback, on_this_machine
 
-__all__ = ["ARRIVED", "NUMBER", "Applied", "LightCell", "document", "problem_of"]
-
 #: Where the actuator writes, and what: cycle, release, and the instant of the call.
 OBSERVED = "DWELL_BENCH_OBSERVED"
 RECORD = struct.Struct("<qqq")

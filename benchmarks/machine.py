@@ -9,8 +9,6 @@ from pathlib import Path
 
 from dwell import __version__
 
-__all__ = ["available_cores", "describe", "pin"]
-
 
 def available_cores() -> list[int]:
     """Cores that this process may use; one nameless core where the system does not say."""

@@ -11,8 +11,6 @@ from benchmarks.canonical import CELL
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import run_module
 
-__all__ = ["measure"]
-
 STATUS = Path("/proc/self/status")
 
 

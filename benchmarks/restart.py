@@ -28,8 +28,6 @@ from dwell.model.document import to_document
 from dwell.testbed.burner import Burner
 from dwell.testbed.chaos.stalls import StallDetector
 
-__all__ = ["measure"]
-
 EXAMPLE = ROOT / "examples" / "live" / "cell.yaml"
 #: Where the cell is pinned; the workers of E have no cycles then.
 HOME = "LOC"

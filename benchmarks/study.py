@@ -14,8 +14,6 @@ from pathlib import Path
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import ROOT, run_module
 
-__all__ = ["measure"]
-
 STUDY = ROOT / "benchmarks" / "study.yaml"
 CORES = 2
 QUICK = 4

@@ -27,8 +27,6 @@ from dwell.testbed.hosts import Hosts
 from dwell.testbed.link import Passed, TunLink
 from dwell.testbed.message_links import LinkFile
 
-__all__ = ["measure"]
-
 ROOT = Path(__file__).resolve().parents[1]
 NODES = "A", "B"
 AB = "A", "B"

@@ -13,18 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-__all__ = [
-    "ROOT",
-    "Stopwatch",
-    "Took",
-    "in_turns",
-    "ratios",
-    "run_module",
-    "run_program",
-    "shared_core",
-    "took",
-]
-
 #: Folder from which `python -m benchmarks...` works.
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -28,8 +28,6 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wiring import SESSIONS, Locator, Role, WiringEntry
 
-__all__ = ["measure"]
-
 #: What each message begins with, and each answer is: a number and an instant.
 MARK = struct.Struct("<qq")
 HEADER = bytes(300)

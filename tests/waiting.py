@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-__all__ = ["PATIENCE_S", "wait_until"]
-
 # Longer than a machine under load ever takes: what does not come until then does not come.
 PATIENCE_S = 20.0
 

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Generic, NamedTuple, TypeVar
 
-__all__ = ["Explored", "Rules", "Step", "ViolationError", "explore", "report", "stuck", "without"]
-
 State = TypeVar("State", bound=Hashable)
 
 

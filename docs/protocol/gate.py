@@ -12,8 +12,6 @@ from typing import NamedTuple, TypeAlias
 
 from docs.protocol.checker import Rules, Step, report
 
-__all__ = ["RULES", "Limits", "State", "good", "initial", "successors"]
-
 #: What can be left out.
 RULES = {
     "reservation": "numbers are reserved before they are used, and left out after a restart",

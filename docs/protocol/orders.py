@@ -27,8 +27,6 @@ from typing import NamedTuple, TypeVar
 
 from docs.protocol.checker import Rules, Step, report
 
-__all__ = ["CASES", "RULES", "Limits", "State", "good", "initial", "successors"]
-
 #: Candidates: the guard's first fallback, where the controllers would like to be, and a third one,
 #: its second fallback.
 FALLBACK, WANTED, OTHER = "LOC", "SO", "HYB"

@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 from docs.protocol.checker import Rules, Step, report
 
-__all__ = ["CASES", "RULES", "Limits", "State", "good", "initial", "successors"]
-
 NODES = "A", "B"
 
 #: What can be left out.

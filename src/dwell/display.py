@@ -5,8 +5,6 @@ Both are made by `dwell.report`, which is imported when something is shown.
 
 from __future__ import annotations
 
-__all__ = ["Displayed"]
-
 
 class Displayed:
     """Has a summary, and in a notebook a picture with its numbers."""

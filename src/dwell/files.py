@@ -7,8 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
-__all__ = ["Content", "write_whole"]
-
 #: What a file shall hold, or what writes it to the path that it is given.
 Content: TypeAlias = bytes | str | Callable[[Path], object]
 

@@ -10,8 +10,6 @@ from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.model import Problem
 
-__all__ = ["dynamic_problem"]
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 

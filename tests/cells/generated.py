@@ -43,8 +43,6 @@ from dwell.model import (
 from dwell.model.objective import Tier
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
-__all__ = ["make_problem", "make_realisation", "random_problem", "random_stamps"]
-
 MS = 1_000_000
 # Turns are those of threads on one core with a quota that is noticed at ticks.
 Scheduler = Literal["fair", "fifo", "priority", "turns"]

@@ -10,8 +10,6 @@ import yaml
 
 from tests.cells import light_stages
 
-__all__ = ["document", "write_cell"]
-
 QUOTAS = {"R1": 0.4, "E": 0.8, "R2": 0.4}
 TASKS = {
     "sensing": ["R1"],

@@ -32,8 +32,6 @@ from dwell.model import (
 from dwell.study import Comparison
 from dwell.study.summary import latency_grid_ms
 
-__all__ = ["SEEDS", "make_comparison", "make_problem"]
-
 SEEDS = tuple(range(1, 9))
 CANDIDATES = ("LOC", "SO", "HYB")
 # What a run shows unless a test says otherwise.

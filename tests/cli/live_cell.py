@@ -23,8 +23,6 @@ from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 
-__all__ = ["EXAMPLE", "MOODY", "PATIENCE_S", "RealCell"]
-
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "live"
 PATIENCE_S = 60.0

@@ -22,8 +22,6 @@ from dwell.model import (
 from dwell.model.fabric import Scheduler
 from tests.cells.generated import make_problem
 
-__all__ = ["DISTURBED", "MOVES", "TASKS", "cell", "truth"]
-
 TASKS = {
     "sense": {"R": 2.0},
     "act": {"R": 8.0, "E": 3.0},

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from dwell.estimators import Evidence, Instants
 from dwell.estimators.evidence import UNKNOWN
 
-__all__ = ["MS", "Row", "instants", "window"]
-
 MS = 1_000_000
 
 #: Of one cycle: readiness and end of each job, then arrival of each message.

@@ -34,13 +34,11 @@ from dwell.live.trust.roster import Roster
 from dwell.live.trust.signing import Seals
 from tests.live.small_world import Bench, Passing, World
 
-__all__ = ["KINDS", "NODES", "TARGETS", "FrozenError", "ReachedError", "seeds"]
-
 NODES = ("R1", "E", "R2")
 KINDS: tuple[type[msgspec.Struct], ...] = tuple(
-    found
-    for name in messages.__all__
-    if isinstance(found := getattr(messages, name), type) and issubclass(found, msgspec.Struct)
+    kind
+    for kind in vars(messages).values()
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 )
 STAMP = messages.Stamp(1, 5, 1, "LOC", 0)
 HOP = messages.Hop("sensing", "R1", 1, 2, 3, (("stamper", 1),))

@@ -21,17 +21,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dwell.errors import DwellError
-from tests.live.real_cell import (
-    FAULTS,
-    HOMES,
-    PERIOD_MS,
-    Fault,
-    Outcome,
-    RealCell,
-    StallDetector,
-    mixed,
-    strike,
-)
+from dwell.testbed.chaos.faults import Fault
+from dwell.testbed.chaos.light_cell import HOMES, PERIOD_MS
+from dwell.testbed.chaos.stalls import StallDetector
+from dwell.testbed.chaos.strike import Outcome
+from tests.live.real_cell import FAULTS, RealCell, mixed, strike
 
 #: Faults that one cell goes through before another is started.
 A_CELL = 60

@@ -21,17 +21,6 @@ from dwell.errors import LiveError
 from dwell.live.transport.expressions import matcher, require_key
 from dwell.live.transport.transport import Arrival, Lane, Receive
 
-__all__ = [
-    "STALLED_MESSAGES",
-    "Clock",
-    "Delivery",
-    "MemoryTransport",
-    "Network",
-    "NetworkConditions",
-    "Participant",
-    "Reach",
-]
-
 #: Says who may hear whom: names of sender and receiver, lane, key.
 Reach: TypeAlias = Callable[[str, str, Lane, str], bool]
 

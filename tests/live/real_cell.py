@@ -13,7 +13,6 @@ from dwell.testbed.chaos.faults import Fault, How
 from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
 from dwell.testbed.chaos.light_cell import (
     GUARD_CYCLES,
-    HOMES,
     MAX_AGE_MS,
     MIN_DWELL,
     PERIOD_MS,
@@ -24,18 +23,6 @@ from dwell.testbed.chaos.stalls import StallDetector
 from dwell.testbed.chaos.strike import Outcome, beyond
 from dwell.testbed.chaos.strike import strike as strike_by
 from dwell.testbed.loopback import Loopback, on_this_machine
-
-__all__ = [
-    "FAULTS",
-    "HOMES",
-    "PERIOD_MS",
-    "Fault",
-    "Outcome",
-    "RealCell",
-    "StallDetector",
-    "mixed",
-    "strike",
-]
 
 
 class RealCell(Harness):

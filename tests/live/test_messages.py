@@ -41,7 +41,9 @@ from dwell.model.document import fingerprint
 from tests.live.small_world import EXEC_MS, Bench, Counting, Passing, World
 
 KINDS: tuple[type[msgspec.Struct], ...] = tuple(
-    found for name in messages.__all__ if isinstance(found := getattr(messages, name), type)
+    kind
+    for kind in vars(messages).values()
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 )
 STAMP = Stamp(1, 5, 1, "LOC", 0)
 

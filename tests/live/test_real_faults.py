@@ -15,18 +15,11 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
-from dwell.testbed.chaos.light_cell import MAX_AGE_MS
-from tests.live.real_cell import (
-    FAULTS,
-    HOMES,
-    PERIOD_MS,
-    Fault,
-    Outcome,
-    RealCell,
-    StallDetector,
-    mixed,
-    strike,
-)
+from dwell.testbed.chaos.faults import Fault
+from dwell.testbed.chaos.light_cell import HOMES, MAX_AGE_MS, PERIOD_MS
+from dwell.testbed.chaos.stalls import StallDetector
+from dwell.testbed.chaos.strike import Outcome
+from tests.live.real_cell import FAULTS, RealCell, mixed, strike
 
 pytestmark = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2,

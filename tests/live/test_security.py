@@ -15,9 +15,10 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from dwell.errors import LiveError, TrustError
 from dwell.live.keys import Keys
-from dwell.live.security import INSECURE, KEYS, Security
+from dwell.live.security import INSECURE, Security
 from dwell.live.transport.transport import Arrival
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
+from dwell.live.trust import KEYS
 from dwell.live.trust.authority import Authority, _general_name, _pem
 from dwell.live.trust.roster import Subject, write_private
 from dwell.live.wiring import Locator, Role, WiringEntry, wire

@@ -24,23 +24,6 @@ from dwell.control import Guard, Presence, Probation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
-__all__ = [
-    "ITSELF",
-    "SHADOW",
-    "CycleResult",
-    "JobResult",
-    "Result",
-    "Split",
-    "Usage",
-    "WindowResult",
-    "apart",
-    "attempt_uniform",
-    "control",
-    "shadow_stamp",
-    "simulate",
-    "transmission_ns",
-]
-
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000
 COMPLETION, ARRIVAL, START, REPEAT, DISTURBANCE, RESTART, STEP, CLOSE, GUARD, RELEASE = range(1, 11)

@@ -14,8 +14,6 @@ from typer.testing import CliRunner
 from dwell.cli.commands import app
 from dwell.cli.exit_codes import ExitCode
 
-__all__ = ["FILE", "HELPS", "helps", "surface"]
-
 FILE = Path(__file__).parent / "data" / "commands.txt"
 HELPS = FILE.with_name("helps.txt")
 #: A terminal's.

@@ -11,8 +11,6 @@ import polars as pl
 
 import dwell
 
-__all__ = ["EXPECTED", "FOLDER", "facts"]
-
 FOLDER = Path(__file__).parent / "data" / "old-runs"
 EXPECTED = FOLDER / "facts.json"
 

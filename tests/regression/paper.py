@@ -7,8 +7,6 @@ from pathlib import Path
 
 import polars as pl
 
-__all__ = ["FULL", "KEYS", "METRICS", "QUICK", "means", "read", "write"]
-
 DATA = Path(__file__).parent / "data"
 QUICK, FULL = DATA / "paper-quick.csv", DATA / "paper-full.csv"
 #: `parameters` are those of a study that has some, as `name=value` with a space between.

@@ -17,8 +17,6 @@ from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
 from dwell.policies.registry import REGISTRY as POLICIES
 
-__all__ = ["EXAMPLES", "Case", "cases", "play", "read", "write"]
-
 ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parent / "data"
 EXAMPLES = ("canonical", "fan-in", "cloud", "live/cell", "visual_servoing/testbed")

@@ -10,8 +10,6 @@ from dwell import Run
 from dwell.model.document import to_document
 from tests.cells.small import make_problem
 
-__all__ = ["PERIOD_NS", "live_run"]
-
 PERIOD_NS = 33_000_000
 #: Of 6 windows of 10 cycles, with two lead cycles before the fourth, and what moved it.
 PLACED = ("LOC", "LOC", "SO", "LOC", "LOC", "LOC")

@@ -13,8 +13,6 @@ from dwell.report.table import Table
 from dwell.study import Comparison, compare
 from tests.cells.small import make_problem
 
-__all__ = ["Page", "facts_of", "small_comparison", "small_run", "table_of"]
-
 VOID = {"meta", "br", "img", "link", "use", "input", "hr", "col"}
 
 

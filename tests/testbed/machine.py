@@ -11,8 +11,6 @@ from dwell.model import Quota
 from dwell.testbed.groups import Groups, Share
 from dwell.testbed.hosts import Hosts
 
-__all__ = ["CPU", "no_groups", "no_hosts", "own_name"]
-
 CPU = max(os.sched_getaffinity(0))
 _numbers = count()
 

@@ -12,8 +12,6 @@ from dwell.model import Problem
 from dwell.record import seal_run
 from dwell.testbed.idle import Idle, Quiet
 
-__all__ = ["ALWAYS_IDLE", "SimulatedRuns"]
-
 
 def ALWAYS_IDLE(quiet: Quiet) -> Idle:  # noqa: N802 (stands for a value)
     """Say that the machine is idle, without looking."""

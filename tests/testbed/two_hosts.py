@@ -11,8 +11,6 @@ from itertools import count
 from dwell.errors import LiveError
 from dwell.testbed.hosts import Hosts, within
 
-__all__ = ["NODES", "TwoHosts", "two_hosts", "why_not"]
-
 NODES = "A", "B"
 PATIENCE_S = 20.0
 

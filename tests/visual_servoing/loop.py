@@ -99,6 +99,3 @@ class Loop:
 
 def rms(errors: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(errors**2)))
-
-
-__all__ = ["PERIOD_NS", "Loop", "rms"]

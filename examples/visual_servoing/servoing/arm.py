@@ -17,8 +17,6 @@ from .messages import Command
 from .scene import Axes, axes
 from .world import Motion, World
 
-__all__ = ["Arm"]
-
 
 class Arm:
     """Applies commands; each is followed until the next one, within the limits of the drives.

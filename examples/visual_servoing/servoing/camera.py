@@ -29,8 +29,6 @@ from .messages import Pose
 from .scene import Array, Scene, axes, rotation
 from .world import World
 
-__all__ = ["Picture", "Renderer", "Sensing", "read_mark", "write_mark"]
-
 #: Pixels of 8 bits: height x width, or a row of a JPEG's bytes.
 Picture: TypeAlias = NDArray[np.uint8]
 

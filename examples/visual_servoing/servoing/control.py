@@ -14,8 +14,6 @@ from dwell.live.stage import Message
 from .messages import Command, Plan
 from .scene import Array, axes
 
-__all__ = ["Control", "velocities"]
-
 
 def velocities(plan: Plan, since_ns: Array) -> Array:
     """Return a plan's velocities.

@@ -11,8 +11,6 @@ import math
 
 from .world import World
 
-__all__ = ["ErrorSampler"]
-
 SAMPLE_NS = 25_000_000
 #: Samples of one stretch, for which a root mean square is kept.
 SAMPLES = 10

@@ -28,8 +28,6 @@ from scipy import sparse
 
 from .scene import Array, Scene
 
-__all__ = ["Horizon", "HorizonSettings", "Motions"]
-
 #: Out of view by this much costs half as much again as the first of it would alone.
 _SLACK_M = 0.002
 

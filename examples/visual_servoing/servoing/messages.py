@@ -11,8 +11,6 @@ import msgspec
 
 from .scene import Axes
 
-__all__ = ["Command", "Plan", "Pose"]
-
 
 class Pose(msgspec.Struct, array_like=True, frozen=True):
     """Where the tag was, seen from the camera, and where the camera was itself.

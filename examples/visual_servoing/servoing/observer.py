@@ -9,8 +9,6 @@ from pathlib import Path
 from .error_sampler import ErrorSampler
 from .world import World
 
-__all__ = ["TrackingObserver"]
-
 #: The arm comes from its home, and first has to get to the tag.
 SETTLED_NS = 3_000_000_000
 

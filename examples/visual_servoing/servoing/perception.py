@@ -19,8 +19,6 @@ from .camera import Picture, read_mark
 from .messages import Pose
 from .scene import Array, Scene
 
-__all__ = ["Perception"]
-
 # Numbers 0 to 29 are in use here: a detector compares whatever looks like a tag with all it knows.
 _TAGS = 30
 # The solver wants the square in a frame whose y points up and z at the camera; ours is turned by

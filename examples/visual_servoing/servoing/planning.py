@@ -23,8 +23,6 @@ from .messages import Plan, Pose
 from .scene import Array, Scene, axes, rotation
 from .tracking import Track, predicted, updated
 
-__all__ = ["Planning", "in_world"]
-
 # A plan that old says nothing any more of what the arm does now.
 _FOLLOWED_STEPS = 3
 

@@ -16,8 +16,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["AXES", "Array", "Axes", "Camera", "Limits", "Scene", "axes", "rotation"]
-
 Array: TypeAlias = NDArray[np.float64]
 #: One value for each of `AXES`: metres and radians, or those a second.
 Axes: TypeAlias = tuple[float, float, float, float]

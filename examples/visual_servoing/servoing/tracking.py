@@ -16,8 +16,6 @@ import numpy as np
 
 from .scene import Array, Axes, axes
 
-__all__ = ["Track", "predicted", "updated"]
-
 #: Of x, y, z and yaw: what the tag's acceleration is like, and what the measurement's noise is.
 _ACCELERATION = np.array([0.8, 0.8, 0.4, 4.0])
 _NOISE = np.array([0.0004, 0.0004, 0.0015, 0.004])

@@ -30,8 +30,6 @@ from dwell.model.instants import NEVER_NS
 
 from .scene import Array, Axes, Limits, Scene
 
-__all__ = ["Motion", "World", "Worth"]
-
 _MAGIC = b"dwell-world-1\n"
 _FRONT_BYTES = 2048
 _RECORDS = 64

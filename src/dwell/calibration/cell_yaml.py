@@ -9,8 +9,6 @@ from pathlib import Path
 
 from dwell.calibration.profile_file import Measurement
 
-__all__ = ["cell_yaml"]
-
 # What YAML reads as this very text also inside of { }.
 PLAIN = re.compile(r"[A-Za-z_][\w./+@-]*(?:->[\w.+-]+)?")
 # Words that YAML, of any version, takes for something else.

@@ -6,8 +6,6 @@ import traceback
 from pathlib import Path
 from types import TracebackType
 
-__all__ = ["blamed", "raised_here"]
-
 LONGEST = 300
 
 

@@ -11,8 +11,6 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["MachineConditions", "MachineCounters", "processor"]
-
 
 @dataclass(frozen=True, slots=True)
 class MachineConditions:

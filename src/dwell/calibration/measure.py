@@ -32,8 +32,6 @@ from dwell.calibration.profile_file import Measurement, stamp, task_name
 from dwell.errors import MeasurementError
 from dwell.model.bounds import MAX_COUNT, PERIOD_MS, Bound
 
-__all__ = ["Pace", "Settings", "Timing", "measure_task", "time_runs", "undisturbed_collector"]
-
 RUNS = Bound(1, MAX_COUNT, whole=True)
 WARMUP = Bound(0, MAX_COUNT, whole=True)
 EMPTY_RUNS = 1000

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from dwell.errors import ProfileError
 
-__all__ = ["choose_cores", "pinned"]
-
 RANGE = re.compile(r"(\d{1,6})(?:-(\d{1,6}))?")
 
 

@@ -22,17 +22,6 @@ from dwell.errors import ProfileError
 from dwell.files import write_whole
 from dwell.model.semantics import LONGEST_NAME, NAME
 
-__all__ = [
-    "Measurement",
-    "link_name",
-    "merge_profiles",
-    "read_profile",
-    "require_free",
-    "stamp",
-    "task_name",
-    "write_profile",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 KEY = "dwell.profile"

@@ -35,8 +35,6 @@ from dwell.calibration.profile_file import Measurement, link_name, stamp
 from dwell.errors import MeasurementError, ProfileError
 from dwell.model.bounds import RATE_MBPS, Bound
 
-__all__ = ["MAX_BYTES", "RoundTrips", "listen", "measure_link", "parse_address", "time_round_trips"]
-
 HEADER = struct.Struct("!4sIQ")
 MAGIC = b"DWL1"
 MAX_BYTES = 64_000_000

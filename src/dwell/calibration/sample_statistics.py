@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from dwell.calibration.profile_file import Measurement
 
-__all__ = ["Statistics", "describe", "find_doubts", "percentile"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 # Above these a measurement is called into question. A busy loop on a core of its own was taken

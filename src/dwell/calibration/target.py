@@ -13,8 +13,6 @@ from pathlib import Path
 from dwell.calibration.error_origin import blamed
 from dwell.errors import ProfileError
 
-__all__ = ["find_callable", "importable_from"]
-
 
 @contextmanager
 def importable_from(folder: Path) -> Iterator[None]:

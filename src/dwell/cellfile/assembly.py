@@ -61,8 +61,6 @@ from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.semantics import CellParts, find_faults
 from dwell.policies import registry as policies
 
-__all__ = ["Assembly"]
-
 # Keys of a disturbance that belong to one kind of it.
 NODE_KEYS = ("stress_threads",)
 LINK_KEYS = ("both_ways", "add_delay_ms", "loss", "rate_mbps")

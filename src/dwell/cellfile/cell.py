@@ -19,8 +19,6 @@ from dwell.model import Problem
 if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables
 
-__all__ = ["from_document", "from_record", "load", "load_without_traces", "read_problem"]
-
 
 def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None) -> Problem:
     """Read a cell file.

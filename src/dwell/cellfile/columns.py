@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from dwell.errors import installing
 
-__all__ = ["SUFFIXES", "FileColumn", "UnreadableError", "column_names", "read_columns"]
-
 Values: TypeAlias = "NDArray[np.float64] | NDArray[np.object_]"
 
 SUFFIXES = (".parquet", ".csv")

@@ -7,8 +7,6 @@ from typing import NoReturn, ParamSpec, TypeAlias, TypeVar
 
 from dwell.errors import Fault, ProblemError, TraceError
 
-__all__ = ["Faults", "Step", "dotted"]
-
 P = ParamSpec("P")
 T = TypeVar("T")
 Step: TypeAlias = str | int

@@ -28,26 +28,6 @@ from dwell.model import bounds
 from dwell.model.bounds import Bound
 from dwell.policies.registry import REGISTRY as POLICIES
 
-__all__ = [
-    "BurstsEntry",
-    "CellEntry",
-    "ControllerEntry",
-    "DisturbanceEntry",
-    "Entry",
-    "EpisodesEntry",
-    "ExecutionEntry",
-    "FlowEntry",
-    "LinkEntry",
-    "LiveEntry",
-    "NodeEntry",
-    "Number",
-    "ObjectiveEntry",
-    "ProcessEntry",
-    "ServoEntry",
-    "TaskEntry",
-    "TraceEntry",
-]
-
 JsonSchema = dict[str, Any]
 
 

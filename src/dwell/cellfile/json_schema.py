@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pydantic_core.core_schema import NullableSchema
 
-__all__ = ["schema"]
-
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of the cell file.

@@ -6,8 +6,6 @@ import math
 
 from dwell.model.bounds import shown
 
-__all__ = ["as_read"]
-
 
 def as_read(value: object) -> str:
     """Return a value as its author wrote it, or what it is where it is no single value."""

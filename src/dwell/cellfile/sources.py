@@ -7,8 +7,6 @@ from collections.abc import Iterable, Iterator
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 
-__all__ = ["digest_of"]
-
 
 def digest_of(names: Iterable[str]) -> str:
     """Return 16 hexadecimal digits that change with any Python file among several.

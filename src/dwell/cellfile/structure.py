@@ -24,8 +24,6 @@ from dwell.model import bounds
 from dwell.model.document import VERSION
 from dwell.model.semantics import nearest
 
-__all__ = ["CELL", "Form", "read_structure"]
-
 MAX_DEPTH = 40
 
 E = TypeVar("E", bound=Entry)

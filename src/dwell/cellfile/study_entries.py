@@ -15,8 +15,6 @@ from dwell.cellfile.rendering import as_read
 from dwell.cellfile.structure import Form
 from dwell.model.bounds import MAX_COUNT, Bound
 
-__all__ = ["STUDY", "StudyEntry"]
-
 VERSION = 1
 
 WINDOWS = Bound(1, MAX_COUNT, whole=True)

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from dwell.cellfile.study_entries import StudyEntry
     from dwell.cellfile.traces import Tables
 
-__all__ = ["DeclaredPoint", "DeclaredPolicy", "DeclaredStudy", "Value", "read_study"]
-
 WINDOWS = 300
 SEEDS = tuple(range(1, 21))
 # Every point is read and checked before the first run.

@@ -14,8 +14,6 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.semantics import nearest
 
-__all__ = ["SETTINGS", "put", "steps_of", "with_settings"]
-
 #: Where the settings of a policy are: what they change is drawn nowhere.
 SETTINGS = ("controller.", "objective.")
 

@@ -22,8 +22,6 @@ from dwell.model.bounds import VALUE
 from dwell.model.document import digest
 from dwell.model.semantics import nearest
 
-__all__ = ["Reading"]
-
 Floats: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
 Frame: TypeAlias = Mapping[str, FileColumn]

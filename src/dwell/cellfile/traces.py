@@ -15,8 +15,6 @@ from dwell.cellfile.document_faults import Faults, Step, dotted
 from dwell.cellfile.entries import CellEntry, Entry, TraceEntry
 from dwell.model import TraceTable
 
-__all__ = ["Source", "Tables", "declared_traces", "read_traces"]
-
 DEFAULT_TIME = "sent_ms"
 
 

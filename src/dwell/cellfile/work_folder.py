@@ -19,8 +19,6 @@ from dwell.cellfile.rendering import as_read
 from dwell.errors import RunError, SimulationError
 from dwell.files import write_whole
 
-__all__ = ["Description", "FolderMark", "claimed", "unwritable"]
-
 # How many differences from other work are listed.
 LISTED = 4
 

@@ -16,8 +16,6 @@ import yaml
 
 from dwell.cellfile.document_faults import Faults, Step, dotted
 
-__all__ = ["read_yaml"]
-
 MAX_BYTES = 4_000_000
 MAX_DEPTH = 40
 MAX_VALUES = 100_000

@@ -26,8 +26,6 @@ from dwell.testbed.execution import Play, State, run_campaign
 from dwell.testbed.playing import interruptible
 from dwell.testbed.timeline import require_playable_scenario
 
-__all__ = ["report_campaign", "run_campaign_file"]
-
 PAGE = "report.html"
 
 

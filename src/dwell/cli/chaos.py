@@ -12,8 +12,6 @@ import typer
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.output import json_text, print_json, write_file
 
-__all__ = ["run_chaos"]
-
 #: A folder with this file is a campaign's, and may be replaced by the next.
 MARK = ".dwell-chaos"
 

@@ -20,8 +20,6 @@ from dwell.model import Problem, Trace
 from dwell.model.user_classes import is_class_path
 from dwell.policies import by_name as make_policy
 
-__all__ = ["check_cell", "find_warnings"]
-
 #: Draws of a process that a percentile is taken of, and their seed.
 DRAWS, SEED = 10_000, 1
 

@@ -18,8 +18,6 @@ from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
 
-__all__ = ["check_node"]
-
 PACKAGES = {"zenoh": "eclipse-zenoh", "msgspec": "msgspec", "psutil": "psutil"}
 
 

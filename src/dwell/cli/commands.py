@@ -45,8 +45,6 @@ from dwell.errors import (
     missing_package,
 )
 
-__all__ = ["app"]
-
 # A TraceError is a ProblemError.
 MISTAKES = (
     ProblemError,

@@ -14,8 +14,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-__all__ = ["LINE", "Shell", "answer", "completions", "script"]
-
 #: Variable of the environment with the line up to the cursor.
 LINE = "DWELL_COMPLETE"
 

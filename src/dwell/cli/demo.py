@@ -16,8 +16,6 @@ from dwell.report import comparison_html, comparison_text
 from dwell.study import Comparison, StudyResult, canonical_demo, real_demo, tenants_demo
 from dwell.study.demo import CANONICAL, REAL, WINDOWS
 
-__all__ = ["run_demo"]
-
 
 def run_demo(
     real: Path | None,

@@ -31,8 +31,6 @@ from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.doctor import Finding
 from dwell.testbed.pressure import Rule
 
-__all__ = ["consult", "print_findings"]
-
 #: What each extra is for.
 EXTRAS = {
     "sim": "dwell run, study, demo, validate",

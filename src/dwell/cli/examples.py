@@ -7,8 +7,6 @@ from pathlib import Path
 import dwell
 from dwell.errors import ProblemError
 
-__all__ = ["find_examples"]
-
 
 def find_examples(given: Path | None) -> Path:
     """Return the folder with the example cells.

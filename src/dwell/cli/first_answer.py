@@ -24,8 +24,6 @@ import dwell
 from dwell.cli.output import working
 from dwell.model import Problem, QoS
 
-__all__ = ["Kernels", "compile_first", "compile_kernels", "find_kernels", "prepare"]
-
 #: Cycles that are played sooner than the kernels are compiled, whatever the cell.
 SHORT_CYCLES = 30_000
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from dwell.live.trust.roster import Roster
     from dwell.model import Problem
 
-__all__ = ["keys"]
-
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the authority.")]
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Node of the cell, or another subject.")]
 Days = Annotated[int, typer.Option(help="How long certificates hold.")]

@@ -32,8 +32,6 @@ from dwell.cli.output import json_text, print_json
 if TYPE_CHECKING:
     from dwell.live.operator_client import OperatorClient
 
-__all__ = ["agent", "controller", "live"]
-
 T = TypeVar("T")
 
 #: Time between two looks of ``status --watch``.
@@ -353,7 +351,8 @@ def _ask(
 
 def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
     """Return this process's environment with what was said of its keys."""
-    from dwell.live.security import INSECURE, KEYS
+    from dwell.live.security import INSECURE
+    from dwell.live.trust import KEYS
 
     said = {KEYS: str(keys.resolve())} if keys is not None else {}
     return {**os.environ, **said, **({INSECURE: "1"} if insecure else {})}

@@ -37,8 +37,6 @@ from dwell.testbed.playing import (
 )
 from dwell.testbed.timeline import timeline_of
 
-__all__ = ["run_live"]
-
 #: A folder with this file is a live run's, and may be replaced by the next.
 MARK = ".dwell-live-run"
 #: What the cell did before everybody was there belongs to the run, up to so many seconds of it.

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-__all__ = ["Lines", "Look", "Screen", "View", "live_view"]
-
 MOST_COLUMNS = 100
 LABEL, VALUE = 10, 10
 BAR = 12

@@ -13,8 +13,6 @@ from dwell.cli.examples import find_examples
 from dwell.cli.schema import SCHEMA_FILE, schema_text
 from dwell.errors import ProblemError
 
-__all__ = ["Origin", "new_cell"]
-
 FOLDER = re.compile(r"\w[\w.+-]{0,62}")
 
 

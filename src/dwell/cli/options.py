@@ -13,27 +13,6 @@ if TYPE_CHECKING:
 
     from dwell.model import Problem
 
-__all__ = [
-    "CellArgument",
-    "CellOption",
-    "Estimator",
-    "Insecure",
-    "Json",
-    "Keys",
-    "Policy",
-    "Processes",
-    "Samples",
-    "Scenario",
-    "Seconds",
-    "Seed",
-    "Traces",
-    "Warmup",
-    "Windows",
-    "require_one_length",
-    "respelt",
-    "windows_of",
-]
-
 CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
 CellOption = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file (YAML).")]
 Traces = Annotated[

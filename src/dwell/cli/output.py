@@ -17,17 +17,6 @@ from dwell.files import write_whole
 if TYPE_CHECKING:
     from dwell.report.page import Page
 
-__all__ = [
-    "Progress",
-    "aligned",
-    "json_text",
-    "print_json",
-    "progress",
-    "working",
-    "write_file",
-    "write_report",
-]
-
 #: Takes how many are done, and of how many.
 Progress = Callable[[int, int], None]
 

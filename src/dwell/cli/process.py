@@ -20,8 +20,6 @@ from dwell.errors import DwellError, missing_package
 if TYPE_CHECKING:
     from dwell.live.hosting import Platform
 
-__all__ = ["main", "server", "words"]
-
 
 def server(cell: Path, program: Sequence[str], owner: int | None = None) -> list[str]:
     """Return the command of the process that those of a cell are forked from.

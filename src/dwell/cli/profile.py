@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from dwell.calibration.measure import Settings
     from dwell.calibration.profile_file import Measurement
 
-__all__ = ["profile"]
-
 FOLDER = Path("profiles")
 PORT = 7411
 

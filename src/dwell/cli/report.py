@@ -16,8 +16,6 @@ from dwell.report.formatting import listed
 from dwell.study.study_folder import is_study, open_study
 from dwell.testbed.execution import is_campaign
 
-__all__ = ["report_folder"]
-
 
 def report_folder(
     folder: Path,

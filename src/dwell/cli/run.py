@@ -19,8 +19,6 @@ from dwell.record import require_free
 from dwell.sim import describe
 from dwell.study.summary import STRETCHES, Row, summarise
 
-__all__ = ["run_cell"]
-
 
 def run_cell(
     problem: Problem,

@@ -10,8 +10,6 @@ import typer
 from dwell.cli.output import write_file
 from dwell.errors import ProblemError
 
-__all__ = ["SCHEMA_FILE", "schema_text", "write_schema"]
-
 #: What a cell file's first line calls its schema.
 SCHEMA_FILE = "cell.schema.json"
 

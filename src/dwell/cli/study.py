@@ -19,8 +19,6 @@ from dwell.report.formatting import Measure, shown_policy, shown_scenario, write
 from dwell.study import Interval, Study, StudyResult, load_study, run_study
 from dwell.study.over_seeds import over_seeds
 
-__all__ = ["run_study_file", "study_text"]
-
 # Groups of a point and a scenario that the terminal shows; the tables have all.
 SHOWN = 40
 

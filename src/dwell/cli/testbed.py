@@ -22,8 +22,6 @@ from dwell.cli.options import (
 )
 from dwell.cli.output import aligned, print_json
 
-__all__ = ["testbed"]
-
 Name = Annotated[str, typer.Option(help="Of the testbed, among others on this machine.")]
 
 testbed = typer.Typer(

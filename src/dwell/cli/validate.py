@@ -18,8 +18,6 @@ from dwell.report.validation_page import validation_html, validation_text
 from dwell.study.validation import GOALS, Validation, validate
 from dwell.testbed.speeds import Usual
 
-__all__ = ["sidecar_of", "validate_runs"]
-
 
 def validate_runs(
     runs: Sequence[Path],

@@ -22,8 +22,6 @@ from dwell.model.user_classes import is_class_path
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
 
-__all__ = ["ClosedWindow", "Controller", "DecisionLog", "static_columns"]
-
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 

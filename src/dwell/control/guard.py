@@ -14,8 +14,6 @@ from typing import TypeAlias
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import GUARD_CYCLES, PROBE_CYCLES, require
 
-__all__ = ["Guard", "Presence", "Probation", "parts_of", "rest_cycles"]
-
 #: However often a cell relapses, no more than this many times as many.
 MOST_DOUBLINGS = 5
 #: Windows' worth of completed cycles that make a cell healthy (see `Probation`).

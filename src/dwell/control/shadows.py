@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["shadow_stamps"]
-
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from dwell.model.instants import NEVER_NS
 
-__all__ = ["final_l95_ms", "l95_rank", "missed_cycles", "seen_l95_ns", "utilisation"]
-
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -51,8 +51,6 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
-__all__ = ["Corrected"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Half-lives after which a measured time gives way to newer ones, and after which a part that was

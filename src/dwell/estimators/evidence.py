@@ -13,8 +13,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["UNKNOWN", "Evidence", "Instants"]
-
 Ints: TypeAlias = NDArray[np.int64]
 Rows: TypeAlias = slice | NDArray[np.bool_] | NDArray[np.int64]
 

@@ -14,8 +14,6 @@ from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 
-__all__ = ["Message", "Meter", "Part", "Site", "message_of", "parts_of"]
-
 Floats: TypeAlias = NDArray[np.float64]
 Rows: TypeAlias = slice | NDArray[np.int64]
 

@@ -10,16 +10,6 @@ from numpy.typing import NDArray
 
 from dwell.model.pipeline import Flow, Pipeline
 
-__all__ = [
-    "Input",
-    "Step",
-    "l95_rank",
-    "longest_path",
-    "order_statistic",
-    "seen_windows",
-    "steps_of",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 

@@ -9,8 +9,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ENOUGH", "LARGEST", "LEAST", "Pool", "middle"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Most times that a pool holds, and fewest that it keeps however old they are.

@@ -36,15 +36,14 @@ from numpy.typing import NDArray
 from dwell.cost import SATURATED
 from dwell.errors import MetricError
 from dwell.estimators.paths import longest_path, order_statistic, steps_of
+from dwell.model.bounds import require
 from dwell.model.fabric import Link, Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.process import Process, Trace, require
+from dwell.model.process import Process, Trace
 from dwell.model.qos import QoS
-
-__all__ = ["Profile", "SampleCycles", "mean_ms"]
 
 Floats: TypeAlias = NDArray[np.float64]
 

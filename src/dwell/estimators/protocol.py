@@ -9,8 +9,6 @@ from dwell.estimators.evidence import Evidence
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
-__all__ = ["Estimator", "Learner", "Support"]
-
 
 class Support(NamedTuple):
     """How much stands behind an estimate.

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from dwell.estimators.protocol import Estimator
     from dwell.model.problem import Problem
 
-__all__ = ["GROUP", "REGISTRY", "EstimatorEntry", "by_name", "name_in_run", "names", "shadowing"]
-
 #: Group of the entry points by which other packages add estimators.
 GROUP = "dwell.estimators"
 

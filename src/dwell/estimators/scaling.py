@@ -53,8 +53,6 @@ from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.semantics import nearest
 
-__all__ = ["Scaling"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Sample cycles from which ratios and bounds are taken where none are given.

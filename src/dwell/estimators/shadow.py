@@ -28,8 +28,6 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
-__all__ = ["ENOUGH", "Shadow"]
-
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from dwell.model.fabric import Node
 
-__all__ = ["explaining_threads", "slowdown"]
-
 
 def slowdown(node: Node, job_threads: int, foreign_threads: float) -> float:
     """Return the factor by which a job takes longer; at least 1."""

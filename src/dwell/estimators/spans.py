@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from dwell.estimators.evidence import Instants
 from dwell.model.problem import Problem
 
-__all__ = ["Spans", "patience_ns", "spans_of"]
-
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 

@@ -154,8 +154,6 @@ from dwell.kernels.nodes import (
     tick,
 )
 
-__all__ = ["advance"]
-
 # More inputs than any task has: a join that can never be complete.
 NEVER = 1 << 30
 

@@ -8,8 +8,6 @@ from typing import Any, cast
 
 from numba.core import registry
 
-__all__ = ["cache_suffix", "fingerprint"]
-
 
 def fingerprint() -> str:
     """Return a hash of the sources of all kernels."""

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from dwell.kernels.cache_name import cache_suffix, fingerprint
 
-__all__ = ["COMPILED", "fixed_columns", "index", "kernel", "phase"]
-
 # Numba's own types know neither the flags below nor its configuration.
 njit: Any = numba.njit
 config: Any = cast(Any, numba).config

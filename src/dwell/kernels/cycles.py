@@ -73,23 +73,6 @@ from dwell.kernels.layout import (
 from dwell.kernels.links import lose, slot_row
 from dwell.kernels.nodes import dispatch, job_row, leave, schedule
 
-__all__ = [
-    "arrive",
-    "become_ready",
-    "complete",
-    "drop_job",
-    "drop_waiting",
-    "finish",
-    "flush",
-    "free_worker",
-    "hand_over",
-    "hop_of",
-    "job_key",
-    "note_ready",
-    "release",
-    "shared_by",
-]
-
 
 @phase
 def job_key(cell: int, cycle: int, local: int) -> int:

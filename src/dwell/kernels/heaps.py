@@ -8,16 +8,6 @@ from __future__ import annotations
 from dwell.kernels.compiled import index, kernel, phase
 from dwell.kernels.layout import N_EVENTS, Floats, Ints
 
-__all__ = [
-    "pop_event",
-    "pop_running",
-    "pop_waiting",
-    "post_event",
-    "push_event",
-    "push_running",
-    "push_waiting",
-]
-
 
 @phase
 def push_event(clock: Ints, event_t: Ints, event_key: Ints, t: int, key: int) -> None:

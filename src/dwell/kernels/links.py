@@ -38,8 +38,6 @@ from dwell.kernels.layout import (
 )
 from dwell.kernels.streams import attempt_uniform
 
-__all__ = ["lose", "send", "send_state", "slot_row"]
-
 
 @phase
 def slot_row(ring: int, cell: int, cycle: int) -> int:

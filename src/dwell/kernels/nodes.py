@@ -99,19 +99,6 @@ from dwell.kernels.layout import (
 )
 from dwell.kernels.streams import attempt_uniform
 
-__all__ = [
-    "admit",
-    "dispatch",
-    "job_row",
-    "leave",
-    "mark",
-    "repace",
-    "restress",
-    "schedule",
-    "set_speed",
-    "tick",
-]
-
 # Work left below this many nanoseconds is rounding, not work.
 SLACK = 1e-3
 # Of those that have received the same, jobs go first.

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 
 from dwell.kernels.compiled import kernel, phase
 
-__all__ = ["DIVERGED", "DONE", "N_STATE", "follow"]
-
 # Status.
 DONE, DIVERGED = 0, 1
 # Columns of a state: since when, and position, velocity and acceleration then.

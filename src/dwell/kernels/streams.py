@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from dwell.kernels.compiled import kernel, phase
 
-__all__ = ["ar1_path", "attempt_uniform", "nanoseconds", "standard_normals"]
-
 CYCLE_STEP = np.uint64(0x9E3779B97F4A7C15)
 ATTEMPT_STEP = np.uint64(0xD1B54A32D192ED03)
 MIX_1 = np.uint64(0xBF58476D1CE4E5B9)

@@ -20,8 +20,6 @@ from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
 from dwell.model.instants import NEVER_NS
 
-__all__ = ["Agent", "CpuCount", "Gauge"]
-
 #: Time between two looks at the processes, and between two reports of what the CPU does.
 LOOK_NS = 20_000_000
 LOAD_NS = 250_000_000

@@ -16,8 +16,6 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-__all__ = ["CONFIRMATIONS", "LATENESS_NS", "RESERVED", "Continuity", "OvershootDetector"]
-
 #: Cycle numbers that the stamper reserves at a time; after a restart the rest of them stays unused.
 RESERVED = 1_024
 #: Messages in a row that are believed, though they do not go on from what was believed before.

@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 from dwell.errors import LiveError
 
-__all__ = ["UNKNOWN", "ControlGroup", "Counts", "own_group"]
-
 UNKNOWN = -1
 PROCESS = Path("/proc/self")
 #: What counts CPU time in a group's folder: of version 1 and 2.

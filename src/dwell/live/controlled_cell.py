@@ -33,8 +33,6 @@ from dwell.live.role import REPEATED_NS, Pulse, RolePlace
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 
-__all__ = ["ControlledCell", "Recorder"]
-
 #: Time between two looks at the stamper, and two sendings of an order that is not answered.
 ASK_NS = 250_000_000
 RESEND_NS = 40_000_000

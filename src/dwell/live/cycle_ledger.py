@@ -22,8 +22,6 @@ from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 from dwell.record import Values
 
-__all__ = ["Ledger", "LiveCycle"]
-
 Ints: TypeAlias = NDArray[np.int64]
 
 UNKNOWN = -1

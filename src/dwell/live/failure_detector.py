@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from dwell.live.continuity import LATENESS_NS, OvershootDetector
 from dwell.live.messages import Beat, Heard
 
-__all__ = ["FailureDetector"]
-
 
 @dataclass(slots=True)
 class _HeardProcess:

@@ -16,8 +16,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-__all__ = ["FAILED", "described", "end_process", "start_thread"]
-
 #: Exit code of a process that cannot go on.
 FAILED = 1
 

@@ -22,8 +22,6 @@ from dwell.live.agent import AGENT_BEAT
 from dwell.live.wiring import Role, roles
 from dwell.model import Problem
 
-__all__ = ["PATIENCE_NS", "Health", "diagnose", "silent_after_ns", "window_late_ns"]
-
 Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
 
 #: Nobody is called silent sooner: a machine that is busy is no fault.

@@ -16,16 +16,6 @@ from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.worker import Job, Worker
 from dwell.model import Problem
 
-__all__ = [
-    "Clock",
-    "Hosted",
-    "Platform",
-    "clock_of",
-    "keep_collections_short",
-    "take_turns",
-    "work",
-]
-
 Clock = Callable[[], int]
 
 #: No role is left alone for longer, so that its thread notices that it shall stop.

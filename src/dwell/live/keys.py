@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["CONTROLLER", "MAIN", "SHADOW", "Keys"]
-
 MAIN, SHADOW = "main", "shadow"
 #: Who orders, among those who have keys; all others of a cell go by their node's name.
 CONTROLLER = "controller"

@@ -16,8 +16,6 @@ from dataclasses import dataclass, field
 
 from dwell.live.messages import Beat, Completion
 
-__all__ = ["Intervals"]
-
 #: Round trips are forgotten after one to two of these.
 SPAN_NS = 60_000_000_000
 #: Cycles that are waited for at a time, and intervals that wait to be told.

@@ -25,8 +25,6 @@ from typing import BinaryIO, Protocol
 
 import psutil
 
-__all__ = ["UNKNOWN_CODE", "ForkServer", "Launcher", "Running", "serve"]
-
 #: Exit code of a process whose fork server has died before it.
 UNKNOWN_CODE = 1 << 16
 LONGEST_BYTES = 1 << 16

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from dwell.errors import Fault
 from dwell.model import Problem
 
-__all__ = ["lint"]
-
 
 def lint(problem: Problem) -> Iterator[Fault]:
     """Yield what a live cell does not do as its file says, or not as well as it could.

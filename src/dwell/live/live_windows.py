@@ -41,8 +41,6 @@ from dwell.live.run_rows import (
 from dwell.model import Problem
 from dwell.record import Row, Values
 
-__all__ = ["LiveWindow", "LiveWindows", "Resume", "Rows"]
-
 Rows: TypeAlias = dict[str, list[Row]]
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from dwell.live.continuity import OvershootDetector
 from dwell.live.messages import Load
 
-__all__ = ["NodeLoad", "ProcessLoads"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Reports remembered of a node.

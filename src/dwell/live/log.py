@@ -9,8 +9,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-__all__ = ["Log", "escape_output", "printable"]
-
 
 def printable(text: str, keep: str = "") -> str:
     """Return a text with escapes in place of all that a terminal may take for something else.

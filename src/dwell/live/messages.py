@@ -13,29 +13,6 @@ import msgspec
 
 from dwell.errors import LiveError
 
-__all__ = [
-    "MAX_CONTROL_BYTES",
-    "MAX_HEADER_BYTES",
-    "Accepted",
-    "Answer",
-    "Ask",
-    "Beat",
-    "Carried",
-    "Completion",
-    "Header",
-    "Heard",
-    "Hop",
-    "Load",
-    "Order",
-    "Restored",
-    "Snapshot",
-    "Stamp",
-    "Stamped",
-    "State",
-    "decode",
-    "encode",
-]
-
 #: Longer headers and control messages are refused before anything of them is read.
 MAX_HEADER_BYTES = 16_384
 MAX_CONTROL_BYTES = 262_144

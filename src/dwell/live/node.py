@@ -28,8 +28,6 @@ from dwell.live.transport.transport import Transport
 from dwell.live.wiring import wire
 from dwell.model import Problem
 
-__all__ = ["run_agent", "run_controller"]
-
 #: Why a folder cannot be made that somebody has to put right; anything else is tried again.
 MISTAKEN = frozenset({errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP})
 

@@ -27,8 +27,6 @@ from typing import NamedTuple, TypeAlias
 from dwell.live.continuity import OvershootDetector
 from dwell.live.messages import Beat
 
-__all__ = ["UNBOUNDED_NS", "Instant", "Offsets"]
-
 #: Bound of an instant that could be anything.
 UNBOUNDED_NS = 1 << 62
 

@@ -19,8 +19,6 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import Role
 from dwell.model import Problem
 
-__all__ = ["OperatorClient"]
-
 RESEND_S = 0.2
 
 

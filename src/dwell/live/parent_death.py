@@ -24,8 +24,6 @@ from pathlib import Path
 from dwell.live.failures import start_thread
 from dwell.live.transport.orphans import remove_orphans
 
-__all__ = ["OPTION", "end_with_owner", "start_sweeper"]
-
 #: Option of agent, controller and processes: id of the process that they end with.
 OPTION = "--owner"
 #: What does not end by itself within this time after its owner is ended.

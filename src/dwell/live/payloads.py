@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from dwell.errors import LiveError
 
-__all__ = ["Payload", "read_payload", "write_payload"]
-
 Payload: TypeAlias = "bytes | NDArray[Any] | msgspec.Struct | dict[str, Any] | list[Any] | None"
 
 #: Kinds of numbers that arrays may hold: no objects, no records.

@@ -13,8 +13,6 @@ from dwell.live.trust.roster import Roster
 from dwell.live.wiring import roles
 from dwell.model import Problem
 
-__all__ = ["senders", "subjects"]
-
 
 def senders(problem: Problem) -> dict[str, frozenset[str]]:
     """Return who may put, by key; the names are those of nodes, and `CONTROLLER`.

@@ -18,9 +18,6 @@ from dwell.model.document import to_document
 from dwell.record import seal_run
 from dwell.record.journal import Journal
 
-__all__ = ["RunRecorder"]
-
-
 #: Rows that wait in memory while the folder cannot be written, some 25 MB; of more, those of the
 #: oldest windows are dropped.
 MOST_WAITING = 50_000

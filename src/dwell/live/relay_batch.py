@@ -10,8 +10,6 @@ from collections import Counter
 
 from dwell.live.messages import MAX_HEADER_BYTES
 
-__all__ = ["MOST_MESSAGES", "RelayBatch"]
-
 #: In one bundle at most; more within the time that it is gathered in are dropped.
 MOST_MESSAGES = 1_000
 #: Of all of them, keys included: two bundles put together are still read.

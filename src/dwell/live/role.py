@@ -46,9 +46,6 @@ REPEATED_NS = 10_000_000_000
 #: Beats of an earlier life, one after another, that no late message explains.
 RIVAL_BEATS = 5
 
-__all__ = ["Pulse", "RoleLogic", "RolePlace", "Sealing"]
-
-
 T = TypeVar("T", bound=msgspec.Struct)
 
 

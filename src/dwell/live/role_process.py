@@ -26,8 +26,6 @@ from dwell.live.wiring import wire
 from dwell.live.worker import Job, Worker
 from dwell.model import Problem
 
-__all__ = ["run_process"]
-
 
 def run_process(
     problem: Problem,

@@ -10,8 +10,6 @@ from dwell.live.keys import MAIN, SHADOW
 from dwell.live.messages import Stamp
 from dwell.model import Problem
 
-__all__ = ["STAMPER", "Destination", "Routes"]
-
 #: Routes that are remembered at most.
 MAX_KNOWN = 1_024
 #: Source of the input that a source task gets.

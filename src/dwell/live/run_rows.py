@@ -21,15 +21,6 @@ from dwell.record import Columns, Feature, Row, Types, Values, column_types, row
 if TYPE_CHECKING:
     from dwell.live.live_windows import LiveWindow
 
-__all__ = [
-    "columns_of",
-    "cycle_values",
-    "decision_values",
-    "rows_of",
-    "sends_shadows",
-    "window_values",
-]
-
 
 def sends_shadows(controller: Controller) -> bool:
     """Whether cycles may be sent through alternatives: to measure them, or to prove them."""

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from dwell.live.role import RolePlace
     from dwell.live.trust.keyring import Keyring
 
-__all__ = ["INSECURE", "KEYS", "Security", "exposed"]
-
 #: Variable of the environment: ``1`` allows addresses beyond this computer without keys.
 INSECURE = "DWELL_INSECURE"
 #: A certificate that ends soon is spoken of once a day.

@@ -14,8 +14,6 @@ from dwell.live.stage import Actuator, Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import longest_bytes
 
-__all__ = ["Highest", "Sink"]
-
 
 class Highest(Protocol):
     """Remembers, across restarts, the highest cycle that was actuated."""

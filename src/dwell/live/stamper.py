@@ -27,8 +27,6 @@ from dwell.live.role import Pulse, RolePlace
 from dwell.live.routing import STAMPER, Destination, Routes
 from dwell.live.transport.transport import Arrival
 
-__all__ = ["Book", "Stamper", "StamperState"]
-
 #: Time after which a controller that is silent is in charge no more.
 LEASE_NS = 1_000_000_000
 #: Time that a new run waits for its placement; then it begins on any fallback that is whole.

@@ -14,8 +14,6 @@ from pathlib import Path
 from dwell.errors import LiveError
 from dwell.live.stamper import StamperState
 
-__all__ = ["BookFile", "HighestFile", "InFlight", "make_folder"]
-
 # Run and cycle, and a checksum of the two.
 _SLOT = struct.Struct("<qqI")
 _LENGTH = struct.Struct("<QI")

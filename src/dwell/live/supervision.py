@@ -21,8 +21,6 @@ from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running
 from dwell.live.log import printable
 from dwell.live.state_files import InFlight
 
-__all__ = ["SupervisedProcess", "Supervisor"]
-
 #: Waits between two starts of a process that keeps dying.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
 #: A process that lived so long has recovered.

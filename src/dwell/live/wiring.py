@@ -17,26 +17,6 @@ from dwell.live.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.transport.transport import Lane
 from dwell.model import Flow, FrozenDict, Problem
 
-__all__ = [
-    "IMAGE_BYTES",
-    "PORTS_PER_ROLE",
-    "SESSIONS",
-    "Kind",
-    "Locator",
-    "Passage",
-    "Role",
-    "Session",
-    "Wire",
-    "Wiring",
-    "WiringEntry",
-    "lane_of",
-    "longest_bytes",
-    "longest_message_bytes",
-    "roles",
-    "session_of",
-    "wire",
-]
-
 Kind: TypeAlias = Literal[
     "stamper", "sink", "agent", "worker", "shadow", "standby", "controller", "visitor"
 ]

@@ -30,8 +30,6 @@ from dwell.live.transport.transport import Arrival, Lane
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import NEVER_NS
 
-__all__ = ["Job", "Worker"]
-
 #: Cycles that may wait for the rest of their inputs.
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.

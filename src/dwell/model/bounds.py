@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from dwell.errors import Fault, ProblemError
 
-__all__ = ["Bound", "require", "shown"]
-
 LARGEST = 1e9
 MAX_COUNT = 1_000_000
 LONGEST_SHOWN = 80

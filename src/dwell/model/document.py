@@ -20,16 +20,6 @@ from dwell.model.process import DRAWN, Constant, Process, Trace, UnreadTrace
 from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
 from dwell.model.servo import Servo
 
-__all__ = [
-    "VERSION",
-    "digest",
-    "disturbance_document",
-    "fingerprint",
-    "objective_document",
-    "relocated",
-    "to_document",
-]
-
 # Version of the cell file.
 VERSION = 1
 

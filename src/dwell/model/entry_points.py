@@ -11,8 +11,6 @@ from typing import Any
 
 from dwell.errors import DwellError
 
-__all__ = ["class_at", "class_named", "names_with"]
-
 
 def class_at(path: str) -> Any:
     """Import a class of ours.

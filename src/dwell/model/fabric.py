@@ -29,8 +29,6 @@ from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.objective import TIERS, Tier
 from dwell.model.process import Constant, Process, require_mean
 
-__all__ = ["SCHEDULERS", "Bursts", "Fabric", "Link", "Node", "Quota", "Scheduler"]
-
 Scheduler: TypeAlias = Literal["fair", "fifo", "priority"]
 SCHEDULERS: tuple[Scheduler, ...] = ("fair", "fifo", "priority")
 

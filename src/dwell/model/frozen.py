@@ -8,8 +8,6 @@ from typing import NoReturn, Protocol, TypeVar
 
 from dwell.model.bounds import require
 
-__all__ = ["FrozenDict", "Named", "require_names", "shortened"]
-
 #: Names that are shown of many.
 SHOWN = 6
 

@@ -2,7 +2,5 @@
 
 from __future__ import annotations
 
-__all__ = ["NEVER_NS"]
-
 #: Later than every instant, longer than every latency; sums of two still fit 64 bits.
 NEVER_NS = 1 << 62

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from dwell.model.bounds import AGE_MS, CHECKPOINT_CYCLES, PORT, require
 from dwell.model.frozen import FrozenDict
 
-__all__ = ["CLOCKS", "MODES", "RELEASES", "SILENCES", "Endpoint", "Host", "LiveSettings"]
-
 RELEASES = ("timer", "frames")
 CLOCKS = ("estimated", "system")
 MODES = ("control", "advise")

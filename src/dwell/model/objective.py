@@ -11,8 +11,6 @@ from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import CAP, TARGET, WEIGHT, require
 from dwell.model.frozen import FrozenDict
 
-__all__ = ["TIERS", "Caps", "Objective", "Targets", "Tier", "Weights"]
-
 Tier: TypeAlias = Literal["robot", "edge", "cloud"]
 TIERS: tuple[Tier, ...] = ("robot", "edge", "cloud")
 

@@ -23,8 +23,6 @@ from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 
-__all__ = ["Execution", "Flow", "Pipeline", "Task"]
-
 
 @dataclass(frozen=True, slots=True)
 class Execution:

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping
 from dwell.errors import PlacementError
 from dwell.model.frozen import FrozenDict
 
-__all__ = ["Placement"]
-
 
 class Placement(FrozenDict[str, str]):
     """An immutable mapping of every task of a pipeline to the node it runs on.

@@ -30,8 +30,6 @@ from dwell.model.scenario import Scenario
 from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
 
-__all__ = ["MIGRATIONS", "ControllerSettings", "Problem"]
-
 MIGRATIONS = ("warm", "cold")
 
 

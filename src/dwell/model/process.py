@@ -20,23 +20,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = [
-    "AR1",
-    "DRAWN",
-    "Constant",
-    "Exponential",
-    "Gamma",
-    "LogNormal",
-    "Normal",
-    "Process",
-    "Trace",
-    "TraceTable",
-    "Uniform",
-    "UnreadTrace",
-    "require",
-    "require_mean",
-]
-
 Floats: TypeAlias = "NDArray[np.float64]"
 
 # One nanosecond, in milliseconds.

@@ -11,8 +11,6 @@ from dwell.errors import MetricError
 from dwell.model.frozen import FrozenDict
 from dwell.model.placement import Placement
 
-__all__ = ["REASONS", "Decision", "QoS", "Reason"]
-
 Reason: TypeAlias = Literal["dwell", "hold", "migrate", "capped", "infeasible", "guard"]
 #: Every reason, in the order in which they are looked at.
 REASONS: tuple[Reason, ...] = get_args(Reason)

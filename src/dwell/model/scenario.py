@@ -22,18 +22,6 @@ from dwell.model.bounds import (
 )
 from dwell.model.process import Process, require_mean
 
-__all__ = [
-    "MAX_LAYERS",
-    "RAMP_LAYERS",
-    "RAMP_STEPS",
-    "Disturbance",
-    "Episodes",
-    "LinkDisturbance",
-    "NodeDisturbance",
-    "Scenario",
-    "is_always_on",
-]
-
 # Equal steps in which a ramp reaches its full strength. Their number has that many binary digits,
 # and every digit of the strength is a layer of extra delay that is on or off.
 RAMP_LAYERS = 5

@@ -29,8 +29,6 @@ from dwell.model.user_classes import is_class_path
 if TYPE_CHECKING:
     from dwell.model.problem import ControllerSettings
 
-__all__ = ["CellParts", "find_faults", "nearest", "nearest_of", "too_many_shadows"]
-
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
 LONGEST_NAME = 64

@@ -8,8 +8,6 @@ from typing import Literal, TypeAlias
 
 from dwell.model.bounds import AMPLITUDE_MM, DAMPING, SERVO_GAIN, TARGET_PERIOD_S, require
 
-__all__ = ["PLANTS", "MovingTarget", "Plant", "Servo"]
-
 Plant: TypeAlias = Literal["integrator", "double-integrator"]
 PLANTS: tuple[Plant, ...] = ("integrator", "double-integrator")
 

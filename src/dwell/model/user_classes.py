@@ -21,8 +21,6 @@ from dwell.errors import DwellError
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
-__all__ = ["import_user_module", "is_class_path", "make_user_class", "source_digest"]
-
 CLASS_PATH = re.compile(r"[^\W\d]\w*(?:\.[^\W\d]\w*)*:[^\W\d]\w*")
 
 #: Modules that were found beside a cell file, by its folder and their name.

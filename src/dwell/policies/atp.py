@@ -46,8 +46,6 @@ from dwell.model.qos import Decision, QoS
 from dwell.policies.atp_thresholds import ATPThresholds
 from dwell.policies.incumbent import NOT_PRICED, check_parameter
 
-__all__ = ["ATP"]
-
 
 class _Shown(NamedTuple):
     """What the rule looks at of a window, observed or estimated: L95 (ms), U_r, U_e and U_c."""

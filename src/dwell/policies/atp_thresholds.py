@@ -29,8 +29,6 @@ from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy, check_name, check_parameter
 from dwell.policies.pricing import Pricing
 
-__all__ = ["ATPThresholds", "Pair", "find_pairs"]
-
 THRESHOLD = Bound(0)
 
 

@@ -24,8 +24,6 @@ from dwell.policies.protocol import MinimalPolicy
 if TYPE_CHECKING:
     from _typeshed import TraceFunction
 
-__all__ = ["MAX_LINES", "check_policy"]
-
 #: Lines of Python that one decision may execute before it counts as never ending.
 MAX_LINES = 100_000
 

@@ -34,8 +34,6 @@ from dwell.policies.dtp import cheapest
 from dwell.policies.incumbent import CandidatePolicy, check_parameter
 from dwell.policies.pricing import Pricing
 
-__all__ = ["Cusum"]
-
 
 class Cusum(CandidatePolicy):
     """Moves to the cheapest candidate whose advantage over the incumbent has added up.

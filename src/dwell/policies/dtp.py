@@ -35,8 +35,6 @@ from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy, check_parameter
 from dwell.policies.pricing import Pricing
 
-__all__ = ["DTP"]
-
 
 class DTP(CandidatePolicy):
     """Moves to the cheapest candidate once it is cheap enough and the dwell is over.

@@ -16,8 +16,6 @@ from dwell.model.semantics import nearest_of
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
 
-__all__ = ["CandidatePolicy", "Incumbent", "check_parameter"]
-
 Number = TypeVar("Number", int, float)
 
 NOT_PRICED: FrozenDict[str, float] = FrozenDict()

@@ -12,8 +12,6 @@ from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy
 from dwell.policies.pricing import Pricing, check_metrics, explain_estimate
 
-__all__ = ["LatencyFirst"]
-
 
 class LatencyFirst(CandidatePolicy):
     """Moves to the lowest estimated L95 in every window, with neither hysteresis nor dwell.

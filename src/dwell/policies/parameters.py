@@ -8,8 +8,6 @@ import math
 from dwell.model.document import objective_document
 from dwell.model.objective import Objective
 
-__all__ = ["parameters_of"]
-
 
 def parameters_of(policy: object) -> dict[str, object]:
     """Return the arguments of a policy's class that it keeps under their own names.

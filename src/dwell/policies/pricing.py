@@ -18,8 +18,6 @@ from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.qos import QoS, Reason
 
-__all__ = ["EXCESS_TOLERANCE", "Pricing", "check_metrics", "explain_estimate"]
-
 INFINITY = math.inf
 
 #: Candidates this close to the least relative excess are told apart by J instead.

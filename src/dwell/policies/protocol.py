@@ -8,8 +8,6 @@ from typing import Protocol, runtime_checkable
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 
-__all__ = ["MinimalPolicy", "Policy"]
-
 
 @runtime_checkable
 class MinimalPolicy(Protocol):

@@ -22,17 +22,6 @@ if TYPE_CHECKING:
     from dwell.model.problem import Problem
     from dwell.policies.protocol import Policy
 
-__all__ = [
-    "FAMILIES",
-    "GROUP",
-    "REGISTRY",
-    "PolicyEntry",
-    "by_name",
-    "estimates",
-    "name_of_class",
-    "names",
-]
-
 #: Group of the entry points by which other packages add policies.
 GROUP = "dwell.policies"
 

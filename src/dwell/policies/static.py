@@ -10,8 +10,6 @@ from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy
 from dwell.policies.pricing import Pricing, check_metrics
 
-__all__ = ["Static"]
-
 
 class Static(CandidatePolicy):
     """Wants its candidate whatever happens; every decision is a hold there.

@@ -45,8 +45,6 @@ from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import CandidatePolicy
 from dwell.policies.pricing import Pricing
 
-__all__ = ["TIE_TOLERANCE", "WorkFunction"]
-
 #: Sums whose relative difference is at most this are a tie: w_k carries rounding errors.
 TIE_TOLERANCE = 1e-9
 

@@ -30,8 +30,6 @@ from dwell.record.schema import TABLES, Columns, Types, polars_schema
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["JOURNAL", "Journal", "Recovered", "read_journal"]
-
 JOURNAL = "journal.bin"
 
 Rows: TypeAlias = Mapping[str, Sequence[Sequence[Any]]]

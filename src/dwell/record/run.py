@@ -23,8 +23,6 @@ from dwell.record.schema import SCHEMA_VERSION, TABLES
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Run", "open_run", "require_free", "seal_run"]
-
 ALWAYS = tuple(name for name, table in TABLES.items() if not table.on_request)
 #: Scenario by which a cell has the disturbances as they were played.
 PLAYED = "played"

@@ -18,25 +18,6 @@ from dwell.model import REASONS, Problem, Reason
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = [
-    "OUTCOMES",
-    "OUTCOME_SENTENCES",
-    "REASON_SENTENCES",
-    "SCHEMA_VERSION",
-    "TABLES",
-    "Column",
-    "Columns",
-    "Feature",
-    "Row",
-    "TableSchema",
-    "Types",
-    "Values",
-    "column_types",
-    "frame_of",
-    "polars_schema",
-    "row_of",
-]
-
 SCHEMA_VERSION = 1
 
 #: What became of a cycle or a job. Their order is that of the kernels' codes.

@@ -22,8 +22,6 @@ from dwell.report.page import TEMPLATES, Block, Fact, Page, Section
 from dwell.report.table import Table, table_text
 from dwell.report.topology import topology
 
-__all__ = ["html_of", "summary_of"]
-
 #: What fits a screen.
 LINES, COLUMNS = 24, 80
 #: Numbers over a picture.

@@ -18,8 +18,6 @@ from dwell.report.table import Columns, Table, Text, table_text
 from dwell.study.campaign_questions import CampaignQuestion, questions
 from dwell.study.measured_campaign import MeasuredCampaign
 
-__all__ = ["campaign_html", "campaign_page", "campaign_text"]
-
 #: Points of a distribution over windows.
 POINTS = 80
 #: An axis of latencies ends after so many deadlines.

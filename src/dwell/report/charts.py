@@ -21,23 +21,6 @@ if TYPE_CHECKING:
 
     from dwell.report.formatting import Measure
 
-__all__ = [
-    "NO_LIMIT",
-    "PARTS_SHOWN",
-    "PART_COLOURS",
-    "Limit",
-    "cumulative",
-    "curves",
-    "distributions",
-    "intervals",
-    "is_wide",
-    "limit_rule",
-    "quantity",
-    "stacked",
-    "styled",
-    "thinned",
-]
-
 #: Names of the parts of a latency, and their colours by these.
 PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
 PART_COLOURS = {PARTS_SHOWN[part]: colour for part, colour in PARTS.items()}

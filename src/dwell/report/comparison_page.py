@@ -23,8 +23,6 @@ from dwell.study.drawn_disturbances import drawn_disturbances
 if TYPE_CHECKING:
     from dwell.model import Node
 
-__all__ = ["comparison_html", "comparison_page", "comparison_text", "predictions_table"]
-
 DTP = "dtp"
 
 

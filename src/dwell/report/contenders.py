@@ -9,8 +9,6 @@ from dwell.model import Problem
 from dwell.report.formatting import OURS, shown_contender
 from dwell.report.palette import FAMILIES, Palette, contended
 
-__all__ = ["describe_contenders", "palette_of"]
-
 #: By what stands in brackets behind a policy.
 BELIEFS = {
     **{name: estimator.sentence for name, estimator in ESTIMATORS.items()},

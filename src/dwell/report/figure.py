@@ -19,8 +19,6 @@ from dwell.report.palette import PRINTED
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["COLUMN_PT", "PAGE_PX", "Figure", "Spec", "javascript", "pdf", "printed_svg", "svg"]
-
 Spec: TypeAlias = "dict[str, Any]"
 
 #: Width of a figure in a page, pixels, and in a paper's column, points.

@@ -15,8 +15,6 @@ from dwell.report.table import Table, Text
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["figure_files", "table_tex"]
-
 #: Width of both columns of a paper, points, and columns of a table above which it has that.
 BOTH_PT, MOST_COLUMNS = 516, 6
 #: What LaTeX writes otherwise.

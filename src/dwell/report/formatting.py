@@ -10,21 +10,6 @@ from typing import NamedTuple
 from dwell.report.palette import FAMILIES, contended
 from dwell.study import Interval
 
-__all__ = [
-    "OURS",
-    "SYMBOL",
-    "Measure",
-    "Written",
-    "listed",
-    "percent",
-    "shown_contender",
-    "shown_in_sentence",
-    "shown_policy",
-    "shown_scenario",
-    "write_interval",
-    "write_number",
-]
-
 #: What has to stand beside everything that shows ATP.
 OURS = "ATP is our reconstruction."
 #: A symbol with its index: V_D, N_min, α_L.

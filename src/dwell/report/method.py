@@ -12,8 +12,6 @@ from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
 
-__all__ = ["cell_definitions", "method_blocks", "ranges"]
-
 
 def method_blocks(
     problem: Problem, scenarios: Sequence[str], policies: Iterable[str], prefix: str = ""

@@ -24,8 +24,6 @@ from dwell.report.table import WORDS, Table
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-__all__ = ["Block", "Definitions", "Fact", "Page", "Section", "environment", "page_html"]
-
 TEMPLATES = Path(__file__).with_name("templates")
 
 

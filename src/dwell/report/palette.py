@@ -17,25 +17,6 @@ from typing import NamedTuple, TypeAlias
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.policies import registry
 
-__all__ = [
-    "BAD",
-    "BELIEFS",
-    "FAMILIES",
-    "INK",
-    "MUTED",
-    "PAPER",
-    "PARTS",
-    "PRINTED",
-    "RAMP",
-    "RULE",
-    "SHADE",
-    "Contended",
-    "Palette",
-    "Style",
-    "contended",
-    "ramp_styles",
-]
-
 #: Lengths of strokes and gaps in turn, pixels.
 Dashes: TypeAlias = tuple[int, ...]
 

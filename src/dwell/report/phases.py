@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.report.run_header import RunHeader
 
-__all__ = ["CALM", "Disturbed", "Phase", "PhaseRow", "disturbed", "phase_rows", "phases"]
-
 CALM = "baseline"
 #: Who is disturbed, as it is called: by what the disturbance acts on.
 NETWORK = "network impairment"

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from dwell.study import StudyRuns
 
-__all__ = ["COST", "KEYS", "L95", "MEASURES", "RATE", "THE_AIM", "PolicyBlocks", "named", "scaled"]
-
 RATE = Measure("violation_rate", "V_D", "%", 100.0)
 L95 = Measure("l95_ms", "L95", "ms")
 COST = Measure("cost", "J", decimals=2)

@@ -12,8 +12,6 @@ from dwell.report.phases import Disturbed, disturbed
 from dwell.report.tracking import Tracking
 from dwell.study.drawn_disturbances import disturbances_of
 
-__all__ = ["RunHeader"]
-
 
 class RunHeader(NamedTuple):
     """Of what a run is the record.

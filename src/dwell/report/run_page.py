@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["run_html", "run_page"]
-
 MOST_ROWS = 200
 WORST = 10
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.

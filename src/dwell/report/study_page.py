@@ -18,8 +18,6 @@ from dwell.study import StudyRuns, over_seeds
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["study_html", "study_page"]
-
 REGRET = Measure("regret", "regret", "%", 100.0)
 MIGRATIONS = Measure("migrations", "migrations")
 

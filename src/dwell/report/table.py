@@ -19,8 +19,6 @@ from dwell.report.formatting import (
 from dwell.report.palette import MUTED, Palette
 from dwell.study import Interval
 
-__all__ = ["WORDS", "Cell", "Columns", "Row", "Table", "Text", "interval_row", "table_text"]
-
 Row: TypeAlias = "Mapping[str, Any]"
 Columns: TypeAlias = "list[Text | Measure]"
 Kind: TypeAlias = Literal["text", "policy", "placement", "scenario", "word"]

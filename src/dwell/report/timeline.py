@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from dwell.report.phases import Disturbed
     from dwell.report.tracking import Tracking
 
-__all__ = ["begins_by_number", "run_timeline"]
-
 #: Marks of a panel at most; of longer runs several windows are one mark.
 MOST_MARKS = 600
 PANEL_PX, USE_PX = 86, 56

@@ -13,8 +13,6 @@ from dwell.report.palette import INK, MUTED, PAPER, SHADE
 if TYPE_CHECKING:
     from dwell.model import Link
 
-__all__ = ["topology"]
-
 #: Size of a node, and the height of a line in it, pixels.
 NODE_PX, LINE_PX = 150, 15
 #: Nodes stand on an ellipse, the edge and the cloud on top, robots below.

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["TraceDocument", "TraceEvent", "trace_events"]
-
 NS_PER_US = 1e3
 # Process of the cycles; nodes follow.
 CELL = 0

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from dwell.errors import RunError
 
-__all__ = ["Tracking"]
-
 
 class Tracking(NamedTuple):
     """Root mean squares of the error of a loop, over short stretches of equal length.

@@ -31,8 +31,6 @@ from dwell.study.validation import GOALS, LEAST_MINUTES, Group, Validation
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["validation_html", "validation_page", "validation_text"]
-
 GOAL_NAMES = {
     "l95_ms": "L95 within 10 %",
     "violation_rate": "V_D within 2 percentage points, or explained",

@@ -14,8 +14,6 @@ from dwell.model.instants import NEVER_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.sim.simulated_guard import back_ns
 
-__all__ = ["Arrays", "lay_out"]
-
 SCHEDULER_CODE = {"fair": k.FAIR, "fifo": k.FIFO, "priority": k.PRIORITY}
 RING_START = 64
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least

@@ -8,8 +8,6 @@ from dwell.kernels.links import send_state
 from dwell.model import Problem
 from dwell.sim.realisation import Realisation
 
-__all__ = ["ColdMigration"]
-
 # The cycle field of an event: number of the migration, attempt, whether it is ready.
 NUMBER_SHIFT = 20
 ATTEMPTS = (1 << (NUMBER_SHIFT - 1)) - 1

@@ -37,8 +37,6 @@ from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 
-__all__ = ["describe", "play", "simulate", "simulate_realisation"]
-
 
 def simulate(
     problem: Problem,

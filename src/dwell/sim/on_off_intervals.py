@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from dwell.model import Process
 from dwell.model.scenario import RAMP_STEPS
 
-__all__ = ["LONGEST_NS", "OnOffIntervals", "drawn_intervals", "interval", "ramp"]
-
 Ints = NDArray[np.int64]
 
 # A duration beyond three years is as good as for ever, and its sums still fit 64 bits.

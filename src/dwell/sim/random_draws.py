@@ -32,8 +32,6 @@ from dwell.model.scenario import RAMP_STEPS
 from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
 
-__all__ = ["draw", "draw_changes", "draw_shadows", "drawn_scenario", "stream"]
-
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 

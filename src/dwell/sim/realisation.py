@@ -9,8 +9,6 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LinkSegment", "LinkSegments", "NodeChange", "NodeChanges", "Phase", "Realisation"]
-
 
 class NodeChange(NamedTuple):
     """From `at_ns` on, a node has `threads` foreign threads in all, and is `down` or not."""

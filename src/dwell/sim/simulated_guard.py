@@ -16,8 +16,6 @@ from dwell.model import Placement, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
-__all__ = ["SimulatedGuard", "back_ns"]
-
 
 def back_ns(problem: Problem, placement: Placement) -> int:
     """Time from a completion until the guard hears of it, nanoseconds.

@@ -25,8 +25,6 @@ from dwell.sim.realisation import Realisation
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["PlayedRealisation", "make_tables"]
-
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)

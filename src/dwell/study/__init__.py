@@ -1,12 +1,13 @@
 """Studies: many runs, and the statistics over their seeds."""
 
-from dwell.study.comparison import AIM, Comparison, Example, compare
+from dwell.study.comparison import AIM, Comparison, compare
 from dwell.study.demo import canonical_demo, longest_run, real_demo, tenants_demo
 from dwell.study.family import Family
 from dwell.study.hindsight import Hindsight
 from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
 from dwell.study.over_seeds import over_seeds
 from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
+from dwell.study.player import Example
 from dwell.study.predictions import paper_predictions
 from dwell.study.results import StudyRuns
 from dwell.study.runner import StudyResult, run_study

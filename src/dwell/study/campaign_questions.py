@@ -17,15 +17,6 @@ from dwell.study.measured_campaign import MeasuredCampaign
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = [
-    "CampaignQuestion",
-    "answer_of",
-    "compared",
-    "fault_scenarios",
-    "questions",
-    "stress_scenarios",
-]
-
 Answer: TypeAlias = Literal["yes", "no", "in part", "not shown"]
 
 METRICS = ("violation_rate", "l95_ms", "u_robot", "cost")

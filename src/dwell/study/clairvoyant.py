@@ -42,8 +42,6 @@ from numpy.typing import ArrayLike, NDArray
 from dwell.errors import MetricError, PolicyError
 from dwell.model.bounds import MIN_DWELL
 
-__all__ = ["TIE_TOLERANCE", "Sequence", "clairvoyant", "priced"]
-
 Bools: TypeAlias = NDArray[np.bool_]
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]

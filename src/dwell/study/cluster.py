@@ -17,8 +17,6 @@ from typing import Any, TypeVar
 
 from dwell.errors import SimulationError, installing
 
-__all__ = ["spread_on_dask"]
-
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
 

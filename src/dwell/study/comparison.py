@@ -20,8 +20,6 @@ from dwell.study.study import Contender, Point, Study
 if TYPE_CHECKING:
     from dwell.policies import MinimalPolicy
 
-__all__ = ["AIM", "Comparison", "Example", "compare"]
-
 Contenders: TypeAlias = "Mapping[str, MinimalPolicy | str]"
 
 #: Share of missed deadlines that a cell should stay under (the paper's 5 %).

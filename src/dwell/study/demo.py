@@ -18,18 +18,6 @@ from dwell.study.comparison import Comparison, compare
 from dwell.study.runner import StudyResult, run_study
 from dwell.study.study import Contender, load_study
 
-__all__ = [
-    "CANONICAL",
-    "POLICIES",
-    "REAL",
-    "SEEDS",
-    "WINDOWS",
-    "canonical_demo",
-    "longest_run",
-    "real_demo",
-    "tenants_demo",
-]
-
 #: Policies beside every candidate as a static placement.
 POLICIES = (
     "atp",

@@ -7,8 +7,6 @@ from dwell.model import Problem, Scenario
 from dwell.record import Run
 from dwell.sim.random_draws import drawn_scenario
 
-__all__ = ["disturbances_of", "drawn_disturbances"]
-
 
 def disturbances_of(run: Run) -> Scenario:
     """Return the disturbances of a run, each with its time: as played, else as drawn.

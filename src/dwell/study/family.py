@@ -29,8 +29,6 @@ from dwell.study.pairs import (
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Contrast", "Difference", "Family", "Labels", "cannot_tell", "holm", "seed_values"]
-
 Floats: TypeAlias = NDArray[np.float64]
 #: Columns of runs and what they have to be, for one run a seed to be left.
 Labels: TypeAlias = Mapping[str, object]

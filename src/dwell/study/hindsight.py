@@ -31,8 +31,6 @@ from dwell.model.instants import NEVER_NS
 if TYPE_CHECKING:
     from dwell.record import Run
 
-__all__ = ["Hindsight"]
-
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 

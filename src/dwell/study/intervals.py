@@ -24,24 +24,6 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "CONFIDENCE",
-    "FARTHEST",
-    "FEWEST",
-    "RESAMPLES",
-    "RESAMPLING_SEED",
-    "Interval",
-    "Verdict",
-    "mean_interval",
-    "median_interval",
-    "rule_of_three",
-    "share_difference_interval",
-    "share_interval",
-    "share_limits",
-    "studentised_limits",
-    "under",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 Values: TypeAlias = Sequence[float] | Floats
 Verdict: TypeAlias = Literal["under", "over", "not shown"]

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["finished_jobs", "job_times", "jobs_of", "links_of", "profiles_of"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 BASELINE = "baseline"

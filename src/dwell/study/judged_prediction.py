@@ -20,20 +20,6 @@ from dwell.study.intervals import CONFIDENCE, Interval, rule_of_three
 from dwell.study.qos_sample import QosSample
 from dwell.study.resampling import ends, resample_units, resample_windows
 
-__all__ = [
-    "L95_ALLOWED",
-    "POINTS_ALLOWED",
-    "USE_ALLOWED",
-    "GroupJudge",
-    "Judged",
-    "Outcome",
-    "chance",
-    "judge",
-    "relative",
-    "within",
-    "worst",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 Outcome: TypeAlias = Literal["met", "explained", "open", "missed", ""]
 

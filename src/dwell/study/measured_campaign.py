@@ -26,8 +26,6 @@ from dwell.testbed.execution import Kept, read_campaign
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["MeasuredCampaign", "read_measured", "without_excluded"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredCampaign:

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["MeasuredRun", "Simulated", "Simulator", "Unit", "excluded_windows", "read_measured"]
-
 Document: TypeAlias = Mapping[str, Any]
 
 NODE_FIELDS = ("tier", "cores", "scheduler", "accelerators", "quota")

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from dwell.study.summary import Row
 
-__all__ = ["difference_of", "interval_of", "metric_values", "over_seeds"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Means of what cannot be below 0, as utilisations cannot.

@@ -27,15 +27,6 @@ from dwell.study.intervals import (
     share_difference_interval,
 )
 
-__all__ = [
-    "PairedDifference",
-    "PairedMedian",
-    "least_p",
-    "paired_difference",
-    "paired_median",
-    "sign_flip_p",
-]
-
 #: Differences below this part of the values are what rounding left of equal ones.
 ROUNDING = 1e-12
 #: Up to so many pairs all 2^n flips are counted; beyond, `FLIPS` of them are drawn.

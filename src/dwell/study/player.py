@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.sim import Realisation
 
-__all__ = ["Example", "PlayedItem", "Player", "judged_cost", "judged_costs"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 

@@ -30,18 +30,6 @@ from dwell.study.results import StudyRuns
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = [
-    "PAPER",
-    "Answer",
-    "Judgement",
-    "PaperClaim",
-    "Prediction",
-    "applies",
-    "judge_claim",
-    "judge_placement",
-    "paper_predictions",
-]
-
 Answer: TypeAlias = Literal["agrees", "agrees in part", "differs", "open"]
 Test: TypeAlias = Callable[["PaperEvidence"], bool | None]
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from dwell.model import Problem
     from dwell.record import Run
 
-__all__ = ["PARTS", "Piece", "QosSample", "piece_of"]
-
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 

@@ -22,16 +22,6 @@ from numpy.typing import NDArray
 from dwell.model import Servo
 from dwell.model.instants import NEVER_NS
 
-__all__ = [
-    "Age",
-    "EffectiveCommands",
-    "TrackingError",
-    "actuations",
-    "age_of_information",
-    "misses_in",
-    "track",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 

@@ -40,19 +40,6 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.sim import Realisation
 
-__all__ = [
-    "CLAIRVOYANT",
-    "CLAIRVOYANT_DWELL",
-    "References",
-    "kept",
-    "mean_cost",
-    "play_alone",
-    "references",
-    "regret",
-    "tier_use",
-    "window_costs",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 CLAIRVOYANT = "clairvoyant"

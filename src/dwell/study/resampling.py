@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED
 
-__all__ = ["DRAWS", "block_windows", "ends", "resample_units", "resample_windows"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: So many that the quantiles of 2.5 % are order statistics of the resamples.

@@ -19,8 +19,6 @@ from dwell.study.over_seeds import difference_of, interval_of, metric_values, ov
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["PARAMETER", "StudyRuns"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Begin of the columns that hold the values of parameters.

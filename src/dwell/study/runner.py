@@ -27,8 +27,6 @@ from dwell.study.workers import available_processes, spread
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["Progress", "StudyResult", "play_in_memory", "run_study"]
-
 Progress: TypeAlias = Callable[[int, int], None]
 #: By their names, see `TABLES`.
 Tables: TypeAlias = "dict[str, pl.DataFrame]"

@@ -14,8 +14,6 @@ from dwell.model import Problem, QoS
 if TYPE_CHECKING:
     from dwell.sim import Realisation
 
-__all__ = ["Script"]
-
 
 class Script:
     """Follows a list of candidates, one for each window; a longer run stays on the last.

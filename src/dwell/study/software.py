@@ -18,8 +18,6 @@ from dwell.model.document import to_document
 from dwell.model.user_classes import is_class_path, source_digest
 from dwell.study.study import Contender, Study
 
-__all__ = ["describe", "software", "versions"]
-
 #: Packages whose versions are noted.
 PACKAGES = ("numpy", "numba", "polars")
 #: Parts of this package that make numbers.

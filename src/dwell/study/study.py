@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from dwell.estimators import Estimator
     from dwell.policies import MinimalPolicy
 
-__all__ = ["Contender", "Item", "Point", "Study", "load_study"]
-
 #: Runs of an item at most, where they can be parted: enough that the time for drawing what they
 #: share does not count, and few enough that little is lost with an item.
 ITEM_RUNS = 64

@@ -24,8 +24,6 @@ from dwell.study.results import StudyRuns
 if TYPE_CHECKING:
     import polars as pl
 
-__all__ = ["TABLES", "StudyFolder", "is_study", "open_study", "opened"]
-
 PARTS = "parts"
 STUDY = FolderMark("study", "study.json", 1, (PARTS,))
 #: Of a finished study, each a Parquet file.

@@ -18,8 +18,6 @@ from dwell.model.fabric import Link, Node
 from dwell.model.placement import Placement
 from dwell.model.scenario import Disturbance, LinkDisturbance, NodeDisturbance
 
-__all__ = ["sum_of_means", "sums_of_shares"]
-
 
 def sum_of_means(
     problem: Problem, placement: Placement, scenario: str, begin_s: float, end_s: float

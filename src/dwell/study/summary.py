@@ -43,21 +43,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = [
-    "GRID_PER_DEADLINE",
-    "STRETCHES",
-    "Counted",
-    "Summary",
-    "count_in",
-    "count_within",
-    "latency_grid_ms",
-    "latency_ms",
-    "longest_streak",
-    "mean_of",
-    "order_statistic",
-    "summarise",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 Row: TypeAlias = dict[str, float | int | str]

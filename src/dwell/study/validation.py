@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from dwell.record import Run
     from dwell.testbed.speeds import Usual
 
-__all__ = ["GOALS", "LEAST_MINUTES", "SEEDS", "Group", "Validation", "validate"]
-
 Progress: TypeAlias = Callable[[int, int], None]
 
 #: Measured time of a group below which its verdicts say little.

@@ -21,8 +21,6 @@ from typing import TypeVar, cast
 
 from dwell.errors import SimulationError
 
-__all__ = ["available_processes", "spread"]
-
 Unit = TypeVar("Unit")
 Result = TypeVar("Result")
 

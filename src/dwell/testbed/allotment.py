@@ -13,8 +13,6 @@ from dwell.errors import LiveError
 from dwell.model import Node, Problem
 from dwell.testbed.groups import Share
 
-__all__ = ["FREE_CORES", "FREE_OF_A_CORE", "allot", "nodes_of"]
-
 #: Of every CPU, and of all together, what no node gets.
 FREE_OF_A_CORE, FREE_CORES = 0.2, 0.4
 TOLERANCE = 1e-9

@@ -22,8 +22,6 @@ from typing import NoReturn, cast
 from dwell.errors import LiveError
 from dwell.testbed.child import PARENT_CHECK_S, Child, Parent, Started
 
-__all__ = ["Burner"]
-
 MAX_THREADS = 1_000
 # Turns of an empty loop between two looks at whether the parent lives: below a millisecond.
 TURNS = 20_000

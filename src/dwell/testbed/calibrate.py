@@ -39,8 +39,6 @@ from dwell.testbed.speeds import Usual, at_speed_of
 from dwell.testbed.task_costs import Site, messaging, sites
 from dwell.testbed.trace_names import move_traces
 
-__all__ = ["Calibrated", "calibrate", "make_runs"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 #: Seed of the delays that stand for a link's own process, and of the cell's own check.

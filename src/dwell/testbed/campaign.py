@@ -24,17 +24,6 @@ from dwell.model.document import to_document
 from dwell.policies.registry import by_name, estimates, names
 from dwell.testbed.trace_names import rename_traces
 
-__all__ = [
-    "PAPERS_SCENARIOS",
-    "TRACES",
-    "Campaign",
-    "Entrant",
-    "Planned",
-    "default_entrants",
-    "default_scenarios",
-    "entrant",
-]
-
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
 #: Folder of a campaign with the trace files of its cell.
 TRACES = "traces"

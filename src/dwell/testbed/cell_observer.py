@@ -10,8 +10,6 @@ from dwell.errors import LiveError
 from dwell.model import Problem
 from dwell.model.user_classes import import_user_module
 
-__all__ = ["CellObserver", "load_observer"]
-
 
 class CellObserver(Protocol):
     """Looks at what a cell controls, in the process that runs the cell.

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from dwell.errors import LiveError
 
-__all__ = ["Cgroups", "find_cgroups"]
-
 #: What v1 needs, and what it uses beside where it is mounted.
 NEEDED = ("cpu", "cpuacct")
 USED = (*NEEDED, "cpuset", "freezer")

@@ -17,8 +17,6 @@ from typing import Self, TypeAlias, cast
 
 from dwell.errors import LiveError
 
-__all__ = ["PARENT_CHECK_S", "Child", "Json", "Parent", "Started"]
-
 Json: TypeAlias = dict[str, object]
 
 # A start imports NumPy, and what else runs on the CPU may be a lot of busy threads.

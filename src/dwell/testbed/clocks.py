@@ -17,8 +17,6 @@ from typing import Self
 from dwell.errors import LiveError
 from dwell.files import write_whole
 
-__all__ = ["ClockFile", "wrong_clock"]
-
 PPB = 1_000_000_000
 
 _MAGIC = b"dwellclk"

@@ -21,8 +21,6 @@ from dwell.model.process import (
     TraceTable,
 )
 
-__all__ = ["CUTS", "Conditions", "Cut", "Scheduling", "changed", "delays_ns", "to_json"]
-
 #: `drop`: data is lost; `hold`: it waits, as in the sender's buffers; either way nothing passes.
 Cut: TypeAlias = Literal["drop", "hold"]
 CUTS: tuple[Cut, ...] = ("drop", "hold")

@@ -29,8 +29,6 @@ from dwell.testbed.probe import Probe
 from dwell.testbed.sampling import EVERY_S
 from dwell.testbed.stress import STRESS_NG
 
-__all__ = ["Finding", "examine"]
-
 #: Periods that are tried, shortest first; with less of a CPU the kernel does not take the first.
 PERIODS_MS = (2.0, 4.0, 10.0, 20.0, 100.0)
 SHARE = 0.5

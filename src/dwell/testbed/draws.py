@@ -8,8 +8,6 @@ import numpy as np
 
 from dwell.testbed.conditions import Conditions, changed, delays_ns
 
-__all__ = ["Draws"]
-
 
 class Draws:
     """Conditions that may change, and streams of their own for each delay and for losses.

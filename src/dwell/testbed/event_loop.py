@@ -15,8 +15,6 @@ from typing import Protocol, TypeAlias
 
 from dwell.testbed.child import PARENT_CHECK_S
 
-__all__ = ["Action", "Loop", "Watched"]
-
 Action: TypeAlias = Callable[[int], None]
 
 

@@ -25,16 +25,6 @@ from dwell.record import Run, open_run
 from dwell.testbed.campaign import TRACES, Campaign, Entrant, Planned
 from dwell.testbed.idle import Idle, Quiet, wait_until_idle
 
-__all__ = [
-    "REPEATS",
-    "Kept",
-    "Play",
-    "State",
-    "is_campaign",
-    "read_campaign",
-    "run_campaign",
-]
-
 RUNS, FAILED, WORK = "runs", "failed", ".work"
 #: Beside the tables of a run: when it was made, and how the machine was.
 ATTEMPT = "attempt.json"

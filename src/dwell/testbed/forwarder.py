@@ -28,8 +28,6 @@ from dwell.testbed.draws import Draws
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.packets import kind_of
 
-__all__ = ["LATE_MS", "main"]
-
 #: Limits of the classes of lateness, ms; the last class has none.
 LATE_MS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 LATE_NS = tuple(round(each * 1e6) for each in LATE_MS)

@@ -22,8 +22,6 @@ from dwell.errors import LiveError
 from dwell.model import Quota
 from dwell.testbed.cgroups import Cgroups, find_cgroups
 
-__all__ = ["PROBES", "Groups", "Share", "group_name", "remove_group"]
-
 #: What the kernel takes (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).
 MIN_US = 1_000
 MAX_PERIOD_US = 1_000_000

@@ -26,15 +26,6 @@ from typing import Self, TypeVar
 
 from dwell.errors import LiveError
 
-__all__ = [
-    "MTU",
-    "Hosts",
-    "namespace_name",
-    "namespace_path",
-    "remove_namespace",
-    "within",
-]
-
 #: Bytes of the largest packet: IPv4 takes 65 535, and a message of 64 kB is one packet.
 MTU = 65_520
 #: Packets that wait in a device for whoever reads it; a message of megabytes is some tens.

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Idle", "Quiet", "Sample", "sample", "wait_until_idle", "waited_s"]
-
 STAT, PSI = Path("/proc/stat"), Path("/proc/pressure/cpu")
 #: Fields of the first line of /proc/stat in which a CPU had nothing to do: idle, iowait.
 RESTING = (3, 4)

@@ -29,8 +29,6 @@ import yaml
 from dwell.errors import Fault, ProblemError
 from dwell.model import Problem
 
-__all__ = ["Inventory", "LinkCommands", "RealHost", "load_inventory"]
-
 VERSION = 1
 FORMAT = "dwell-inventory"
 FOLDER = "/var/tmp/dwell"  # noqa: S108 - on the hosts; a folder of the testbed's own is made in it

@@ -23,8 +23,6 @@ from dwell.testbed.cgroups import Cgroups, find_cgroups
 from dwell.testbed.groups import group_name, remove_group
 from dwell.testbed.hosts import namespace_name, namespace_path, remove_namespace
 
-__all__ = ["Claim", "claims_folder"]
-
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
 
 

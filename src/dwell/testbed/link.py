@@ -25,8 +25,6 @@ from dwell.errors import LiveError
 from dwell.testbed.child import Child, Json, Started
 from dwell.testbed.conditions import Conditions, Scheduling, to_json
 
-__all__ = ["GAP_MS", "LONGEST_MS", "Passed", "TunLink"]
-
 #: A sender that is stopped by its CPU quota in the middle of a message goes on within 4 ms.
 GAP_MS = 4.0
 #: From then on a flow that never pauses draws its next delay.

@@ -21,8 +21,6 @@ from dwell.live.failures import start_thread
 from dwell.live.transport.transport import Arrival, Lane, Receive, Transport
 from dwell.testbed.message_links import LinkEnds, Way
 
-__all__ = ["LinkedTransport", "target_of", "without_source"]
-
 #: Begins a header that says where its message comes from; MessagePack never uses this byte.
 _SOURCE = b"\xc1"
 #: Keys whose fifth chunk is the one node that a message is for (see `Keys`).

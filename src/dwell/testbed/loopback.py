@@ -28,8 +28,6 @@ from dwell.testbed.processes import Processes, expected, without_keys
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, differing, usual_conditions
 
-__all__ = ["Loopback", "on_this_machine"]
-
 #: How long every process may take to be ready, on a machine that has a lot else to do.
 START_S = 60.0
 #: Where ports are looked for; below what the kernel gives out by itself.

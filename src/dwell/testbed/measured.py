@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-__all__ = ["Disturbed", "Measured", "Visit", "look_at", "usable"]
-
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 

@@ -20,17 +20,6 @@ from dwell.model import Problem
 if TYPE_CHECKING:
     from dwell.testbed.measured import Measured
 
-__all__ = [
-    "LEAST_JOBS",
-    "QUICK",
-    "MessageCost",
-    "OnTheWay",
-    "floors",
-    "hops",
-    "own_delays",
-    "share",
-]
-
 Floats: TypeAlias = NDArray[np.float64]
 #: Source, target, and the nodes of both.
 HopName: TypeAlias = tuple[str, str, str, str]

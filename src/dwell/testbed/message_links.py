@@ -33,8 +33,6 @@ from dwell.model import Link
 from dwell.testbed.conditions import Conditions, changed, to_json
 from dwell.testbed.draws import Draws
 
-__all__ = ["LinkEnds", "LinkFile", "Way", "transmission_ns"]
-
 _MAGIC = b"dwelllnk"
 # Magic, seed, bytes of the names that follow the directions.
 _HEAD = struct.Struct("<8sQQ")

@@ -38,8 +38,6 @@ from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, differing, usual_conditions
 from dwell.testbed.watcher import Watcher
 
-__all__ = ["NetnsTestbed", "require_playable"]
-
 FIRST_PORT = 7_450
 #: With a share of a CPU, a node's processes take a while to start.
 START_S = 120.0

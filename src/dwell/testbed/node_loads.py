@@ -17,15 +17,6 @@ from dwell.testbed.message_costs import LEAST_JOBS
 from dwell.testbed.speeds import Usual
 from dwell.testbed.task_costs import Site
 
-__all__ = [
-    "backgrounds",
-    "beside_jobs",
-    "contentions",
-    "contentions_stressed",
-    "interferences",
-    "wakes",
-]
-
 #: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
 #: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
 #: wakes or sleeps is as long as with 0.40 (E) to 0.52 (R1) times as many that come alone.

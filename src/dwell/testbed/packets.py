@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["Kind", "kind_of"]
-
 ICMP, TCP, UDP = 1, 6, 17
 FIN_SYN_RST = 0x07
 # Don't-fragment left out: more fragments, and where in the packet this one begins.

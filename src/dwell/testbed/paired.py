@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from dwell.model import FrozenDict
 
-__all__ = ["Part", "paired"]
-
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 

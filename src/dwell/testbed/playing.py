@@ -22,21 +22,6 @@ from dwell.testbed.conditions import Conditions
 from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import Change, Timeline, first_ns, last_ns, step_ns
 
-__all__ = [
-    "LOOK_S",
-    "Ask",
-    "Played",
-    "begun",
-    "come_up",
-    "crowded",
-    "interruptible",
-    "longest_run",
-    "make_folder",
-    "play",
-    "play_on",
-    "undisturbed",
-]
-
 #: Takes for how many seconds to wait, and returns how the cell is; a LiveError if nobody answers.
 Ask: TypeAlias = Callable[[float], Mapping[str, Any]]
 

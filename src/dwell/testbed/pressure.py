@@ -30,8 +30,6 @@ from itertools import pairwise
 from statistics import fmean
 from typing import Any
 
-__all__ = ["Rule", "Sample", "Span", "judged"]
-
 
 @dataclass(frozen=True, slots=True)
 class Rule:

@@ -21,8 +21,6 @@ from typing import cast
 
 from dwell.testbed.child import Child, Parent, Started
 
-__all__ = ["Lateness", "Probe"]
-
 SLEEP_NS = 5_000_000
 #: Wakes between two pieces of work, and turns of its loop: about 0.1 ms.
 WORK_EVERY, WORK_TURNS = 5, 2_000

@@ -21,8 +21,6 @@ from dwell.testbed.clocks import wrong_clock
 from dwell.testbed.linked_transport import LinkedTransport
 from dwell.testbed.message_links import LinkEnds
 
-__all__ = ["FaultyPlatform", "main", "program"]
-
 
 def program(*, links: Path | None = None, clocks: Path | None = None) -> tuple[str, ...]:
     """Return the module, and its first arguments, that runs agents and controllers with faults.

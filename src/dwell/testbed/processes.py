@@ -26,8 +26,6 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.testbed.trace_names import move_traces
 
-__all__ = ["Inside", "Processes", "expected", "outright", "without_keys"]
-
 #: Takes a node and the words of a command; returns those that run it there, in the same process.
 Inside: TypeAlias = Callable[[str, Sequence[str]], Sequence[str]]
 

@@ -38,8 +38,6 @@ from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import Change, timeline_of, usual_conditions
 
-__all__ = ["RealHosts", "require_commands", "run_on_hosts"]
-
 MARK = ".dwell-testbed"
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
 #: For a command that is to end by itself.

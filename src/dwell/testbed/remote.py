@@ -23,8 +23,6 @@ from types import FrameType
 
 from dwell.live.parent_death import end_with_owner
 
-__all__ = ["SHELL_ID", "local_words", "script_of"]
-
 #: Word of a command that stands for the process id of the shell on the other side.
 SHELL_ID = "$$"
 #: 3 is the other side's standard input; a command in the background has none.

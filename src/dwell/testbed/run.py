@@ -28,8 +28,6 @@ from dwell.testbed.pressure import Rule, Span, judged
 from dwell.testbed.sampling import Sampler
 from dwell.testbed.timeline import timeline_of
 
-__all__ = ["MARK", "length_s", "require_machine", "run_once", "spans_of"]
-
 #: A folder with this file is a testbed's, and may be replaced by its next run.
 MARK = ".dwell-testbed"
 #: Time for a controller's last window, beyond its grace.

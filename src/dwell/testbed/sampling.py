@@ -17,8 +17,6 @@ from dwell.testbed.link import Passed, TunLink
 from dwell.testbed.pressure import Rule, Sample
 from dwell.testbed.probe import Probe
 
-__all__ = ["EVERY_S", "Sampler", "cpu_times"]
-
 EVERY_S = 0.1
 STAT = Path("/proc/stat")
 # Fields of a CPU's line in /proc/stat.

@@ -21,8 +21,6 @@ import numpy as np
 from dwell.testbed.measured import Floats, Measured, SiteName, Visit
 from dwell.testbed.speeds import Usual, window_work_ms
 
-__all__ = ["sensitivities", "usual_of"]
-
 #: Jobs that a window's mean needs; windows in a row that are one point; points that a slope needs.
 LEAST_JOBS, TOGETHER, LEAST_POINTS = 10, 5, 8
 #: How wide the 95 % interval of a slope may be: of nothing that changes, nothing follows.

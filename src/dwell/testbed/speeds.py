@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from dwell.model import Execution, Process
     from dwell.record import Run
 
-__all__ = ["Usual", "at_speed_of", "slowed", "window_work_ms", "work_ms"]
-
 
 @dataclass(frozen=True, slots=True)
 class Usual:

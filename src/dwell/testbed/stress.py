@@ -13,8 +13,6 @@ from collections.abc import Collection, Sequence
 
 from dwell.testbed.burner import Burner
 
-__all__ = ["STRESS_NG", "Stress"]
-
 #: One busy process; a loop without memory traffic, as the simulator has its foreign threads.
 STRESS_NG = ("stress-ng", "--quiet", "--cpu", "1", "--cpu-method", "loop", "--timeout", "0")
 

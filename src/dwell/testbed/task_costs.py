@@ -26,8 +26,6 @@ from dwell.testbed.message_costs import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
 from dwell.testbed.speeds import Usual
 
-__all__ = ["Site", "messaging", "sites"]
-
 #: How many times as long as usual messaging takes where a stage takes longer: in the runs of the
 #: example as many as that, window by window; a job that finds nothing to do has its messages still.
 SLOWER = 0.5, 2.0

@@ -16,8 +16,6 @@ from dwell.testbed.child import Started
 from dwell.testbed.processes import Processes
 from dwell.testbed.timeline import Change
 
-__all__ = ["LocalTestbed", "Testbed"]
-
 
 class Testbed(Started):
     """A cell on hosts, links and CPUs that can be disturbed; a context manager.

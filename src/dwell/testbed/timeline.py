@@ -20,19 +20,6 @@ from dwell.testbed.conditions import Conditions
 if TYPE_CHECKING:
     from dwell.sim import LinkSegment
 
-__all__ = [
-    "Change",
-    "NodeState",
-    "Timeline",
-    "differing",
-    "first_ns",
-    "last_ns",
-    "require_playable_scenario",
-    "step_ns",
-    "timeline_of",
-    "usual_conditions",
-]
-
 NS_PER_S = 1e9
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["move_traces", "rename_traces"]
-
 
 def rename_traces(values: object, renamed: Callable[[str], str]) -> None:
     """Give all trace files in a cell's plain values another name, in place."""

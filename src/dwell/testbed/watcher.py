@@ -12,8 +12,6 @@ from typing import Any, cast
 from dwell.errors import DwellError, LiveError
 from dwell.testbed.child import Child, Parent, Started
 
-__all__ = ["Watcher"]
-
 #: Beyond the patience of a question, for the process itself.
 SLACK_S = 5.0
 

@@ -12,8 +12,6 @@ from itertools import pairwise
 
 from dwell.errors import LiveError
 
-__all__ = ["matcher", "require_expression", "require_key"]
-
 # What Zenoh forbids, and `@` in front, which no wildcard of Zenoh's would match.
 _CHUNK = re.compile(r"[^/*$?#@\s][^/*$?#\s]*")
 

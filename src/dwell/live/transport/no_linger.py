@@ -17,8 +17,6 @@ from contextlib import suppress
 
 from dwell.live.failures import start_thread
 
-__all__ = ["Connections"]
-
 #: Open files of this process, by number.
 _OPEN = "/dev/fd"
 _ON_FOR = "ii"

@@ -13,8 +13,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["remove_orphans"]
-
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where Linux keeps it
 #: A file that young may be without its lock yet.
 YOUNG_S = 0.5

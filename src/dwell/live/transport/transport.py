@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias
 
-__all__ = ["Arrival", "Lane", "Receive", "Transport"]
-
 #: `control` is for what is small and must not wait; `images` for payloads, newest first.
 Lane: TypeAlias = Literal["control", "images"]
 

@@ -35,8 +35,6 @@ from dwell.model import FrozenDict
 if TYPE_CHECKING:
     import zenoh
 
-__all__ = ["LONGEST_BYTES", "ZenohSettings", "ZenohTransport"]
-
 #: Longest message that is put together from its fragments; Zenoh's own limit is 1 GiB.
 LONGEST_BYTES = 64 << 20
 #: Begins an attachment that says which key it was put under. No header does: MessagePack never

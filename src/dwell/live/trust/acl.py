@@ -12,8 +12,6 @@ from typing import Any, TypeAlias
 
 from dwell.live.trust.roster import Roster
 
-__all__ = ["AccessControl", "access_control"]
-
 #: Zenoh's `access_control`.
 AccessControl: TypeAlias = dict[str, Any]
 

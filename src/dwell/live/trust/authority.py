@@ -24,8 +24,6 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from dwell.errors import TrustError
 from dwell.live.trust.roster import ROLES, Role, Roster, Subject, write_private
 
-__all__ = ["AUTHORITY", "DAYS", "Authority"]
-
 #: Folder of the authority's own key, which stays where the others are issued.
 AUTHORITY = "ca"
 #: How long certificates hold, unless asked otherwise; the authority's own holds ten times that.

@@ -16,8 +16,6 @@ from cryptography.x509.oid import NameOID
 from dwell.errors import TrustError
 from dwell.live.trust.roster import Roster, Subject
 
-__all__ = ["SOON_DAYS", "Keyring"]
-
 #: From how many days before its end on a certificate is warned of.
 SOON_DAYS = 30
 

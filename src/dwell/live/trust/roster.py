@@ -17,8 +17,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from dwell.errors import TrustError
 from dwell.files import write_whole
 
-__all__ = ["ROLES", "Role", "Roster", "Subject", "write_private"]
-
 #: A `node` runs an agent and what it starts; the `controller` orders; an `operator` asks for pins
 #: and drains; an `observer` reads.
 Role: TypeAlias = Literal["node", "controller", "operator", "observer"]

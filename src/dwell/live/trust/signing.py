@@ -13,8 +13,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from dwell.errors import TrustError
 from dwell.live.trust.keyring import Keyring
 
-__all__ = ["SIGNATURE_BYTES", "Seals"]
-
 SIGNATURE_BYTES = 64
 #: Sealed messages that are known to be good, so that the second copy of each costs nothing.
 REMEMBERED = 512

@@ -10,8 +10,6 @@ from pathlib import Path
 from dwell.testbed.chaos.light_cell import CANDIDATES
 from dwell.testbed.chaos.stages import APPLY, HOLD, NODES, RECORD, ZERO
 
-__all__ = ["Actuations", "Seen", "out_of_order", "unsafe"]
-
 _PLACEMENTS = {(p["perception"], p["planning"]): name for name, p in CANDIDATES.items()}
 
 

@@ -17,8 +17,6 @@ from typing import Self
 
 from dwell.errors import LiveError
 
-__all__ = ["DiskHog", "SmallDisk", "limit_file_size", "may_mount", "unmount_leftovers"]
-
 NAME = "dwell-chaos"
 #: Of a small disk while it is not full.
 ROOMY_BYTES = 512 << 20

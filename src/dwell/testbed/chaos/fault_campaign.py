@@ -30,8 +30,6 @@ from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.testbed import LocalTestbed
 
-__all__ = ["FaultCampaign", "Result", "Staging", "on_hosts", "on_loopback", "summary"]
-
 #: Takes the number of a cell among those of a campaign; returns where it runs, and its home.
 Staging: TypeAlias = Callable[[int], tuple[LocalTestbed, str | None]]
 

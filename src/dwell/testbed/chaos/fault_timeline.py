@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from dwell.testbed.chaos.faults import Fault
 
-__all__ = ["PlannedFault", "planned"]
-
 #: How long faults last, seconds: shorter and longer than a session's lease.
 LASTS_S = 0.5, 2.4
 #: And how long the cell is left alone before the next one.

@@ -11,8 +11,6 @@ from dwell.control.guard import parts_of
 from dwell.live.wiring import roles
 from dwell.model import Problem
 
-__all__ = ["Fault", "How", "Means", "bound_of", "faults_of", "hit_by"]
-
 How: TypeAlias = Literal["kill", "freeze", "cut", "jump", "drift", "starve", "fill", "hog"]
 
 #: What oscillators do, and what nobody's should.

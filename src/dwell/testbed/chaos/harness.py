@@ -27,8 +27,6 @@ from dwell.testbed.processes import expected
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, NodeState
 
-__all__ = ["CLOCK_FILE", "Harness", "environment_of", "pid_of"]
-
 OBSERVED, CLOCK_FILE = "observed", "clocks"
 #: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
 HEALTH_S = 5.0

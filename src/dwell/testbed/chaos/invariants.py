@@ -24,8 +24,6 @@ from dwell.live.messages import (
 )
 from dwell.model import Problem
 
-__all__ = ["Judge", "Term"]
-
 #: Stamps and orders that are remembered.
 MEMORY = 10_000
 

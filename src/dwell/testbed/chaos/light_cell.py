@@ -6,20 +6,6 @@ from typing import Any
 
 from dwell.testbed.chaos.stages import FRAME_BYTES, NODES
 
-__all__ = [
-    "CANDIDATES",
-    "GUARD_CYCLES",
-    "HOMES",
-    "MAX_AGE_MS",
-    "MIN_DWELL",
-    "PATIENT_MS",
-    "PERIOD_MS",
-    "P_NS",
-    "WINDOW_CYCLES",
-    "document",
-    "exec_ms",
-]
-
 PERIOD_MS = 40
 P_NS = PERIOD_MS * 1_000_000
 GUARD_CYCLES = 3

@@ -16,23 +16,6 @@ from collections.abc import Mapping
 
 from dwell.live.stage import Actuator, Message, load_actuator
 
-__all__ = [
-    "APPLY",
-    "FRAME_BYTES",
-    "HOLD",
-    "NODES",
-    "RECORD",
-    "START",
-    "TOLD",
-    "ZERO",
-    "Control",
-    "Perception",
-    "Planning",
-    "Sensing",
-    "Witness",
-    "Witnessed",
-]
-
 #: Variable with what the processes are told: ``observed`` (file), ``exec_ms`` (by task and node),
 #: ``actuators`` (by task, those that are called behind the witness).
 TOLD = "DWELL_CHAOS"

@@ -7,8 +7,6 @@ import threading
 import time
 from collections.abc import Collection
 
-__all__ = ["StallDetector"]
-
 
 class StallDetector:
     """Threads, one pinned to each CPU, that note when they were not scheduled: the machine's doing.

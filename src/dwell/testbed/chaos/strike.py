@@ -13,8 +13,6 @@ from dwell.testbed.chaos.harness import Harness
 from dwell.testbed.chaos.stages import APPLY, HOLD, ZERO
 from dwell.testbed.chaos.stalls import StallDetector
 
-__all__ = ["Outcome", "beyond", "strike"]
-
 #: Time in which a cell has to have recovered.
 RECOVERED_S = 60.0
 #: Longest time that a fault may take to be brought about, or to pass.

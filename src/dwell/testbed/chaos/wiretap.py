@@ -23,8 +23,6 @@ from dwell.testbed.chaos.invariants import Judge
 from dwell.testbed.child import Child, Parent, Started
 from dwell.testbed.testbed import LocalTestbed
 
-__all__ = ["ActuatorObserver", "Records", "Wiretap", "entry_for", "heard"]
-
 _HEAD = struct.Struct("<QIII")
 #: How long it may take until everything is heard for the first time, seconds.
 HEARD_S = 20.0
