@@ -10,10 +10,11 @@ import pytest
 import dwell
 from dwell.errors import LiveError
 from dwell.record import open_run
+from dwell.record.campaign_folder import read_campaign
 from dwell.report.campaign_page import campaign_html
 from dwell.study.measured_campaign import read_measured
 from dwell.testbed.campaign import Campaign, entrant
-from dwell.testbed.execution import read_campaign, run_campaign
+from dwell.testbed.execution import run_campaign
 from dwell.testbed.idle import Quiet
 from dwell.testbed.run import require_machine, run_once
 from tests.testbed.machine import own_name

@@ -12,9 +12,9 @@ import typer
 from dwell.cli.output import print_json, working, write_file, write_report
 from dwell.errors import RunError
 from dwell.record import Run, open_run
+from dwell.record.campaign_folder import is_campaign
 from dwell.report.formatting import listed
 from dwell.study.study_folder import is_study, open_study
-from dwell.testbed.execution import is_campaign
 
 
 def report_folder(

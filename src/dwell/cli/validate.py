@@ -10,13 +10,13 @@ from typing import Any
 import typer
 
 import dwell
+from dwell.calibration.speeds import Usual
 from dwell.cli.first_answer import compile_first
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
 from dwell.record import Run, open_run
 from dwell.report.validation_page import validation_html, validation_text
 from dwell.study.validation import GOALS, Validation, validate
-from dwell.testbed.speeds import Usual
 
 
 def validate_runs(

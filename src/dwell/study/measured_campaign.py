@@ -17,11 +17,11 @@ from dwell.cellfile import from_document
 from dwell.errors import RunError
 from dwell.model import Problem
 from dwell.record import Run, open_run
+from dwell.record.campaign_folder import CampaignFolder, read_campaign
 from dwell.study.comparison import Comparison
 from dwell.study.job_times import jobs_of, links_of, profiles_of
 from dwell.study.player import Example
 from dwell.study.summary import Row, latency_grid_ms, summarise
-from dwell.testbed.execution import Kept, read_campaign
 
 if TYPE_CHECKING:
     import polars as pl
@@ -206,7 +206,7 @@ def _contender(name: str, run: Run) -> str:
     return f"atp-thresholds{plus}{estimator}" if policy == "atp" and by_thresholds else name
 
 
-def _failed(kept: Kept, renamed: Mapping[str, str]) -> pl.DataFrame:
+def _failed(kept: CampaignFolder, renamed: Mapping[str, str]) -> pl.DataFrame:
     import polars as pl
 
     names = ("scenario", "policy", "repetition", "attempt", "outcome", "reason")

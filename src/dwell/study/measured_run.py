@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from dwell.calibration.speeds import Usual, at_speed_of
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.model import Problem
@@ -23,7 +24,6 @@ from dwell.model.scenario import Disturbance, Scenario
 from dwell.policies.registry import by_name, name_of_class
 from dwell.study.job_times import finished_jobs
 from dwell.study.qos_sample import Piece, piece_of
-from dwell.testbed.speeds import Usual, at_speed_of
 
 if TYPE_CHECKING:
     import polars as pl

@@ -38,8 +38,8 @@ from dwell.study.workers import available_processes, spread
 if TYPE_CHECKING:
     import polars as pl
 
+    from dwell.calibration.speeds import Usual
     from dwell.record import Run
-    from dwell.testbed.speeds import Usual
 
 Progress: TypeAlias = Callable[[int, int], None]
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
+from dwell.calibration.speeds import Usual, at_speed_of
 from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
@@ -35,7 +36,6 @@ from dwell.testbed.node_loads import (
 )
 from dwell.testbed.paired import paired
 from dwell.testbed.sensitivity import usual_of
-from dwell.testbed.speeds import Usual, at_speed_of
 from dwell.testbed.task_costs import Site, messaging, sites
 from dwell.testbed.trace_names import move_traces
 

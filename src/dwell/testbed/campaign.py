@@ -22,11 +22,10 @@ from dwell.errors import LiveError, PolicyError, ProblemError
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.policies.registry import by_name, estimates, names
+from dwell.record.campaign_folder import TRACES
 from dwell.testbed.trace_names import rename_traces
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
-#: Folder of a campaign with the trace files of its cell.
-TRACES = "traces"
 #: Parts of this package that a measurement depends on.
 SOURCES = (*("control", "cost.py", "demo", "estimators", "live", "model", "policies", "testbed"),)
 

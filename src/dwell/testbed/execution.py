@@ -1,9 +1,7 @@
 """Execution of a campaign: its runs, one after the other, whatever comes between.
 
-The folder holds ``campaign.json`` (what campaign it is), ``traces`` (files that its cell replays),
-``runs`` (a Run folder for every run that is done) and ``failed`` (all that attempts left which are
-not). Nothing else says what is done: a run's folder appears complete, in one step. So a campaign
-goes on wherever it was stopped.
+Nothing but its folder (`dwell.record.campaign_folder`) says what is done, and a run's folder
+appears complete, in one step. So a campaign goes on wherever it was stopped.
 """
 
 from __future__ import annotations
@@ -17,18 +15,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from dwell.cellfile.work_folder import FolderMark, claimed, unwritable
-from dwell.errors import DwellError, LiveError, RunError
+from dwell.cellfile.work_folder import claimed, unwritable
+from dwell.errors import DwellError, LiveError
 from dwell.files import write_whole
 from dwell.model import Problem
 from dwell.record import Run, open_run
-from dwell.testbed.campaign import TRACES, Campaign, Entrant, Planned
+from dwell.record.campaign_folder import ATTEMPT, CAMPAIGN, FAILED, RUNS
+from dwell.testbed.campaign import Campaign, Entrant, Planned
 from dwell.testbed.idle import Idle, Quiet, wait_until_idle
 
-RUNS, FAILED, WORK = "runs", "failed", ".work"
-#: Beside the tables of a run: when it was made, and how the machine was.
-ATTEMPT = "attempt.json"
-CAMPAIGN = FolderMark("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
+#: Where a run is kept while it is made, in a campaign's folder.
+WORK = ".work"
 #: How often a run that failed is repeated.
 REPEATS = 2
 #: So many attempts that end with an error before any does not: nothing works.
@@ -285,52 +282,3 @@ def _judged(run: Run) -> dict[str, Any]:
     if not windows:
         return {"outcome": "failed", "reason": "it has no window after the warm-up"}
     return {"outcome": "done", "reason": "", "windows": windows, "excluded": excluded}
-
-
-class Kept(NamedTuple):
-    """What is in a campaign's folder.
-
-    Parameters
-    ----------
-    description : mapping
-        See `Campaign.describe`.
-    done : mapping of Path to mapping
-        Folder of every run that is done, in the order of the plan, with its record.
-    failed : tuple of mapping
-        Records of the attempts that failed.
-    """
-
-    description: Mapping[str, Any]
-    done: Mapping[Path, Mapping[str, Any]]
-    failed: tuple[Mapping[str, Any], ...]
-
-
-def is_campaign(folder: Path) -> bool:
-    """Whether a folder is a campaign's."""
-    return (folder / CAMPAIGN.file).is_file()
-
-
-def read_campaign(folder: Path) -> Kept:
-    """Return what is in a campaign's folder, also while it goes on.
-
-    Raises
-    ------
-    RunError
-        If it holds none, or what it holds cannot be read.
-    """
-    if not is_campaign(folder):
-        raise RunError(f"{folder}: not a campaign (it has no {CAMPAIGN.file})")
-    described = _read(folder / CAMPAIGN.file)
-    if "plan" not in described:
-        raise RunError(f"{folder / CAMPAIGN.file} describes no campaign")
-    done = {file.parent: _read(file) for file in sorted((folder / RUNS).glob(f"*/{ATTEMPT}"))}
-    failed = tuple(_read(file) for file in sorted((folder / FAILED).glob(f"*/{ATTEMPT}")))
-    return Kept(described, done, failed)
-
-
-def _read(file: Path) -> dict[str, Any]:
-    try:
-        told = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunError(f"{file}: cannot be read ({error})") from None
-    return told if isinstance(told, dict) else {}

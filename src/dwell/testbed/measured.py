@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.calibration.speeds import work_ms
 from dwell.errors import RunError
 from dwell.model import LinkDisturbance, Problem
 from dwell.model.scenario import is_always_on
 from dwell.testbed.message_costs import LEAST_JOBS
-from dwell.testbed.speeds import work_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -115,7 +115,7 @@ class Measured:
     used : dict of str to float
         Cores that were busy on each node.
     work_ms : dict of str to float
-        CPU time of a fixed piece of work on every node (`dwell.testbed.speeds`).
+        CPU time of a fixed piece of work on every node (`dwell.calibration.speeds`).
     begins_ms, ends_ms : dict of (str, str) to float
         From the arrival of the last input, or a release, to the start of the job; of sinks, from
         the end of the job to that of the cycle. Unhindered, but where something counts what the

@@ -10,11 +10,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from dwell.calibration.speeds import Usual
 from dwell.model import Problem
 from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
 from dwell.testbed.measured import Measured, SiteName
 from dwell.testbed.message_costs import LEAST_JOBS
-from dwell.testbed.speeds import Usual
 from dwell.testbed.task_costs import Site
 
 #: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a

@@ -18,8 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from dwell.calibration.speeds import Usual, window_work_ms
 from dwell.testbed.measured import Floats, Measured, SiteName, Visit
-from dwell.testbed.speeds import Usual, window_work_ms
 
 #: Jobs that a window's mean needs; windows in a row that are one point; points that a slope needs.
 LEAST_JOBS, TOGETHER, LEAST_POINTS = 10, 5, 8

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dwell.calibration.speeds import Usual
 from dwell.model import Flow, Problem
 from dwell.testbed.measured import Floats, Measured, SiteName
 from dwell.testbed.message_costs import LEAST_JOBS, OnTheWay, share
 from dwell.testbed.paired import Part
-from dwell.testbed.speeds import Usual
 
 #: How many times as long as usual messaging takes where a stage takes longer: in the runs of the
 #: example as many as that, window by window; a job that finds nothing to do has its messages still.

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 import dwell
+from dwell.calibration.speeds import Usual, at_speed_of, slowed, window_work_ms, work_ms
 from dwell.cellfile import from_document
 from dwell.model import Problem, Trace
 from dwell.model.document import to_document
 from dwell.record import Run
-from dwell.testbed.speeds import Usual, at_speed_of, slowed, window_work_ms, work_ms
 from tests.cells.small import make_problem
 
 META = {
