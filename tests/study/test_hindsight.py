@@ -89,20 +89,6 @@ def test_utilisation_of_a_shifted_window_is_that_of_the_windows_it_overlaps() ->
         assert told[name].utilisation["R1"] == pytest.approx(np.mean(busy[1:3]), rel=1e-6)
 
 
-def test_it_tells_of_any_window() -> None:
-    realisation = draw(PROBLEM, scenario=SCENARIO, seed=1, windows=WINDOWS)
-    alone = play_alone(PROBLEM, realisation)
-    hindsight = Hindsight(alone)
-    hindsight.start(PROBLEM)
-    for window in (0, 5, WINDOWS - 1):
-        told = hindsight.metrics(window * PROBLEM.window_cycles)
-        for name, run in alone.items():
-            row = run.windows.row(window, named=True)
-            assert told[name].l95_ms == row["seen_l95_ms"]
-            assert told[name].violation_rate == row["seen_violation_rate"]
-            assert told[name].utilisation["E"] == pytest.approx(row["u_E"], rel=1e-9)
-
-
 def test_it_has_to_be_told() -> None:
     realisation = draw(PROBLEM, scenario=SCENARIO, seed=1, windows=WINDOWS)
     with pytest.raises(SimulationError, match="knows no run of LOC, SO, HYB alone"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from polars.testing import assert_frame_equal
 
-from dwell.errors import PolicyError, SimulationError
+from dwell.errors import SimulationError
 from dwell.model import (
     Caps,
     Constant,
@@ -134,22 +134,21 @@ def test_plans_are_simulated_as_they_are_whatever_orders_take(
         assert run.decisions["migrated"].sum() == 4
 
 
-def test_the_dwell_is_that_of_the_problem_or_the_one_given() -> None:
+def test_the_dwell_is_that_of_the_problem() -> None:
     spans = [("AB"[k % 4 == 1], k, 2) for k in range(3, 15, 2)]
     problem = two_nodes(4.0, stressed(("B", 0, 3), *spans), switching=0.1)
     realisation = realise(problem, 15)
 
-    def moves(min_dwell: int | None) -> list[int]:
-        found = references(problem, realisation, min_dwell=min_dwell)
+    def moves(min_dwell: int) -> list[int]:
+        controller = replace(problem.controller, min_dwell=min_dwell)
+        found = references(replace(problem, controller=controller), realisation)
         free, bound = (found.sequences[title].choice for title in (CLAIRVOYANT, CLAIRVOYANT_DWELL))
         assert (np.flatnonzero(np.diff(free)) + 1).tolist() == [3, 5, 7, 9, 11, 13]
         return [int(k) + 1 for k in np.flatnonzero(np.diff(bound))]
 
-    assert moves(None) == moves(1) == [3, 5, 7, 9, 11, 13]
+    assert moves(1) == [3, 5, 7, 9, 11, 13]
     assert min(np.diff([0, *moves(2)])) >= 3
     assert moves(20) == []
-    with pytest.raises(PolicyError, match="min_dwell is -1"):
-        references(problem, realisation, min_dwell=-1)
 
 
 def test_taking_turns_beats_two_overloaded_nodes_and_the_reference() -> None:

@@ -8,6 +8,7 @@ can be shown below some n, whatever is measured. Every row says the least p that
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
@@ -53,20 +54,19 @@ class CampaignQuestion(NamedTuple):
 def questions(measured: MeasuredCampaign) -> tuple[CampaignQuestion, ...]:
     """Return the questions that the runs have anything to say on, answered."""
     comparison = measured.comparison
-    problem, there = comparison.problem, comparison.policies
-    rules, singles = (_of_family(there, names) for names in (TOGETHER, (SINGLE,)))
-    binary = [name for name in BINARY if name in there]
-    stress = stress_scenarios(problem, comparison.scenarios)
-    faults = fault_scenarios(problem, comparison.scenarios)
-    found = []
+    problem, policies = comparison.problem, comparison.policies
+    rules, singles = (_of_family(policies, names) for names in (TOGETHER, (SINGLE,)))
+    binary = [name for name in BINARY if name in policies]
+    answered = []
     if rules and singles:
-        pairs = [(rule, single) for rule in rules for single in singles]
-        found.append(_asked(comparison.runs, RQ1, stress, pairs, (rules[0], singles)))
-    if binary and HYBRID in there:
-        pairs = [(HYBRID, name) for name in binary]
-        pairs += [(rule, other) for rule in rules for other in (*binary, *singles)]
-        found.append(_asked(comparison.runs, RQ2, faults, pairs, (HYBRID, binary)))
-    return tuple(one for one in found if one.table.height)
+        scenarios = stress_scenarios(problem, comparison.scenarios)
+        pairs = list(product(rules, singles))
+        answered.append(_answered(comparison.runs, RQ1, scenarios, pairs, (rules[0], singles)))
+    if binary and HYBRID in policies:
+        scenarios = fault_scenarios(problem, comparison.scenarios)
+        pairs = [*product([HYBRID], binary), *product(rules, (*binary, *singles))]
+        answered.append(_answered(comparison.runs, RQ2, scenarios, pairs, (HYBRID, binary)))
+    return tuple(question for question in answered if question.table.height)
 
 
 def stress_scenarios(problem: Problem, names: Sequence[str]) -> tuple[str, ...]:
@@ -98,27 +98,25 @@ def compared(
     import polars as pl
 
     differences: dict[str, Difference] = {}
-    for name, (first, second) in pairs.items():
-        sides = [
-            runs.filter(*(pl.col(key) == value for key, value in one.items()))
-            for one in (first, second)
-        ]
-        both = set(sides[0]["seed"]) & set(sides[1]["seed"])
-        if both:
+    for name, pair in pairs.items():
+        first, second = (
+            set(runs.filter(*(pl.col(key) == value for key, value in labels.items()))["seed"])
+            for labels in pair
+        )
+        if both := first & second:
             shared = runs.filter(pl.col("seed").is_in(sorted(both)))
-            one = Family.of_runs(shared, question, metric, {name: (first, second)})
-            differences |= one.comparisons
+            differences |= Family.of_runs(shared, question, metric, {name: pair}).comparisons
     return Family(question, metric, differences)
 
 
-def _asked(
+def _answered(
     runs: pl.DataFrame,
     title: str,
     scenarios: Sequence[str],
     pairs: Sequence[tuple[str, str]],
-    asked: tuple[str, Sequence[str]],
+    subject: tuple[str, Sequence[str]],
 ) -> CampaignQuestion:
-    """Compare pairs in every scenario and metric; `asked` is whom the answer is about."""
+    """Compare pairs in every scenario and metric; `subject` is whom the answer is about."""
     import polars as pl
 
     names = {
@@ -127,55 +125,35 @@ def _asked(
         for first, second in pairs
     }
     contrasts: dict[str, Contrast] = {
-        name: ({"scenario": scenario, "policy": one}, {"scenario": scenario, "policy": other})
-        for name, (scenario, one, other) in names.items()
+        name: ({"scenario": scenario, "policy": first}, {"scenario": scenario, "policy": second})
+        for name, (scenario, first, second) in names.items()
     }
+    schema = dict.fromkeys(("scenario", "first", "second"), pl.String)
+    renamed = {"effect": "difference", "p": "p_holm", "word": "verdict"}
+    columns = ("metric", "n", "effect", "low", "high", "p", "p_least", "word")
     parts = []
     for metric in METRICS:
         rows = compared(runs, title, metric, contrasts).table()
         labels = [names[name] for name in rows["comparison"]]
-        columns = {
-            called: pl.Series(called, [label[place] for label in labels], dtype=pl.String)
-            for place, called in enumerate(("scenario", "first", "second"))
-        }
         parts.append(
-            rows.select(
-                **columns,
-                metric="metric",
-                n="n",
-                effect="difference",
-                low="low",
-                high="high",
-                p="p_holm",
-                p_least="p_least",
-                word="verdict",
+            pl.DataFrame(labels, schema=schema, orient="row").hstack(
+                rows.select(pl.col(renamed.get(name, name)).alias(name) for name in columns)
             )
         )
     table = pl.concat(parts, how="vertical_relaxed")
-    return CampaignQuestion(title, answer_of(table, *asked), table)
+    return CampaignQuestion(title, answer_of(table, *subject), table)
 
 
 def answer_of(table: pl.DataFrame, first: str, others: Sequence[str]) -> Answer:
-    """Return what comparisons of V_D say of the first against all others (see the class).
-
-    Parameters
-    ----------
-    table : DataFrame
-        With ``metric``, ``scenario``, ``first``, ``second`` and ``word``.
-    others : sequence of str
-    """
-    mine = table.filter(
-        metric="violation_rate",
-        first=first,
-    )
+    """Return what the table's comparisons of V_D say of the first against all others."""
     words: dict[str, set[str]] = {}
-    for row in mine.iter_rows(named=True):
+    for row in table.filter(metric="violation_rate", first=first).iter_rows(named=True):
         if row["second"] in others:
             words.setdefault(row["scenario"], set()).add(row["word"])
-    lower = [one for one in words.values() if one == {"lower"}]
+    lower = sum(shown == {"lower"} for shown in words.values())
     if lower:
-        return "yes" if len(lower) == len(words) else "in part"
-    return "no" if any("higher" in one for one in words.values()) else "not shown"
+        return "yes" if lower == len(words) else "in part"
+    return "no" if any("higher" in shown for shown in words.values()) else "not shown"
 
 
 def _of_family(policies: Sequence[str], families: Sequence[str]) -> list[str]:

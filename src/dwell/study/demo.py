@@ -7,15 +7,17 @@ repository's folder of examples; the measurements are not part of it.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
 from dwell.errors import TraceError
 from dwell.model import Problem
 from dwell.study.comparison import Comparison, compare
-from dwell.study.runner import StudyResult, run_study
+from dwell.study.runner import Progress, StudyResult, run_study
 from dwell.study.study import Contender, load_study
 
 #: Policies beside every candidate as a static placement.
@@ -36,7 +38,6 @@ REAL = ("real.yaml", "real-5g.yaml")
 #: Study of the assumption that decides the demo's answer, in the same folder.
 TENANTS = "studies/tenants.yaml"
 
-Progress: TypeAlias = Callable[[int, int], None]
 Folder: TypeAlias = "str | os.PathLike[str]"
 
 
@@ -67,8 +68,7 @@ def canonical_demo(
     from dwell.cellfile import load
 
     problem = load(Path(examples) / CANONICAL)
-    (comparison,) = _compare_all([problem], seeds, windows, processes, progress)
-    return comparison
+    return _compare_all([problem], seeds, windows, processes, progress)[0]
 
 
 def tenants_demo(
@@ -83,10 +83,8 @@ def tenants_demo(
 
     Parameters
     ----------
-    examples : path-like
-        Folder with `TENANTS`.
-    seeds, windows, processes, progress
-        See `canonical_demo`.
+    examples, seeds, windows, processes, progress
+        See `canonical_demo`; the folder has `TENANTS`.
 
     Raises
     ------
@@ -115,12 +113,10 @@ def real_demo(
         Folder with the cells of `REAL`.
     traces : path-like
         Folder with the measurements that they name.
-    seeds : int
-        Number of seeds: 1 to this; a seed chooses where in the measurements replay starts.
-    windows : int
-        Fewer are played where a trace that does not wrap is too short for them.
-    processes, progress
-        See `dwell.study.compare`; progress counts the runs of all cells.
+    seeds, windows, processes, progress
+        See `canonical_demo`. A seed chooses where in the measurements replay starts; fewer windows
+        are played where a trace that does not wrap is too short for them; progress counts the runs
+        of all cells.
 
     Returns
     -------
@@ -146,28 +142,24 @@ def longest_run(problem: Problem, windows: int) -> int:
     TraceError
         If they do not last for a single window after the warm-up.
     """
-    enough, too_many = problem.warmup_windows, windows + 1
-    fault: TraceError | None = None
-    while too_many - enough > 1:
-        # All of them at first, then halves.
-        middle = windows if too_many > windows else (enough + too_many) // 2
-        fault = _too_short(problem, middle)
-        enough, too_many = (middle, too_many) if fault is None else (enough, middle)
-    if fault is not None and enough == problem.warmup_windows:
-        raise fault
-    return enough
-
-
-def _too_short(problem: Problem, windows: int) -> TraceError | None:
-    """Say which trace is too short for a run of so many windows."""
     from dwell.sim import draw
 
-    try:
-        for scenario in problem.scenarios:
-            draw(problem, scenario=scenario, seed=0, windows=windows)
-    except TraceError as fault:
-        return fault
-    return None
+    def too_many(length: int) -> bool:
+        try:
+            for scenario in problem.scenarios:
+                draw(problem, scenario=scenario, seed=0, windows=length)
+        except TraceError:
+            # Not even the shortest run is possible.
+            if length == lengths[0]:
+                raise
+            return True
+        return False
+
+    lengths = range(problem.warmup_windows + 1, windows + 1)
+    enough = len(lengths)
+    if lengths and too_many(windows):
+        enough = bisect_left(lengths, True, key=too_many)
+    return problem.warmup_windows + enough
 
 
 def _compare_all(
@@ -178,25 +170,26 @@ def _compare_all(
     progress: Progress | None,
 ) -> tuple[Comparison, ...]:
     """Compare on one problem after another, counting the runs of all together."""
-    sizes = [
-        len(problem.scenarios) * (len(problem.candidates) + len(POLICIES)) * seeds
-        for problem in problems
+    contenders: list[list[str | Contender]] = [
+        [*problem.candidates, *POLICIES] for problem in problems
     ]
-    comparisons = []
-    for index, problem in enumerate(problems):
+    sizes = [
+        len(problem.scenarios) * len(policies) * seeds
+        for problem, policies in zip(problems, contenders, strict=True)
+    ]
 
-        def count(done: int, _: int, before: int = sum(sizes[:index])) -> None:
-            if progress is not None:
-                progress(before + done, sum(sizes))
+    def count(before: int, done: int, _: int) -> None:
+        if progress is not None:
+            progress(before + done, sum(sizes))
 
-        comparisons.append(
-            compare(
-                problem,
-                policies=[*problem.candidates, *POLICIES],
-                seeds=range(1, seeds + 1),
-                windows=longest_run(problem, windows),
-                processes=processes,
-                progress=count,
-            )
+    return tuple(
+        compare(
+            problem,
+            policies=policies,
+            seeds=range(1, seeds + 1),
+            windows=longest_run(problem, windows),
+            processes=processes,
+            progress=partial(count, sum(sizes[:index])),
         )
-    return tuple(comparisons)
+        for index, (problem, policies) in enumerate(zip(problems, contenders, strict=True))
+    )

@@ -91,26 +91,12 @@ class Hindsight:
             )
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ns = round(problem.censor_ms * 1e6)
-        self._grace_ns = round(problem.controller.close_grace_ms * 1e6)
-        self._cycles = problem.window_cycles
         self._candidates = tuple(problem.candidates)
 
     def learn(self, evidence: Evidence) -> None:
         """Look up the cycles of a window."""
-        self._seen = self._told(evidence.release_ns, evidence.close_ns)
-
-    def metrics(self, first_cycle: int) -> dict[str, QoS]:
-        """Return what every candidate alone showed in the window that begins with a cycle."""
-        alone = next(iter(self._alone.values()))
-        release_ns = alone.release_ns[first_cycle : first_cycle + self._cycles]
-        after = first_cycle + self._cycles
-        ended = after >= len(alone.release_ns)
-        close_ns = int(alone.open_ns[-1] if ended else alone.release_ns[after])
-        return self._told(release_ns, close_ns + self._grace_ns)
-
-    def _told(self, release_ns: Ints, close_ns: int) -> dict[str, QoS]:
-        return {
-            name: self._metrics(self._alone[name], release_ns, close_ns)
+        self._seen = {
+            name: self._metrics(self._alone[name], evidence.release_ns, evidence.close_ns)
             for name in self._candidates
         }
 

@@ -21,7 +21,7 @@ from dwell.record.campaign_folder import CampaignFolder, read_campaign
 from dwell.study.comparison import Comparison
 from dwell.study.job_times import jobs_of, links_of, profiles_of
 from dwell.study.player import Example
-from dwell.study.summary import Row, latency_grid_ms, summarise
+from dwell.study.summary import Row, busiest_nodes, latency_grid_ms, summarise
 
 if TYPE_CHECKING:
     import polars as pl
@@ -35,7 +35,8 @@ class MeasuredCampaign:
     ----------
     comparison : Comparison
         Of its runs; repetitions are the seeds.
-    estimators : mapping of policy to str
+    estimators : mapping of str to str
+        By policy.
     kinds : frozenset of str
         ``live``, or ``simulated`` where runs were simulated in place of the testbed's.
     where : str
@@ -237,33 +238,23 @@ def _latencies(
 
     grid_ms = latency_grid_ms(problem.pipeline.deadline_ms)
     parts = []
-    for (scenario, policy), mine in runs.group_by("scenario", "policy", maintain_order=True):
-        share = within[str(scenario), str(policy)] / mine["cycles"].sum()
-        labels = {"scenario": pl.lit(scenario), "policy": pl.lit(policy)}
-        parts.append(
-            pl.DataFrame({"latency_ms": grid_ms, "share": share})
-            .with_columns(**labels)
-            .select("scenario", "policy", "latency_ms", "share")
-        )
-    return pl.concat(parts)
+    for (scenario, policy), group in runs.group_by("scenario", "policy", maintain_order=True):
+        share = within[str(scenario), str(policy)] / group["cycles"].sum()
+        points = pl.DataFrame({"latency_ms": grid_ms, "share": share})
+        parts.append(points.select(pl.all(), scenario=pl.lit(scenario), policy=pl.lit(policy)))
+    return pl.concat(parts).select("scenario", "policy", "latency_ms", "share")
 
 
 def _windows(run: Run, problem: Problem, scenario: str, policy: str) -> pl.DataFrame:
     """Return the windows that count, with the busiest node of each tier."""
     import polars as pl
 
-    from dwell.cost import tier_nodes
-
-    tiers = tier_nodes(problem.objective)
-    used = {
-        f"u_{tier}": pl.max_horizontal([f"u_{node}" for node in nodes]) if nodes else pl.lit(0.0)
-        for tier in ("robot", "edge")
-        for nodes in (getattr(tiers, tier),)
-    }
+    used = busiest_nodes(problem)
     return run.windows.filter(~pl.col("warmup")).select(
         scenario=pl.lit(scenario),
         policy=pl.lit(policy),
         l95_ms="seen_l95_ms",
         violation_rate="seen_violation_rate",
-        **used,
+        u_robot=used["u_robot"],
+        u_edge=used["u_edge"],
     )

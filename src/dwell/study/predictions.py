@@ -9,14 +9,14 @@ seeds says so.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.study.comparison import AIM
 from dwell.study.intervals import (
+    Floats,
     Interval,
     mean_interval,
     median_interval,
@@ -31,63 +31,13 @@ if TYPE_CHECKING:
     import polars as pl
 
 Answer: TypeAlias = Literal["agrees", "agrees in part", "differs", "open"]
-Test: TypeAlias = Callable[["PaperEvidence"], bool | None]
+Test: TypeAlias = Callable[[StudyRuns, str], bool | None]
 
 CANDIDATES = {"LOC", "SO", "HYB"}
 DTP = "dtp"
 
 
-@dataclass(frozen=True, slots=True)
-class PaperEvidence:
-    """A comparison, seen from one scenario; tests answer None where the runs do not tell."""
-
-    comparison: StudyRuns
-    scenario: str
-
-    def under_aim(self, policy: str) -> bool | None:
-        """Whether the violation rate is under the aim."""
-        values = self._values(policy, "violation_rate")
-        known = {"under": True, "over": False}
-        return None if values is None else known.get(under(values, AIM))
-
-    def more(
-        self, policy: str, column: str, other: str, *, scenario: str | None = None
-    ) -> bool | None:
-        """Whether a policy shows more of something than another, here or in another scenario."""
-        mine, theirs = self._values(policy, column), self._values(other, column, scenario)
-        if mine is None or theirs is None or not np.isfinite([*mine, *theirs]).all():
-            return None
-        return _sign(difference_of(column)(mine, theirs))
-
-    def saturated(self, policy: str, column: str) -> bool | None:
-        """Whether a tier is at its utilisation cap, or above."""
-        values = self._values(policy, column)
-        cap = min(self.comparison.problem.objective.caps.utilisation, 1.0)
-        # Just under the cap, so that a node at exactly 1 all the time counts.
-        return None if values is None else _sign(mean_interval(values - (cap - 1e-9)))
-
-    def typically_in_time(self, policy: str) -> bool | None:
-        """Whether the median latency is within the deadline."""
-        values = self._values(policy, "p50_ms")
-        if values is None:
-            return None
-        median, deadline_ms = median_interval(values), self.comparison.problem.pipeline.deadline_ms
-        if not median.known:
-            return None
-        return True if median.high <= deadline_ms else False if median.low > deadline_ms else None
-
-    def _values(
-        self, policy: str, column: str, scenario: str | None = None
-    ) -> NDArray[np.float64] | None:
-        """One number a seed; None where there are no such runs."""
-        scenario = scenario or self.scenario
-        if policy not in self.comparison.policies or scenario not in self.comparison.scenarios:
-            return None
-        return self.comparison.values(scenario, policy, column)
-
-
-@dataclass(frozen=True, slots=True)
-class PaperClaim:
+class PaperClaim(NamedTuple):
     """A few words of the paper on a static placement, and the condition they are read as.
 
     Parameters
@@ -97,7 +47,7 @@ class PaperClaim:
     reading : str
         The condition, in words.
     holds : callable
-        The condition: True, False, or None where the runs do not tell.
+        The condition on runs in a scenario: True, False, or None where the runs do not tell.
     """
 
     words: str
@@ -105,8 +55,7 @@ class PaperClaim:
     holds: Test
 
 
-@dataclass(frozen=True, slots=True)
-class Prediction:
+class Prediction(NamedTuple):
     """One row of the paper's table.
 
     Parameters
@@ -136,13 +85,76 @@ class Prediction:
         return f"{names} leads, with at least {self.share * 100:.0f} % of the windows"
 
 
-def _low(policy: str) -> PaperClaim:
-    return PaperClaim("Low V_D", "V_D under 5 %", lambda e: e.under_aim(policy))
+def _under_aim(words: str, policy: str) -> PaperClaim:
+    """The violation rate is under the aim."""
+    return PaperClaim(words, "V_D under 5 %", partial(_is_under_aim, policy))
 
 
-def _high(policy: str) -> PaperClaim:
-    return PaperClaim("High V_D", "V_D above 5 %", lambda e: _not(e.under_aim(policy)))
+def _over_aim(policy: str) -> PaperClaim:
+    """The violation rate is above the aim."""
 
+    def holds(comparison: StudyRuns, scenario: str) -> bool | None:
+        is_under = _is_under_aim(policy, comparison, scenario)
+        return None if is_under is None else not is_under
+
+    return PaperClaim("High V_D", "V_D above 5 %", holds)
+
+
+def _is_under_aim(policy: str, comparison: StudyRuns, scenario: str) -> bool | None:
+    rates = _values(comparison, scenario, policy, "violation_rate")
+    return None if rates is None else {"under": True, "over": False}.get(under(rates, AIM))
+
+
+def _more(
+    words: str, reading: str, policy: str, column: str, other: str, *, than_in: str | None = None
+) -> PaperClaim:
+    """A policy shows more in a column than another policy, which may be in another scenario."""
+
+    def holds(comparison: StudyRuns, scenario: str) -> bool | None:
+        first = _values(comparison, scenario, policy, column)
+        second = _values(comparison, than_in or scenario, other, column)
+        if first is None or second is None or not np.isfinite([*first, *second]).all():
+            return None
+        return _sign(difference_of(column)(first, second))
+
+    return PaperClaim(words, reading, holds)
+
+
+def _saturated(words: str, reading: str, policy: str, column: str) -> PaperClaim:
+    """A tier is at its utilisation cap, or above."""
+
+    def holds(comparison: StudyRuns, scenario: str) -> bool | None:
+        values = _values(comparison, scenario, policy, column)
+        cap = min(comparison.problem.objective.caps.utilisation, 1.0)
+        # Just under the cap, so that a node at exactly 1 all the time counts.
+        return None if values is None else _sign(mean_interval(values - (cap - 1e-9)))
+
+    return PaperClaim(words, reading, holds)
+
+
+def _typically_in_time(words: str, policy: str) -> PaperClaim:
+    """The median latency is within the deadline."""
+
+    def holds(comparison: StudyRuns, scenario: str) -> bool | None:
+        values = _values(comparison, scenario, policy, "p50_ms")
+        if values is None:
+            return None
+        median, deadline_ms = median_interval(values), comparison.problem.pipeline.deadline_ms
+        if not median.known:
+            return None
+        return True if median.high <= deadline_ms else False if median.low > deadline_ms else None
+
+    return PaperClaim(words, "the median latency is within D", holds)
+
+
+def _values(comparison: StudyRuns, scenario: str, policy: str, column: str) -> Floats | None:
+    """One number a seed; None where there are no such runs."""
+    if policy not in comparison.policies or scenario not in comparison.scenarios:
+        return None
+    return comparison.values(scenario, policy, column)
+
+
+_SPREAD = "distance from the median to the 95th percentile below SO's"
 
 #: The paper's table, row by row.
 PAPER: tuple[Prediction, ...] = (
@@ -150,16 +162,12 @@ PAPER: tuple[Prediction, ...] = (
         "baseline",
         {
             "LOC": (
-                _low("LOC"),
-                PaperClaim("high U_r", "U_r above SO's", lambda e: e.more("LOC", "u_robot", "SO")),
+                _under_aim("Low V_D", "LOC"),
+                _more("high U_r", "U_r above SO's", "LOC", "u_robot", "SO"),
             ),
             "SO": (
-                PaperClaim("Low U_r", "U_r below LOC's", lambda e: e.more("LOC", "u_robot", "SO")),
-                PaperClaim(
-                    "moderate V_D",
-                    "V_D above LOC's",
-                    lambda e: e.more("SO", "violation_rate", "LOC"),
-                ),
+                _more("Low U_r", "U_r below LOC's", "LOC", "u_robot", "SO"),
+                _more("moderate V_D", "V_D above LOC's", "SO", "violation_rate", "LOC"),
             ),
         },
         "Mostly LOC; occasional HYB",
@@ -169,20 +177,13 @@ PAPER: tuple[Prediction, ...] = (
     Prediction(
         "robot-cpu-stress",
         {
-            "LOC": (
-                _high("LOC"),
-                PaperClaim("U_r sat.", "U_r at its cap", lambda e: e.saturated("LOC", "u_robot")),
-            ),
+            "LOC": (_over_aim("LOC"), _saturated("U_r sat.", "U_r at its cap", "LOC", "u_robot")),
             "SO": (
-                PaperClaim(
-                    "Mitigated",
-                    "V_D below LOC's",
-                    lambda e: e.more("LOC", "violation_rate", "SO"),
-                ),
-                PaperClaim(
-                    "higher L95",
-                    "L95 above that of LOC without stress",
-                    lambda e: e.more("SO", "l95_ms", "LOC", scenario="baseline"),
+                _more("Mitigated", "V_D below LOC's", "LOC", "violation_rate", "SO"),
+                _more(
+                    *("higher L95", "L95 above that of LOC without stress"),
+                    *("SO", "l95_ms", "LOC"),
+                    than_in="baseline",
                 ),
             ),
         },
@@ -194,15 +195,10 @@ PAPER: tuple[Prediction, ...] = (
         "edge-cpu-stress",
         {
             "LOC": (
-                PaperClaim("Stable", "V_D under 5 %", lambda e: e.under_aim("LOC")),
-                PaperClaim(
-                    "U_r elevated", "U_r above SO's", lambda e: e.more("LOC", "u_robot", "SO")
-                ),
+                _under_aim("Stable", "LOC"),
+                _more("U_r elevated", "U_r above SO's", "LOC", "u_robot", "SO"),
             ),
-            "SO": (
-                _high("SO"),
-                PaperClaim("U_e sat.", "U_e at its cap", lambda e: e.saturated("SO", "u_edge")),
-            ),
+            "SO": (_over_aim("SO"), _saturated("U_e sat.", "U_e at its cap", "SO", "u_edge")),
         },
         "LOC or HYB",
         ("LOC", "HYB"),
@@ -211,21 +207,8 @@ PAPER: tuple[Prediction, ...] = (
     Prediction(
         "network-impairment",
         {
-            "LOC": (
-                PaperClaim(
-                    "Low variance",
-                    "distance from the median to the 95th percentile below SO's",
-                    lambda e: e.more("SO", "spread_ms", "LOC"),
-                ),
-            ),
-            "SO": (
-                _high("SO"),
-                PaperClaim(
-                    "via jitter",
-                    "the median latency is within D",
-                    lambda e: e.typically_in_time("SO"),
-                ),
-            ),
+            "LOC": (_more("Low variance", _SPREAD, "SO", "spread_ms", "LOC"),),
+            "SO": (_over_aim("SO"), _typically_in_time("via jitter", "SO")),
         },
         "Converges to LOC",
         ("LOC",),
@@ -234,8 +217,7 @@ PAPER: tuple[Prediction, ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(NamedTuple):
     """What DTP did in a scenario, beside what the paper predicts.
 
     Parameters
@@ -292,7 +274,7 @@ def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str =
 
 def judge_claim(comparison: StudyRuns, scenario: str, claim: PaperClaim) -> Answer:
     """Hold the words on a static placement against its runs."""
-    return _answer(claim.holds(PaperEvidence(comparison, scenario)))
+    return _answer(claim.holds(comparison, scenario))
 
 
 def _answer(holds: bool | None) -> Answer:
@@ -346,7 +328,3 @@ def _sign(difference: Interval) -> bool | None:
     if difference.low > 0:
         return True
     return False if difference.high < 0 else None
-
-
-def _not(answer: bool | None) -> bool | None:
-    return None if answer is None else not answer

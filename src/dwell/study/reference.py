@@ -18,6 +18,7 @@ it is applied to.) Where ``close_grace_ms`` is set, a migration still comes that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
@@ -26,13 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.windows import seen_l95_ns
-from dwell.cost import hamming, price, tier_nodes
+from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.script import Script
+from dwell.study.summary import busiest_nodes, mean_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -117,9 +119,7 @@ def play_alone(problem: Problem, realisation: Realisation) -> dict[str, Run]:
     }
 
 
-def references(
-    problem: Problem, realisation: Realisation, *, min_dwell: int | None = None
-) -> References:
+def references(problem: Problem, realisation: Realisation) -> References:
     """Simulate every candidate alone, plan with what they cost, and simulate the plans.
 
     All of it with the estimator ``profile``: nobody here needs estimates, and shadow jobs would be
@@ -129,23 +129,16 @@ def references(
     ----------
     realisation : Realisation
         Drawn for this problem.
-    min_dwell : int, optional
-        N_min of the sequence with a dwell; the problem's where None.
 
     Raises
     ------
-    PolicyError
-        If `min_dwell` is out of its range.
     SimulationError
         If the controller sees no window after the warm-up, or a candidate has the name of a
         sequence.
     """
     from dwell.sim import simulate_realisation
 
-    dwells = {
-        CLAIRVOYANT: 0,
-        CLAIRVOYANT_DWELL: problem.controller.min_dwell if min_dwell is None else min_dwell,
-    }
+    dwells = {CLAIRVOYANT: 0, CLAIRVOYANT_DWELL: problem.controller.min_dwell}
     names = tuple(problem.candidates)
     if taken := dwells.keys() & set(names):
         raise SimulationError(
@@ -232,8 +225,8 @@ def mean_cost(run: Run) -> float:
         If there is none.
     """
     windows = run.windows
-    mean = windows.filter(~windows["warmup"])["cost"].mean()
-    if not isinstance(mean, float):
+    mean = mean_of(windows.filter(~windows["warmup"])["cost"])
+    if math.isnan(mean):
         raise SimulationError(
             f"of {windows.height} windows none is left that is after the warm-up and that the "
             "controller saw; ask for more windows"
@@ -280,15 +273,8 @@ def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Float
 
 def tier_use(windows: pl.DataFrame, problem: Problem) -> tuple[Floats, Floats, Floats]:
     """Utilisation of the busiest node of each tier, robot, edge and cloud, in every window."""
-    import polars as pl
-
-    robot, edge, cloud = (
-        windows.select(pl.max_horizontal(0.0, *(f"u_{node}" for node in nodes)))
-        .to_series()
-        .to_numpy()
-        for nodes in tier_nodes(problem.objective)
-    )
-    return robot, edge, cloud
+    robot, edge, cloud = windows.select(**busiest_nodes(problem)).fill_null(0.0)
+    return robot.to_numpy(), edge.to_numpy(), cloud.to_numpy()
 
 
 def _in_time(problem: Problem) -> Problem:

@@ -14,6 +14,7 @@ from typing import Any
 from dwell import __version__
 from dwell.cellfile.sources import digest_of
 from dwell.errors import SimulationError
+from dwell.model import FrozenDict
 from dwell.model.document import to_document
 from dwell.model.user_classes import is_class_path, source_digest
 from dwell.study.study import Contender, Study
@@ -35,13 +36,9 @@ def versions() -> dict[str, str]:
 
 
 @cache
-def _software() -> tuple[tuple[str, str], ...]:
-    return (*versions().items(), ("sources", digest_of(SOURCES)))
-
-
-def software() -> dict[str, str]:
+def software() -> Mapping[str, str]:
     """Return the versions, and a digest of the sources of this package that make numbers."""
-    return dict(_software())
+    return FrozenDict({**versions(), "sources": digest_of(SOURCES)})
 
 
 def describe(study: Study) -> dict[str, Any]:

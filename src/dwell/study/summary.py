@@ -31,12 +31,7 @@ from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
-from dwell.study.quality import (
-    actuations,
-    age_of_information,
-    misses_in,
-    track,
-)
+from dwell.study.quality import actuations, age_of_information, misses_in, track
 
 if TYPE_CHECKING:
     import polars as pl
@@ -91,11 +86,6 @@ def latency_grid_ms(deadline_ms: float) -> Floats:
 def count_in(run: Run, window_cycles: int) -> Counted:
     """Leave out the warm-up, and the cycles after the last complete window.
 
-    Parameters
-    ----------
-    window_cycles : int
-        W.
-
     Raises
     ------
     SimulationError
@@ -140,14 +130,14 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     """
     windows, decisions, cycles = count_in(run, problem.window_cycles)
     missed = cycles["missed"].to_numpy()
-    latency_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
+    ascending_ns = np.sort(cycles["latency_ns"].fill_null(NEVER_NS).to_numpy())
     row: Row = {
         **labels,
         "windows": windows.height,
         "cycles": cycles.height,
         "violation_rate": float(missed.mean()),
         "l95_ms": mean_of(windows["seen_l95_ms"]),
-        **_percentiles(latency_ns),
+        **_percentiles(ascending_ns),
         **_utilisation(windows, problem),
         **_migrations(decisions),
         **_shares(windows["placement"], tuple(problem.candidates)),
@@ -161,7 +151,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         "queue_ms": mean_of(cycles["queue_ns"]) / 1e6,
         "network_ms": mean_of(cycles["network_ns"]) / 1e6,
     }
-    within = count_within(latency_ns, problem.pipeline.deadline_ms)
+    within = count_within(ascending_ns, problem.pipeline.deadline_ms)
     return Summary(row, _costs(windows, decisions, problem, labels), within)
 
 
@@ -194,44 +184,28 @@ def _actuator(played: pl.DataFrame, counted: pl.DataFrame, problem: Problem) -> 
     begin_ns = counted["release_ns"][0]
     end_ns = counted["release_ns"][-1] + round(problem.pipeline.period_ms * 1e6)
     age = age_of_information(actuated, begin_ns, end_ns)
-    row = {
-        "aoi_mean_ms": age.mean_ms,
-        "aoi_p95_ms": age.p95_ms,
-        "aoi_peak_ms": age.peak_ms,
-        "aoi_mean_peak_ms": age.mean_peak_ms,
-    }
+    row = {f"aoi_{name}": value for name, value in age._asdict().items()}
     if problem.servo is not None:
         tracking = track(problem.servo, actuated, begin_ns, end_ns)
         row |= {"tracking_rms_mm": tracking.rms_mm, "tracking_iae_mm": tracking.mean_mm}
     return row
 
 
-def count_within(latency_ns: Ints, deadline_ms: float) -> Ints:
+def count_within(ascending_ns: Ints, deadline_ms: float) -> Ints:
     """Count the cycles that finished within each point of the latency grid.
 
     Parameters
     ----------
-    latency_ns : int64 array, shape (n,)
-        `NEVER_NS` where the cycle never finished.
-    deadline_ms : float
-        D.
+    ascending_ns : int64 array, shape (n,)
+        Latencies, `NEVER_NS` where the cycle never finished.
 
     Returns
     -------
     int64 array
         One a point of `latency_grid_ms`; a point is rounded to nanoseconds as the deadline is.
     """
-    grid_ms = latency_grid_ms(deadline_ms)
-    ends_ns = np.append(np.rint(grid_ms * 1e6), np.inf)
-    count = len(grid_ms)
-    # A point's number by division, and then the one beside it where rounding decides.
-    place = latency_ns * (GRID_PER_DEADLINE / (deadline_ms * 1e6))
-    beyond = np.minimum(np.ceil(place), count + 1).astype(np.int64) - 1
-    np.maximum(beyond, 0, out=beyond)
-    beyond += latency_ns > ends_ns[beyond]
-    beyond -= latency_ns <= np.append(ends_ns, -np.inf)[beyond - 1]
-    within: Ints = np.bincount(beyond, minlength=count + 1)[:count].cumsum()
-    return within
+    ends_ns = np.rint(latency_grid_ms(deadline_ms) * 1e6).astype(np.int64)
+    return np.searchsorted(ascending_ns, ends_ns, side="right")
 
 
 def mean_of(values: pl.Series) -> float:
@@ -252,25 +226,34 @@ def order_statistic(values: Floats, percent: int) -> float:
     return float(np.partition(values, rank - 1)[rank - 1])
 
 
-def _percentiles(latency_ns: Ints) -> dict[str, float]:
+def _percentiles(ascending_ns: Ints) -> dict[str, float]:
     """Percentiles of all cycles together, and how far the 95th is from the median."""
-    ranks = [-(-percent * len(latency_ns) // 100) - 1 for percent in (50, 95)]
-    found = np.partition(latency_ns, ranks)[ranks]
-    p50, p95 = (float(ns) / 1e6 if ns < NEVER_NS else np.inf for ns in found)
+    ranks = [-(-percent * len(ascending_ns) // 100) - 1 for percent in (50, 95)]
+    p50, p95 = (float(ns) / 1e6 if ns < NEVER_NS else np.inf for ns in ascending_ns[ranks])
     # Infinity less infinity is no number: where half of the cycles are lost, the tail has no end.
     return {"p95_ms": p95, "p50_ms": p50, "spread_ms": p95 - p50 if p50 < np.inf else np.inf}
 
 
-def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
-    """Mean over windows of the busiest node of a tier, and of every node."""
+def busiest_nodes(problem: Problem) -> dict[str, pl.Expr]:
+    """Utilisation of the busiest node of each tier in a window; 0 of a tier without nodes.
+
+    Returns
+    -------
+    dict of str to expression
+        ``u_robot``, ``u_edge`` and ``u_cloud``, of the columns of windows.
+    """
     import polars as pl
 
-    tiers = tier_nodes(problem.objective)
-    used: dict[str, float] = {}
-    for tier in ("robot", "edge"):
-        names = [f"u_{node}" for node in getattr(tiers, tier)]
-        busiest = windows.select(pl.max_horizontal(names)).to_series() if names else None
-        used[f"u_{tier}"] = 0.0 if busiest is None else mean_of(busiest)
+    return {
+        f"u_{tier}": pl.max_horizontal([f"u_{node}" for node in nodes]) if nodes else pl.lit(0.0)
+        for tier, nodes in tier_nodes(problem.objective)._asdict().items()
+    }
+
+
+def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
+    """Mean over windows of the busiest node of a tier, and of every node."""
+    busiest = windows.select(**busiest_nodes(problem))
+    used = {name: mean_of(busiest[name]) for name in ("u_robot", "u_edge")}
     return used | {f"node_{node}": mean_of(windows[f"u_{node}"]) for node in problem.fabric.nodes}
 
 
