@@ -23,8 +23,9 @@ import numpy as np
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.link_end import Specification
 from dwell.model import Constant, Normal
+from dwell.testbed.forwarder import Passed
 from dwell.testbed.hosts import Hosts
-from dwell.testbed.link import Passed, TunLink
+from dwell.testbed.link import TunLink
 from dwell.testbed.message_links import LinkFile
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -75,6 +75,11 @@ class Conditions:
         bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 
 
+def fields_of(conditions: Conditions) -> dict[str, object]:
+    """Return all fields by their names, as `to_json` and the links' `set` take them."""
+    return {item.name: getattr(conditions, item.name) for item in fields(conditions)}
+
+
 # --------------------------------------------------------------- on the way to the process
 
 

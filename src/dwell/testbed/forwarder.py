@@ -12,7 +12,6 @@ import ctypes
 import errno
 import gc
 import os
-import select
 import struct
 import time
 from bisect import bisect_right
@@ -23,7 +22,7 @@ from typing import TypedDict, cast
 
 from dwell.errors import DwellError
 from dwell.testbed.child import Json, Parent
-from dwell.testbed.conditions import Conditions, Scheduling, changed
+from dwell.testbed.conditions import Scheduling, changed
 from dwell.testbed.draws import Draws
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.packets import kind_of
@@ -65,7 +64,33 @@ class _Settings(TypedDict):
 
 
 @dataclass(slots=True)
-class _Counts:
+class Passed:
+    """Counts of the packets that have passed one direction.
+
+    Parameters
+    ----------
+    packets, bytes : int
+        Handed over.
+    bursts : int
+        Bursts of data that have begun.
+    held : int
+        Those of them that were held back for a timeout or more.
+    vanished : int
+        Packets lost to an outage, a full queue or a host that is gone.
+    ignored : int
+        Packets that are no cell's: IPv6, multicast, broadcast.
+    delay_ns, squares : int, float
+        Sums of the delays drawn for bursts of data, timeouts included, and of their squares.
+    waited_ns : int
+        Sum of the times that bursts of data waited for the one before them in their flow.
+    late_ns, late_max_ns : int
+        Sum and maximum of the times by which packets left later than they were due.
+    late : list of int
+        Packets by lateness: the classes of `LATE_MS`, and one above.
+    cpu_s : float
+        CPU time of the process since its start, both directions.
+    """
+
     packets: int = 0
     bytes: int = 0
     bursts: int = 0
@@ -78,8 +103,37 @@ class _Counts:
     late_ns: int = 0
     late_max_ns: int = 0
     late: list[int] = field(default_factory=lambda: [0] * (len(LATE_NS) + 1))
+    cpu_s: float = 0.0
+
+    @property
+    def delay_mean_ms(self) -> float:
+        """Mean of the delays drawn; 0 without bursts, as all means here."""
+        return self.delay_ns / max(self.bursts, 1) / 1e6
+
+    @property
+    def delay_std_ms(self) -> float:
+        """Standard deviation of the delays drawn."""
+        bursts = max(self.bursts, 1)
+        variance = self.squares / bursts - (self.delay_ns / bursts) ** 2
+        return float(max(variance, 0.0) ** 0.5) / 1e6
+
+    @property
+    def waited_mean_ms(self) -> float:
+        """Mean time that a burst waited for the one before it."""
+        return self.waited_ns / max(self.bursts, 1) / 1e6
+
+    @property
+    def late_mean_ms(self) -> float:
+        """Mean lateness of a packet."""
+        return self.late_ns / max(self.packets, 1) / 1e6
+
+    @property
+    def late_max_ms(self) -> float:
+        """Largest lateness of a packet."""
+        return self.late_max_ns / 1e6
 
     def left(self, size_bytes: int, late_ns: int) -> None:
+        """Count a packet that was handed over."""
         self.packets += 1
         self.bytes += size_bytes
         self.late_ns += late_ns
@@ -87,6 +141,7 @@ class _Counts:
         self.late[bisect_right(LATE_NS, late_ns)] += 1
 
     def began(self, delay_ns: int, waits_ns: int) -> None:
+        """Count a burst of data that has begun."""
         self.bursts += 1
         self.delay_ns += delay_ns
         self.squares += float(delay_ns) ** 2
@@ -110,7 +165,7 @@ class _Direction:
 
     def __init__(self, loop: Loop, settings: _Settings, index: int) -> None:
         self.draws = Draws((settings["seed"], index))
-        self.counts = _Counts()
+        self.counts = Passed()
         self._loop = loop
         self._source = settings["descriptors"][index]
         self._target = settings["descriptors"][1 - index]
@@ -120,9 +175,9 @@ class _Direction:
         self._free_ns = 0
         self._waiting_bytes = 0
         os.set_blocking(self._source, False)
-        loop.watch(self._source, select.EPOLLIN, self)
+        loop.watch(self._source, self)
 
-    def ready(self, _events: int) -> None:
+    def ready(self) -> None:
         """Take in what has come; it came when this was called, however long reading it takes."""
         self.served_ns = time.monotonic_ns()
         for _ in range(AT_ONCE):
@@ -131,7 +186,7 @@ class _Direction:
             except BlockingIOError:
                 return
             except OSError:  # the device is gone, and its node with it
-                self._loop.watch(self._source, 0, self)
+                self._loop.unwatch(self._source)
                 return
             self._take(packet, self.served_ns)
 
@@ -198,48 +253,20 @@ class _Direction:
 
 
 class _Link:
-    """The two directions."""
+    """The two directions, which change and are read as the parent's requests say."""
 
-    def __init__(self, settings: _Settings) -> None:
-        self.loop = Loop()
+    served_ns = 0
+
+    def __init__(self, parent: Parent, settings: _Settings) -> None:
+        self.loop, self._parent = Loop(), parent
         self._directions = {
             name: _Direction(self.loop, settings, index)
             for index, name in enumerate(settings["nodes"])
         }
-        self.apply(settings["sets"])
+        self._apply(settings["sets"])
+        self.loop.watch(parent.fileno(), self)
 
-    def conditions_from(self, source: str) -> Conditions:
-        """Those of the direction from a node."""
-        return self._directions[source].draws.conditions
-
-    def apply(self, sets: Sequence[_Set]) -> None:
-        """Change conditions."""
-        for item in sets:
-            self._directions[item["source"]].draws.apply(item["changes"])
-
-    def stats(self, *, reset: bool) -> Json:
-        """Return what has passed each direction."""
-        cpu_s = time.process_time()
-        counted: Json = {
-            name: {**asdict(direction.counts), "cpu_s": cpu_s}
-            for name, direction in self._directions.items()
-        }
-        if reset:
-            for direction in self._directions.values():
-                direction.counts = _Counts()
-        return counted
-
-
-class _Orders:
-    """Carries out the parent's requests as they come in a loop."""
-
-    served_ns = 0
-
-    def __init__(self, parent: Parent, link: _Link) -> None:
-        self._parent, self._link = parent, link
-        link.loop.watch(parent.fileno(), select.EPOLLIN, self)
-
-    def ready(self, _events: int) -> None:
+    def ready(self) -> None:
         """Carry out a request; an `EOFError` ends the process."""
         request = self._parent.receive()
         try:
@@ -248,19 +275,32 @@ class _Orders:
             self._parent.answer({"error": str(error)})
 
     def _answer(self, request: Json) -> Json:
-        link = self._link
         if request["do"] == "stats":
-            return {"stats": link.stats(reset=bool(request["reset"]))}
+            return {"stats": self._stats(reset=bool(request["reset"]))}
         sets = cast("list[_Set]", request["sets"])
         for item in sets:  # all faults before anything has changed
-            changed(link.conditions_from(item["source"]), item["changes"])
+            changed(self._directions[item["source"]].draws.conditions, item["changes"])
         at_ns = cast("int | None", request["at_ns"]) or 0
         now_ns = time.monotonic_ns()
         if at_ns <= now_ns:
-            link.apply(sets)
+            self._apply(sets)
             return {"at_ns": now_ns}
-        link.loop.at(at_ns, lambda _: link.apply(sets))
+        self.loop.at(at_ns, lambda _: self._apply(sets))
         return {"at_ns": at_ns}
+
+    def _apply(self, sets: Sequence[_Set]) -> None:
+        for item in sets:
+            self._directions[item["source"]].draws.apply(item["changes"])
+
+    def _stats(self, *, reset: bool) -> Json:
+        """Return the counts of each direction, by its source."""
+        counts: Json = {}
+        for name, direction in self._directions.items():
+            direction.counts.cpu_s = time.process_time()
+            counts[name] = asdict(direction.counts)
+            if reset:
+                direction.counts = Passed()
+        return counts
 
 
 def _come_first() -> Scheduling:
@@ -290,11 +330,10 @@ def main() -> None:
         try:
             if settings["cpus"] is not None:
                 os.sched_setaffinity(0, settings["cpus"])
-            link = _Link(settings)
+            link = _Link(parent, settings)
         except (DwellError, OSError) as error:
             parent.answer({"error": str(error)})
             return
-        _Orders(parent, link)
         parent.answer({"scheduling": _come_first()})
         gc.freeze()
         while parent.alive:

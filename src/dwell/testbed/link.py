@@ -17,62 +17,19 @@ What differs from a real link:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
-from typing import cast
+from collections.abc import Collection, Mapping
+from typing import Any, cast
 
 from dwell.errors import LiveError
 from dwell.testbed.child import Child, Json, Started
-from dwell.testbed.conditions import Conditions, Scheduling, to_json
+from dwell.testbed.conditions import Conditions, Scheduling, fields_of, to_json
+from dwell.testbed.forwarder import Passed
 
 #: A sender that is stopped by its CPU quota in the middle of a message goes on within 4 ms.
 GAP_MS = 4.0
 #: From then on a flow that never pauses draws its next delay.
 LONGEST_MS = 20.0
 NO_CONDITIONS: Mapping[tuple[str, str], Conditions] = {}
-
-
-@dataclass(frozen=True, slots=True)
-class Passed:
-    """What has passed one direction.
-
-    Parameters
-    ----------
-    packets, bytes : int
-        Handed over.
-    bursts : int
-        Of data, begun.
-    held : int
-        Of them, held back for a timeout or more.
-    vanished : int
-        Packets lost to an outage, a full queue or a host that is gone.
-    ignored : int
-        Packets that are no cell's: IPv6, multicast, broadcast.
-    delay_mean_ms, delay_std_ms : float
-        Drawn for bursts of data, timeouts included.
-    waited_mean_ms : float
-        What bursts of data waited for the one before them in their flow.
-    late_mean_ms, late_max_ms : float
-        What packets left later than they were due.
-    late : tuple of int
-        Packets by lateness: up to 0.1, 0.2, 0.3, 0.5, 1, 2, 5, 10, 20, 50 ms, and above.
-    cpu_s : float
-        CPU time of the process since its start, both directions.
-    """
-
-    packets: int
-    bytes: int
-    bursts: int
-    held: int
-    vanished: int
-    ignored: int
-    delay_mean_ms: float
-    delay_std_ms: float
-    waited_mean_ms: float
-    late_mean_ms: float
-    late_max_ms: float
-    late: tuple[int, ...]
-    cpu_s: float
 
 
 class TunLink(Started):
@@ -129,7 +86,7 @@ class TunLink(Started):
         self._settings: Json = {
             "nodes": nodes,
             "descriptors": files,
-            "sets": self._usual(usual),
+            "sets": [self._change(*way, fields_of(each)) for way, each in usual.items()],
             "retransmit_ns": {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
             "gap_ns": round(gap_ms * 1e6),
             "longest_ns": round(longest_ms * 1e6),
@@ -184,7 +141,9 @@ class TunLink(Started):
             If there is no such direction or field, a value is out of its bounds or none that this
             kind of link has, or the process has ended.
         """
-        return self._send([self._change(source, target, changes)], at_ns)
+        sets = [self._change(source, target, changes)]
+        answer = self._child.ask({"do": "set", "sets": sets, "at_ns": at_ns})
+        return cast("int", answer["at_ns"])
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
         """Begin or end an outage of a direction; returns the instant, as `set`.
@@ -202,15 +161,8 @@ class TunLink(Started):
             If the process has ended.
         """
         answer = self._child.ask({"do": "stats", "reset": reset})
-        counted = cast("dict[str, Json]", answer["stats"])
-        return {way: _passed(counted[way[0]]) for way in self.ways}
-
-    def _usual(self, conditions: Mapping[tuple[str, str], Conditions]) -> list[Json]:
-        """Return the changes that make up the conditions at the beginning."""
-        return [
-            self._change(*way, {name: getattr(each, name) for name in Conditions.__slots__})
-            for way, each in conditions.items()
-        ]
+        counts = cast("dict[str, dict[str, Any]]", answer["stats"])
+        return {way: Passed(**counts[way[0]]) for way in self.ways}
 
     def _require(self, source: str, target: str) -> None:
         if (source, target) not in self.ways:
@@ -227,29 +179,3 @@ class TunLink(Started):
         if changes.get("cut") == "hold":
             raise LiveError(f"{way}: what is sent while it is down vanishes (cut='drop')")
         return {"source": source, "changes": to_json(changes)}
-
-    def _send(self, sets: Iterable[Json], at_ns: int | None) -> int:
-        answer = self._child.ask({"do": "set", "sets": list(sets), "at_ns": at_ns})
-        return cast("int", answer["at_ns"])
-
-
-def _passed(counted: Json) -> Passed:
-    found = cast("dict[str, float]", counted)
-    bursts, packets = max(found["bursts"], 1), max(found["packets"], 1)
-    mean_ns = found["delay_ns"] / bursts
-    variance = max(found["squares"] / bursts - mean_ns**2, 0.0)
-    return Passed(
-        packets=int(found["packets"]),
-        bytes=int(found["bytes"]),
-        bursts=int(found["bursts"]),
-        held=int(found["held"]),
-        vanished=int(found["vanished"]),
-        ignored=int(found["ignored"]),
-        delay_mean_ms=mean_ns / 1e6,
-        delay_std_ms=variance**0.5 / 1e6,
-        waited_mean_ms=found["waited_ns"] / bursts / 1e6,
-        late_mean_ms=found["late_ns"] / packets / 1e6,
-        late_max_ms=found["late_max_ns"] / 1e6,
-        late=tuple(cast("list[int]", counted["late"])),
-        cpu_s=found["cpu_s"],
-    )

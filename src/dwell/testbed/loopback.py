@@ -20,7 +20,7 @@ from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model import Host, Problem
 from dwell.testbed.burner import Burner
-from dwell.testbed.conditions import Conditions
+from dwell.testbed.conditions import Conditions, fields_of
 from dwell.testbed.message_links import LinkFile
 from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
@@ -165,9 +165,7 @@ class Loopback(LocalTestbed):
         file = LinkFile(self.folder / LINK_FILE, tuple(fabric.nodes), links, seed=self.seed)
         self._links = self._stack.enter_context(file)
         for link in links:
-            usual = self._conditions[link.name]
-            changes = {name: getattr(usual, name) for name in usual.__slots__}
-            file.set(link.source, link.target, **changes)
+            file.set(link.source, link.target, **fields_of(self._conditions[link.name]))
 
     def expected(self, node: str) -> list[str]:
         """Return the processes of a node that its agent starts, and the agent."""

@@ -30,7 +30,7 @@ from typing import Self
 from dwell.errors import LiveError, ProblemError
 from dwell.files import write_whole
 from dwell.model import Link
-from dwell.testbed.conditions import Conditions, changed, to_json
+from dwell.testbed.conditions import Conditions, changed, fields_of, to_json
 from dwell.testbed.draws import Draws
 
 _MAGIC = b"dwelllnk"
@@ -110,10 +110,9 @@ class LinkFile:
             self._conditions[way] = changed(self._conditions[way], to_json(changes))
         except ProblemError as error:
             raise LiveError(f"link {source}->{target}: {error}") from None
-        fields = {name: getattr(self._conditions[way], name) for name in Conditions.__slots__}
         kind = self._kinds.get(way)
         told = {
-            "conditions": to_json(fields),
+            "conditions": to_json(fields_of(self._conditions[way])),
             "retransmit_ms": None if kind is None else kind.retransmit_ms,
             "in_order": kind is not None and kind.in_order,
         }
@@ -226,9 +225,7 @@ class Way:
             return
         told = json.loads(_file_of(self._path, self._place).read_text(encoding="utf-8"))
         # A delay that stays goes on where it is.
-        known = to_json(
-            {name: getattr(self._draws.conditions, name) for name in Conditions.__slots__}
-        )
+        known = to_json(fields_of(self._draws.conditions))
         changes = {
             name: value for name, value in told["conditions"].items() if known[name] != value
         }

@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
 from dwell.errors import LiveError
-from dwell.testbed.forwarder import LATE_MS
+from dwell.testbed.forwarder import LATE_MS, Passed
 from dwell.testbed.idle import waited_s
-from dwell.testbed.link import Passed, TunLink
+from dwell.testbed.link import TunLink
 from dwell.testbed.pressure import Rule, Sample
 from dwell.testbed.probe import Probe
 
@@ -21,6 +22,8 @@ EVERY_S = 0.1
 STAT = Path("/proc/stat")
 # Fields of a CPU's line in /proc/stat.
 IDLE, IOWAIT, STEAL = 3, 4, 7
+#: Counts of a link that are summed up over all samples.
+TOTALS = ("bursts", "delay_ns", "squares", "held", "vanished")
 
 
 class Sampler:
@@ -55,7 +58,7 @@ class Sampler:
         self.samples: list[Sample] = []
         #: What kept it from going on, if anything did.
         self.trouble = ""
-        self._totals: dict[tuple[str, str], list[float]] = {}
+        self._totals: defaultdict[tuple[str, str], Passed] = defaultdict(Passed)
         self._switches = {node: Rate(read) for node, read in switches.items()}
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
@@ -106,7 +109,9 @@ class Sampler:
             ways = link.read()
             passed[name] = list(ways.values())
             for way, counted in ways.items():
-                self._add(way, counted)
+                for total in TOTALS:
+                    so_far = getattr(self._totals[way], total)
+                    setattr(self._totals[way], total, so_far + getattr(counted, total))
         return Sample(
             at_ns=at_ns,
             idle_s=idle_s,
@@ -126,12 +131,6 @@ class Sampler:
             },
         )
 
-    def _add(self, way: tuple[str, str], counted: Passed) -> None:
-        n, mean_ms, std_ms = counted.bursts, counted.delay_mean_ms, counted.delay_std_ms
-        new = (n, n * mean_ms, n * (mean_ms**2 + std_ms**2), counted.held, counted.vanished)
-        old = self._totals.get(way, [0.0] * len(new))
-        self._totals[way] = [a + b for a, b in zip(old, new, strict=True)]
-
     def wakes_hz(self) -> dict[str, float]:
         """Return how often a node's threads have woken, per second, over all of them."""
         return {node: round(rate.hz, 1) for node, rate in self._switches.items()}
@@ -139,14 +138,16 @@ class Sampler:
     def links(self) -> dict[str, Any]:
         """Return what the links have drawn for the messages of each direction, ready for JSON."""
         found = {}
-        for (source, target), (n, total_ms, squares, held, vanished) in self._totals.items():
-            mean_ms = total_ms / max(n, 1)
-            std_ms = max(squares / max(n, 1) - mean_ms**2, 0.0) ** 0.5
+        for (source, target), total in self._totals.items():
+            delay_ms = {
+                "mean": round(total.delay_mean_ms, 4),
+                "std": round(total.delay_std_ms, 4),
+            }
             found[f"{source}->{target}"] = {
-                "messages": int(n),
-                "delay_ms": {"mean": round(mean_ms, 4), "std": round(std_ms, 4)} if n else None,
-                "held": int(held),
-                "vanished": int(vanished),
+                "messages": total.bursts,
+                "delay_ms": delay_ms if total.bursts else None,
+                "held": total.held,
+                "vanished": total.vanished,
             }
         return found
 
