@@ -152,7 +152,7 @@ def test_nothing_is_left_of_hosts_and_of_what_runs_in_them() -> None:
     assert sleeper.wait(PATIENCE_S) < 0
     assert not any(path.exists() for path in paths)
     assert subprocess.run(["ip", "-o", "link"], capture_output=True, check=True).stdout == before
-    hosts.close()
+    hosts.stop()
 
 
 def test_a_name_that_is_taken_is_an_error_and_what_is_there_stays(hosts: Hosts) -> None:

@@ -26,19 +26,19 @@ NODES = ("A", "B")
 OWNER = """
 import subprocess, sys, time
 from pathlib import Path
+from dwell.testbed.burner import stress
 from dwell.testbed.groups import Groups, Share
 from dwell.testbed.hosts import Hosts
 from dwell.testbed.leftovers import Claim
-from dwell.testbed.stress import Stress
 name, folder = sys.argv[1], Path(sys.argv[2])
 nodes = ("A", "B")
 with (
     Claim(name, nodes, folder=folder),
     Hosts(name, nodes, [nodes]) as hosts,
     Groups(name, {node: Share() for node in nodes}) as groups,
-    Stress(groups.inside("A", [])) as stress,
+    stress(groups.inside("A", [])) as busy,
 ):
-    stress.set(1)
+    busy.set(1)
     words = groups.inside("B", hosts.inside("B", ["setsid", "sleep", "600"]))
     sleeper = subprocess.Popen(words)
     alone = subprocess.Popen(hosts.inside("A", ["sleep", "600"]))

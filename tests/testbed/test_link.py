@@ -278,7 +278,7 @@ def test_a_message_in_pieces_has_one_delay(hosts: TwoHosts, link: TunLink) -> No
 def test_a_host_that_is_gone_is_no_reason_to_end() -> None:
     with two_hosts() as others, TunLink(NODES, others.tuns) as link:
         Probe(others).send("x")
-        others.hosts.close()
+        others.hosts.stop()
         passed = link.read()
         assert passed[AB].packets + passed[AB].vanished <= 1
 

@@ -15,6 +15,7 @@ from dwell.errors import LiveError
 from dwell.model import Constant
 from dwell.testbed.hosts import namespace_path
 from dwell.testbed.netns_testbed import NetnsTestbed
+from dwell.testbed.processes import expected
 from dwell.testbed.timeline import Change, NodeState, usual_conditions
 from tests.cells.light import document, write_cell
 from tests.testbed.machine import no_groups, no_hosts, own_name
@@ -70,7 +71,7 @@ def test_a_run_begins_anew_with_everybody_there(testbed: NetnsTestbed) -> None:
     status = watcher.status(10.0)
     assert status["placement"] == "SO"
     assert status["origin_ns"] in before
-    assert set(testbed.expected(testbed.problems[0])) <= status["processes"].keys()
+    assert set(expected(testbed.problems[0])) <= status["processes"].keys()
     testbed.processes.stop_controllers()
     # Another one is another run.
     again = testbed.begin()[0]
@@ -122,7 +123,7 @@ def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
 
     def ready() -> bool:
         heard = watcher.status(10.0)["processes"]
-        names = [who for who in testbed.expected(testbed.problems[0]) if "@R2" in who]
+        names = [who for who in expected(testbed.problems[0]) if "@R2" in who]
         return all(who in heard and heard[who]["age_ms"] < 1_000 for who in names)
 
     wait_for(ready, "the processes of R2")

@@ -2,26 +2,28 @@
 
 Each is what the simulator calls a foreign thread (`stress_threads`): always runnable, pinned to the
 node's CPUs, no memory traffic to speak of. It is a process of its own, because threads of one
-Python process take turns instead of competing; the kernel knows no difference.
+Python process take turns instead of competing; the kernel knows no difference. All end with the
+process that starts them, and that one with the testbed's.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
-import heapq
 import os
-import select
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Collection, Sequence
-from itertools import count
-from typing import NoReturn, cast
+from typing import cast
 
 from dwell.errors import LiveError
-from dwell.testbed.child import PARENT_CHECK_S, Child, Parent, Started
+from dwell.testbed.child import Child, Parent, Started
+from dwell.testbed.event_loop import Loop
 
+#: One busy process; a loop without memory traffic, as the simulator has its foreign threads.
+STRESS_NG = ("stress-ng", "--quiet", "--cpu", "1", "--cpu-method", "loop", "--timeout", "0")
 MAX_THREADS = 1_000
 # Turns of an empty loop between two looks at whether the parent lives: below a millisecond.
 TURNS = 20_000
@@ -116,6 +118,22 @@ class Burner(Started):
         self.pids = ()
 
 
+def stress(prefix: Sequence[str], cpus: Collection[int] = ()) -> Burner:
+    """Return foreign work in a node's group, by stress-ng where it is installed.
+
+    To the kernel its processes, and those of the burner's own loop, are the same.
+
+    Parameters
+    ----------
+    prefix : sequence of str
+        Of its command: ``groups.inside(node, [])``.
+    cpus : collection of int
+        Where its threads run; the CPUs of this process if empty.
+    """
+    program = STRESS_NG if shutil.which(STRESS_NG[0]) else ()
+    return Burner(cpus or os.sched_getaffinity(0), prefix=prefix, program=program)
+
+
 def _check(threads: int) -> None:
     from dwell.model.bounds import Bound  # the burner's own process does without the model
 
@@ -129,54 +147,60 @@ def main() -> None:
     """Keep as many busy processes as the parent wants, until it ends."""
     parent = Parent()
     gc.freeze()
-    fire = _Fire()
+    fire = _Fire(parent)
     try:
-        settings = parent.receive()
-        fire.program = cast("list[str]", settings["program"])
-        os.sched_setaffinity(0, cast("list[int]", settings["cpus"]))
-        fire.burn(cast("int", settings["threads"]))
-        parent.answer({"pids": fire.pids})
-        _serve(parent, fire)
+        fire.begin()
+        while parent.alive:
+            fire.loop.turn()
     except EOFError:
         pass
     finally:
         fire.burn(0)
 
 
-def _serve(parent: Parent, fire: _Fire) -> NoReturn:
-    planned: list[tuple[int, int, int]] = []
-    order = count()
-    while True:
-        wait_s = PARENT_CHECK_S
-        if planned:
-            wait_s = min(wait_s, max(0, planned[0][0] - time.monotonic_ns()) / 1e9)
-        asked, _, _ = select.select([parent], [], [], wait_s)
-        at_ns = 0
-        if asked:
-            request = parent.receive()
-            at_ns = max(cast("int | None", request["at_ns"]) or 0, time.monotonic_ns())
-            heapq.heappush(planned, (at_ns, next(order), cast("int", request["threads"])))
-        now_ns = time.monotonic_ns()
-        while planned and planned[0][0] <= now_ns:
-            fire.burn(heapq.heappop(planned)[2])
-        if asked:
-            parent.answer({"pids": fire.pids, "at_ns": at_ns})
-        if not parent.alive:
-            raise EOFError
-
-
 class _Fire:
-    """The busy processes."""
+    """The busy processes: as many as the parent's requests say."""
 
-    def __init__(self) -> None:
-        self.pids: list[int] = []
-        self.program: list[str] = []
+    served_ns = 0
+
+    def __init__(self, parent: Parent) -> None:
+        self.loop, self._parent = Loop(), parent
+        self._pids: list[int] = []
+        self._program: list[str] = []
+
+    def begin(self) -> None:
+        """Do as the parent's settings say, and listen for its requests."""
+        settings = self._parent.receive()
+        self._program = cast("list[str]", settings["program"])
+        os.sched_setaffinity(0, cast("list[int]", settings["cpus"]))
+        self.burn(cast("int", settings["threads"]))
+        self._parent.answer({"pids": self._pids})
+        self.loop.watch(self._parent.fileno(), self)
+
+    def ready(self) -> None:
+        """Carry out a request when its instant has come; it is answered at once."""
+        request = self._parent.receive()
+        threads, now_ns = cast("int", request["threads"]), time.monotonic_ns()
+        at_ns = max(cast("int | None", request["at_ns"]) or 0, now_ns)
+
+        def answer() -> None:
+            self._parent.answer({"pids": self._pids, "at_ns": at_ns})
+
+        def burn(_: int) -> None:
+            self.burn(threads)
+            if at_ns == now_ns:
+                answer()
+
+        # Also where it is to be done at once: what is due before it has not been done yet.
+        self.loop.at(at_ns, burn)
+        if at_ns > now_ns:
+            answer()
 
     def burn(self, threads: int) -> None:
         """Have so many of them."""
-        while len(self.pids) < threads:
-            self.pids.append(_fork(self.program))
-        ended, self.pids = self.pids[threads:], self.pids[:threads]
+        while len(self._pids) < threads:
+            self._pids.append(_fork(self._program))
+        ended, self._pids = self._pids[threads:], self._pids[:threads]
         for pid in ended:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(pid, signal.SIGKILL)

@@ -20,6 +20,7 @@ from pathlib import Path
 from dwell.errors import LiveError
 from dwell.model import Problem, Quota
 from dwell.testbed.allotment import FREE_CORES, FREE_OF_A_CORE, allot
+from dwell.testbed.burner import STRESS_NG
 from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.groups import Groups, Share
 from dwell.testbed.hosts import Hosts
@@ -27,7 +28,6 @@ from dwell.testbed.leftovers import Claim
 from dwell.testbed.pressure import Rule
 from dwell.testbed.probe import Probe
 from dwell.testbed.sampling import EVERY_S
-from dwell.testbed.stress import STRESS_NG
 
 #: Periods that are tried, shortest first; with less of a CPU the kernel does not take the first.
 PERIODS_MS = (2.0, 4.0, 10.0, 20.0, 100.0)

@@ -11,16 +11,15 @@ import os
 import shlex
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from dwell.errors import LiveError
 from dwell.model import Quota
 from dwell.testbed.cgroups import Cgroups, find_cgroups
+from dwell.testbed.child import Started
 
 #: What the kernel takes (kernel/sched/core.c: min_cfs_quota_period, max_cfs_quota_period).
 MIN_US = 1_000
@@ -86,17 +85,17 @@ def group_name(name: str) -> str:
     return f"dwell-{name}"
 
 
-class Groups:
+class Groups(Started):
     """One group per node; a context manager, at whose end nothing in them lives.
 
     Parameters
     ----------
     name : str
-        Of the testbed.
+        Name of the testbed.
     shares : mapping of str to Share
         By node.
     cgroups : Cgroups, optional
-        Where; found if left out.
+        Where to make them; found if left out.
 
     Raises
     ------
@@ -119,7 +118,7 @@ class Groups:
         self._shares = dict(shares)
         self._made = False
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         """Make the groups.
 
         Raises
@@ -134,22 +133,12 @@ class Groups:
         try:
             self._make()
         except OSError as error:
-            self.close()
+            self.stop()
             reason = f"{error.filename}: {error.strerror}"
             raise LiveError(f"no groups of processes can be made here ({reason})") from None
         except BaseException:
-            self.close()
+            self.stop()
             raise
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End what is in them, and remove them."""
-        self.close()
 
     def _make(self) -> None:
         for folder in self._cgroups.groups(self._parent):
@@ -279,7 +268,7 @@ class Groups:
         self._require(node)
         _kill(self._cgroups.groups(self._parent, node))
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """End what is in the groups, and remove them; safe to call twice."""
         if self._made:
             remove_group(self._parent, self._cgroups)
@@ -338,26 +327,48 @@ def _pids(folder: Path) -> list[int]:
     return [pid for pid in pids if pid > 0]
 
 
-def _kill(folders: Sequence[Path]) -> None:
-    """Kill until nobody is left: whoever was started meanwhile is in the group too."""
+def kill_all(
+    pids: Callable[[], Collection[int]], place: str, thaw: Callable[[], None] = lambda: None
+) -> None:
+    """Kill processes until there are none: whoever was started meanwhile is among them too.
+
+    Parameters
+    ----------
+    pids : callable
+        Returns the processes that are there; called again and again.
+    place : str
+        For the message: ``in the group``.
+    thaw : callable
+        Called when all have been sent the signal: frozen ones of cgroup v1 do not notice it.
+
+    Raises
+    ------
+    LiveError
+        If some do not end.
+    """
     until = time.monotonic() + GONE_S
-    while alive := sorted({pid for folder in folders for pid in _pids(folder)}):
+    while alive := pids():
         for pid in alive:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        for folder in folders:
-            _thaw(folder)
+        thaw()
         if time.monotonic() > until:
-            raise LiveError(f"processes {', '.join(map(str, alive))} of {folders[0]} do not end")
+            raise LiveError(f"processes {', '.join(map(str, alive))} {place} do not end")
         time.sleep(CHECK_S)
 
 
-def _thaw(folder: Path) -> None:
-    """Let frozen processes run to their end: those of v1 do not notice that they are killed."""
-    for name, value in (("freezer.state", "THAWED"), ("cgroup.freeze", "0")):
-        if (folder / name).exists():
-            with suppress(OSError):
-                (folder / name).write_text(value)
+def _kill(folders: Sequence[Path]) -> None:
+    def alive() -> list[int]:
+        return sorted({pid for folder in folders for pid in _pids(folder)})
+
+    def thaw() -> None:
+        for folder in folders:
+            for name, value in (("freezer.state", "THAWED"), ("cgroup.freeze", "0")):
+                if (folder / name).exists():
+                    with suppress(OSError):
+                        (folder / name).write_text(value)
+
+    kill_all(alive, f"of {folders[0]}" if folders else "", thaw)
 
 
 def _remove(folder: Path) -> None:

@@ -11,20 +11,18 @@ import ctypes
 import fcntl
 import os
 import shutil
-import signal
 import struct
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from functools import partial
 from ipaddress import IPv4Address
 from pathlib import Path
-from types import TracebackType
-from typing import Self, TypeVar
+from typing import TypeVar
 
 from dwell.errors import LiveError
+from dwell.testbed.child import Started
+from dwell.testbed.groups import kill_all
 
 #: Bytes of the largest packet: IPv4 takes 65 535, and a message of 64 kB is one packet.
 MTU = 65_520
@@ -48,8 +46,6 @@ SETTINGS = {
 }
 CLONE_NEWNET = 0x40000000  # linux/sched.h
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 0x0001, 0x1000  # linux/if_tun.h
-GONE_S = 10.0
-CHECK_S = 0.005
 
 T = TypeVar("T")
 
@@ -64,13 +60,13 @@ def namespace_path(namespace: str) -> Path:
     return NAMESPACES / namespace
 
 
-class Hosts:
+class Hosts(Started):
     """Namespaces, addresses and TUN devices of nodes; a context manager.
 
     Parameters
     ----------
     name : str
-        Of the testbed.
+        Name of the testbed.
     nodes : sequence of str
     pairs : iterable of (str, str)
         Nodes with a link between them, each pair in either order.
@@ -94,7 +90,7 @@ class Hosts:
         self._tuns: dict[tuple[str, str], int] = {}
         self._made: list[str] = []
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         """Make them.
 
         Raises
@@ -114,18 +110,8 @@ class Hosts:
                 _ip("netns", "add", self.namespace(node))
                 self._furnish(node)
         except BaseException:
-            self.close()
+            self.stop()
             raise
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End what runs in them, and remove them."""
-        self.close()
 
     def _furnish(self, node: str) -> None:
         namespace = self.namespace(node)
@@ -181,7 +167,7 @@ class Hosts:
         """
         return ["nsenter", f"--net={namespace_path(self.namespace(node))}", "--", *words]
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """End what runs in the namespaces, and remove them; safe to call twice."""
         while self._tuns:
             os.close(self._tuns.popitem()[1])
@@ -234,15 +220,9 @@ def remove_namespace(namespace: str) -> None:
     """
     if not namespace_path(namespace).exists():
         return
-    until = time.monotonic() + GONE_S
-    # Killed until nobody is left: whoever was started meanwhile is in it too.
-    while alive := _ip("netns", "pids", namespace).split():
-        for pid in map(int, alive):
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        if time.monotonic() > until:
-            raise LiveError(f"processes {', '.join(alive)} in {namespace} do not end")
-        time.sleep(CHECK_S)
+    kill_all(
+        lambda: [int(pid) for pid in _ip("netns", "pids", namespace).split()], f"in {namespace}"
+    )
     _ip("netns", "delete", namespace)
 
 

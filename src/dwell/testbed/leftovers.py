@@ -14,12 +14,12 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Self, cast
+from typing import cast
 
 from dwell.errors import LiveError
 from dwell.files import write_whole
 from dwell.testbed.cgroups import Cgroups, find_cgroups
+from dwell.testbed.child import Started
 from dwell.testbed.groups import group_name, remove_group
 from dwell.testbed.hosts import namespace_name, namespace_path, remove_namespace
 
@@ -33,7 +33,7 @@ def claims_folder() -> Path:
     return Path(os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.geteuid()}", "dwell")
 
 
-class Claim:
+class Claim(Started):
     """The right to make the hosts and groups of one name; a context manager.
 
     Entered before anything is made. What a dead testbed of this very name left is removed; hosts
@@ -42,7 +42,7 @@ class Claim:
     Parameters
     ----------
     name : str
-        Of the testbed.
+        Name of the testbed.
     nodes : sequence of str
         Those that will have a network namespace and a group.
     folder : Path, optional
@@ -66,8 +66,8 @@ class Claim:
         self._lock, self._record = folder / f"{name}.lock", folder / f"{name}.json"
         self._handle: int | None = None
 
-    def __enter__(self) -> Self:
-        """Take the name.
+    def start(self) -> None:
+        """Take the name; nothing if it is taken already.
 
         Raises
         ------
@@ -75,6 +75,8 @@ class Claim:
             If a testbed of this name runs (nothing is changed then), what one left cannot be
             removed, or something is in the way that none of this name left.
         """
+        if self._handle is not None:
+            return
         try:
             self._lock.parent.mkdir(parents=True, exist_ok=True)
             self._handle = self._open()
@@ -87,14 +89,8 @@ class Claim:
         except BaseException:
             self._release()
             raise
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def stop(self) -> None:
         """Give the name back; what is left in spite of all is removed first."""
         if self._handle is None:
             return

@@ -10,7 +10,6 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +17,19 @@ from dwell.errors import LiveError
 from dwell.live.hosting import clock_of
 from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
-from dwell.model import Host, Problem
+from dwell.model import Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.conditions import Conditions, fields_of
 from dwell.testbed.message_links import LinkFile
 from dwell.testbed.playing import come_up
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected, without_keys
+from dwell.testbed.processes import Processes, expected, with_hosts, without_keys
 from dwell.testbed.testbed import LocalTestbed
-from dwell.testbed.timeline import Change, differing, usual_conditions
+from dwell.testbed.timeline import NodeState, usual_conditions
 
 #: How long every process may take to be ready, on a machine that has a lot else to do.
 START_S = 60.0
+ADDRESS = "127.0.0.1"
 #: Where ports are looked for; below what the kernel gives out by itself.
 PORTS = range(10_000, 32_000, 500)
 LINK_FILE = "links"
@@ -43,22 +43,17 @@ def on_this_machine(problem: Problem) -> Problem:
     LiveError
         If there are not enough ports.
     """
-    nodes = list(problem.fabric.nodes)
-    counts = [PORTS_PER_ROLE * sum(role.node == node for role in roles(problem)) for node in nodes]
+    count = PORTS_PER_ROLE * len(roles(problem))
     for base in PORTS:
-        if all(_free(port) for port in range(base, base + sum(counts))):
-            begins = [base + sum(counts[:place]) for place in range(len(nodes))]
-            hosts = {
-                node: Host("127.0.0.1", begin) for node, begin in zip(nodes, begins, strict=True)
-            }
-            return replace(problem, live=replace(problem.live, hosts=hosts))
-    raise LiveError(f"no {sum(counts)} free ports in a row on this machine")
+        if all(_free(port) for port in range(base, base + count)):
+            return with_hosts(problem, lambda node: ADDRESS, {ADDRESS: base})
+    raise LiveError(f"no {count} free ports in a row on this machine")
 
 
 def _free(port: int) -> bool:
     with socket.socket() as one:
         try:
-            one.bind(("127.0.0.1", port))
+            one.bind((ADDRESS, port))
         except OSError:
             return False
     return True
@@ -141,9 +136,7 @@ class Loopback(LocalTestbed):
             self.processes.write()
             self._start_links()
             for cpu in sorted(set(self.cpus.values())):
-                burner = Burner([cpu])
-                burner.start()
-                self._stack.callback(burner.stop)
+                burner = self._stack.enter_context(Burner([cpu]))
                 for node in (node for node, its in self.cpus.items() if its == cpu):
                     self.burners[node] = burner
             # Processes end before links and burners do.
@@ -152,7 +145,7 @@ class Loopback(LocalTestbed):
                 self.processes.start_agent(node)
             self.processes.start_controllers()
             self.client = self._stack.enter_context(OperatorClient(self.problem, without_keys()))
-            awaited = [who for node in self.problem.fabric.nodes for who in self.expected(node)]
+            awaited = expected(self.problem)
             status = come_up(self.sample, awaited, self.folder, patience_s=START_S)
             self.begun_ns = int(status.get("origin_ns") or clock_of(self.problem)())
         except BaseException:
@@ -160,30 +153,21 @@ class Loopback(LocalTestbed):
             raise
 
     def _start_links(self) -> None:
-        fabric = self.problem.fabric
-        links = tuple(fabric.links.values())
-        file = LinkFile(self.folder / LINK_FILE, tuple(fabric.nodes), links, seed=self.seed)
+        nodes, links = tuple(self.problem.fabric.nodes), tuple(self.problem.fabric.links.values())
+        file = LinkFile(self.folder / LINK_FILE, nodes, links, seed=self.seed)
         self._links = self._stack.enter_context(file)
         for link in links:
             file.set(link.source, link.target, **fields_of(self._conditions[link.name]))
 
-    def expected(self, node: str) -> list[str]:
-        """Return the processes of a node that its agent starts, and the agent."""
-        return expected(self.problem, node)
+    def _apply_to_node(self, node: str, state: NodeState) -> None:
+        self._threads[node] = state.threads
+        burner = self.burners[node]
+        nodes = [node for node, its in self.burners.items() if its is burner]
+        burner.set(sum(self._threads.get(node, 0) for node in nodes))
 
-    def apply(self, change: Change) -> None:
-        """Have a link, or a node's CPU, be as a change says."""
-        place, state = change.place, change.state
-        if not isinstance(state, Conditions):
-            self._threads[place] = state.threads
-            burner = self.burners[place]
-            nodes = [node for node, its in self.burners.items() if its is burner]
-            burner.set(sum(self._threads.get(node, 0) for node in nodes))
-            return
-        link = self.problem.fabric.links[place]
-        changes = differing(self._conditions[place], state)
-        self._conditions[place] = state
-        if changes:
+    def _apply_to_link(self, name: str, now: Conditions) -> None:
+        link = self.problem.fabric.links[name]
+        if changes := self._changes(name, now):
             self.links.set(link.source, link.target, **changes)
 
     def cut(self, source: str, target: str, at_ns: int) -> int:

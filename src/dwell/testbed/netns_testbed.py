@@ -10,7 +10,8 @@ import json
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
@@ -21,9 +22,9 @@ from typing import Any
 from dwell.errors import LiveError
 from dwell.live.security import INSECURE
 from dwell.live.transport.orphans import remove_orphans
-from dwell.live.wiring import PORTS_PER_ROLE, roles
-from dwell.model import Host, Link, Node, Problem
+from dwell.model import Link, Node, Problem
 from dwell.testbed.allotment import allot, nodes_of
+from dwell.testbed.burner import Burner, stress
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.groups import PROBES, Groups, Share
 from dwell.testbed.hosts import Hosts
@@ -32,10 +33,9 @@ from dwell.testbed.link import TunLink
 from dwell.testbed.message_links import LinkFile
 from dwell.testbed.playing import come_up, undisturbed
 from dwell.testbed.process import program
-from dwell.testbed.processes import Processes, expected
-from dwell.testbed.stress import Stress
+from dwell.testbed.processes import Processes, expected, with_hosts
 from dwell.testbed.testbed import LocalTestbed
-from dwell.testbed.timeline import Change, differing, usual_conditions
+from dwell.testbed.timeline import NodeState, usual_conditions
 from dwell.testbed.watcher import Watcher
 
 FIRST_PORT = 7_450
@@ -90,22 +90,6 @@ def _pairs_of(problems: Sequence[Problem]) -> list[tuple[str, str]]:
         for pair in combinations(problem.fabric.nodes, 2):
             found.setdefault(frozenset(pair), pair)
     return list(found.values())
-
-
-def _with_hosts(problems: Sequence[Problem], address: Callable[[str], str]) -> tuple[Problem, ...]:
-    """Return cells that know where their nodes are; on a shared node each has ports of its own."""
-    following: dict[str, int] = {}
-    found = []
-    for problem in problems:
-        everybody = roles(problem)
-        hosts = {}
-        for node in problem.fabric.nodes:
-            port = following.get(node, FIRST_PORT)
-            hosts[node] = Host(address(node), port)
-            there = sum(role.node == node for role in everybody)
-            following[node] = port + PORTS_PER_ROLE * there
-        found.append(replace(problem, live=replace(problem.live, hosts=hosts)))
-    return tuple(found)
 
 
 class NetnsTestbed(LocalTestbed):
@@ -167,7 +151,7 @@ class NetnsTestbed(LocalTestbed):
         self.folder, self.name, self.seed = folder.resolve(), name, seed
         self.links: dict[frozenset[str], TunLink] = {}
         self.watchers: tuple[Watcher, ...] = ()
-        self.stress: dict[str, Stress] = {}
+        self.stress: dict[str, Burner] = {}
         self._usual = _links_of(self.problems)
         self._more = tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
@@ -175,7 +159,6 @@ class NetnsTestbed(LocalTestbed):
         self._threads = dict.fromkeys(self.nodes, 0)
         self._down: set[str] = set()
         self._claim = Claim(name, list(self.nodes))
-        self._claimed = False
         # Run of each cell that is no part of any measurement any more.
         self._past: dict[str, object] = {}
         self._stack = ExitStack()
@@ -190,10 +173,7 @@ class NetnsTestbed(LocalTestbed):
         LiveError
             If a testbed of this name runs, or something else is in the way.
         """
-        if not self._claimed:
-            self._stack.enter_context(self._claim)
-            self._stack.callback(remove_orphans)
-            self._claimed = True
+        self._stack.enter_context(self._claim)
 
     def start(self) -> None:
         """Make hosts, links and groups, start everything, and begin a run of every cell.
@@ -205,6 +185,7 @@ class NetnsTestbed(LocalTestbed):
         """
         try:
             self.claim()
+            self._stack.callback(remove_orphans)
             self._make()
             for node in self.nodes:
                 self.processes.start_agent(node)
@@ -220,7 +201,11 @@ class NetnsTestbed(LocalTestbed):
         nodes, pairs = list(self.nodes), _pairs_of(self.problems)
         self._hosts = enter(Hosts(self.name, nodes, pairs))
         self._groups = enter(Groups(self.name, {**self.shares, PROBES: Share()}))
-        self.problems = _with_hosts(self.problems, self._hosts.address)
+        # On a node that cells share each has ports of its own.
+        following = defaultdict[str, int](lambda: FIRST_PORT)
+        self.problems = tuple(
+            with_hosts(problem, self._hosts.address, following) for problem in self.problems
+        )
         self.problem = self.problems[0]
         self.folder.mkdir(parents=True, exist_ok=True)
         self._losses = enter(LinkFile(self.folder / LINK_FILE, nodes, seed=self.seed))
@@ -285,24 +270,18 @@ class NetnsTestbed(LocalTestbed):
         return Watcher(self.processes.file_of(problem), prefix)
 
     def _start_stress(self, node: str) -> None:
-        stress = Stress(self._groups.inside(node, []), self.shares[node].cpus)
-        stress.__enter__()
-        self.stress[node] = stress
+        self.stress[node] = stress(self._groups.inside(node, []), self.shares[node].cpus)
+        self.stress[node].start()
 
     def _stop_stress(self) -> None:
         for node in list(self.stress):
-            self.stress.pop(node).__exit__(None, None, None)
+            self.stress.pop(node).stop()
 
     def stop(self) -> None:
         """End everything, and leave nothing behind; safe to call twice."""
         self._stack.close()
-        self._claimed = False
 
     # ------------------------------------------------------------------------- running
-
-    def expected(self, problem: Problem) -> list[str]:
-        """Return the processes of a cell without its controller."""
-        return [who for node in problem.fabric.nodes for who in expected(problem, node)]
 
     def _come_up(self) -> None:
         """Wait until everybody is there, with every cell on its initial placement.
@@ -318,9 +297,7 @@ class NetnsTestbed(LocalTestbed):
         # Interpreters that start would take most of a minute of what a small robot has.
         with self._groups.unlimited():
             for problem, watcher in zip(self.problems, self.watchers, strict=True):
-                status = come_up(
-                    watcher.status, self.expected(problem), self.folder, patience_s=START_S
-                )
+                status = self._status(problem, watcher)
                 self._past[problem.name] = status["run"]
 
     def begin(self) -> list[int]:
@@ -360,9 +337,7 @@ class NetnsTestbed(LocalTestbed):
     def _origin(self, problem: Problem, watcher: Watcher) -> int:
         until = time.monotonic() + START_S
         while time.monotonic() < until:
-            status = come_up(
-                watcher.status, self.expected(problem), self.folder, patience_s=START_S
-            )
+            status = self._status(problem, watcher)
             # A late answer of the controller before tells of the run before.
             new = status["run"] is not None and status["run"] != self._past.get(problem.name)
             if new and status.get("origin_ns") is not None:
@@ -371,36 +346,33 @@ class NetnsTestbed(LocalTestbed):
             time.sleep(0.05)
         raise LiveError(f"cell {problem.name!r} releases no cycles; see the logs in {self.folder}")
 
+    def _status(self, problem: Problem, watcher: Watcher) -> Mapping[str, Any]:
+        """Return how a cell is when everybody is there."""
+        return come_up(watcher.status, expected(problem), self.folder, patience_s=START_S)
+
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return how the first cell is, as its controller says."""
         return self.watchers[0].status(patience_s)
 
     # --------------------------------------------------------------------- disturbances
 
-    def apply(self, change: Change) -> None:
-        """Have a node or a link be as a change says."""
-        if isinstance(change.state, Conditions):
-            self._apply_to_link(self._usual[change.place], change.state)
-        else:
-            self._apply_to_node(change.place, change.state.threads, down=change.state.down)
-
-    def _apply_to_node(self, node: str, threads: int, *, down: bool) -> None:
-        self._threads[node] = threads
-        if down and node not in self._down:
+    def _apply_to_node(self, node: str, state: NodeState) -> None:
+        self._threads[node] = state.threads
+        if state.down and node not in self._down:
             self._down.add(node)
             self._take_down(node)
-        elif not down and node in self._down:
+        elif not state.down and node in self._down:
             self._down.remove(node)
             self._bring_up(node)
-        elif not down:
-            self.stress[node].set(threads)
+        elif not state.down:
+            self.stress[node].set(state.threads)
 
     def _take_down(self, node: str) -> None:
         """Kill everything on a node at once, as a loss of power does."""
         self._groups.kill(node)
         self.processes.forget(node)
         with suppress(LiveError):
-            self.stress.pop(node).__exit__(None, None, None)
+            self.stress.pop(node).stop()
 
     def _bring_up(self, node: str) -> None:
         self._start_stress(node)
@@ -409,9 +381,8 @@ class NetnsTestbed(LocalTestbed):
         if any(problem.controller_node == node for problem in self.problems):
             self.processes.start_controller(node)
 
-    def _apply_to_link(self, link: Link, now: Conditions) -> None:
-        changes = differing(self._conditions[link.name], now)
-        self._conditions[link.name] = now
+    def _apply_to_link(self, name: str, now: Conditions) -> None:
+        link, changes = self._usual[name], self._changes(name, now)
         if link.retransmit_ms is None and "loss" in changes:
             self._losses.set(link.source, link.target, loss=changes.pop("loss"))
         if changes:
@@ -454,22 +425,16 @@ class NetnsTestbed(LocalTestbed):
             "name": self.name,
             "kernel": os.uname().release,
             "cpus": os.cpu_count(),
-            "nodes": dict(self._node_facts()),
+            "nodes": {
+                node: {
+                    "cpus": list(share.cpus),
+                    "quota": share.quota
+                    and {"cpu": share.quota.cpu, "period_ms": share.quota.period_ms},
+                }
+                for node, share in self.shares.items()
+            },
             "links": {
                 "-".join(link.nodes): {"scheduling": link.scheduling}
                 for link in self.links.values()
             },
         }
-
-    def _node_facts(self) -> Iterator[tuple[str, dict[str, Any]]]:
-        for node, share in self.shares.items():
-            quota = share.quota
-            yield (
-                node,
-                {
-                    "cpus": list(share.cpus),
-                    "quota": None
-                    if quota is None
-                    else {"cpu": quota.cpu, "period_ms": quota.period_ms},
-                },
-            )

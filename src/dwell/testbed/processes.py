@@ -7,11 +7,12 @@ becomes of those in between, and leave no shared memory.
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,8 +22,8 @@ from dwell.errors import LiveError
 from dwell.live.parent_death import OPTION, start_sweeper
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.trust import KEYS
-from dwell.live.wiring import roles
-from dwell.model import Problem
+from dwell.live.wiring import PORTS_PER_ROLE, roles
+from dwell.model import Host, Problem
 from dwell.model.document import to_document
 from dwell.testbed.trace_names import move_traces
 
@@ -55,9 +56,34 @@ def _module_path(problems: Iterable[Problem]) -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(paths)} if folders else {}
 
 
-def expected(problem: Problem, node: str) -> list[str]:
-    """Return the processes of a node that its agent starts, and the agent."""
-    return [role.who for role in roles(problem) if role.node == node and role.kind != "controller"]
+def expected(problem: Problem, node: str | None = None) -> list[str]:
+    """Return the agent of a node and all that it starts; those of all nodes if none is named."""
+    return [
+        role.who
+        for role in roles(problem)
+        if node in (None, role.node) and role.kind != "controller"
+    ]
+
+
+def with_hosts(
+    problem: Problem, address: Callable[[str], str], following: dict[str, int]
+) -> Problem:
+    """Return a cell that knows where its nodes are.
+
+    Parameters
+    ----------
+    address : callable
+        Returns the address of a node.
+    following : dict of str to int
+        Next port by address; those that the nodes take are taken from it.
+    """
+    counts = Counter(role.node for role in roles(problem))
+    hosts = {}
+    for node in problem.fabric.nodes:
+        place = address(node)
+        hosts[node] = Host(place, following[place])
+        following[place] += PORTS_PER_ROLE * counts[node]
+    return replace(problem, live=replace(problem.live, hosts=hosts))
 
 
 class Processes:
@@ -216,14 +242,18 @@ class Processes:
 
     def end(self, names: Iterable[str], patience_s: float) -> None:
         """Tell some to end, and kill those that have not when patience is over."""
-        ending = [self.running.pop(who) for who in names]
-        for process in ending:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-        deadline = time.monotonic() + patience_s
-        for process in ending:
-            try:
-                process.wait(max(deadline - time.monotonic(), 0.1))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        end_all([self.running.pop(who) for who in names], patience_s)
+
+
+def end_all(processes: Iterable[subprocess.Popen[bytes]], patience_s: float) -> None:
+    """Tell processes to end, and kill those that have not when patience is over."""
+    ending = list(processes)
+    for process in ending:
+        process.terminate()
+    deadline = time.monotonic() + patience_s
+    for process in ending:
+        try:
+            process.wait(max(deadline - time.monotonic(), 0.1))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

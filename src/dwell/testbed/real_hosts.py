@@ -33,10 +33,10 @@ from dwell.record import open_run
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
 from dwell.testbed.playing import Played, come_up, longest_run, make_folder, play_on, undisturbed
-from dwell.testbed.processes import Processes, expected
+from dwell.testbed.processes import Processes, end_all, expected
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.testbed import Testbed
-from dwell.testbed.timeline import Change, timeline_of, usual_conditions
+from dwell.testbed.timeline import NodeState, timeline_of, usual_conditions
 
 MARK = ".dwell-testbed"
 NAME = re.compile(r"[A-Za-z0-9_-]{1,32}")
@@ -208,10 +208,9 @@ class RealHosts(Testbed):
             time.sleep(0.05)
 
     def _came_up(self) -> Mapping[str, Any]:
-        """Wait until everybody is there; returns how the cell is then."""
+        """Return how the cell is when everybody is there."""
         problem = self.problem
-        awaited = [who for node in problem.fabric.nodes for who in expected(problem, node)]
-        return come_up(self.sample, awaited, self.folder, patience_s=START_S)
+        return come_up(self.sample, expected(problem), self.folder, patience_s=START_S)
 
     def fetch_runs(self) -> None:
         """Bring what the controller has written to this computer.
@@ -228,13 +227,7 @@ class RealHosts(Testbed):
 
     # --------------------------------------------------------------------- disturbances
 
-    def apply(self, change: Change) -> None:
-        """Have a host or a link be as a change says."""
-        state = change.state
-        if isinstance(state, Conditions):
-            self._disturb(self.problem.fabric.links[change.place], state)
-            return
-        node = change.place
+    def _apply_to_node(self, node: str, state: NodeState) -> None:
         # The steps of a ramp are many more than whole threads.
         if state.threads == self._threads.get(node, 0):
             return
@@ -245,26 +238,19 @@ class RealHosts(Testbed):
             words = self._words(node, ["sh", "-c", line], whole=True)
             self.stress[node] = subprocess.Popen(words, process_group=0)  # noqa: S603 - as above
 
-    def _disturb(self, link: Link, now: Conditions) -> None:
+    def _apply_to_link(self, name: str, now: Conditions) -> None:
         """Run a link's command for what is on, again where it changes, or for the end of it."""
-        commands = self.inventory.links[link.name]
+        link, commands = self.problem.fabric.links[name], self.inventory.links[name]
         if asked := disturbance_of(link, now):
-            self._disturbed.add(link.name)
+            self._disturbed.add(name)
             self.shell(link.source, commands.begin.format(**asked))
-        elif link.name in self._disturbed:
-            self._disturbed.remove(link.name)
+        elif name in self._disturbed:
+            self._disturbed.remove(name)
             self.shell(link.source, commands.end)
 
     def _end_stress(self, node: str) -> None:
-        process = self.stress.pop(node, None)
-        if process is None:
-            return
-        process.terminate()
-        try:
-            process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        if node in self.stress:
+            end_all([self.stress.pop(node)], STOP_S)
 
     def _undisturb(self) -> None:
         for node in list(self.stress):

@@ -9,9 +9,10 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from dwell.errors import LiveError
+from dwell.testbed.child import Started
 from dwell.testbed.forwarder import LATE_MS, Passed
 from dwell.testbed.idle import waited_s
 from dwell.testbed.link import TunLink
@@ -26,7 +27,7 @@ IDLE, IOWAIT, STEAL = 3, 4, 7
 TOTALS = ("bursts", "delay_ns", "squares", "held", "vanished")
 
 
-class Sampler:
+class Sampler(Started):
     """Takes samples in a thread of its own until it is stopped; a context manager.
 
     Parameters
@@ -68,7 +69,7 @@ class Sampler:
         self._stack = ExitStack()
         self._thread = threading.Thread(target=self._run, name="sampler", daemon=True)
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
         """Start it."""
         try:
             for probe in self._probes:
@@ -79,9 +80,8 @@ class Sampler:
         for rate in self._switches.values():
             rate.begin()
         self._thread.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def stop(self) -> None:
         """Take no more samples."""
         self._stopped.set()
         self._thread.join()

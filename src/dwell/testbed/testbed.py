@@ -13,8 +13,9 @@ from typing import Any
 
 from dwell.model import Problem
 from dwell.testbed.child import Started
+from dwell.testbed.conditions import Conditions
 from dwell.testbed.processes import Processes
-from dwell.testbed.timeline import Change
+from dwell.testbed.timeline import Change, NodeState, differing
 
 
 class Testbed(Started):
@@ -41,9 +42,18 @@ class Testbed(Started):
     processes: Processes
     begun_ns: int
 
-    @abstractmethod
     def apply(self, change: Change) -> None:
         """Have a node or a link be as a change says, from now on."""
+        if isinstance(change.state, Conditions):
+            self._apply_to_link(change.place, change.state)
+        else:
+            self._apply_to_node(change.place, change.state)
+
+    @abstractmethod
+    def _apply_to_node(self, node: str, state: NodeState) -> None: ...
+
+    @abstractmethod
+    def _apply_to_link(self, name: str, now: Conditions) -> None: ...
 
     @abstractmethod
     def sample(self, patience_s: float) -> Mapping[str, Any]:
@@ -66,6 +76,13 @@ class LocalTestbed(Testbed):
     """
 
     own_cpus: bool
+    #: Those that hold now, by link.
+    _conditions: dict[str, Conditions]
+
+    def _changes(self, name: str, now: Conditions) -> dict[str, Any]:
+        """Take the conditions of a link for those that hold now; returns what is other."""
+        before, self._conditions[name] = self._conditions[name], now
+        return differing(before, now)
 
     @abstractmethod
     def cut(self, source: str, target: str, at_ns: int) -> int:
