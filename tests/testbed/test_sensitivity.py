@@ -51,7 +51,7 @@ def measured(
         usual_ms = 5.0 * (speed**exponent if site[1] == "R1" else 1.0)
         stage_ms = usual_ms * changes[site[1]][jobs] ** exponent * noise
         none_ms = np.zeros(len(jobs))
-        visits[site] = Visit(stage_ms, stage_ms, none_ms, np.arange(len(jobs)), jobs)
+        visits[site] = Visit(stage_ms, none_ms, np.arange(len(jobs)), jobs)
     meta = {
         "problem": CELL,
         "testbed": {"nodes": {"R1": {"cpus": [0]}, "E": {"cpus": [1]}}},
@@ -63,7 +63,6 @@ def measured(
         disturbed=Disturbed(frozenset(stressed), frozenset(), frozenset(stressed)),
         placement="",
         windows=windows,
-        cycles=windows * JOBS,
         jobs_s=1.0,
         visits=visits,
         rates={},

@@ -7,7 +7,6 @@ runs that it was made from. That is no validation; `dwell validate` refuses thos
 
 from __future__ import annotations
 
-import copy
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +23,7 @@ from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
 from dwell.model import Problem, Trace
-from dwell.testbed.measured import Measured, look_at, usable
+from dwell.testbed.measured import Measured, cycles_in, look_at, usable
 from dwell.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell.testbed.node_loads import (
     backgrounds,
@@ -51,16 +50,25 @@ LEAST_MS = 1e-3
 CHECK_WINDOWS = 300
 
 
+#: What is said of a node by each of its keys, where it is nothing else's.
+NODE_LINES = {
+    "contention": "{node}: others have {value:.3g} of its CPUs while jobs run",
+    "contention_stressed": "{node}: and {value:.3g} while {other} is stressed",
+    "background_hz": "{node}: something wakes {value:.4g} times a second",
+    "interference": "{node}: stages take {value:.3g} times as long beside foreign threads",
+}
+
+
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What was written.
+    """Files that were written, and what is in them.
 
     Parameters
     ----------
     problem : Problem
-        As the cell file says it now.
+        As read from the new cell file.
     report : dict
-        What the sidecar says.
+        As in the sidecar.
     missing : tuple of str
         Tasks and links that no run has visited, and that are as they were.
     """
@@ -95,7 +103,7 @@ def calibrate(
         Whether links have the delays that the cell asks for, and only what they add is measured;
         else their delays are what was measured.
     say : callable
-        Takes lines about what was found.
+        Takes the lines of the report.
 
     Raises
     ------
@@ -111,81 +119,69 @@ def calibrate(
     if out.exists() and out.samefile(cell):
         raise RunError(f"{out} is the cell itself; name another file")
     problem = dwell.load(cell)
-    measured = _looked_at(runs, problem)
+    measured = _measured(runs, problem)
     messaging_ms = messaging(measured, problem)
     usual = usual_of(measured)
     known = hops(measured, messaging_ms, problem, _asked(problem) if emulated else {})
     found = sites(measured, messaging_ms, known, problem, usual)
-    behind = backgrounds(measured, found, problem)
     if not found:
         raise RunError("no task has enough jobs in windows that can be used")
     cpus = _cpus(measured)
     columns = paired({site: of.samples for site, of in found.items()}, cpus)
     rows = len(next(iter(columns.values())))
     added_ms, delays_ms = _links(measured, known, problem, rows, emulated=emulated)
+    behind = backgrounds(measured, found, problem)
+    nodes = _short(
+        {
+            "background": behind,
+            "background_beside": beside_jobs(measured, behind),
+            "interference": interferences(measured, found, usual),
+            "contention": contentions(measured),
+            "background_hz": wakes(measured, problem),
+            "contention_stressed": contentions_stressed(measured, cpus),
+        }
+    )
     document = _document(cell, out)
     samples = out.with_name(f"{out.stem}.samples.parquet")
     _write_samples(samples, found, columns, delays_ms, measured, added_ms)
-    beside = beside_jobs(measured, behind)
-    of_nodes = {
-        name: {node: _short(value) for node, value in values.items()}
-        for name, values in (
-            ("interference", interferences(measured, found, usual)),
-            ("contention", contentions(measured)),
-            ("background_hz", wakes(measured, problem)),
-        )
-    }
-    _put_in(document, samples.name, found, delays_ms, behind, beside)
-    stressed = {
-        node: {other: _short(share) for other, share in shares.items()}
-        for node, shares in contentions_stressed(measured, cpus).items()
-    }
-    for name, values in of_nodes.items():
-        for node, value in values.items():
-            document["nodes"][node][name] = value
-    for node, shares in stressed.items():
-        document["nodes"][node]["contention_stressed"] = shares
+    _put_in(document, samples.name, found, delays_ms, nodes)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
     missing = _missing(problem, found, delays_ms)
     report = {
-        "runs": [path.resolve().name for path in runs],
+        "runs": [one.name for one in measured],
         "ids": [one.run.run_id for one in measured if one.run.run_id is not None],
         "cell": problem.name,
         **stamp(),
         "emulated_links": emulated,
         "tasks": {task_name(*site): _about(of) for site, of in found.items()},
         "links": {
-            link: {"added_ms": _short(added_ms.get(link)), "mean_ms": _short(values.mean())}
+            link: _short({"added_ms": added_ms.get(link), "mean_ms": values.mean()})
             for link, values in delays_ms.items()
         },
-        "background": {node: _short(value) for node, value in behind.items()},
-        **of_nodes,
-        "contention_stressed": stressed,
-        "work_ms": {node: _short(value) for node, value in usual.work_ms.items()},
-        "sensitivity": {
-            task_name(*site): _short(value) for site, value in usual.sensitivity.items()
-        },
-        "background_beside": {node: _short(value) for node, value in beside.items()},
+        **nodes,
+        "work_ms": _short(usual.work_ms),
+        "sensitivity": _short(
+            {task_name(*site): value for site, value in usual.sensitivity.items()}
+        ),
         "check": [row for one in measured if (row := _check(one, written, usual)) is not None],
         "missing": list(missing),
     }
     sidecar = out.with_name(f"{out.stem}.calibration.json")
     write_whole(sidecar, json.dumps(report, indent=2) + "\n")
-    for line in _told(report):
+    for line in _lines(report):
         say(line)
     return Calibrated(out, samples, sidecar, written, report, missing)
 
 
 def _cpus(measured: Sequence[Measured]) -> dict[str, tuple[int, ...]]:
     """Return which CPUs of its computer each node had, where the runs were on a testbed's."""
-    found: dict[str, tuple[int, ...]] = {}
-    for one in measured:
-        testbed = one.run.meta.get("testbed")
-        for node, about in (testbed or {}).get("nodes", {}).items():
-            if about.get("cpus"):
-                found[node] = tuple(about["cpus"])
-    return found
+    return {
+        node: tuple(about["cpus"])
+        for one in measured
+        for node, about in (one.run.meta.get("testbed") or {}).get("nodes", {}).items()
+        if about.get("cpus")
+    }
 
 
 def make_runs(
@@ -201,16 +197,14 @@ def make_runs(
 
     Parameters
     ----------
-    cell : Path
-        Cell file.
     folder : Path
         For the runs, a folder each.
     seconds : float
-        Of each, the warm-up included.
+        Length of each, the warm-up included.
     seed : int
-        Of delays and losses.
+        Seed of delays and losses.
     name : str
-        Of the testbed.
+        Name of the testbed.
     tell : callable
         Takes a line on what happens.
 
@@ -246,7 +240,7 @@ def make_runs(
     return runs
 
 
-def _looked_at(runs: Sequence[Path], problem: Problem) -> list[Measured]:
+def _measured(runs: Sequence[Path], problem: Problem) -> list[Measured]:
     import dwell
 
     names = [path.resolve().name for path in runs]
@@ -308,7 +302,7 @@ def _write_samples(
     added_ms: Mapping[str, float],
 ) -> None:
     """Write all columns; those of one file share their rows in a replay."""
-    about = {"runs": [one.name for one in measured], **stamp()}
+    about: dict[str, Any] = {"runs": [one.name for one in measured], **stamp()}
     measurements = [
         Measurement(
             task_name(*site),
@@ -319,13 +313,7 @@ def _write_samples(
     ]
     for link, values in delays_ms.items():
         source, _, target = link.partition("->")
-        of_link: dict[str, Any] = {
-            "kind": "link",
-            "from": source,
-            "to": target,
-            "rate_mbps": None,
-            **about,
-        }
+        of_link = {"kind": "link", "from": source, "to": target, "rate_mbps": None, **about}
         of_link["added_ms"] = added_ms.get(link)
         measurements.append(Measurement(link, {link: values}, of_link))
     write_profile(path, measurements)
@@ -336,10 +324,9 @@ def _document(cell: Path, out: Path) -> dict[str, Any]:
     from dwell.cellfile.document_faults import Faults
     from dwell.cellfile.yaml_text import read_yaml
 
-    text = read_yaml(str(cell), Faults(str(cell)))
-    if not isinstance(text, dict):
+    document = read_yaml(str(cell), Faults(str(cell)))
+    if not isinstance(document, dict):
         raise RunError(f"{cell}: no cell")
-    document = copy.deepcopy(text)
     document.setdefault("name", cell.stem)
     move_traces(document, Path(os.path.relpath(cell.resolve().parent, out.resolve().parent)))
     return document
@@ -350,9 +337,10 @@ def _put_in(
     file: str,
     found: Mapping[tuple[str, str], Site],
     delays_ms: Mapping[str, Floats],
-    behind: Mapping[str, float],
-    beside: Mapping[str, float],
+    nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
+    """Put into a cell's document what was found of tasks, of nodes by key, and of links."""
+
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
 
@@ -362,11 +350,13 @@ def _put_in(
         on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
         # The samples have what the task shares with others already.
         document["tasks"][task].pop("scale", None)
-    for node, cores in behind.items():
-        document["nodes"][node]["background"] = _short(cores)
+    for node in nodes["background"]:
         document["nodes"][node].pop("background_beside", None)
-        if node in beside and document["nodes"][node].get("quota"):
-            document["nodes"][node]["background_beside"] = _short(beside[node])
+    for key, values in nodes.items():
+        for node, value in values.items():
+            entry = document["nodes"][node]
+            if key != "background_beside" or entry.get("quota"):
+                entry[key] = value
     links = []
     for entry in document.get("links") or ():
         ways = [(entry["from"], entry["to"])]
@@ -390,9 +380,7 @@ def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[
             return True
 
     names = ", ".join(path.resolve().name for path in runs)
-    text = yaml.dump(
-        copy.deepcopy(document), Dumper=Plain, sort_keys=False, width=100, allow_unicode=True
-    )
+    text = yaml.dump(document, Dumper=Plain, sort_keys=False, width=100, allow_unicode=True)
     head = f"# {cell.name} with what was measured of it, by `dwell testbed calibrate`.\n"
     head += f"# Runs: {names}\n"
     write_whole(out, head + text)
@@ -417,21 +405,26 @@ def _about(of: Site) -> dict[str, Any]:
     return {
         "mean_ms": _short(of.samples_ms.mean()),
         "std_ms": _short(of.samples_ms.std()),
-        "stage_ms": _short(of.stage_ms),
-        "messaging_ms": _short(of.messaging_ms),
-        "before_ms": _short(of.before_ms),
-        "after_ms": _short(of.after_ms),
+        **{
+            name: _short(getattr(of, name))
+            for name in ("stage_ms", "messaging_ms", "before_ms", "after_ms")
+        },
         "jobs": len(of.samples_ms),
         "of_runs": list(of.samples),
     }
 
 
-def _short(value: float | None) -> float | None:
+def _short(value: Any) -> Any:
+    """Return a number, or all numbers of a mapping, with five digits."""
+    if isinstance(value, Mapping):
+        return {key: _short(each) for key, each in value.items()}
     return None if value is None else float(f"{value:.5g}")
 
 
 def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | None:
-    """Set what the cell says of a run that it was made from beside what that one showed."""
+    """Set what the cell predicts of a run that it was made from beside what that run showed."""
+    import polars as pl
+
     from dwell.sim import draw, simulate_realisation
 
     scenario = str(one.run.meta.get("scenario") or "baseline")
@@ -443,33 +436,27 @@ def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | No
     except RunError:
         return None
     problem = at_speed_of(one.run, replace(problem, warmup_windows=2), usual)
-    windows = min(max(one.windows, 50), CHECK_WINDOWS)
-    real = draw(problem, scenario=scenario, seed=SEED, windows=windows)
+    count = min(max(one.windows, 50), CHECK_WINDOWS)
+    real = draw(problem, scenario=scenario, seed=SEED, windows=count)
     played = simulate_realisation(problem, real, policy=one.placement, estimator=estimator)
+    shares = ["violation_rate", *(f"u_{node}" for node in problem.fabric.nodes)]
     row: dict[str, Any] = {"run": one.name, "scenario": scenario, "placement": one.placement}
     for what, run in (("measured", one.run), ("predicted", played)):
-        counted = usable(run)
-        cycles = _in_windows(run.cycles, counted, problem.window_cycles)
+        windows = usable(run)
+        cycles = run.cycles.with_columns(pl.col("cycle").cast(pl.Int64))
+        cycles = cycles.join(cycles_in(windows, problem), on="cycle", how="semi")
         latency_ms = cycles["latency_ns"].fill_null(np.iinfo(np.int64).max).to_numpy() / 1e6
         l95_ms = float(np.quantile(latency_ms, 0.95, method="inverted_cdf"))
+        means = {name: windows[name].to_numpy().mean() for name in shares}
         row[what] = {
             "l95_ms": _short(l95_ms) if l95_ms < 1e9 else None,
             "mean_ms": _short(latency_ms[latency_ms < 1e9].mean()),
-            "violation_rate": _short(counted["violation_rate"].to_numpy().mean()),
-            **{f"u_{n}": _short(counted[f"u_{n}"].to_numpy().mean()) for n in problem.fabric.nodes},
+            **_short(means),
         }
     return row
 
 
-def _in_windows(cycles: Any, windows: Any, size: int) -> Any:
-    import polars as pl
-
-    first = windows["first_cycle"].to_numpy()
-    inside = (first[:, None] + np.arange(size)).ravel()
-    return cycles.filter(pl.col("cycle").is_in(inside.tolist()))
-
-
-def _told(report: Mapping[str, Any]) -> list[str]:
+def _lines(report: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, of in report["tasks"].items():
         lines.append(
@@ -482,15 +469,10 @@ def _told(report: Mapping[str, Any]) -> list[str]:
         beside = report["background_beside"].get(node)
         more = "" if beside is None else f", {beside:.3g} while jobs run"
         lines.append(f"{node}: background {value:.3g} cores{more}")
-    for node, value in report["contention"].items():
-        lines.append(f"{node}: others have {value:.3g} of its CPUs while jobs run")
-    for node, shares in report["contention_stressed"].items():
-        for other, value in shares.items():
-            lines.append(f"{node}: and {value:.3g} while {other} is stressed")
-    for node, value in report["background_hz"].items():
-        lines.append(f"{node}: something wakes {value:.4g} times a second")
-    for node, value in report["interference"].items():
-        lines.append(f"{node}: stages take {value:.3g} times as long beside foreign threads")
+    for key, line in NODE_LINES.items():
+        for node, found in report[key].items():
+            values = found if isinstance(found, dict) else {"": found}
+            lines += [line.format(node=node, other=o, value=value) for o, value in values.items()]
     for name, value in report["sensitivity"].items():
         lines.append(f"{name}: takes x^{value:.3g} times as long where a CPU is x times as slow")
     for row in report["check"]:

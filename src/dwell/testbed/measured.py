@@ -74,10 +74,8 @@ class Visit:
 
     Parameters
     ----------
-    cpu_ms : float64 array, shape (jobs,)
-        CPU time of the stage, in the order of cycles; 0 of a task that an accelerator runs.
     stage_ms : float64 array, shape (jobs,)
-        Time that the stage needs where nothing hinders it.
+        Time that the stage needs where nothing hinders it, in the order of cycles.
     beside_ms : float64 array, shape (jobs,)
         CPU time that its node took meanwhile for others, by thread of the job, beyond what it takes
         in the mean of as long: both use up the quota. 0 where nothing counts it, and of a task that
@@ -85,7 +83,6 @@ class Visit:
     cycles, windows : int64 array, shape (jobs,)
     """
 
-    cpu_ms: Floats
     stage_ms: Floats
     beside_ms: Floats
     cycles: NDArray[np.int64]
@@ -100,8 +97,8 @@ class Measured:
     ----------
     placement : str
         Candidate of all its windows; empty where it moved.
-    windows, cycles : int
-        Used.
+    windows : int
+        Number of the windows used.
     jobs_s : float
         Time in which the jobs of the used windows became due, seconds.
     visits : dict of (str, str) to Visit
@@ -138,7 +135,6 @@ class Measured:
     disturbed: Disturbed
     placement: str
     windows: int
-    cycles: int
     jobs_s: float
     visits: dict[SiteName, Visit]
     rates: dict[tuple[str, str], float]
@@ -170,22 +166,18 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
     windows = usable(run)
     if not windows.height:
         raise RunError(f"{name}: no window is left after warm-up, mixed and excluded ones")
-    size = problem.window_cycles
-    in_window = (
-        windows.select("window", cycle=pl.int_ranges("first_cycle", pl.col("first_cycle") + size))
-        .explode("cycle")
-        .cast({"cycle": pl.Int64})
-    )
     jobs = run.jobs.with_columns(pl.col("cycle").cast(pl.Int64))
     if "shadow" not in jobs.columns:
         jobs = jobs.with_columns(shadow=False)
-    jobs = jobs.join(in_window, on="cycle").filter(pl.col("outcome").cast(str) == "done")
+    jobs = jobs.join(cycles_in(windows, problem), on="cycle").filter(
+        pl.col("outcome").cast(str) == "done"
+    )
     jobs = jobs.with_columns(
         pl.col("task", "node").cast(str), took=pl.col("end_ns") - pl.col("start_ns")
     ).filter(pl.col("cpu_ns").is_not_null() & (pl.col("took") >= 0))
     jobs = jobs.sort("cycle", maintain_order=True)
     placements = set(windows["placement"].cast(str))
-    jobs_s = windows.height * size * problem.pipeline.period_ms / 1e3
+    jobs_s = windows.height * problem.window_cycles * problem.pipeline.period_ms / 1e3
     jobs = jobs.with_columns(accompanied=_accompanied(jobs))
     visits, starts, spent_ms = {}, {}, {}
     for (task, node, shadow), of in jobs.group_by("task", "node", "shadow", maintain_order=True):
@@ -198,7 +190,6 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
             on_cpu = execution.accelerator is None
             stage_ms = cpu_ms / execution.threads if on_cpu else of["took"].to_numpy() / 1e6
             visits[key[:2]] = Visit(
-                cpu_ms,
                 np.asarray(stage_ms, np.float64),
                 _beside_ms(of) / execution.threads if on_cpu else np.zeros(of.height),
                 of["cycle"].to_numpy(),
@@ -216,7 +207,6 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
         disturbed=Disturbed.of(run),
         placement=placements.pop() if len(placements) == 1 else "",
         windows=windows.height,
-        cycles=windows.height * size,
         jobs_s=jobs_s,
         visits=visits,
         rates=_rates(run, windows, problem),
@@ -276,6 +266,14 @@ def usable(run: Run) -> pl.DataFrame:
     pressure = run.meta.get("pressure")
     out = pressure.get("excluded", ()) if isinstance(pressure, Mapping) else ()
     return windows.filter(~pl.col("window").is_in([int(number) for number in out]))
+
+
+def cycles_in(windows: pl.DataFrame, problem: Problem) -> pl.DataFrame:
+    """Return the cycles of windows: `window`, and `cycle` (Int64)."""
+    import polars as pl
+
+    ranges = pl.int_ranges("first_cycle", pl.col("first_cycle") + problem.window_cycles)
+    return windows.select("window", cycle=ranges).explode("cycle").cast({"cycle": pl.Int64})
 
 
 def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, float]]:
