@@ -42,18 +42,19 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 @pytest.fixture
 def child(module: str) -> Iterator[Child]:
-    made = Child(module, "the echo")
+    made = Child(module, "the echo", {"a": 1})
     yield made
     made.stop()
 
 
 def test_it_answers_until_it_is_stopped(child: Child) -> None:
-    assert child.start({"a": 1}) == {"a": 1}
+    child.start()
+    assert child.answered == {"a": 1}
     assert child.ask({"b": [2, "é"]}) == {"b": [2, "é"]}
     with pytest.raises(LiveError, match="the echo: no"):
         child.ask({"do": "fail"})
     with pytest.raises(LiveError, match="has been started before"):
-        child.start({})
+        child.start()
     pid = child.pid
     child.stop()
     assert not psutil.pid_exists(pid)
@@ -65,13 +66,13 @@ def test_it_answers_until_it_is_stopped(child: Child) -> None:
 def test_one_that_has_ended_is_told(child: Child) -> None:
     with pytest.raises(LiveError, match="has not been started"):
         _ = child.pid
-    child.start({})
+    child.start()
     with pytest.raises(LiveError, match=r"the echo \(process \d+\) has ended"):
         child.ask({"do": "die"})
 
 
 def test_one_that_hangs_is_told_and_ended(child: Child) -> None:
-    child.start({})
+    child.start()
     os.kill(child.pid, signal.SIGSTOP)
     with pytest.raises(LiveError, match=r"has not answered within 0\.1 s"):
         child.ask({}, timeout_s=0.1)
@@ -83,7 +84,7 @@ def test_one_that_hangs_is_told_and_ended(child: Child) -> None:
 def test_it_ends_where_its_parent_is_killed(module: str) -> None:
     code = (
         "import time; from dwell.testbed.child import Child\n"
-        f"child = Child({module!r}, 'echo'); child.start({{}}); print(child.pid, flush=True)\n"
+        f"child = Child({module!r}, 'echo', {{}}); child.start(); print(child.pid, flush=True)\n"
         "time.sleep(1000)"
     )
     words = [sys.executable, "-c", code]

@@ -23,7 +23,7 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from dwell.testbed.conditions import Conditions, changed, delays_ns, to_json
+from dwell.testbed.conditions import Conditions, Draws, changed, delays_ns, to_json
 
 PROCESSES = [
     Constant(3.0),
@@ -87,3 +87,17 @@ def test_unknown_processes_are_refused() -> None:
         to_json({"delay_ms": Odd()})
     with pytest.raises(ProblemError, match="loss"):
         changed(Conditions(), {"loss": 1.0})
+
+
+def test_a_stream_goes_on_while_its_share_changes() -> None:
+    process = AR1(20.0, 0.2, 0.9)
+    plain, changing = Draws((1, 0)), Draws((1, 0))
+    for draws in (plain, changing):
+        draws.apply(to_json({"add_delays_ms": (Constant(2.0), process), "shares": (0.0, 1.0)}))
+    whole = [plain.delay_ns() for _ in range(9)]
+    found = []
+    for share in (1.0, 0.0, 0.5):
+        changing.apply(to_json({"shares": (1.0, share)}))
+        found += [(changing.delay_ns() - 2_000_000, share) for _ in range(3)]
+    expected = [delay * share for delay, (_, share) in zip(whole, found, strict=True)]
+    assert [delay for delay, _ in found] == pytest.approx(expected, abs=1)

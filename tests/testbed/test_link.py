@@ -13,8 +13,8 @@ import pytest
 from dwell.errors import LiveError
 from dwell.model import Constant, Normal, Trace, TraceTable
 from dwell.testbed.conditions import Conditions, delays_ns
-from dwell.testbed.forwarder import LATE_MS
-from dwell.testbed.link import GAP_MS, TunLink
+from dwell.testbed.forwarder import GAP_MS, LATE_MS
+from dwell.testbed.link import TunLink
 from tests.testbed.two_hosts import NODES, TwoHosts, two_hosts, why_not
 
 WHY_NOT = why_not()

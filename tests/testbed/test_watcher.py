@@ -44,4 +44,4 @@ def test_its_command_may_have_words_before_it(tmp_path: Path) -> None:
         Watcher(written(tmp_path), words) as watcher,
         pytest.raises(LiveError, match="no controller"),
     ):
-        watcher.ask("pin", "SO", patience_s=0.2)
+        watcher.status(0.2)

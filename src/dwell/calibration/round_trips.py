@@ -21,13 +21,14 @@ import os
 import socket
 import struct
 import time
-from array import array
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
-from typing import NoReturn
+from dataclasses import asdict
+from itertools import count
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.calibration.machine_conditions import MachineCounters
 from dwell.calibration.measure import Pace, Settings
@@ -39,7 +40,8 @@ HEADER = struct.Struct("!4sIQ")
 MAGIC = b"DWL1"
 MAX_BYTES = 64_000_000
 CHUNK_BYTES = 2**16
-WARMUP = 10
+#: What the peer is asked before the rounds begin, for messages.
+FIRST = "the first message"
 
 PAYLOAD_BYTES = Bound(1, MAX_BYTES, whole=True)
 PERIOD_MS = Bound(1e-3, 10_000)
@@ -107,27 +109,24 @@ def listen(
 def _answer(connection: socket.socket, idle_s: float) -> tuple[int, str]:
     """Answer every message of a connection; return how many, and why it ended."""
     answered = 0
-    buffer = memoryview(bytearray(CHUNK_BYTES))
     try:
         connection.settimeout(idle_s)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        while True:
-            first = connection.recv_into(buffer[: HEADER.size])
-            if first == 0:
-                return answered, "it has ended"
-            _receive(connection, buffer[first : HEADER.size])
-            magic, number, length = HEADER.unpack(buffer[: HEADER.size])
-            if magic != MAGIC:
-                return answered, "refused: this is no message of `dwell profile link`"
-            if length > MAX_BYTES:
-                return answered, f"refused: {length} bytes announced, over {MAX_BYTES}"
-            while length > 0:
-                count = connection.recv_into(buffer[: min(length, CHUNK_BYTES)])
-                if count == 0:
-                    raise EOFError
-                length -= count
-            connection.sendall(HEADER.pack(MAGIC, number, 0))
-            answered += 1
+        with connection.makefile("rb") as messages:
+            while header := messages.read(HEADER.size):
+                magic, number, length = _unpacked(header)
+                if magic != MAGIC:
+                    return answered, "refused: this is no message of `dwell profile link`"
+                if length > MAX_BYTES:
+                    return answered, f"refused: {length} bytes announced, over {MAX_BYTES}"
+                while length > 0:
+                    chunk = messages.read(min(length, CHUNK_BYTES))
+                    if not chunk:
+                        raise EOFError
+                    length -= len(chunk)
+                connection.sendall(HEADER.pack(MAGIC, number, 0))
+                answered += 1
+        return answered, "it has ended"
     except TimeoutError:
         return answered, f"refused: nothing came for {idle_s:g} s"
     except EOFError:
@@ -143,38 +142,36 @@ def _reason(error: OSError) -> str:
     return os.strerror(error.errno)
 
 
-def _receive(connection: socket.socket, buffer: memoryview) -> None:
-    """Fill a buffer.
+def _unpacked(header: bytes) -> tuple[bytes, int, int]:
+    """Return magic, number and length of a message.
 
     Raises
     ------
     EOFError
-        If the connection ends before.
+        If the connection has ended before.
     """
-    while len(buffer) > 0:
-        count = connection.recv_into(buffer)
-        if count == 0:
-            raise EOFError
-        buffer = buffer[count:]
+    if len(header) < HEADER.size:
+        raise EOFError
+    magic, number, length = HEADER.unpack(header)
+    return magic, number, length
 
 
 # -------------------------------------------------------------------------------- the measurer
 
 
-@dataclass(frozen=True, slots=True)
-class RoundTrips:
+class RoundTrips(NamedTuple):
     """Round trips of the two messages of each round.
 
     Parameters
     ----------
-    minimal_ns, payload_ns : array of int
-        One value a round: without payload, and with it.
+    minimal_ns, payload_ns : int64 array, shape (rounds,)
+        Without payload, and with it.
     late : int
         Rounds that began after their release.
     """
 
-    minimal_ns: array[int]
-    payload_ns: array[int]
+    minimal_ns: NDArray[np.int64]
+    payload_ns: NDArray[np.int64]
     late: int
 
 
@@ -226,6 +223,54 @@ def time_round_trips(
     PAYLOAD_BYTES.check("bytes", payload_bytes)
     if settings.period_ms is not None:
         PERIOD_MS.check("period_ms", settings.period_ms)
+    peer = f"{host}:{port}"
+    connection = _connect(host, port, connect_s)
+    minimal, large = bytearray(HEADER.size), bytearray(HEADER.size) + os.urandom(payload_bytes)
+    numbers = count(1)
+    when = FIRST
+    with closing(connection), connection.makefile("rb") as answers:
+
+        def round_trip(message: bytearray) -> int:
+            number = next(numbers) % 2**32
+            HEADER.pack_into(message, 0, MAGIC, number, len(message) - HEADER.size)
+            start = time.perf_counter_ns()
+            connection.sendall(message)
+            answer = answers.read(HEADER.size)
+            end = time.perf_counter_ns()
+            if _unpacked(answer) != (MAGIC, number, 0):
+                raise MeasurementError(
+                    f"{peer}: answered, but it is no `dwell profile listen` of this version"
+                )
+            return end - start
+
+        try:
+            round_trip(minimal)  # to see whether the peer speaks the same
+            connection.settimeout(answer_s)
+            pace = Pace(settings.period_ms)
+            for phase, rounds in (
+                ("round {} of the warm-up", settings.warmup),
+                ("round {}", settings.runs),
+            ):
+                pace.late = 0
+                trips_ns = np.zeros((rounds, 2), np.int64)
+                for done in range(rounds):
+                    when = phase.format(done)
+                    pace.wait()
+                    trips_ns[done] = round_trip(minimal), round_trip(large)
+        except TimeoutError:
+            if when == FIRST:
+                raise MeasurementError(
+                    f"{peer}: took the connection but has not answered within {connect_s:g} s; "
+                    "it is no `dwell profile listen`, or busy with another peer"
+                ) from None
+            raise MeasurementError(f"{peer}: no answer within {answer_s:g} s in {when}") from None
+        except (EOFError, OSError) as error:
+            why = _reason(error) if isinstance(error, OSError) else "it closed it"
+            raise MeasurementError(f"{peer}: connection lost in {when} ({why})") from None
+    return RoundTrips(trips_ns[:, 0], trips_ns[:, 1], pace.late)
+
+
+def _connect(host: str, port: int, connect_s: float) -> socket.socket:
     try:
         connection = socket.create_connection((host, port), timeout=connect_s)
     except TimeoutError:
@@ -235,76 +280,8 @@ def time_round_trips(
             f"{host}:{port}: no connection ({_reason(error)}); run "
             f"`dwell profile listen --host ADDRESS --port {port}` there first"
         ) from None
-    with closing(connection):
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        peer = _Peer(connection, f"{host}:{port}", payload_bytes)
-        peer.greet(connect_s)
-        connection.settimeout(answer_s)
-        pace = Pace(settings.period_ms)
-        peer.rounds(settings.warmup, pace, "round {} of the warm-up")
-        pace.late = 0
-        minimal_ns, payload_ns = peer.rounds(settings.runs, pace, "round {}")
-    return RoundTrips(minimal_ns, payload_ns, pace.late)
-
-
-class _Peer:
-    """The other end of a connection."""
-
-    def __init__(self, connection: socket.socket, name: str, payload_bytes: int) -> None:
-        self._connection = connection
-        self._name = name
-        self._number = 0
-        self._minimal = bytearray(HEADER.size)
-        self._large = bytearray(HEADER.size) + os.urandom(payload_bytes)
-        self._answer = memoryview(bytearray(HEADER.size))
-
-    def greet(self, timeout_s: float) -> None:
-        """Send a first message, to see whether the peer speaks the same."""
-        self._connection.settimeout(timeout_s)
-        try:
-            self._round_trip(self._minimal)
-        except TimeoutError:
-            raise MeasurementError(
-                f"{self._name}: took the connection but has not answered within {timeout_s:g} s; "
-                "it is no `dwell profile listen`, or busy with another peer"
-            ) from None
-        except (EOFError, OSError) as error:
-            self._lost("the first message", error)
-
-    def rounds(self, count: int, pace: Pace, what: str) -> tuple[array[int], array[int]]:
-        """Return the round trips of both messages in `count` rounds, nanoseconds."""
-        minimal_ns, payload_ns = array("q", bytes(8 * count)), array("q", bytes(8 * count))
-        done = 0
-        try:
-            for done in range(count):
-                pace.wait()
-                minimal_ns[done] = self._round_trip(self._minimal)
-                payload_ns[done] = self._round_trip(self._large)
-        except TimeoutError:
-            limit = self._connection.gettimeout()
-            raise MeasurementError(
-                f"{self._name}: no answer within {limit:g} s in {what.format(done)}"
-            ) from None
-        except (EOFError, OSError) as error:
-            self._lost(what.format(done), error)
-        return minimal_ns, payload_ns
-
-    def _round_trip(self, message: bytearray) -> int:
-        self._number = (self._number + 1) % 2**32
-        HEADER.pack_into(message, 0, MAGIC, self._number, len(message) - HEADER.size)
-        start = time.perf_counter_ns()
-        self._connection.sendall(message)
-        _receive(self._connection, self._answer)
-        end = time.perf_counter_ns()
-        if HEADER.unpack(self._answer) != (MAGIC, self._number, 0):
-            raise MeasurementError(
-                f"{self._name}: answered, but it is no `dwell profile listen` of this version"
-            )
-        return end - start
-
-    def _lost(self, when: str, error: Exception) -> NoReturn:
-        why = _reason(error) if isinstance(error, OSError) else "it closed it"
-        raise MeasurementError(f"{self._name}: connection lost in {when} ({why})") from None
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
 
 
 def measure_link(
@@ -315,8 +292,6 @@ def measure_link(
     *,
     payload_bytes: int,
     settings: Settings,
-    connect_s: float = CONNECT_S,
-    answer_s: float = ANSWER_S,
 ) -> Measurement:
     """Measure the link from this node to another one, where a `listen` runs.
 
@@ -324,7 +299,7 @@ def measure_link(
     ----------
     source, target : str
         Names of this node and the other in the cell.
-    host, port, payload_bytes, settings, connect_s, answer_s
+    host, port, payload_bytes, settings
         See `time_round_trips`.
 
     Returns
@@ -342,16 +317,8 @@ def measure_link(
     """
     name = link_name(source, target)
     watch = MachineCounters(os.sched_getaffinity(0))
-    trips = time_round_trips(
-        host,
-        port,
-        payload_bytes=payload_bytes,
-        settings=settings,
-        connect_s=connect_s,
-        answer_s=answer_s,
-    )
-    minimal_ms = np.array(trips.minimal_ns, np.float64) / 1e6
-    payload_ms = np.array(trips.payload_ns, np.float64) / 1e6
+    trips = time_round_trips(host, port, payload_bytes=payload_bytes, settings=settings)
+    minimal_ms, payload_ms = trips.minimal_ns / 1e6, trips.payload_ns / 1e6
     columns = {
         name: minimal_ms / 2,
         f"{name}/round_trip_ms": minimal_ms,

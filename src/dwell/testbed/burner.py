@@ -19,7 +19,7 @@ from collections.abc import Collection, Sequence
 from typing import cast
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Child, Parent, Started
+from dwell.testbed.child import Child, Parent
 from dwell.testbed.event_loop import Loop
 
 #: One busy process; a loop without memory traffic, as the simulator has its foreign threads.
@@ -30,7 +30,7 @@ TURNS = 20_000
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-class Burner(Started):
+class Burner(Child):
     """Burns what it can get of some CPUs, on command.
 
     Parameters
@@ -59,15 +59,9 @@ class Burner(Started):
             raise LiveError(f"a burner cannot run on {asked}; this process may use {known}")
         #: Ids of the threads as of the last answer: each is a process.
         self.pids: tuple[int, ...] = ()
-        self._cpus = sorted(cpus)
-        self._program = list(program)
-        name = f"burner on {','.join(map(str, self._cpus))}"
-        self._child = Child("dwell.testbed.burner", name, prefix=prefix)
-
-    @property
-    def pid(self) -> int:
-        """Id of the process that starts and ends the threads, and uses next to nothing itself."""
-        return self._child.pid
+        settings = {"cpus": sorted(cpus), "threads": 0, "program": list(program)}
+        name = f"burner on {','.join(map(str, sorted(cpus)))}"
+        super().__init__("dwell.testbed.burner", name, settings, prefix=prefix)
 
     def start(self, threads: int = 0) -> None:
         """Start it with so many threads.
@@ -80,10 +74,9 @@ class Burner(Started):
             If it has been started before, or does not start.
         """
         _check(threads)
-        answer = self._child.start(
-            {"cpus": self._cpus, "threads": threads, "program": self._program}
-        )
-        self.pids = tuple(cast("list[int]", answer["pids"]))
+        self.settings["threads"] = threads
+        super().start()
+        self.pids = tuple(cast("list[int]", self.answered["pids"]))
 
     def set(self, threads: int, *, at_ns: int | None = None) -> int:
         """Have so many threads from now on, or from an instant on.
@@ -108,13 +101,13 @@ class Burner(Started):
             If it does not run.
         """
         _check(threads)
-        answer = self._child.ask({"threads": threads, "at_ns": at_ns})
+        answer = self.ask({"threads": threads, "at_ns": at_ns})
         self.pids = tuple(cast("list[int]", answer["pids"]))
         return cast("int", answer["at_ns"])
 
     def stop(self) -> None:
         """End it, and with it all threads; safe to call twice."""
-        self._child.stop()
+        super().stop()
         self.pids = ()
 
 

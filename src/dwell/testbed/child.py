@@ -54,8 +54,8 @@ class Started(ABC):
         self.stop()
 
 
-class Child:
-    """The parent's side.
+class Child(Started):
+    """The parent's side; a context manager.
 
     The child stays in the parent's session: in one of its own, a kernel that shares the CPU by
     session (autogroup) would give all of its threads together what one of the others gets.
@@ -66,22 +66,31 @@ class Child:
         Run as ``python -m``; its main function makes a `Parent`.
     name : str
         For messages.
+    settings : mapping
+        First request, which it is started with.
     descriptors : sequence of int
         Open files that it has under the same numbers.
     prefix : sequence of str
         Words of a command that runs the words behind them, in the same process.
+
+    Attributes
+    ----------
+    answered : dict
+        Answer to the settings, once it has been started.
     """
 
     def __init__(
         self,
         module: str,
         name: str,
-        descriptors: Sequence[int] = (),
+        settings: Mapping[str, object],
         *,
+        descriptors: Sequence[int] = (),
         prefix: Sequence[str] = (),
     ) -> None:
+        self.name, self.settings = name, dict(settings)
+        self.answered: Json = {}
         self._module = module
-        self._name = name
         self._descriptors = tuple(descriptors)
         self._prefix = tuple(prefix)
         self._process: subprocess.Popen[bytes] | None = None
@@ -98,11 +107,11 @@ class Child:
             If it has not been started.
         """
         if self._process is None:
-            raise LiveError(f"{self._name} has not been started")
+            raise LiveError(f"{self.name} has not been started")
         return self._process.pid
 
-    def start(self, settings: Mapping[str, object]) -> Json:
-        """Start it and return its answer to its settings.
+    def start(self) -> None:
+        """Start it, and wait for its answer to its settings.
 
         Raises
         ------
@@ -110,7 +119,7 @@ class Child:
             If it has been started before, or does not answer, or answers with an error.
         """
         if self._process is not None:
-            raise LiveError(f"{self._name} has been started before")
+            raise LiveError(f"{self.name} has been started before")
         ours, theirs = socket.socketpair()
         with theirs:
             # Standard output and error are the parent's: a child that fails says why there.
@@ -121,7 +130,7 @@ class Child:
             )
         self._socket = ours
         try:
-            return self.ask(settings, START_S)
+            self.answered = self.ask(self.settings, START_S)
         except LiveError:
             self.stop()
             raise
@@ -136,19 +145,19 @@ class Child:
         """
         with self._lock:
             if self._socket is None:
-                raise LiveError(f"{self._name} does not run")
+                raise LiveError(f"{self.name} does not run")
             self._socket.settimeout(timeout_s)
             try:
                 self._socket.sendall(json.dumps(request).encode() + b"\n")
                 answer = self._receive(self._socket)
             except TimeoutError:
                 raise LiveError(
-                    f"{self._name} (process {self.pid}) has not answered within {timeout_s:g} s"
+                    f"{self.name} (process {self.pid}) has not answered within {timeout_s:g} s"
                 ) from None
             except (EOFError, OSError):
-                raise LiveError(f"{self._name} (process {self.pid}) has ended") from None
+                raise LiveError(f"{self.name} (process {self.pid}) has ended") from None
         if "error" in answer:
-            raise LiveError(f"{self._name}: {answer['error']}")
+            raise LiveError(f"{self.name}: {answer['error']}")
         return answer
 
     @staticmethod
@@ -186,7 +195,7 @@ class Parent:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._pid = os.getppid()
         self._socket = socket.socket(fileno=0)
-        self._line = bytearray()
+        self._lines = self._socket.makefile("rb")
 
     def fileno(self) -> int:
         """Descriptor that is readable when there is a request, or the parent has gone."""
@@ -205,14 +214,11 @@ class Parent:
         EOFError
             If the parent has gone, or wants this process to end.
         """
-        while not self._line.endswith(b"\n"):
-            received = b""
-            with contextlib.suppress(ConnectionError):
-                received = self._socket.recv(RECEIVE_BYTES)
-            if not received:
-                raise EOFError
-            self._line += received
-        request, self._line = self._line, bytearray()
+        request = b""
+        with contextlib.suppress(ConnectionError):
+            request = self._lines.readline()
+        if not request.endswith(b"\n"):
+            raise EOFError
         return cast("Json", json.loads(request))
 
     def answer(self, answer: Mapping[str, object]) -> None:

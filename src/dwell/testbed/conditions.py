@@ -1,10 +1,11 @@
-"""Conditions of one direction of an emulated link, and the delays drawn from them."""
+"""Conditions of one direction of an emulated link, and what is drawn from them on the way."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
+from itertools import cycle
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -152,20 +153,13 @@ def delays_ns(process: Process, rng: np.random.Generator) -> Iterator[int]:
         while True:
             yield value
     if isinstance(process, Trace):
-        yield from _replayed(process, rng)
+        values = np.rint(process.values * NS_PER_MS).astype(np.int64)
+        yield from cycle(np.roll(values, -rng.integers(len(values))).tolist())
     if isinstance(process, AR1) and process.cv > 0:
         yield from _remembering(process, rng)
     while True:
         block = np.rint(process.marginal(rng, BLOCK) * NS_PER_MS).astype(np.int64)
         yield from block.tolist()
-
-
-def _replayed(trace: Trace, rng: np.random.Generator) -> Iterator[int]:
-    values = np.rint(trace.values * NS_PER_MS).astype(np.int64).tolist()
-    row = int(rng.integers(len(values)))
-    while True:
-        yield values[row]
-        row = (row + 1) % len(values)
 
 
 def _remembering(process: AR1, rng: np.random.Generator) -> Iterator[int]:
@@ -177,3 +171,41 @@ def _remembering(process: AR1, rng: np.random.Generator) -> Iterator[int]:
         for noise in rng.standard_normal(BLOCK).tolist():
             yield round(math.exp(mu + sigma * state) * NS_PER_MS)
             state = r * state + fresh * noise
+
+
+class Draws:
+    """Conditions that may change, and streams of their own for each delay and for losses.
+
+    A stream goes on for as long as its process stays, whether it counts or not.
+
+    Parameters
+    ----------
+    seed : (int, int)
+        Of the link, and of the direction.
+    """
+
+    def __init__(self, seed: tuple[int, int]) -> None:
+        self.conditions = Conditions()
+        self._delays_rng, self._added_rng, self._losses = np.random.default_rng(seed).spawn(3)
+        self._delays = delays_ns(self.conditions.delay_ms, self._delays_rng)
+        self._added: list[Iterator[int]] = []
+
+    def apply(self, changes: dict[str, object]) -> None:
+        """Change conditions, as `to_json` has written them."""
+        before, now = self.conditions, changed(self.conditions, changes)
+        self.conditions = now
+        if before.delay_ms != now.delay_ms:
+            self._delays = delays_ns(now.delay_ms, self._delays_rng)
+        if before.add_delays_ms != now.add_delays_ms:
+            rngs = self._added_rng.spawn(len(now.add_delays_ms))
+            pairs = zip(now.add_delays_ms, rngs, strict=True)
+            self._added = [delays_ns(process, rng) for process, rng in pairs]
+
+    def lose(self) -> bool:
+        """Decide whether what comes next is lost."""
+        return self.conditions.loss > 0 and self._losses.random() < self.conditions.loss
+
+    def delay_ns(self) -> int:
+        """Draw a delay."""
+        shares = zip(self._added, self.conditions.shares, strict=True)
+        return next(self._delays) + sum(round(next(added) * share) for added, share in shares)

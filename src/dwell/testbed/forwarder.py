@@ -22,14 +22,20 @@ from typing import TypedDict, cast
 
 from dwell.errors import DwellError
 from dwell.testbed.child import Json, Parent
-from dwell.testbed.conditions import Scheduling, changed
-from dwell.testbed.draws import Draws
+from dwell.testbed.conditions import Draws, Scheduling, changed
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.packets import kind_of
 
 #: Limits of the classes of lateness, ms; the last class has none.
 LATE_MS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 LATE_NS = tuple(round(each * 1e6) for each in LATE_MS)
+
+#: Pause that ends a burst: a sender that is stopped by its CPU quota in the middle of a message
+#: goes on within 4 ms.
+GAP_MS = 4.0
+#: From then on a flow that never pauses draws its next delay.
+LONGEST_MS = 20.0
+GAP_NS, LONGEST_NS = round(GAP_MS * 1e6), round(LONGEST_MS * 1e6)
 
 PACKET_BYTES = 65_536
 # Packets read at a time, a message of 300 kB; what is due does not wait for more.
@@ -57,10 +63,7 @@ class _Settings(TypedDict):
     descriptors: list[int]
     sets: list[_Set]
     retransmit_ns: dict[str, int]
-    gap_ns: int
-    longest_ns: int
     seed: int
-    cpus: list[int] | None
 
 
 @dataclass(slots=True)
@@ -170,7 +173,6 @@ class _Direction:
         self._source = settings["descriptors"][index]
         self._target = settings["descriptors"][1 - index]
         self._retransmit_ns = settings["retransmit_ns"].get(settings["nodes"][index], 0)
-        self._gap_ns, self._longest_ns = settings["gap_ns"], settings["longest_ns"]
         self._flows: dict[bytes, _Flow] = {}
         self._free_ns = 0
         self._waiting_bytes = 0
@@ -203,9 +205,7 @@ class _Direction:
         self._free_ns += round(len(packet) * 8e3 / conditions.rate_mbps)
         flow = self._flows.get(kind.flow)
         begins = (
-            flow is None
-            or now_ns - flow.last_ns > self._gap_ns
-            or now_ns - flow.begun_ns > self._longest_ns
+            flow is None or now_ns - flow.last_ns > GAP_NS or now_ns - flow.begun_ns > LONGEST_NS
         )
         if flow is None:
             flow = self._flows[kind.flow] = _Flow()
@@ -244,7 +244,7 @@ class _Direction:
 
     def _forget(self, now_ns: int) -> None:
         if len(self._flows) > FLOWS:
-            old_ns = now_ns - self._longest_ns
+            old_ns = now_ns - LONGEST_NS
             self._flows = {
                 name: flow
                 for name, flow in self._flows.items()
@@ -328,8 +328,6 @@ def main() -> None:
     with contextlib.suppress(EOFError):
         settings = cast("_Settings", parent.receive())
         try:
-            if settings["cpus"] is not None:
-                os.sched_setaffinity(0, settings["cpus"])
             link = _Link(parent, settings)
         except (DwellError, OSError) as error:
             parent.answer({"error": str(error)})

@@ -17,22 +17,18 @@ What differs from a real link:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, cast
 
 from dwell.errors import LiveError
-from dwell.testbed.child import Child, Json, Started
+from dwell.testbed.child import Child, Json
 from dwell.testbed.conditions import Conditions, Scheduling, fields_of, to_json
 from dwell.testbed.forwarder import Passed
 
-#: A sender that is stopped by its CPU quota in the middle of a message goes on within 4 ms.
-GAP_MS = 4.0
-#: From then on a flow that never pauses draws its next delay.
-LONGEST_MS = 20.0
 NO_CONDITIONS: Mapping[tuple[str, str], Conditions] = {}
 
 
-class TunLink(Started):
+class TunLink(Child):
     """The link between two hosts, as its parent sees it; a context manager.
 
     Its conditions can be changed at any time.
@@ -48,10 +44,6 @@ class TunLink(Started):
         Timeout of the directions that send again what was lost; others may have no `loss`.
     seed : int
         Of delays and losses.
-    gap_ms, longest_ms : float
-        Pause that ends a burst, and time after which one ends without.
-    cpus : collection of int, optional
-        Where it runs; anywhere if left out.
 
     Raises
     ------
@@ -67,58 +59,34 @@ class TunLink(Started):
         *,
         retransmit_ms: Mapping[tuple[str, str], float] | None = None,
         seed: int = 0,
-        gap_ms: float = GAP_MS,
-        longest_ms: float = LONGEST_MS,
-        cpus: Collection[int] | None = None,
     ) -> None:
         if nodes[0] == nodes[1] or set(descriptors) != set(nodes):
             raise LiveError(f"link {'-'.join(nodes)}: needs one device each of two nodes")
         files = [descriptors[node] for node in nodes]
-        self.nodes = nodes
-        self.name = f"link {nodes[0]}-{nodes[1]}"
-        #: How well it can keep its instants beside busy threads.
-        self.scheduling: Scheduling = "usual"
-        self._child = Child("dwell.testbed.forwarder", self.name, files)
         timeouts = dict(retransmit_ms or {})
+        self.nodes, self.name = nodes, f"link {nodes[0]}-{nodes[1]}"
         for source, target in timeouts:
             self._require(source, target)
         self._repeats = frozenset(source for source, _ in timeouts)
-        self._settings: Json = {
+        settings: Json = {
             "nodes": nodes,
             "descriptors": files,
             "sets": [self._change(*way, fields_of(each)) for way, each in usual.items()],
             "retransmit_ns": {source: round(ms * 1e6) for (source, _), ms in timeouts.items()},
-            "gap_ns": round(gap_ms * 1e6),
-            "longest_ns": round(longest_ms * 1e6),
             "seed": seed,
-            "cpus": sorted(cpus) if cpus is not None else None,
         }
+        super().__init__("dwell.testbed.forwarder", self.name, settings, descriptors=files)
 
     @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._child.pid
+    def scheduling(self) -> Scheduling:
+        """How well it can keep its instants beside busy threads."""
+        return cast("Scheduling", self.answered.get("scheduling", "usual"))
 
     @property
     def ways(self) -> tuple[tuple[str, str], tuple[str, str]]:
         """Both directions, as (source, target)."""
         first, second = self.nodes
         return (first, second), (second, first)
-
-    def start(self) -> None:
-        """Start it; returns when it forwards.
-
-        Raises
-        ------
-        LiveError
-            If a value of the conditions is out of its bounds, or it does not start.
-        """
-        answer = self._child.start(self._settings)
-        self.scheduling = cast("Scheduling", answer["scheduling"])
-
-    def stop(self) -> None:
-        """End it; what is on its way is lost. Safe to call twice."""
-        self._child.stop()
 
     def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
         """Change some conditions of a direction for what begins its way from then on.
@@ -142,7 +110,7 @@ class TunLink(Started):
             kind of link has, or the process has ended.
         """
         sets = [self._change(source, target, changes)]
-        answer = self._child.ask({"do": "set", "sets": sets, "at_ns": at_ns})
+        answer = self.ask({"do": "set", "sets": sets, "at_ns": at_ns})
         return cast("int", answer["at_ns"])
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
@@ -160,7 +128,7 @@ class TunLink(Started):
         LiveError
             If the process has ended.
         """
-        answer = self._child.ask({"do": "stats", "reset": reset})
+        answer = self.ask({"do": "stats", "reset": reset})
         counts = cast("dict[str, dict[str, Any]]", answer["stats"])
         return {way: Passed(**counts[way[0]]) for way in self.ways}
 

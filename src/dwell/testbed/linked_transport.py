@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from dwell.live.failures import start_thread
 from dwell.live.transport.transport import Arrival, Lane, Receive, Transport
-from dwell.testbed.message_links import LinkEnds, Way
+from dwell.testbed.message_links import HELD, LOST, LinkEnds, Way
 
 #: Begins a header that says where its message comes from; MessagePack never uses this byte.
 _SOURCE = b"\xc1"
@@ -137,14 +137,14 @@ class LinkedTransport:
             if stream.held is not None:
                 stream.held.append((size, act))
                 return
-            passed = way.begin(size, now_ns)
-            if passed.held:
+            arrival_ns = way.begin(size, now_ns)
+            if arrival_ns == HELD:
                 stream.held = deque([(size, act)])
                 self._wait(now_ns + LOOK_NS, stream, None)
                 return
-            if passed.arrival_ns < 0:
+            if arrival_ns == LOST:
                 return
-            stream.latest_ns = max(passed.arrival_ns, stream.latest_ns)
+            stream.latest_ns = max(arrival_ns, stream.latest_ns)
             if stream.moving or stream.latest_ns > now_ns:
                 self._wait(stream.latest_ns, stream, act)
                 return
@@ -192,12 +192,12 @@ class LinkedTransport:
         held = stream.held
         while held:
             size, act = held[0]
-            passed = stream.way.begin(size, now_ns)
-            if passed.held:
+            arrival_ns = stream.way.begin(size, now_ns)
+            if arrival_ns == HELD:
                 self._wait(now_ns + LOOK_NS, stream, None)
                 return
             held.popleft()
-            if passed.arrival_ns >= 0:
-                stream.latest_ns = max(passed.arrival_ns, stream.latest_ns)
+            if arrival_ns != LOST:
+                stream.latest_ns = max(arrival_ns, stream.latest_ns)
                 self._wait(stream.latest_ns, stream, act)
         stream.held = None

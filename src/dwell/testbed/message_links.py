@@ -23,15 +23,13 @@ import os
 import struct
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from dwell.errors import LiveError, ProblemError
 from dwell.files import write_whole
 from dwell.model import Link
-from dwell.testbed.conditions import Conditions, changed, fields_of, to_json
-from dwell.testbed.draws import Draws
+from dwell.testbed.conditions import Conditions, Draws, changed, fields_of, to_json
 
 _MAGIC = b"dwelllnk"
 # Magic, seed, bytes of the names that follow the directions.
@@ -41,6 +39,9 @@ _CHANGES, _FREE_NS, _LAST_NS = range(3)
 _WAY = struct.Struct("<3q")
 #: What waits longer for its turn is lost.
 LONGEST_WAIT_S = 10.0
+#: Instead of the arrival of a message that is lost, and of one that the sender has to hold: the
+#: direction is cut, and loses nothing.
+LOST, HELD = -1, -2
 #: Attempts at a message on a link that retransmits.
 MOST_ATTEMPTS = 20
 
@@ -149,25 +150,6 @@ def _file_of(path: Path, place: int) -> Path:
     return path.with_name(f"{path.name}.{place}")
 
 
-@dataclass(frozen=True, slots=True)
-class Passing:
-    """What became of a message that was to begin its way.
-
-    Parameters
-    ----------
-    arrival_ns : int
-        When it is there; -1 where it is not.
-    held : bool
-        Whether it has to wait: the direction is cut, and holds what it is sent.
-    """
-
-    arrival_ns: int
-    held: bool = False
-
-
-LOST, HELD = Passing(-1), Passing(-1, held=True)
-
-
 class Way:
     """One direction of a link, as one process meets it.
 
@@ -193,8 +175,8 @@ class Way:
         self._lock = threading.Lock()
         self._file = os.open(path, os.O_RDWR)
 
-    def begin(self, size_bytes: int, now_ns: int) -> Passing:
-        """Let a message begin its way.
+    def begin(self, size_bytes: int, now_ns: int) -> int:
+        """Let a message begin its way; returns when it arrives, or `LOST` or `HELD`.
 
         Parameters
         ----------
@@ -211,7 +193,7 @@ class Way:
                 return LOST
             for _ in range(MOST_ATTEMPTS):
                 if not self._draws.lose():
-                    return Passing(self._arrived(sent_ns + self._draws.delay_ns()))
+                    return self._arrived(sent_ns + self._draws.delay_ns())
                 if self._retransmit_ms is None:
                     return LOST
                 took_ns = transmission_ns(size_bytes, self._draws.conditions.rate_mbps)

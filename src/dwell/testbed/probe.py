@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
-from dwell.testbed.child import Child, Parent, Started
+from dwell.testbed.child import Child, Parent
 
 SLEEP_NS = 5_000_000
 #: Wakes between two pieces of work, and turns of its loop: about 0.1 ms.
@@ -42,7 +42,7 @@ class Lateness:
     work_ms: float | None
 
 
-class Probe(Started):
+class Probe(Child):
     """Measures on one CPU until it is stopped; a context manager.
 
     Parameters
@@ -53,21 +53,7 @@ class Probe(Started):
 
     def __init__(self, cpu: int, prefix: Sequence[str] = ()) -> None:
         self.cpu = cpu
-        self._child = Child("dwell.testbed.probe", f"probe of CPU {cpu}", prefix=prefix)
-
-    def start(self) -> None:
-        """Start it.
-
-        Raises
-        ------
-        LiveError
-            If it does not start.
-        """
-        self._child.start({"cpu": self.cpu})
-
-    def stop(self) -> None:
-        """End it; safe to call twice."""
-        self._child.stop()
+        super().__init__("dwell.testbed.probe", f"probe of CPU {cpu}", {"cpu": cpu}, prefix=prefix)
 
     def read(self) -> Lateness:
         """Return how late it was since this was last asked.
@@ -77,7 +63,7 @@ class Probe(Started):
         LiveError
             If it does not run.
         """
-        found = cast("dict[str, float]", self._child.ask({}))
+        found = cast("dict[str, float]", self.ask({}))
         wakes = int(found["wakes"])
         return Lateness(
             wakes=wakes,

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from dwell.errors import DwellError, LiveError
-from dwell.testbed.child import Child, Parent, Started
+from dwell.testbed.child import Child, Parent
 
 #: Beyond the patience of a question, for the process itself.
 SLACK_S = 5.0
 
 
-class Watcher(Started):
+class Watcher(Child):
     """Asks a cell's controller, as its parent sees it; a context manager.
 
     Parameters
@@ -28,22 +28,8 @@ class Watcher(Started):
     """
 
     def __init__(self, cell: Path, prefix: Sequence[str] = ()) -> None:
-        self._cell = cell
-        self._child = Child("dwell.testbed.watcher", f"watcher of {cell}", prefix=prefix)
-
-    def start(self) -> None:
-        """Start it.
-
-        Raises
-        ------
-        LiveError
-            If it does not start, or the cell file cannot be read.
-        """
-        self._child.start({"cell": str(self._cell)})
-
-    def stop(self) -> None:
-        """End it; safe to call twice."""
-        self._child.stop()
+        name, settings = f"watcher of {cell}", {"cell": str(cell)}
+        super().__init__("dwell.testbed.watcher", name, settings, prefix=prefix)
 
     def status(self, patience_s: float) -> Mapping[str, Any]:
         """Return how the cell is.
@@ -53,18 +39,7 @@ class Watcher(Started):
         LiveError
             If nobody answers.
         """
-        return self.ask("status", patience_s=patience_s)
-
-    def ask(self, what: str, about: str = "", *, patience_s: float = 3.0) -> Mapping[str, Any]:
-        """Ask as `OperatorClient.ask` does.
-
-        Raises
-        ------
-        LiveError
-            If it is refused, or nobody answers.
-        """
-        request = {"what": what, "about": about, "patience_s": patience_s}
-        answer = self._child.ask(request, patience_s + SLACK_S)
+        answer = self.ask({"patience_s": patience_s}, patience_s + SLACK_S)
         return cast("Mapping[str, Any]", answer["status"])
 
 
@@ -88,12 +63,9 @@ def main() -> None:
         parent.answer({})
         with visitor:
             while True:
-                asked = cast("dict[str, Any]", parent.receive())
+                patience_s = cast("float", parent.receive()["patience_s"])
                 try:
-                    status = visitor.ask(
-                        asked["what"], asked["about"], patience_s=asked["patience_s"]
-                    )
-                    parent.answer({"status": status})
+                    parent.answer({"status": visitor.ask("status", patience_s=patience_s)})
                 except LiveError as error:
                     parent.answer({"error": str(error)})
     except EOFError:

@@ -20,7 +20,7 @@ from dwell.live.keys import Keys
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
 from dwell.testbed.chaos.invariants import Judge
-from dwell.testbed.child import Child, Parent, Started
+from dwell.testbed.child import Child, Parent
 from dwell.testbed.testbed import LocalTestbed
 
 _HEAD = struct.Struct("<QIII")
@@ -46,7 +46,7 @@ def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
     return WiringEntry(role, {}, ends)
 
 
-class Wiretap(Started):
+class Wiretap(Child):
     """The process, as its parent sees it; a context manager.
 
     Parameters
@@ -64,32 +64,13 @@ class Wiretap(Started):
     def __init__(
         self, cell: Path, nodes: Sequence[str], out: Path, prefix: Sequence[str] = ()
     ) -> None:
-        self._settings: dict[str, object] = {
-            "cell": str(cell),
-            "nodes": list(nodes),
-            "out": str(out),
-        }
-        self._child = Child(
-            "dwell.testbed.chaos.wiretap", f"tap at {','.join(nodes)}", prefix=prefix
-        )
-
-    def start(self) -> None:
-        """Start it.
-
-        Raises
-        ------
-        LiveError
-            If it does not start.
-        """
-        self._child.start(self._settings)
-
-    def stop(self) -> None:
-        """End it; safe to call twice."""
-        self._child.stop()
+        name = f"tap at {','.join(nodes)}"
+        settings = {"cell": str(cell), "nodes": list(nodes), "out": str(out)}
+        super().__init__("dwell.testbed.chaos.wiretap", name, settings, prefix=prefix)
 
     def peers(self) -> int:
         """Return how many sessions it is connected to now."""
-        return cast("int", self._child.ask({})["peers"])
+        return cast("int", self.ask({})["peers"])
 
 
 class Records:
