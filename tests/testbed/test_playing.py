@@ -94,7 +94,6 @@ def test_the_run_is_told_what_was_played_when(problem: Problem, tmp_path: Path) 
     assert told["at_s"] == pytest.approx(10 * PERIOD_NS / 1e9, abs=1e-3)
     assert told["for_s"] == pytest.approx(10 * PERIOD_NS / 1e9, abs=1e-3)
     assert longest_run(tmp_path) == folder
-    assert longest_run(tmp_path, "another cell") is None
     assert longest_run(tmp_path / "nothing") is None
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from dwell.errors import LiveError
 from dwell.testbed.pressure import Rule
-from dwell.testbed.sampling import Rate, Sampler, cpu_times
+from dwell.testbed.sampling import Sampler, cpu_times, rate_hz
 from tests.waiting import wait_until
 
 CPU = min(os.sched_getaffinity(0))
@@ -55,11 +55,5 @@ def test_what_cannot_be_read_ends_the_samples_and_not_the_run() -> None:
     assert sampler.samples == []
 
 
-def test_a_rate_is_of_what_is_there_at_both_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts = [{1: 10, 2: 5}, {1: 30, 3: 99}]
-    now_s = iter([100.0, 104.0])
-    rate = Rate(lambda: counts.pop(0))
-    monkeypatch.setattr("dwell.testbed.sampling.time.monotonic", lambda: next(now_s))
-    rate.begin()
-    rate.end()
-    assert rate.hz == 5.0
+def test_a_rate_is_of_what_is_there_at_both_looks() -> None:
+    assert rate_hz({1: 10, 2: 5}, {1: 30, 3: 99}, 4.0) == 5.0

@@ -19,12 +19,12 @@ from __future__ import annotations
 import gc
 import os
 import time
-from array import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.calibration.error_origin import blamed, raised_here
 from dwell.calibration.machine_conditions import MachineConditions, MachineCounters, processor
@@ -43,10 +43,8 @@ class Settings:
 
     Parameters
     ----------
-    runs : int
-        Samples.
     warmup : int
-        Runs before them that are not kept.
+        Runs before those that are kept.
     period_ms : float or None
         Time between the begins of two runs; None begins each when the one before has ended.
     """
@@ -110,20 +108,18 @@ class Timing:
 
     Parameters
     ----------
-    wall_ns, cpu_ns : array of int
-        One value a run, in the order of the runs.
+    wall_ns, cpu_ns : int64 array, shape (runs,)
+        In the order of the runs.
     first_ns : int
         Wall time of the very first run, of the warm-up where there is one.
     late : int
         Runs that began after their release, because those before took too long.
     collections : tuple of int
         Garbage collections during the runs, by generation.
-    conditions : MachineConditions
-        During the runs.
     """
 
-    wall_ns: array[int]
-    cpu_ns: array[int]
+    wall_ns: NDArray[np.int64]
+    cpu_ns: NDArray[np.int64]
     first_ns: int
     late: int
     collections: tuple[int, ...]
@@ -161,7 +157,7 @@ def time_runs(
     return Timing(
         wall_ns=wall_ns,
         cpu_ns=cpu_ns,
-        first_ns=(warm_wall or wall_ns)[0],
+        first_ns=int((warm_wall if settings.warmup else wall_ns)[0]),
         late=pace.late,
         collections=tuple(late - early for late, early in zip(after, before, strict=True)),
         conditions=watch.conditions(),
@@ -174,16 +170,18 @@ def _series(
     count: int,
     pace: Pace,
     what: str,
-) -> tuple[array[int], array[int]]:
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return wall and CPU time of `count` runs."""
-    wall_ns, cpu_ns = array("q", bytes(8 * count)), array("q", bytes(8 * count))
+    wall_ns, cpu_ns = np.zeros((2, count), np.int64)
     wall, cpu = time.perf_counter_ns, time.process_time_ns
     arguments: tuple[object, ...] = ()
-    run = 0
+    run, prepared = 0, True
     try:
         for run in range(count):
             if inputs is not None:
-                arguments = _prepared(inputs, run, what)
+                prepared = False
+                arguments = (inputs(run),)
+                prepared = True
             pace.wait()
             cpu_start = cpu()
             start = wall()
@@ -193,25 +191,15 @@ def _series(
             wall_ns[run] = end - start
             cpu_ns[run] = cpu_end - cpu_start
             del result
-    except MeasurementError:
-        raise
     except (Exception, SystemExit) as error:
-        hint = ""
-        if isinstance(error, TypeError) and raised_here(error.__traceback__):
-            given = "one argument, from --inputs" if inputs else "no arguments (see --inputs)"
-            hint = f"; it is called with {given}"
-        raise MeasurementError(f"{what.format(run)}: {blamed(error)}{hint}") from error
+        given = "one argument, from --inputs" if inputs else "no arguments (see --inputs)"
+        when = what.format(run)
+        if not prepared:
+            given, when = "the number of the run", f"inputs of {when}"
+        wrong_call = isinstance(error, TypeError) and raised_here(error.__traceback__)
+        hint = f"; it is called with {given}" if wrong_call else ""
+        raise MeasurementError(f"{when}: {blamed(error)}{hint}") from error
     return wall_ns, cpu_ns
-
-
-def _prepared(inputs: Callable[[int], object], run: int, what: str) -> tuple[object]:
-    try:
-        return (inputs(run),)
-    except (Exception, SystemExit) as error:
-        hint = ""
-        if isinstance(error, TypeError) and raised_here(error.__traceback__):
-            hint = "; it is called with the number of the run"
-        raise MeasurementError(f"inputs of {what.format(run)}: {blamed(error)}{hint}") from error
 
 
 @contextmanager
@@ -242,7 +230,7 @@ def measure_task(
     Parameters
     ----------
     task, node : str
-        Their names in the cell.
+        Names in the cell.
     call, settings, inputs
         See `time_runs`.
     source, inputs_source : str, optional
@@ -267,8 +255,7 @@ def measure_task(
         timing = time_runs(call, settings, inputs)
     except MeasurementError as error:
         raise MeasurementError(f"{task}, {error}") from error.__cause__
-    wall_ns = np.array(timing.wall_ns, np.float64)
-    cpu_ns = np.array(timing.cpu_ns, np.float64)
+    wall_ns, cpu_ns = timing.wall_ns, timing.cpu_ns
     about = {
         **stamp(),
         "kind": "task",

@@ -13,11 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-STAT, PSI = Path("/proc/stat"), Path("/proc/pressure/cpu")
-#: Fields of the first line of /proc/stat in which a CPU had nothing to do: idle, iowait.
-RESTING = (3, 4)
-#: Fields that are part of others there: guest, guest_nice.
-COUNTED = 8
+PSI = Path("/proc/pressure/cpu")
 
 
 class Sample(NamedTuple):
@@ -25,10 +21,8 @@ class Sample(NamedTuple):
 
     Parameters
     ----------
-    at_s : float
-        Of the clock of the samples.
     busy, all : float
-        CPU time that was used and that passed, all CPUs together, in the kernel's ticks.
+        CPU time that was used and that passed, all CPUs together, seconds.
     waited_s : float or None
         Time in which something waited for a CPU; None where the kernel does not say.
     """
@@ -82,9 +76,12 @@ class Idle(NamedTuple):
 
 def sample() -> Sample:
     """Read the counters of this machine."""
-    fields = [float(field) for field in STAT.read_text().splitlines()[0].split()[1 : COUNTED + 1]]
-    resting = sum(fields[i] for i in RESTING)
-    return Sample(time.monotonic(), sum(fields) - resting, sum(fields), waited_s())
+    import psutil  # what a campaign has measured is read without it
+
+    times = psutil.cpu_times()
+    # Guests are in user and nice already.
+    passed = sum(times) - times.guest - times.guest_nice
+    return Sample(time.monotonic(), passed - times.idle - times.iowait, passed, waited_s())
 
 
 def waited_s() -> float | None:
@@ -102,17 +99,7 @@ def wait_until_idle(
     read: Callable[[], Sample] = sample,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Idle:
-    """Wait until the machine has been idle for a while, or for as long as patience lasts.
-
-    Parameters
-    ----------
-    read, sleep : callable
-        Of this machine unless a test says otherwise.
-
-    Returns
-    -------
-    Idle
-    """
+    """Wait until the machine has been idle for a while, or for as long as patience lasts."""
     begun = before = read()
     while True:
         sleep(quiet.for_s)

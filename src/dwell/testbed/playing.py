@@ -7,7 +7,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
@@ -169,32 +169,28 @@ def crowded(run: Run, problem: Problem) -> list[str]:
     return found
 
 
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Have whoever ends this process, or closes its terminal, interrupt it as Ctrl-C does."""
-
-    def interrupt(number: int, frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    numbers = (signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt
 
 
 @contextmanager
-def undisturbed() -> Iterator[None]:
-    """Have nobody interrupt what takes everything down, nor whoever is impatient."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+def _handled(numbers: Sequence[int], handler: Any) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, usual in before.items():
+            signal.signal(number, usual)
+
+
+def interruptible() -> AbstractContextManager[None]:
+    """Have SIGTERM, and the end of the terminal, interrupt this process as Ctrl-C does."""
+    return _handled((signal.SIGTERM, signal.SIGHUP), _interrupt)
+
+
+def undisturbed() -> AbstractContextManager[None]:
+    """Have no signal interrupt this process while it takes everything down."""
+    return _handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
 
 
 def make_folder(out: Path, mark: str, whose: str) -> None:
@@ -318,20 +314,24 @@ def play_on(
     play(changes, seconds, lambda: (clock() - testbed.begun_ns) / 1e9, apply, look)
 
 
-def longest_run(runs: Path, cell: str | None = None) -> Path | None:
-    """Return the longest of the runs in a folder; None where there is none.
+def require_run(out: Path) -> Path:
+    """Return the longest of the runs of a testbed's folder.
 
-    Parameters
-    ----------
-    cell : str, optional
-        Runs of other cells do not count.
+    Raises
+    ------
+    LiveError
+        If there is none.
     """
+    folder = longest_run(out / "runs")
+    if folder is None:
+        raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
+    return folder
+
+
+def longest_run(runs: Path) -> Path | None:
+    """Return the longest of the runs in a folder; None where there is none."""
     found: list[tuple[int, Path]] = []
     for folder in sorted(runs.iterdir()) if runs.is_dir() else ():
-        try:
-            meta = open_run(folder).meta
-        except DwellError:
-            continue
-        if cell is None or meta.get("cell") == cell:
-            found.append((int(meta.get("windows", 0)), folder))
+        with suppress(DwellError):
+            found.append((int(open_run(folder).meta.get("windows", 0)), folder))
     return max(found)[1] if found else None

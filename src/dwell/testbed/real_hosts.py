@@ -32,7 +32,7 @@ from dwell.policies.registry import by_name
 from dwell.record import open_run
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
-from dwell.testbed.playing import Played, come_up, longest_run, make_folder, play_on, undisturbed
+from dwell.testbed.playing import Played, come_up, make_folder, play_on, require_run, undisturbed
 from dwell.testbed.processes import Processes, end_all, expected
 from dwell.testbed.remote import SHELL_ID, local_words, script_of
 from dwell.testbed.testbed import Testbed
@@ -345,9 +345,7 @@ def run_on_hosts(
     finally:
         with undisturbed():
             hosts.stop()
-    folder = longest_run(out / "runs")
-    if folder is None:
-        raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
+    folder = require_run(out)
     release_ns = open_run(folder).cycles["release_ns"]
     last_ns = hosts.begun_ns + (int(release_ns[-1]) if len(release_ns) else 0)
     played.note(folder, (hosts.begun_ns, last_ns))

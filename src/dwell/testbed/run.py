@@ -22,6 +22,7 @@ from dwell.testbed.playing import (
     longest_run,
     make_folder,
     play_on,
+    require_run,
     undisturbed,
 )
 from dwell.testbed.pressure import Rule, Span, judged
@@ -81,15 +82,15 @@ def run_once(
     seconds : float
         From the first release on, the warm-up included.
     seed : int
-        Of the realisation that is played, and of delays and losses.
+        Seed of the realisation that is played, and of delays and losses.
     out : Path
         For states, logs and the run; one of a run before is replaced.
     name : str
-        Of the testbed, among others on this machine.
+        Name of the testbed, among others on this machine.
     jobs : bool
         Whether the run keeps its jobs.
     rule : Rule, optional
-        Of the machine's pressure.
+        When the machine was under too much pressure.
     tell : callable
         Takes a line on what happens.
 
@@ -135,9 +136,7 @@ def run_once(
             _seal(folder, testbed, played, samplers, rule, interrupted=True)
             tell(f"interrupted; run: {folder}")
         raise
-    folder = longest_run(out / "runs")
-    if folder is None:
-        raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
+    folder = require_run(out)
     _seal(folder, testbed, played, samplers, rule, interrupted=False)
     shutil.rmtree(out / STARTING, ignore_errors=True)
     return folder
@@ -168,7 +167,7 @@ def _seal(
     rule: Rule,
     *,
     interrupted: bool,
-) -> Run:
+) -> None:
     """Tell the run what was played, on what, and how the machine was."""
     more: dict[str, Any] = {"testbed": testbed.facts()}
     if interrupted:
@@ -179,7 +178,7 @@ def _seal(
         pressure = judged(sampler.samples, spans, rule)
         more["pressure"] = {**pressure, "trouble": sampler.trouble} if sampler.trouble else pressure
         more["links"], more["wakes_hz"] = sampler.links(), sampler.wakes_hz()
-    return played.note(folder, **more)
+    played.note(folder, **more)
 
 
 def spans_of(run: Run, played: Played) -> list[Span]:
@@ -218,16 +217,12 @@ def summary(run: Run) -> dict[str, Any]:
     pressure = run.meta.get("pressure") or {}
     excluded = set(pressure.get("excluded", ()))
     kept = windows.filter(~windows["window"].is_in(sorted(excluded)))
-    means = {node: _mean(kept[f"u_{node}"].mean()) for node in run.problem.fabric.nodes}
+    means = kept.mean().row(0, named=True)
     return {
         "windows": windows.height,
         "excluded": len(excluded),
-        "l95_ms": _mean(kept["l95_ms"].mean()),
-        "violation_rate": _mean(kept["violation_rate"].mean()),
-        "utilisation": means,
+        "l95_ms": means["l95_ms"],
+        "violation_rate": means["violation_rate"],
+        "utilisation": {node: means[f"u_{node}"] for node in run.problem.fabric.nodes},
         "migrations": int(run.decisions["migrated"].sum()),
     }
-
-
-def _mean(value: Any) -> float | None:
-    return None if value is None else float(value)

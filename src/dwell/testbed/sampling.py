@@ -60,7 +60,9 @@ class Sampler(Started):
         #: What kept it from going on, if anything did.
         self.trouble = ""
         self._totals: defaultdict[tuple[str, str], Passed] = defaultdict(Passed)
-        self._switches = {node: Rate(read) for node, read in switches.items()}
+        self._switches = dict(switches)
+        self._begun: dict[str, tuple[Mapping[int, int], float]] = {}
+        self._wakes_hz: dict[str, float] = {}
         self._cpus, self._used_ns, self._links = sorted(cpus), dict(used_ns), dict(links)
         self._clock = clock
         self._first_late = next((i for i, ms in enumerate(LATE_MS) if ms >= rule.late_ms), 0) + 1
@@ -77,8 +79,9 @@ class Sampler(Started):
         except BaseException:
             self._stack.close()
             raise
-        for rate in self._switches.values():
-            rate.begin()
+        # A look reads a file per thread, a hundred of them: there is one here and one at the end.
+        for node, read in self._switches.items():
+            self._begun[node] = read(), time.monotonic()
         self._thread.start()
 
     def stop(self) -> None:
@@ -86,8 +89,9 @@ class Sampler(Started):
         self._stopped.set()
         self._thread.join()
         self._stack.close()
-        for rate in self._switches.values():
-            rate.end()
+        for node, (before, begun_s) in self._begun.items():
+            after, lasted_s = self._switches[node](), time.monotonic() - begun_s
+            self._wakes_hz[node] = round(rate_hz(before, after, lasted_s), 1)
 
     def _run(self) -> None:
         due_s = time.monotonic()
@@ -133,7 +137,7 @@ class Sampler(Started):
 
     def wakes_hz(self) -> dict[str, float]:
         """Return how often a node's threads have woken, per second, over all of them."""
-        return {node: round(rate.hz, 1) for node, rate in self._switches.items()}
+        return self._wakes_hz
 
     def links(self) -> dict[str, Any]:
         """Return what the links have drawn for the messages of each direction, ready for JSON."""
@@ -152,35 +156,13 @@ class Sampler(Started):
         return found
 
 
-class Rate:
-    """How often what is counted for each thread happens, from a begin to an end.
+def rate_hz(before: Mapping[int, int], after: Mapping[int, int], lasted_s: float) -> float:
+    """Return how often in a second something happened that is counted for each thread.
 
-    Each look reads a file per thread, a hundred of them, so that there are only these two. Threads
-    that are not there at both do not count.
-
-    Parameters
-    ----------
-    read : callable
-        Returns the counts by thread.
+    Threads that are not there at both looks do not count.
     """
-
-    def __init__(self, read: Callable[[], Mapping[int, int]]) -> None:
-        self._read = read
-        self._begun_s = 0.0
-        self._before: Mapping[int, int] = {}
-        #: Per second.
-        self.hz = 0.0
-
-    def begin(self) -> None:
-        """Look for the first time."""
-        self._before, self._begun_s = self._read(), time.monotonic()
-
-    def end(self) -> None:
-        """Look for the last time."""
-        after, lasted_s = self._read(), time.monotonic() - self._begun_s
-        both = after.keys() & self._before.keys()
-        counted = sum(after[thread] - self._before[thread] for thread in both)
-        self.hz = counted / max(lasted_s, 1e-9)
+    both = after.keys() & before.keys()
+    return sum(after[thread] - before[thread] for thread in both) / max(lasted_s, 1e-9)
 
 
 def cpu_times(cpus: Collection[int]) -> tuple[dict[int, float], dict[int, float]]:
