@@ -36,7 +36,7 @@ def system() -> list[str]:
     """Namespaces, groups and devices that there are now."""
     folders = [Path("/run/netns"), Path("/run/dwell")]
     if not no_groups():
-        folders += find_cgroups().tops
+        folders += find_cgroups().groups()
     files = [str(file) for folder in folders if folder.is_dir() for file in folder.iterdir()]
     links = os.listdir("/sys/class/net")
     return sorted(file for file in (*files, *links) if "doctor" in file or "/" not in file)
@@ -132,7 +132,7 @@ class Standing:
     def read(self) -> Lateness:
         self.looks += 1
         late_ms = 30.0 if self.looks % 3 == 0 else 0.1
-        return Lateness(wakes=20, mean_ms=0.1, max_ms=late_ms, work_ms=None)
+        return Lateness(max_ms=late_ms, work_ms=None)
 
 
 def test_a_machine_that_stands_still_at_times_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,8 +20,6 @@ def test_a_probe_tells_how_late_it_was_and_what_its_work_took() -> None:
             assert time.monotonic() < until_s
             time.sleep(0.05)
             found.append(probe.read())
-        last = found[-1]
-        assert last.wakes >= 1
-        assert 0 <= last.mean_ms <= last.max_ms
+        assert found[-1].max_ms > 0
     finally:
         probe.stop()

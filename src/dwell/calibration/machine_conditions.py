@@ -1,4 +1,4 @@
-"""What else the machine did while something was measured, as far as Linux says it."""
+"""Conditions of the machine while something was measured, as far as Linux says them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class MachineConditions:
     governor : str or None
         Who chooses the frequency of the first of the cores.
     frequency_mhz : tuple of float or None
-        Of that core, before and after.
+        Frequency of that core, before and after.
     steal : float or None
         Share of the cores' time that the hypervisor gave to others.
     preemptions : int
@@ -44,13 +44,7 @@ class MachineConditions:
 
 
 class MachineCounters:
-    """Takes the counters when it is made, and their differences when asked.
-
-    Parameters
-    ----------
-    cores : collection of int
-        Those in use.
-    """
+    """Counters of the cores in use, taken when this is made; returns their differences."""
 
     def __init__(self, cores: Collection[int]) -> None:
         self._cores = sorted(cores)
@@ -61,7 +55,7 @@ class MachineCounters:
         self._preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw
 
     def conditions(self) -> MachineConditions:
-        """Return what was the case since this watch was made."""
+        """Return the conditions since this was made."""
         preemptions = resource.getrusage(resource.RUSAGE_SELF).ru_nivcsw - self._preemptions
         cpu_s = time.process_time() - self._cpu_s
         ticks = _ticks(self._cores)

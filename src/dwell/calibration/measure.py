@@ -104,7 +104,7 @@ class Pace:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What the runs of one callable took.
+    """Times of the runs of one callable.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def measure_task(
     call, settings, inputs
         See `time_runs`.
     source, inputs_source : str, optional
-        What the file is to say about where `call` and `inputs` are from; their own names if not
+        Names of `call` and `inputs` that the file is to have; their own names if not
         given.
 
     Returns

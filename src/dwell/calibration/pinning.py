@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
+from itertools import groupby
 from pathlib import Path
 
 from dwell.errors import ProfileError
@@ -77,12 +78,9 @@ def _threads() -> list[int]:
 
 def _shown(cores: Collection[int]) -> str:
     """Return cores as a list with ranges: 0-3,6."""
-    parts: list[str] = []
-    ordered = sorted(cores)
-    begin = 0
-    for index, core in enumerate(ordered):
-        if index + 1 == len(ordered) or ordered[index + 1] != core + 1:
-            first = ordered[begin]
-            parts.append(str(core) if first == core else f"{first}-{core}")
-            begin = index + 1
+    parts = []
+    # In a row of cores the distance to their places stays.
+    for _, row in groupby(enumerate(sorted(cores)), lambda pair: pair[1] - pair[0]):
+        run = [core for _, core in row]
+        parts.append(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]))
     return ",".join(parts)

@@ -106,7 +106,7 @@ def require_free(path: Path, names: Collection[str]) -> None:
     path : Path
         Fine where it does not exist, or holds a profile of nothing else than `names`.
     names : collection of str
-        What the new profile will hold.
+        Names of the new profile's measurements.
 
     Raises
     ------

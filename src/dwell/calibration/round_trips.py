@@ -207,7 +207,7 @@ def time_round_trips(
     Parameters
     ----------
     payload_bytes : int
-        Of the larger message; random bytes, so that nothing on the way compresses them.
+        Payload of the larger message; random bytes, so that nothing on the way compresses them.
     settings : Settings
         Rounds, rounds of warm-up, and the time between two.
     connect_s, answer_s : float

@@ -25,7 +25,7 @@ OVERHEAD = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Of n samples, in milliseconds; `lag1` is None where all are the same, or there is one."""
+    """Statistics of n samples, ms; `lag1` is None where all are the same, or there is one."""
 
     n: int
     mean: float
@@ -38,19 +38,11 @@ class Statistics:
 
 
 def describe(samples: Floats) -> Statistics:
-    """Sum up samples, in the order in which they were taken.
+    """Sum up samples, at least one, in the order in which they were taken.
 
-    Parameters
-    ----------
-    samples : array of float64, shape (n,)
-        At least one.
-
-    Returns
-    -------
-    Statistics
-        Percentiles are samples, never interpolated (see `percentile`); cv is the standard
-        deviation over the mean, of the samples as they are (divisor n); `lag1` the correlation
-        of neighbours, sum of (x[i] - m)(x[i+1] - m) over sum of (x[i] - m)^2.
+    Percentiles are samples, never interpolated (see `percentile`); cv is the standard deviation
+    over the mean, of the samples as they are (divisor n); `lag1` the correlation of neighbours, sum
+    of (x[i] - m)(x[i+1] - m) over sum of (x[i] - m)^2.
     """
     mean = float(samples.mean())
     centred = samples - mean

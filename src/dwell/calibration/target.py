@@ -35,7 +35,7 @@ def find_callable(name: str, option: str) -> Callable[..., object]:
     name : str
         ``package.module:function``; after the colon also ``object.method``, to any depth.
     option : str
-        What it was given as, for messages: ``--task perception``.
+        Option that it was given as, for messages: ``--task perception``.
 
     Raises
     ------

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from dwell.errors import LiveError
-from dwell.model import Node, Problem
+from dwell.model import Link, Node, Problem
 from dwell.testbed.groups import Share
 
 #: Of every CPU, and of all together, what no node gets.
 FREE_OF_A_CORE, FREE_CORES = 0.2, 0.4
 TOLERANCE = 1e-9
+
+T = TypeVar("T")
 
 
 @dataclass(slots=True)
@@ -37,7 +40,7 @@ class _Cpus:
         return tuple(sorted(best))
 
 
-def nodes_of(problems: Sequence[Problem]) -> dict[str, Node]:
+def nodes_of(problems: Iterable[Problem]) -> dict[str, Node]:
     """Return the nodes of some cells; those of one name are one computer.
 
     Raises
@@ -45,35 +48,40 @@ def nodes_of(problems: Sequence[Problem]) -> dict[str, Node]:
     LiveError
         If two cells say different things of a node that they share.
     """
-    found: dict[str, Node] = {}
-    faults = []
-    for problem in problems:
-        for name, node in problem.fabric.nodes.items():
-            if found.setdefault(name, node) != node:
-                faults.append(f"nodes.{name}: two cells share it and say different things of it")
+    return _shared("nodes.", (problem.fabric.nodes for problem in problems))
+
+
+def links_of(problems: Iterable[Problem]) -> dict[str, Link]:
+    """Return the links of some cells; those of one name are one link.
+
+    Raises
+    ------
+    LiveError
+        If two cells say different things of a link that they share.
+    """
+    return _shared("links ", (problem.fabric.links for problem in problems))
+
+
+def _shared(kind: str, cells: Iterable[Mapping[str, T]]) -> dict[str, T]:
+    found: dict[str, T] = {}
+    faults = [
+        f"{kind}{name}: two cells share it and say different things of it"
+        for parts in cells
+        for name, part in parts.items()
+        if found.setdefault(name, part) != part
+    ]
     if faults:
         raise LiveError("; ".join(dict.fromkeys(faults)))
     return found
 
 
 def allot(problems: Sequence[Problem], cpus: Collection[int]) -> dict[str, Share]:
-    """Give every node of some cells its CPUs.
-
-    Parameters
-    ----------
-    problems : sequence of Problem
-    cpus : collection of int
-        Those of this machine that may be used.
-
-    Returns
-    -------
-    dict of str to Share
-        By node.
+    """Give every node of some cells its share of the CPUs of this machine that may be used.
 
     Raises
     ------
     LiveError
-        With everything that does not fit, and what would.
+        With everything that does not fit, and what would help.
     """
     nodes = nodes_of(problems)
     left = _Cpus(dict.fromkeys(sorted(cpus), 1.0 - FREE_OF_A_CORE))

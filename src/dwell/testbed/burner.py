@@ -119,7 +119,7 @@ def stress(prefix: Sequence[str], cpus: Collection[int] = ()) -> Burner:
     Parameters
     ----------
     prefix : sequence of str
-        Of its command: ``groups.inside(node, [])``.
+        First words of its command: ``groups.inside(node, [])``.
     cpus : collection of int
         Where its threads run; the CPUs of this process if empty.
     """

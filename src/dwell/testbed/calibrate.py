@@ -276,7 +276,7 @@ def _links(
     *,
     emulated: bool,
 ) -> tuple[dict[str, float], dict[str, Floats]]:
-    """What each link adds, and the delays of so many of its messages, ms."""
+    """Return the time that each link adds, and the delays of so many of its messages, ms."""
     if not emulated:
         own = own_delays(measured, known, problem)
         return {}, {link_name(*link): np.resize(values, rows) for link, values in own.items()}

@@ -72,22 +72,20 @@ class Planned(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of the folder of the run."""
         return re.sub(r"[^\w.+-]", "_", f"{self.place:04d}-{self.scenario}-{self.policy}")
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """What is to be measured.
+    """A measurement: every policy in every scenario, so many times.
 
     Parameters
     ----------
-    scenarios : tuple of str
-    entrants : tuple of Entrant
     seconds : float
-        Of each run, warm-up included.
+        Length of each run, warm-up included.
     seed : int
-        Of the order, and of what is drawn in the runs.
+        Seed of the order, and of what is drawn in the runs.
     where : str
         ``testbed``, or a digest of the inventory of real hosts.
 

@@ -1,4 +1,4 @@
-"""What looks on while a cell runs: a class of the cell's own, named by ``live.observer``."""
+"""Observer of a cell that runs: a class of the cell's own, named by ``live.observer``."""
 
 from __future__ import annotations
 

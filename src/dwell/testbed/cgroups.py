@@ -27,14 +27,10 @@ class Cgroups:
     version: int
     folders: Mapping[str, Path]
 
-    @property
-    def tops(self) -> tuple[Path, ...]:
-        """The hierarchies, each once (v1 may have two controllers in one)."""
-        return tuple(dict.fromkeys(self.folders.values()))
-
     def groups(self, *names: str) -> list[Path]:
         """Return the folders of a group, one in each hierarchy, whether they exist or not."""
-        return [top.joinpath(*names) for top in self.tops]
+        # v1 may have two controllers in one hierarchy.
+        return [top.joinpath(*names) for top in dict.fromkeys(self.folders.values())]
 
     def __str__(self) -> str:
         """Return version and controllers, for messages."""

@@ -29,7 +29,7 @@ PARENT_CHECK_S = 0.5
 
 
 class Started(ABC):
-    """What runs from the beginning of a ``with`` statement to its end."""
+    """Base of all that runs from the beginning of a ``with`` statement to its end."""
 
     @abstractmethod
     def start(self) -> None:

@@ -29,7 +29,7 @@ _NODE_BYTES = _TURN.size + 2 * _SETTING.size
 
 
 class ClockFile:
-    """What is wrong with the clocks of nodes: the side that writes.
+    """Faults of the nodes' clocks: the side that writes them.
 
     A setting is written beside the one that holds, which then gives way to it at once: who reads
     sees the one or the other.

@@ -37,14 +37,14 @@ NS_PER_MS = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What a message meets on its way.
+    """Conditions that a message meets on its way.
 
     Parameters
     ----------
     delay_ms : Process
         Propagation delay, one value a message.
     add_delays_ms : tuple of Process
-        What each disturbance of the link adds to it, whether it is on or not.
+        Extra delays of the link's disturbances, whether they are on or not.
     shares : tuple of float
         How much of each of them is added now, in [0, 1].
     rate_mbps : float
@@ -181,7 +181,7 @@ class Draws:
     Parameters
     ----------
     seed : (int, int)
-        Of the link, and of the direction.
+        Seed of the link, and number of the direction.
     """
 
     def __init__(self, seed: tuple[int, int]) -> None:

@@ -1,4 +1,4 @@
-"""What this machine can and cannot do as a testbed, found by trying, and what to do about it.
+"""Doctor: finds out, by trying, whether this machine can be a testbed, and says what is missing.
 
 Whatever is made for a trial is removed at once; nothing is changed that stays.
 """
@@ -48,16 +48,14 @@ PRIVILEGED = "run it as root; in a container, start that with --privileged"
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing looked at.
+    """Result of looking at one thing.
 
     Parameters
     ----------
     name : str
-        What, in a few words.
-    found : str
-        What was found.
+        The thing, in a few words.
     remedy : str
-        What to do about it; empty if there is nothing to do.
+        Empty if there is nothing to do.
     needed : bool
         Whether a testbed cannot run without.
     """

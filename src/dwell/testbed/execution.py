@@ -56,9 +56,6 @@ class Play(Protocol):
         ...
 
 
-Progress = Callable[[str], None]
-
-
 class State(NamedTuple):
     """How far a campaign is.
 
@@ -106,21 +103,15 @@ def run_campaign(
     folder : Path
         Its own; one of the same campaign is gone on with.
     name : str
-        Of the testbed, among others on this machine.
+        Name of the testbed, among others on this machine.
     quiet : Quiet, optional
-        What counts as idle before a run.
+        When the machine counts as idle before a run.
     repeats : int
-        Of a run that fails.
+        How often a run that fails is repeated.
     minutes : float, optional
         After which no run is begun that would not end in time.
     tell : callable
         Takes a line on everything that happens.
-    wait, clock : callable
-        Of this machine unless a test says otherwise.
-
-    Returns
-    -------
-    State
 
     Raises
     ------

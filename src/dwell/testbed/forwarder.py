@@ -77,17 +77,15 @@ class Passed:
     bursts : int
         Bursts of data that have begun.
     held : int
-        Those of them that were held back for a timeout or more.
+        Bursts that were held back for a timeout or more.
     vanished : int
         Packets lost to an outage, a full queue or a host that is gone.
     ignored : int
         Packets that are no cell's: IPv6, multicast, broadcast.
     delay_ns, squares : int, float
         Sums of the delays drawn for bursts of data, timeouts included, and of their squares.
-    waited_ns : int
-        Sum of the times that bursts of data waited for the one before them in their flow.
-    late_ns, late_max_ns : int
-        Sum and maximum of the times by which packets left later than they were due.
+    late_max_ns : int
+        Longest time by which a packet left later than it was due.
     late : list of int
         Packets by lateness: the classes of `LATE_MS`, and one above.
     cpu_s : float
@@ -102,15 +100,13 @@ class Passed:
     ignored: int = 0
     delay_ns: int = 0
     squares: float = 0.0
-    waited_ns: int = 0
-    late_ns: int = 0
     late_max_ns: int = 0
     late: list[int] = field(default_factory=lambda: [0] * (len(LATE_NS) + 1))
     cpu_s: float = 0.0
 
     @property
     def delay_mean_ms(self) -> float:
-        """Mean of the delays drawn; 0 without bursts, as all means here."""
+        """Mean of the delays drawn; 0 without bursts."""
         return self.delay_ns / max(self.bursts, 1) / 1e6
 
     @property
@@ -121,16 +117,6 @@ class Passed:
         return float(max(variance, 0.0) ** 0.5) / 1e6
 
     @property
-    def waited_mean_ms(self) -> float:
-        """Mean time that a burst waited for the one before it."""
-        return self.waited_ns / max(self.bursts, 1) / 1e6
-
-    @property
-    def late_mean_ms(self) -> float:
-        """Mean lateness of a packet."""
-        return self.late_ns / max(self.packets, 1) / 1e6
-
-    @property
     def late_max_ms(self) -> float:
         """Largest lateness of a packet."""
         return self.late_max_ns / 1e6
@@ -139,16 +125,14 @@ class Passed:
         """Count a packet that was handed over."""
         self.packets += 1
         self.bytes += size_bytes
-        self.late_ns += late_ns
         self.late_max_ns = max(self.late_max_ns, late_ns)
         self.late[bisect_right(LATE_NS, late_ns)] += 1
 
-    def began(self, delay_ns: int, waits_ns: int) -> None:
+    def began(self, delay_ns: int) -> None:
         """Count a burst of data that has begun."""
         self.bursts += 1
         self.delay_ns += delay_ns
         self.squares += float(delay_ns) ** 2
-        self.waited_ns += waits_ns
 
 
 @dataclass(slots=True)
@@ -162,7 +146,7 @@ class _Flow:
 
 
 class _Direction:
-    """One way of the link."""
+    """A direction of the link."""
 
     served_ns = 0
 
@@ -215,8 +199,7 @@ class _Direction:
             flow.delay_ns = self.draws.delay_ns()
             if kind.data:
                 flow.delay_ns += self._held_back()
-                arrival_ns = self._free_ns + flow.delay_ns
-                counts.began(flow.delay_ns, max(0, flow.due_ns - arrival_ns))
+                counts.began(flow.delay_ns)
         flow.last_ns = now_ns
         flow.due_ns = max(self._free_ns + flow.delay_ns, flow.due_ns)
         self._waiting_bytes += len(packet)

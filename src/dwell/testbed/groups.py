@@ -31,15 +31,7 @@ CHECK_S = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What a node has of this machine's CPUs.
-
-    Parameters
-    ----------
-    cpus : tuple of int
-        Those it may use; all if empty.
-    quota : Quota, optional
-        How much of them.
-    """
+    """Share of a node in this machine's CPUs: those that it may use (all if empty), and a quota."""
 
     cpus: tuple[int, ...] = ()
     quota: Quota | None = None
@@ -86,7 +78,7 @@ def group_name(name: str) -> str:
 
 
 class Groups(Started):
-    """One group per node; a context manager, at whose end nothing in them lives.
+    """Groups of processes, one per node; a context manager, at whose end nothing in them lives.
 
     Parameters
     ----------

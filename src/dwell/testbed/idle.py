@@ -35,7 +35,7 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Quiet:
-    """What counts as idle.
+    """Bounds below which a machine counts as idle.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ import json
 import re
 import shlex
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -37,8 +37,6 @@ STRESS = (
     "if command -v stress-ng >/dev/null; then exec stress-ng --quiet --cpu {threads}; fi; "
     "i=0; while [ $i -lt {threads} ]; do while :; do :; done & i=$((i + 1)); done; wait"
 )
-HOST_KEYS = ("run", "address", "port", "python", "folder", "cpus", "stress")
-LINK_KEYS = ("begin", "end")
 CPUS = re.compile(r"\d+(-\d+)?(,\d+(-\d+)?)*")
 
 
@@ -59,7 +57,7 @@ class RealHost:
     folder : str
         Where files may be put there.
     cpus : str
-        Those that the cell may use, as ``2-7``; any where empty.
+        CPUs that the cell may use, as ``2-7``; any where empty.
     stress : str
         Line for a shell that loads ``{threads}`` threads until it is told to end.
     """
@@ -104,23 +102,14 @@ class Inventory:
 
     @property
     def digest(self) -> str:
-        """What a campaign knows these hosts by."""
-        told = {
-            "hosts": {name: asdict(host) for name, host in self.hosts.items()},
-            "links": {name: asdict(link) for name, link in self.links.items()},
-        }
-        digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+        """Name by which a campaign knows these hosts."""
+        document = json.dumps(asdict(self), sort_keys=True)
+        digest = hashlib.sha256(document.encode()).hexdigest()[:16]
         return f"hosts {digest}"
 
 
 def load_inventory(path: str | PathLike[str], problem: Problem) -> Inventory:
-    """Read an inventory for a cell.
-
-    Parameters
-    ----------
-    path : str or path
-    problem : Problem
-        Every node of which has to be there.
+    """Read an inventory for a cell, every node of which has to be in it.
 
     Raises
     ------
@@ -184,7 +173,7 @@ def _keys(
 
 def _host(path: str, value: Any, faults: list[Fault]) -> RealHost:
     told = dict(_mapping(value, path, faults))
-    _keys(path, told, HOST_KEYS, ("run", "address"), faults)
+    _keys(path, told, [item.name for item in fields(RealHost)], ("run", "address"), faults)
     run = told.get("run", "")
     try:
         words = tuple(map(str, run)) if isinstance(run, list) else tuple(shlex.split(str(run)))
@@ -209,8 +198,8 @@ def _host(path: str, value: Any, faults: list[Fault]) -> RealHost:
 
 
 def _link(path: str, value: Any, faults: list[Fault]) -> LinkCommands:
-    told = dict(_mapping(value, path, faults))
-    _keys(path, told, LINK_KEYS, LINK_KEYS, faults)
+    told, keys = dict(_mapping(value, path, faults)), [item.name for item in fields(LinkCommands)]
+    _keys(path, told, keys, keys, faults)
     commands = LinkCommands(str(told.get("begin", "")), str(told.get("end", "")))
     try:
         commands.begin.format(mean_ms=0, std_ms=0, loss_percent=0, rate_mbps=0)

@@ -44,7 +44,7 @@ class Claim(Started):
     name : str
         Name of the testbed.
     nodes : sequence of str
-        Those that will have a network namespace and a group.
+        Nodes that will have a network namespace and a group.
     folder : Path, optional
         Where names are taken.
 

@@ -37,13 +37,13 @@ class TunLink(Child):
     ----------
     nodes : pair of str
     descriptors : mapping of str to int
-        Of each node the TUN device that leads to the other, without packet information.
+        TUN device of each node that leads to the other, without packet information.
     usual : mapping of (source, target) to Conditions
         At the beginning; a direction that is not there has no delay, loss or limit.
     retransmit_ms : mapping of (source, target) to float
         Timeout of the directions that send again what was lost; others may have no `loss`.
     seed : int
-        Of delays and losses.
+        Seed of delays and losses.
 
     Raises
     ------
@@ -114,10 +114,7 @@ class TunLink(Child):
         return cast("int", answer["at_ns"])
 
     def down(self, source: str, target: str, down: bool, *, at_ns: int | None = None) -> int:
-        """Begin or end an outage of a direction; returns the instant, as `set`.
-
-        What is on its way already arrives.
-        """
+        """Begin or end an outage of a direction: packets on their way arrive; returns as `set`."""
         return self.set(source, target, at_ns=at_ns, cut="drop" if down else None)
 
     def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:

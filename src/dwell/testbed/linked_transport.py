@@ -61,13 +61,7 @@ class _Stream:
 
 
 class LinkedTransport:
-    """A transport with emulated links; see `Transport`.
-
-    Parameters
-    ----------
-    ends : LinkEnds
-        Of the process's node.
-    """
+    """A transport with emulated links, those that end at the process's node; see `Transport`."""
 
     def __init__(self, transport: Transport, ends: LinkEnds) -> None:
         self._transport, self._ends = transport, ends

@@ -69,13 +69,13 @@ class Loopback(LocalTestbed):
     folder : Path
         For the cell file, states, logs and runs.
     cpus : mapping of str to int
-        Of each node, and of its burners; a node that is not there uses any, and has none.
+        CPU of each node and of its burner; a node that is not there uses any, and has no burner.
     seed : int
-        Of delays and losses.
+        Seed of delays and losses.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
     clocks : Path, optional
-        What is wrong with the nodes' clocks, of a `ClockFile`.
+        File of a `ClockFile`, which says what is wrong with the nodes' clocks.
     more : sequence of str
         Further arguments of the controller.
 
@@ -119,7 +119,7 @@ class Loopback(LocalTestbed):
 
     @property
     def links(self) -> LinkFile:
-        """What the links are like, while the cell is there."""
+        """Conditions of the links, while the cell is there."""
         if self._links is None:
             raise LiveError("the cell has not been started")
         return self._links

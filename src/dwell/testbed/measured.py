@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -29,13 +29,12 @@ UNHINDERED = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Disturbed:
-    """What a run's scenario did.
+    """Nodes and links that a run's scenario disturbed.
 
     Parameters
     ----------
     nodes : frozenset of str
         With foreign threads, or down.
-    links : frozenset of (str, str)
     stressed : frozenset of str
         Nodes that had foreign threads all the time.
     """
@@ -91,7 +90,7 @@ class Visit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """One run: what its windows show that are neither warm-up nor mixed nor excluded.
+    """Measurements of a run, from its windows that are neither warm-up nor mixed nor excluded.
 
     Parameters
     ----------
@@ -306,9 +305,9 @@ def _accompanied(jobs: pl.DataFrame) -> pl.Series:
 
 
 def _beside_ms(of: pl.DataFrame) -> Floats:
-    """What a site's jobs took of their node beside them beyond the mean, ms.
+    """CPU time that a site's node took beside each of its jobs, beyond the mean, ms.
 
-    Of one that another job accompanied it is not known; it takes what the one before did.
+    Unknown of a job that another one accompanied: it is that of the job before.
     """
     import polars as pl
 
@@ -371,16 +370,15 @@ def _delays(own: pl.DataFrame, problem: Problem) -> dict[tuple[str, str, str, st
 def _begins(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:
     import polars as pl
 
+    tasks, pipeline = problem.pipeline.tasks, problem.pipeline
+    offset_ms = {name: task.offset_ms for name, task in tasks.items() if not pipeline.inputs(name)}
     released = run.cycles.select(pl.col("cycle").cast(pl.Int64), "release_ns")
-    found: dict[SiteName, float] = {}
-    for task in problem.pipeline.tasks.values():
-        of = own.filter(pl.col("task") == task.name)
-        since, offset_ms = "ready_ns", 0.0
-        if not problem.pipeline.inputs(task.name):
-            of, since, offset_ms = of.join(released, on="cycle"), "release_ns", task.offset_ms
-        wait_ms = (of["start_ns"] - of[since]).to_numpy() / 1e6 - offset_ms
-        found |= _unhindered(task.name, of["node"].to_list(), wait_ms)
-    return found
+    since_ns = (
+        pl.when(pl.col("task").is_in(list(offset_ms))).then("release_ns").otherwise("ready_ns")
+    )
+    offsets = pl.col("task").replace_strict(offset_ms, default=0.0, return_dtype=pl.Float64)
+    waits = own.join(released, on="cycle", how="left")
+    return _unhindered(waits, (pl.col("start_ns") - since_ns) / 1e6 - offsets)
 
 
 def _ends(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:
@@ -394,12 +392,11 @@ def _ends(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float
         pl.col("cycle").cast(pl.Int64), done=pl.col("release_ns") + pl.col("latency_ns")
     )
     of = own.filter(pl.col("task") == sinks[0]).join(done, on="cycle")
-    return _unhindered(sinks[0], of["node"].to_list(), (of["done"] - of["end_ns"]).to_numpy() / 1e6)
+    return _unhindered(of, (pl.col("done") - pl.col("end_ns")) / 1e6)
 
 
-def _unhindered(task: str, nodes: Sequence[str], wait_ms: Floats) -> dict[SiteName, float]:
-    where = np.array(nodes)
-    return {
-        (task, str(node)): max(float(np.quantile(wait_ms[where == node], UNHINDERED)), 0.0)
-        for node in np.unique(where)
-    }
+def _unhindered(jobs: pl.DataFrame, wait_ms: pl.Expr) -> dict[SiteName, float]:
+    """Quick waits of jobs, by task and node."""
+    quick_ms = wait_ms.quantile(UNHINDERED, "linear").clip(0.0)
+    quick = jobs.group_by("task", "node").agg(quick_ms.alias("ms"))
+    return {(task, node): ms for task, node, ms in quick.iter_rows()}

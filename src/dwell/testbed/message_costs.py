@@ -33,25 +33,19 @@ QUICK = 0.1
 MESSAGE_BYTES = 20_000
 
 
-class MessageCost(NamedTuple):
-    """Of a message, the CPU time that lies on its way, ms: its sender's and its receiver's."""
-
-    sender_ms: float
-    receiver_ms: float
-
-
 class OnTheWay(NamedTuple):
-    """What is known of the messages of a cell.
+    """Costs of the messages of a cell.
 
     Parameters
     ----------
-    hops : dict of (str, str, str, str) to MessageCost
-        By source, target, and the nodes of both.
+    hops : dict of (str, str, str, str) to (float, float)
+        CPU time of sender and receiver that lies on a message's way, ms, by source, target, and
+        the nodes of both.
     asked_ms : mapping of (str, str) to float64 array
         Delays that the cell asks of links that are emulated.
     """
 
-    hops: dict[HopName, MessageCost]
+    hops: dict[HopName, tuple[float, float]]
     asked_ms: Mapping[Link, Floats]
 
     def known_ms(self, hop: HopName, problem: Problem) -> float:
@@ -97,7 +91,8 @@ def hops(
             spends = np.where(is_open, sides_ms, 0.0)
             spends = spends if spends.sum() > over_ms else sides_ms
             sides_ms = sides_ms - over_ms * spends / spends.sum()
-        found[hop] = MessageCost(*sides_ms.tolist())
+        sender_ms, receiver_ms = sides_ms.tolist()
+        found[hop] = sender_ms, receiver_ms
     return OnTheWay(found, asked_ms)
 
 
@@ -146,7 +141,7 @@ def share(problem: Problem, task: str, source: str, target: str) -> float:
 
 
 def floors(measured: Sequence[Measured], known: OnTheWay, problem: Problem) -> dict[Link, float]:
-    """What the messages of every emulated link take beyond what was asked of it, ms."""
+    """Time that the messages of every emulated link take beyond the delay asked of it, ms."""
     over: dict[Link, list[float]] = {}
     for _, hop, delay_ms in _undisturbed(measured):
         asked = known.asked_ms.get(hop[2:])

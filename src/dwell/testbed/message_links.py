@@ -52,7 +52,7 @@ def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
 
 
 class LinkFile:
-    """What the links of a testbed are like: the side that says so.
+    """Conditions of the links of a testbed: the side that writes them.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class LinkFile:
     links : sequence of Link
         Directions that are not among them have no delay, loss or limit.
     seed : int
-        Of delays and losses, in [0, 2**63).
+        Seed of delays and losses, in [0, 2**63).
 
     Raises
     ------
@@ -151,18 +151,16 @@ def _file_of(path: Path, place: int) -> Path:
 
 
 class Way:
-    """One direction of a link, as one process meets it.
+    """A direction of a link, as one process meets it.
 
     Parameters
     ----------
-    path : Path
-        Of the `LinkFile`.
     place : int
-        Of the direction in it.
+        Where the direction begins in the file.
     memory : mmap
-        That file.
+        The file.
     seed : (int, int)
-        Of this process's draws.
+        Seed of this process's draws.
     """
 
     def __init__(self, path: Path, place: int, memory: mmap.mmap, seed: tuple[int, int]) -> None:
@@ -178,10 +176,7 @@ class Way:
     def begin(self, size_bytes: int, now_ns: int) -> int:
         """Let a message begin its way; returns when it arrives, or `LOST` or `HELD`.
 
-        Parameters
-        ----------
-        now_ns : int
-            Of the clock that all processes on this computer share.
+        `now_ns` is of the clock that all processes on this computer share.
         """
         with self._lock:
             self._refresh()

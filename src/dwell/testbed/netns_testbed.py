@@ -22,8 +22,8 @@ from typing import Any
 from dwell.errors import LiveError
 from dwell.live.security import INSECURE
 from dwell.live.transport.orphans import remove_orphans
-from dwell.model import Link, Node, Problem
-from dwell.testbed.allotment import allot, nodes_of
+from dwell.model import Node, Problem
+from dwell.testbed.allotment import allot, links_of, nodes_of
 from dwell.testbed.burner import Burner, stress
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.groups import PROBES, Groups, Share
@@ -67,20 +67,11 @@ def require_playable(problems: Sequence[Problem]) -> None:
             if link.bursts is not None
         ]
     try:
-        _links_of(problems)
+        links_of(problems)
     except LiveError as error:
         faults.append(str(error))
     if faults:
         raise LiveError("; ".join(dict.fromkeys(faults)))
-
-
-def _links_of(problems: Sequence[Problem]) -> dict[str, Link]:
-    found: dict[str, Link] = {}
-    for problem in problems:
-        for name, link in problem.fabric.links.items():
-            if found.setdefault(name, link) != link:
-                raise LiveError(f"links {name}: two cells share it and say different things of it")
-    return found
 
 
 def _pairs_of(problems: Sequence[Problem]) -> list[tuple[str, str]]:
@@ -102,17 +93,17 @@ class NetnsTestbed(LocalTestbed):
     folder : Path
         For cell files, states, logs and runs.
     name : str
-        Of this testbed, among others on this machine.
+        Name of this testbed, among others on this machine.
     seed : int
-        Of delays and losses.
+        Seed of delays and losses.
     more : sequence of str
         Further arguments of the controllers.
     cpus : sequence of int, optional
-        Those that nodes may use; all that this process may use if left out.
+        CPUs that nodes may use; all that this process may use if left out.
     environment : mapping of str to str, optional
         Variables that all processes get as well.
     clocks : Path, optional
-        What is wrong with the nodes' clocks, of a `ClockFile`.
+        File of a `ClockFile`, which says what is wrong with the nodes' clocks.
 
     Attributes
     ----------
@@ -121,7 +112,7 @@ class NetnsTestbed(LocalTestbed):
     links : dict of frozenset of str to TunLink
         By pair of nodes.
     watchers : tuple of Watcher
-        Of every cell.
+        One of each cell.
 
     Raises
     ------
@@ -152,7 +143,7 @@ class NetnsTestbed(LocalTestbed):
         self.links: dict[frozenset[str], TunLink] = {}
         self.watchers: tuple[Watcher, ...] = ()
         self.stress: dict[str, Burner] = {}
-        self._usual = _links_of(self.problems)
+        self._usual = links_of(self.problems)
         self._more = tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
         self._conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
@@ -406,12 +397,12 @@ class NetnsTestbed(LocalTestbed):
 
     @property
     def used_ns(self) -> dict[str, Callable[[], int]]:
-        """What reads the CPU time that a node has taken so far, by node."""
+        """Readers of the CPU time that a node has taken so far, by node."""
         return {node: partial(self._groups.used_ns, node) for node in self.nodes}
 
     @property
     def switches(self) -> dict[str, Callable[[], dict[int, int]]]:
-        """What reads how often each thread of a node has gone to sleep so far, by node."""
+        """Readers of how often each thread of a node has gone to sleep so far, by node."""
         return {node: partial(self._groups.switches, node) for node in self.nodes}
 
     @property

@@ -50,13 +50,7 @@ def backgrounds(
 
 
 def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> dict[str, float]:
-    """Cores of every node's background that were taken while its jobs ran, where it is known.
-
-    Parameters
-    ----------
-    behind : mapping of str to float
-        The backgrounds.
-    """
+    """Cores of every node's background that were taken while its jobs ran, where it is known."""
     result = {}
     for node, cores in behind.items():
         of = [
@@ -68,7 +62,7 @@ def beside_jobs(measured: Sequence[Measured], behind: Mapping[str, float]) -> di
 
 
 def _cores(of: Sequence[tuple[float, float]]) -> float | None:
-    """What somebody took while jobs ran, over how long these ran; None where none did."""
+    """CPU time taken while jobs ran, over how long these ran; None where none did."""
     took_s = sum(took for _, took in of)
     return sum(taken for taken, _ in of) / took_s if took_s > 0 else None
 
@@ -90,13 +84,7 @@ def contentions(measured: Sequence[Measured]) -> dict[str, float]:
 def contentions_stressed(
     measured: Sequence[Measured], cpus: Mapping[str, Collection[int]]
 ) -> dict[str, dict[str, float]]:
-    """Contention of every node while another one on its CPUs is stressed, by both.
-
-    Parameters
-    ----------
-    cpus : mapping of str to collection of int
-        CPUs of every node.
-    """
+    """Contention of every node while another one on the same CPUs is stressed, by both."""
     result: dict[str, dict[str, float]] = {}
     for other in sorted({name for one in measured for name in one.disturbed.stressed}):
         runs = [one for one in measured if one.disturbed.nodes == {other}]

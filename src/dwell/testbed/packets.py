@@ -1,4 +1,4 @@
-"""What an emulated link has to know of a packet: which flow it is of, and what it carries."""
+"""Packets on an emulated link: which flow each is of, and whether it carries data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TCP_BYTES = 20
 
 
 class Kind(NamedTuple):
-    """Of a packet.
+    """Kind of a packet.
 
     Parameters
     ----------

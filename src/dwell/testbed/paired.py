@@ -45,7 +45,7 @@ def paired(
     parts : mapping of (str, str) to mapping of str to Part
         By task and node, and by run; at least one run each.
     cpus : mapping of str to hashable
-        What CPUs a node has; those of a node that is not there are its own.
+        CPUs of a node; those of a node that is not there are its own.
     """
     runs = list(dict.fromkeys(run for of in parts.values() for run in of))
     blocks = {

@@ -34,7 +34,7 @@ START_S = 30.0
 
 @dataclass(slots=True)
 class Played:
-    """What was played in a run, and when: its controller knows nothing of it.
+    """Record of the changes made in a run: its controller knows nothing of them.
 
     Instants are of the clock that the cell's processes read on this computer.
 
@@ -109,7 +109,7 @@ class Played:
     ) -> Mapping[str, object] | None:
         """Return a disturbance with its times in the run; None where it was not played.
 
-        One that was on at the end is told as on until then; a ramp keeps its slope.
+        A disturbance that was on at the end is told as on until then; a ramp keeps its slope.
         """
         begun_ns, ended_ns = self.begun_ns(item), self.ended_ns(item)
         if begun_ns is None:
@@ -135,15 +135,8 @@ def begun(run: Run) -> tuple[int, int] | None:
 def crowded(run: Run, problem: Problem) -> list[str]:
     """Return warnings of nodes that were full although nothing disturbed them.
 
-    Parameters
-    ----------
-    run : Run
-        One that was played: its meta say when it was disturbed.
-
-    Returns
-    -------
-    list of str
-        One a node whose utilisation was 97 % or more in most of the windows without a disturbance.
+    A node is full whose utilisation is 97 % or more in most of the windows without a disturbance;
+    the run's meta say when it was disturbed.
     """
     span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
     played = [(item.at_s, item.end_s) for item in run.played or ()]
@@ -297,8 +290,6 @@ def play_on(
 
     Parameters
     ----------
-    played : Played
-        What is to be played.
     seconds : float
         From the first release on.
     look : callable

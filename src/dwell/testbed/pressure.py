@@ -75,7 +75,7 @@ class Sample:
     at_ns : int
         On the clock of the run.
     idle_s, stolen_s : mapping of int to float
-        Of each CPU, since the machine was started.
+        Since the machine was started, by CPU.
     used_s : mapping of str to float
         CPU time of each node.
     waited_s : float or None
@@ -122,14 +122,7 @@ class Span:
 
 
 def judged(samples: Sequence[Sample], spans: Sequence[Span], rule: Rule) -> dict[str, Any]:
-    """Judge the windows of a run.
-
-    Parameters
-    ----------
-    samples : sequence of Sample
-        In the order of time.
-    spans : sequence of Span
-        The run's windows.
+    """Judge the windows of a run, by samples in the order of time.
 
     Returns
     -------

@@ -14,10 +14,8 @@ import gc
 import os
 import select
 import time
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import cast
+from typing import NamedTuple, cast
 
 from dwell.testbed.child import Child, Parent
 
@@ -26,18 +24,9 @@ SLEEP_NS = 5_000_000
 WORK_EVERY, WORK_TURNS = 5, 2_000
 
 
-@dataclass(frozen=True, slots=True)
-class Lateness:
-    """How late a probe ran.
+class Lateness(NamedTuple):
+    """Longest lateness of a probe, and the mean CPU time of its work; None where it did none."""
 
-    Parameters
-    ----------
-    work_ms : float or None
-        CPU time of its piece of work, the mean; None where it has done none.
-    """
-
-    wakes: int
-    mean_ms: float
     max_ms: float
     work_ms: float | None
 
@@ -63,14 +52,9 @@ class Probe(Child):
         LiveError
             If it does not run.
         """
-        found = cast("dict[str, float]", self.ask({}))
-        wakes = int(found["wakes"])
-        return Lateness(
-            wakes=wakes,
-            mean_ms=found["late_ns"] / max(wakes, 1) / 1e6,
-            max_ms=found["max_ns"] / 1e6,
-            work_ms=found["work_ns"] / works / 1e6 if (works := found["works"]) else None,
-        )
+        counts = cast("dict[str, float]", self.ask({}))
+        works = counts["works"]
+        return Lateness(counts["max_ns"] / 1e6, counts["work_ns"] / works / 1e6 if works else None)
 
 
 def main() -> None:
@@ -84,26 +68,21 @@ def main() -> None:
 
 
 def _measure(parent: Parent) -> None:
-    counts = Counter[str]()
-    longest_ns, wakes = 0, 0
+    longest_ns, wakes, works, work_ns = 0, 0, 0, 0
     due_ns = time.monotonic_ns() + SLEEP_NS
     while parent.alive:
         wait_s = max(due_ns - time.monotonic_ns(), 0) / 1e9
         asked, _, _ = select.select([parent], [], [], wait_s)
         now_ns = time.monotonic_ns()
         if now_ns >= due_ns:
-            late_ns = now_ns - due_ns
-            counts.update(wakes=1, late_ns=late_ns)
-            longest_ns, wakes = max(longest_ns, late_ns), wakes + 1
+            longest_ns, wakes = max(longest_ns, now_ns - due_ns), wakes + 1
             if wakes % WORK_EVERY == 0:
-                counts.update(works=1, work_ns=_work_ns())
+                works, work_ns = works + 1, work_ns + _work_ns()
             due_ns = time.monotonic_ns() + SLEEP_NS
         if asked:
             parent.receive()
-            told = ("wakes", "late_ns", "works", "work_ns")
-            parent.answer({name: counts[name] for name in told} | {"max_ns": longest_ns})
-            counts.clear()
-            longest_ns = 0
+            parent.answer({"max_ns": longest_ns, "works": works, "work_ns": work_ns})
+            longest_ns, works, work_ns = 0, 0, 0
 
 
 def _work_ns() -> int:

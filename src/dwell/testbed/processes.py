@@ -102,7 +102,7 @@ class Processes:
         Variables that all processes get as well. A keyring that this process has is of another
         cell, and not theirs.
     cpus : mapping of str to int, optional
-        Of each node; one that is not there uses any.
+        CPU of each node; a node that is not there uses any.
     more : sequence of str
         Further arguments of the controllers.
     program : sequence of str

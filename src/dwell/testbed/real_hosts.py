@@ -58,7 +58,7 @@ class RealHosts(Testbed):
     folder : Path
         For cell file and logs on this computer.
     name : str
-        Of this testbed, among others on those hosts.
+        Name of this testbed, among others on those hosts.
     more : sequence of str
         Further arguments of the controller.
 
@@ -319,7 +319,7 @@ def run_on_hosts(
     seconds : float
         From the first release on, the warm-up included.
     seed : int
-        Of the episodes of disturbances; delays and losses are the links'.
+        Seed of the episodes of disturbances; delays and losses are the links'.
     out : Path
         For logs and the run; one of a run before is replaced.
     jobs : bool

@@ -33,7 +33,7 @@ class Sampler(Started):
     Parameters
     ----------
     cpus : collection of int
-        Those that nodes use.
+        CPUs that nodes use.
     used_ns : mapping of str to callable
         CPU time that a node has taken so far, by node.
     switches : mapping of str to callable

@@ -30,12 +30,7 @@ LOWEST, HIGHEST = 0.0, 2.0
 
 
 def usual_of(measured: Sequence[Measured]) -> Usual:
-    """How fast the CPUs were in some runs; of nodes of which every run knows it.
-
-    Parameters
-    ----------
-    measured : sequence of Measured
-    """
+    """Return how fast the CPUs were in some runs, for the nodes of which every run knows it."""
     nodes = set.intersection(*(set(one.work_ms) for one in measured)) if measured else set()
     return Usual(
         {node: float(np.mean([one.work_ms[node] for one in measured])) for node in sorted(nodes)},
@@ -44,13 +39,7 @@ def usual_of(measured: Sequence[Measured]) -> Usual:
 
 
 def sensitivities(measured: Sequence[Measured]) -> dict[SiteName, float]:
-    """Exponents by task and node, where the runs show them.
-
-    Parameters
-    ----------
-    measured : sequence of Measured
-        Of each only the nodes that nothing disturbs.
-    """
+    """Return exponents by task and node, where nodes that nothing disturbs show them."""
     from scipy.stats import theilslopes
 
     points: dict[SiteName, list[tuple[Floats, Floats]]] = {}

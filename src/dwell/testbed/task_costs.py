@@ -40,7 +40,7 @@ class Site:
     Parameters
     ----------
     samples : dict of str to Part
-        What an undisturbed job takes of the node, its share of messaging included, by run.
+        Time that an undisturbed job takes of the node, its share of messaging included, by run.
     stage_ms, messaging_ms : float
         Means of the stage alone, and of its worker's messaging what lies on the way.
     before_ms, after_ms : float
@@ -56,7 +56,7 @@ class Site:
 
     @property
     def samples_ms(self) -> Floats:
-        """Those of all runs, one after the other."""
+        """Samples of all runs, one after the other."""
         return np.concatenate([part.times_ms for part in self.samples.values()])
 
 
@@ -74,7 +74,7 @@ def sites(
     messaging_ms : mapping of (str, str) to float
         CPU time that a worker takes for a job besides its stage (`messaging`).
     known : OnTheWay
-        What of that lies on the way of messages.
+        Part of that which lies on the way of messages.
     usual : Usual
         How fast the CPUs were in all runs together: samples are of CPUs as fast as that.
     """

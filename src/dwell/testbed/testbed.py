@@ -30,7 +30,7 @@ class Testbed(Started):
     problem : Problem
         The cell, with its hosts.
     folder : Path
-        Of cell file, states, logs and runs on this computer.
+        Folder of cell file, states, logs and runs on this computer.
     processes : Processes
         Agents and controller, once it has been started.
     begun_ns : int

@@ -25,7 +25,7 @@ NS_PER_S = 1e9
 
 @dataclass(frozen=True, slots=True)
 class NodeState:
-    """What is done to a node: foreign threads that it has, and whether it is down."""
+    """State of a node: foreign threads that it has, and whether it is down."""
 
     threads: int
     down: bool = False
@@ -57,7 +57,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """What is done to the nodes and links that a scenario disturbs.
+    """Changes of the nodes and links that a scenario disturbs.
 
     Parameters
     ----------
