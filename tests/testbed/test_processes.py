@@ -73,7 +73,7 @@ def test_each_runs_where_it_belongs_with_what_it_needs(problem: Problem, tmp_pat
     assert dwell.load(tmp_path / "cell.yaml") == problem
     try:
         processes.start_agent("R1")
-        processes.start_controllers(more=["--policy", "LOC"])
+        processes.start_controller("E", more=["--policy", "LOC"])
         assert processes.running.keys() == {"agent@R1", "controller@E"}
         agent = logged(tmp_path / "agent@R1.log")
         assert f'["R1", "{sys.executable}", "-m", "dwell", "agent", "--node", "R1"' in agent

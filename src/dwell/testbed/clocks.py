@@ -7,7 +7,6 @@ file changes that while they run.
 
 from __future__ import annotations
 
-import json
 import mmap
 import struct
 from collections.abc import Callable, Sequence
@@ -15,13 +14,11 @@ from pathlib import Path
 from typing import Self
 
 from dwell.errors import LiveError
-from dwell.files import write_whole
+from dwell.testbed.mapped_file import HEAD, make_file, open_file
 
 PPB = 1_000_000_000
 
-_MAGIC = b"dwellclk"
-# Magic, and bytes of the names that follow the nodes' settings.
-_HEAD = struct.Struct("<8sQ")
+_KIND = "clocks"
 # Which of the two settings holds. Both: since when, ahead by how much then, and by what rate since.
 _TURN = struct.Struct("<Q")
 _SETTING = struct.Struct("<qqq")
@@ -50,15 +47,7 @@ class ClockFile:
 
     def __init__(self, path: Path, nodes: Sequence[str], clock: Callable[[], int]) -> None:
         self.path, self.nodes, self._clock = path, tuple(nodes), clock
-        names = json.dumps(self.nodes).encode()
-        content = bytearray(_HEAD.size + _NODE_BYTES * len(self.nodes))
-        _HEAD.pack_into(content, 0, _MAGIC, len(names))
-        try:
-            write_whole(path, bytes(content + names), durable=False)
-            with path.open("r+b") as file:
-                self._map = mmap.mmap(file.fileno(), len(content))
-        except OSError as error:
-            raise LiveError(f"{path}: cannot be written ({error.strerror})") from None
+        self._map = make_file(path, _KIND, self.nodes, _NODE_BYTES * len(self.nodes))
 
     def set(self, node: str, *, jump_ns: int = 0, drift_ppb: int = 0) -> int:
         """Have a node's clock jump now, and drift from now on; returns what it is ahead by.
@@ -77,7 +66,7 @@ class ClockFile:
         """
         if node not in self.nodes:
             raise LiveError(f"{self.path}: no node {node}; it has {', '.join(self.nodes)}")
-        begin = _HEAD.size + _NODE_BYTES * self.nodes.index(node)
+        begin = HEAD.size + _NODE_BYTES * self.nodes.index(node)
         turn, since_ns, ahead_ns, ppb = _read(self._map, begin)
         now_ns = self._clock()
         ahead_ns += (now_ns - since_ns) * ppb // PPB + jump_ns
@@ -108,10 +97,8 @@ def wrong_clock(clock: Callable[[], int], path: Path, node: str) -> Callable[[],
     LiveError
         If there is no such file, it is another kind of file, or has no such node.
     """
-    content, names = _open(path)
-    if node not in names:
-        raise LiveError(f"{path}: no node {node}; it has {', '.join(names)}")
-    begin = _HEAD.size + _NODE_BYTES * names.index(node)
+    content, names, _ = open_file(path, _KIND, node, lambda count: _NODE_BYTES * count)
+    begin = HEAD.size + _NODE_BYTES * names.index(node)
 
     def wrong() -> int:
         now_ns = clock()
@@ -125,21 +112,3 @@ def _read(content: mmap.mmap, begin: int) -> tuple[int, int, int, int]:
     """Return which setting of a node holds, and the setting."""
     (turn,) = _TURN.unpack_from(content, begin)
     return (turn, *_SETTING.unpack_from(content, begin + _TURN.size + turn * _SETTING.size))
-
-
-def _open(path: Path) -> tuple[mmap.mmap, tuple[str, ...]]:
-    try:
-        with path.open("rb") as file:
-            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError) as error:
-        raise LiveError(f"{path}: cannot be read ({error})") from None
-    try:
-        magic, length = _HEAD.unpack_from(content)
-        names = json.loads(content[len(content) - length :])
-        good = magic == _MAGIC and all(isinstance(name, str) for name in names)
-        good = good and len(content) == _HEAD.size + _NODE_BYTES * len(names) + length
-    except (struct.error, ValueError, TypeError):
-        good = False
-    if not good:
-        raise LiveError(f"{path}: is no file of clocks")
-    return content, tuple(names)

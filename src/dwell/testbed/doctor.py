@@ -118,10 +118,10 @@ def _tried() -> list[Finding]:
         with ExitStack() as stack:
             name = _take_name(stack)
             return [
-                _attempt("network namespaces", lambda: _host(name), PRIVILEGED),
+                _attempt("network namespaces", lambda: _hosts(name, [ALONE], []), PRIVILEGED),
                 _attempt(
                     "TUN devices",
-                    lambda: _devices(name),
+                    lambda: _hosts(name, PAIR, [PAIR]),
                     "modprobe tun; in a container, start that with --device /dev/net/tun",
                 ),
                 _attempt("CPU quotas", lambda: _quotas(name), PRIVILEGED),
@@ -145,13 +145,8 @@ def _attempt(name: str, attempt: Callable[[], str], remedy: str) -> Finding:
         return Finding(name, False, str(error), remedy)
 
 
-def _host(name: str) -> str:
-    with Hosts(name, [ALONE], []):
-        return "made and removed"
-
-
-def _devices(name: str) -> str:
-    with Hosts(name, PAIR, [PAIR]):
+def _hosts(name: str, nodes: Sequence[str], pairs: Sequence[tuple[str, str]]) -> str:
+    with Hosts(name, nodes, pairs):
         return "made and removed"
 
 

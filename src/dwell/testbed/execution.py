@@ -21,7 +21,7 @@ from dwell.files import write_whole
 from dwell.model import Problem
 from dwell.record import Run, open_run
 from dwell.record.campaign_folder import ATTEMPT, CAMPAIGN, FAILED, RUNS
-from dwell.testbed.campaign import Campaign, Entrant, Planned
+from dwell.testbed.campaign import Campaign, Planned
 from dwell.testbed.idle import Idle, Quiet, wait_until_idle
 
 #: Where a run is kept while it is made, in a campaign's folder.
@@ -214,7 +214,15 @@ class _Attempts:
         }
         run: Path | None = None
         try:
-            run = self._play(planned, one, work)
+            run = self.play(
+                one.problem(self.campaign.problem),
+                scenario=planned.scenario,
+                policy=one.policy,
+                seconds=self.campaign.seconds,
+                seed=planned.seed,
+                out=work,
+                jobs=True,
+            )
             record |= _judged(open_run(run))
         except DwellError as error:
             record |= {"outcome": "error", "reason": str(error)}
@@ -224,17 +232,6 @@ class _Attempts:
         self._worked = self._worked or not failed
         self.errors += failed and not self._worked
         return record
-
-    def _play(self, planned: Planned, one: Entrant, work: Path) -> Path:
-        return self.play(
-            one.problem(self.campaign.problem),
-            scenario=planned.scenario,
-            policy=one.policy,
-            seconds=self.campaign.seconds,
-            seed=planned.seed,
-            out=work,
-            jobs=True,
-        )
 
     def _keep(
         self, planned: Planned, number: int, record: Mapping[str, Any], run: Path | None

@@ -30,10 +30,9 @@ from dwell.errors import LiveError, ProblemError
 from dwell.files import write_whole
 from dwell.model import Link
 from dwell.testbed.conditions import Conditions, Draws, changed, fields_of, to_json
+from dwell.testbed.mapped_file import HEAD, make_file, open_file
 
-_MAGIC = b"dwelllnk"
-# Magic, seed, bytes of the names that follow the directions.
-_HEAD = struct.Struct("<8sQQ")
+_KIND = "links"
 # Of a direction: how often its conditions have changed, when it is free, its last arrival.
 _CHANGES, _FREE_NS, _LAST_NS = range(3)
 _WAY = struct.Struct("<3q")
@@ -76,15 +75,7 @@ class LinkFile:
         self.path, self.nodes = path, tuple(nodes)
         self._kinds = {(link.source, link.target): link for link in links}
         self._conditions: dict[tuple[str, str], Conditions] = {}
-        names = json.dumps(self.nodes).encode()
-        content = bytearray(_HEAD.size + _WAY.size * len(self.nodes) ** 2)
-        _HEAD.pack_into(content, 0, _MAGIC, seed, len(names))
-        try:
-            write_whole(path, bytes(content + names), durable=False)
-        except OSError as error:
-            raise LiveError(f"{path}: cannot be written ({error.strerror})") from None
-        with path.open("r+b") as file:
-            self._map = mmap.mmap(file.fileno(), len(content))
+        self._map = make_file(path, _KIND, self.nodes, _size(len(self.nodes)), seed)
         for source in self.nodes:
             for target in self.nodes:
                 if source != target:
@@ -123,10 +114,6 @@ class LinkFile:
         (count,) = struct.unpack_from("<q", self._map, place)
         struct.pack_into("<q", self._map, place, count + 1)
 
-    def conditions(self, source: str, target: str) -> Conditions:
-        """Return what a direction is like now."""
-        return self._conditions[source, target]
-
     def close(self) -> None:
         """Write no more; the files stay."""
         self._map.close()
@@ -140,10 +127,15 @@ class LinkFile:
         self.close()
 
 
+def _size(count: int) -> int:
+    """Return how many bytes the directions between so many nodes take."""
+    return _WAY.size * count**2
+
+
 def _place(nodes: Sequence[str], source: str, target: str) -> int:
     """Return where a direction begins in the file."""
     index = nodes.index(source) * len(nodes) + nodes.index(target)
-    return _HEAD.size + _WAY.size * index
+    return HEAD.size + _WAY.size * index
 
 
 def _file_of(path: Path, place: int) -> Path:
@@ -236,10 +228,6 @@ class Way:
         finally:
             fcntl.lockf(self._file, fcntl.LOCK_UN, 8, place)
 
-    def close(self) -> None:
-        """Let no more begin."""
-        os.close(self._file)
-
 
 class LinkEnds:
     """The directions that begin or end at the node of a process.
@@ -258,16 +246,8 @@ class LinkEnds:
     """
 
     def __init__(self, path: Path, who: str, node: str) -> None:
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise LiveError(f"{path}: cannot be read ({error.strerror})") from None
-        seed, names = _head(path, content)
-        if node not in names:
-            raise LiveError(f"{path}: no node {node}; it has {', '.join(names)}")
+        self._memory, names, seed = open_file(path, _KIND, node, _size)
         self.node = node
-        with path.open("r+b") as file:
-            self._memory = mmap.mmap(file.fileno(), len(content))
 
         def way(source: str, target: str) -> Way:
             words = f"{who}/{source}/{target}".encode()
@@ -278,28 +258,3 @@ class LinkEnds:
         #: Those that begin here, by target, and that end here, by source.
         self.to: Mapping[str, Way] = {name: way(node, name) for name in others}
         self.since: Mapping[str, Way] = {name: way(name, node) for name in others}
-
-    def close(self) -> None:
-        """Let nothing more begin its way."""
-        for way in (*self.to.values(), *self.since.values()):
-            way.close()
-
-
-def _head(path: Path, content: bytes) -> tuple[int, tuple[str, ...]]:
-    """Return seed and nodes of a file.
-
-    Raises
-    ------
-    LiveError
-        If it is no `LinkFile`.
-    """
-    try:
-        magic, seed, length = _HEAD.unpack_from(content)
-        names = json.loads(content[len(content) - length :])
-        good = magic == _MAGIC and all(isinstance(name, str) for name in names)
-        good = good and len(content) == _HEAD.size + _WAY.size * len(names) ** 2 + length
-    except (struct.error, ValueError, TypeError):
-        good = False
-    if not good:
-        raise LiveError(f"{path}: is no file of links")
-    return seed, tuple(names)

@@ -166,8 +166,15 @@ class Processes:
             words = ["agent", "--node", node, "--state", str(state), *self._on_cpus(node)]
             self._start(self._name("agent", node, problem), node, words, [problem])
 
-    def start_controllers(self, *, out: Path | None = None, more: Sequence[str] = ()) -> None:
-        """Start the controllers, one on every node that decides for cells.
+    def start_controllers(self) -> None:
+        """Start the controllers, one on every node that decides for cells."""
+        for node in dict.fromkeys(problem.controller_node for problem in self.problems):
+            self.start_controller(node)
+
+    def start_controller(
+        self, node: str, *, out: Path | None = None, more: Sequence[str] = ()
+    ) -> None:
+        """Start a node's controller, or start it again.
 
         Parameters
         ----------
@@ -176,13 +183,6 @@ class Processes:
         more : sequence of str
             Further arguments.
         """
-        for node in dict.fromkeys(problem.controller_node for problem in self.problems):
-            self.start_controller(node, out=out, more=more)
-
-    def start_controller(
-        self, node: str, *, out: Path | None = None, more: Sequence[str] = ()
-    ) -> None:
-        """Start a node's controller, or start it again."""
         cells = [problem for problem in self.problems if problem.controller_node == node]
         runs = self.folder / "runs" if out is None else out
         words = ["controller", "--out", str(runs), *self._on_cpus(node), *self._more, *more]
