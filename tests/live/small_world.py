@@ -9,9 +9,9 @@ from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import CONTROLLER, Keys
-from dwell.live.live_windows import Resume, Rows
 from dwell.live.messages import Ask, Order, encode
 from dwell.live.role import RolePlace, Sealing
+from dwell.live.run_rows import Resume, Rows
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Stamper, StamperState

@@ -14,8 +14,8 @@ from msgspec.structs import replace as replaced
 import dwell
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import Keys
-from dwell.live.live_windows import Rows
 from dwell.live.messages import Answer, Ask, Order, decode, encode
+from dwell.live.run_rows import Rows
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
@@ -141,7 +141,7 @@ def test_what_is_remembered_is_none_of_the_garbage_collectors_business(problem: 
     world.run(8_000)
     windows = cell_of(world).windows
     assert windows is not None
-    remembered = windows._recorded
+    remembered = windows.record._recorded
     assert len(remembered) > 100
     for cycle in remembered:
         held = (cycle, cycle.reports, cycle.heard_ns, cycle.replaced, cycle.shifts)

@@ -13,9 +13,8 @@ import dwell
 from dwell.live import payloads
 from dwell.live.control_group import Counts
 from dwell.live.controlled_cell import ControlledCell
-from dwell.live.live_windows import Resume, Rows
 from dwell.live.recording import RunRecorder
-from dwell.live.run_rows import columns_of
+from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.live.sink import Sink
 from dwell.model import Problem
 from dwell.record import column_types
@@ -216,7 +215,7 @@ def test_jobs_survive_in_the_folder(problem: Problem, tmp_path: Path) -> None:
     world.run(4_000)
     cell = cell_of(world)
     assert cell.windows is not None
-    folder = world.kept.finish(cell.windows.rows(last=True))
+    folder = world.kept.finish(cell.windows.record.rows(last=True))
     assert folder is not None
     run = dwell.open_run(folder)
     assert run.has_jobs

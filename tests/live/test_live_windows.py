@@ -23,10 +23,10 @@ import dwell
 from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.errors import LiveError
 from dwell.estimators import Profile
-from dwell.live.live_windows import LiveWindows, Resume, Rows
+from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import Completion, Hop, Load, Stamp
 from dwell.live.offsets import Offsets
-from dwell.live.run_rows import columns_of
+from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, Task
 from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant
@@ -217,9 +217,9 @@ def replay(
             evidence.append(window.evidence())
             closed.append(window)
             controller.close(window)
-            rows.append(windows.rows())
+            rows.append(windows.record.rows())
             on_close(windows, window, rows[-1])
-    rows.append(windows.rows())
+    rows.append(windows.record.rows())
     return windows, controller, closed, evidence, rows
 
 
@@ -445,7 +445,7 @@ class Hand:
 
     def record(self) -> None:
         columns = columns_of(self.controller)
-        for table, rows in self.windows.rows().items():
+        for table, rows in self.windows.record.rows().items():
             for row in rows:
                 named = dict(zip(columns[table], row, strict=True))
                 if table in self.table:
@@ -841,8 +841,8 @@ def test_memory_is_bounded() -> None:
         hand.table["cycles"].clear()
     windows = hand.windows
     assert len(windows._by_key) < 2000
-    assert len(windows._windows) < 2000 / W
-    assert len(windows._in_flight) < 2000
+    assert len(windows.record._windows) < 2000 / W
+    assert len(windows.record._in_flight) < 2000
     # Nobody says what has become of an order.
     windows.ordered()
     hand.release(range(4_000, 12_000))

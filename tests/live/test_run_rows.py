@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 
 from dwell.control import Controller
-from dwell.live.run_rows import columns_of, decision_values, rows_of, sends_shadows
+from dwell.live.run_rows import columns_of, decision_values, sends_shadows
 from dwell.model import Problem, QoS
+from dwell.record import row_of
 from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
@@ -38,8 +39,7 @@ def test_what_was_decided_and_not_done_is_no_migration() -> None:
     assert done["refused"] is None
     assert refused["reason"] == done["reason"]
     for values in (done, refused):
-        ((*found,),) = rows_of(types, [values])
-        assert found == [values[name] for name in types]
+        assert list(row_of(types, values)) == [values[name] for name in types]
 
 
 def test_what_is_no_number_is_null() -> None:

@@ -15,7 +15,7 @@ from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
 from dwell.live.continuity import Continuity
 from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
-from dwell.live.live_windows import LiveWindow, LiveWindows, Resume, Rows
+from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import (
     Accepted,
     Answer,
@@ -30,6 +30,7 @@ from dwell.live.messages import (
     encode,
 )
 from dwell.live.role import REPEATED_NS, Pulse, RolePlace
+from dwell.live.run_rows import LiveWindow, Resume, Rows
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 
@@ -272,7 +273,7 @@ class ControlledCell:
         if not by_guard:
             if self.windows is not None:
                 if move is None or move.name == placement:
-                    self.windows.carried_out()
+                    self.windows.record.end_order()
                 else:
                     self.windows.refused(f"the placement became {placement} meanwhile")
             self.migrations += 1
@@ -536,7 +537,7 @@ class ControlledCell:
         if target != wanted:
             self.controller.resume(held.placement, fallback=held.fallback)
             if self.place.problem.live.mode == "control":
-                windows.overruled(self._overruled())
+                windows.record.overrule(self._overruled())
         if target != held.placement:
             self._begin(target, now_ns, decided=target == wanted)
 
@@ -544,7 +545,7 @@ class ControlledCell:
         """Record the windows that have closed since the last time."""
         self._unwritten = False
         if self.windows is not None:
-            self._recorder.append(self.windows.rows(), origin_ns=self.windows.origin_ns)
+            self._recorder.append(self.windows.record.rows(), origin_ns=self.windows.origin_ns)
 
     def _allowed(self, wanted: str, now_ns: int) -> str:
         """Return what people let the policy have."""

@@ -242,6 +242,14 @@ class Ledger:
             shift = cycle.shifts[node] = Shift(found.instant_ns - instant_ns, found.bound_ns)
         return instant_ns + shift.by_ns - cycle.origin_ns
 
+    def span_ns(self, node: str, first: LiveCycle, close_ns: int) -> tuple[int, int]:
+        """Begin and end of a window on a node's clock."""
+        begin_ns, end_ns = (
+            self._offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
+            for at_ns in (first.at_ns, close_ns)
+        )
+        return begin_ns, end_ns
+
     def _split(self, cycle: LiveCycle, last: Completion) -> tuple[int, int, int] | None:
         """Part a latency into compute, queue and network along its critical path.
 

@@ -15,33 +15,20 @@ fewer periods have passed than numbers.
 from __future__ import annotations
 
 import bisect
-from collections import deque
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import ClosedWindow, Controller, final_l95_ms
+from dwell.control import ClosedWindow, Controller
 from dwell.errors import LiveError
 from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.run_rows import (
-    columns_of,
-    cycle_values,
-    decision_values,
-    rows_of,
-    sends_shadows,
-    window_values,
-)
+from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows
 from dwell.model import Problem
-from dwell.record import Row, Values
-
-Rows: TypeAlias = dict[str, list[Row]]
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.
 PROVEN_SHARE = 0.2
@@ -52,61 +39,6 @@ NEAR_PERIOD = (0.75, 1.25)
 CLOCK_BREAK_NS = 60_000_000_000
 #: Cycles remembered beyond some windows.
 KEPT_CYCLES = 1_000
-
-
-@dataclass(frozen=True, slots=True)
-class Resume:
-    """Where a run is gone on with, after its controller has been restarted.
-
-    Parameters
-    ----------
-    window, cycle : int
-        Numbers of the first window and cycle that will be recorded.
-    origin_ns : int, optional
-        First release of the run, on the stamper's clock; that of the first stamp heard where None.
-    jobs : bool
-        Whether the jobs, and what each process took of the CPUs, are recorded, too.
-    """
-
-    window: int = 0
-    cycle: int = 0
-    origin_ns: int | None = None
-    jobs: bool = False
-
-
-@dataclass(eq=False, slots=True)
-class LiveWindow:
-    """A closed window as it is recorded.
-
-    Parameters
-    ----------
-    cycles : list of LiveCycle
-    close_ns : int
-        Since the origin.
-    lead : int
-        Cycles between the window before and this one.
-    heard : int
-        Cycles of which anything was heard. Of a window with none nothing is known, and it is none
-        to decide on (`Controller.miss`).
-    bound_ns : int
-        Of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
-    unproven : bool
-        Whether that is more than 20 % of D.
-    used : float64 array, shape (3, nodes)
-        Busy, own and shadow share of the cores.
-    closed_unix_ns : int, optional
-        Time of day of its close.
-    """
-
-    number: int
-    cycles: list[LiveCycle]
-    close_ns: int
-    lead: int
-    heard: int
-    bound_ns: int
-    unproven: bool
-    used: NDArray[np.float64]
-    closed_unix_ns: int | None
 
 
 class LiveWindows:
@@ -147,37 +79,26 @@ class LiveWindows:
         self._loads = {node: NodeLoad() for node in problem.fabric.nodes}
         self._processes = ProcessLoads()
         self._keeps_jobs = resume.jobs
-        self._columns = columns_of(controller, jobs=resume.jobs)
-        # First cycle whose jobs are not recorded yet, and windows whose processes are not.
-        self._next_jobs = resume.cycle
-        self._unwritten: deque[LiveWindow] = deque()
         self._size = problem.window_cycles
         self._period_ns = round(problem.pipeline.period_ms * 1e6)
-        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
-        self._proven_ns = int(PROVEN_SHARE * self._deadline_ns)
+        self._proven_ns = int(PROVEN_SHARE * round(problem.pipeline.deadline_ms * 1e6))
         self._grace_ns = round(problem.controller.close_grace_ms * 1e6)
         self._longest = 8 * self._size + KEPT_CYCLES
-        self._kept = 4 * self._size + KEPT_CYCLES
+        #: What is recorded.
+        self.record = RunRows(
+            *(controller, self._ledger, self._processes),
+            resume=resume,
+            kept=4 * self._size + KEPT_CYCLES,
+        )
         # Cycles that are in no closed window yet, by release; and all that are remembered.
         self._line: list[LiveCycle] = []
         self._by_key: dict[tuple[int, int], LiveCycle] = {}
-        self._recorded: deque[LiveCycle] = deque()
         self._newest: tuple[LiveCycle, int | None] | None = None
-        self._newest_done = (-1, -1)
         self._ordered = False
         # What `_begin` found, as long as nothing has changed that.
         self._beginning: tuple[int, bool] | None = None
         self._lead = 0
-        self._first_window = self._next_window = resume.window
-        self._next_row = resume.cycle
-        self._windows: dict[int, LiveWindow] = {}
-        self._changed: dict[int, LiveCycle] = {}
-        self._changed_windows: set[int] = set()
-        self._in_flight: dict[int, LiveCycle] = {}
-        self._decisions_taken = 0
-        # Of the log's decisions: the one whose order is under way, and why some were not followed.
-        self._open_decision: int | None = None
-        self._refused: dict[int, str] = {}
+        self._next_window = resume.window
 
     # ------------------------------------------------------------------ what is heard
 
@@ -218,13 +139,10 @@ class LiveWindows:
         if cycle is None or not cycle.take(completion, at_ns):
             return
         if self._ledger.complete(cycle):
-            self._newest_done = max(self._newest_done, cycle.key)
-        if cycle.row >= 0:
-            self._ledger.settle(cycle)
-            self._touch(cycle)
-        else:
-            # Now rather than all at once when the window closes.
-            self._ledger.settle(cycle, most_ns=self._proven_ns)
+            self.record.newest_done = max(self.record.newest_done, cycle.key)
+        # Before its window closes, rather than all at once then, where the clocks' bound allows.
+        self._ledger.settle(cycle, most_ns=None if cycle.row >= 0 else self._proven_ns)
+        self.record.touch(cycle)
 
     def measured(self, run: int, intervals: Iterable[tuple[int, int]]) -> None:
         """The stamper has measured how long cycles took, ns."""
@@ -232,10 +150,10 @@ class LiveWindows:
             cycle = self._by_key.get((run, number))
             if cycle is not None:
                 cycle.stamper_interval_ns = interval_ns
-                self._newest_done = max(self._newest_done, cycle.key)
+                self.record.newest_done = max(self.record.newest_done, cycle.key)
                 if cycle.row >= 0:
                     self._ledger.settle(cycle)
-                    self._touch(cycle)
+                    self.record.touch(cycle)
 
     def loaded(self, load: Load) -> None:
         """A node's agent has read its counters."""
@@ -262,22 +180,12 @@ class LiveWindows:
         """
         self._ordered, self._beginning = True, None
         if decided:
-            self._open_decision = len(self._controller.log.decisions) - 1
-
-    def carried_out(self) -> None:
-        """The migration has come about."""
-        self._open_decision = None
+            self.record.order_last()
 
     def refused(self, why: str = "") -> None:
         """The migration will not come about: windows go on where they were."""
         self._ordered, self._beginning = False, None
-        if self._open_decision is not None:
-            self._refused[self._open_decision] = why
-            self._open_decision = None
-
-    def overruled(self, why: str) -> None:
-        """What the controller decided last will not be ordered."""
-        self._refused[len(self._controller.log.decisions) - 1] = why
+        self.record.end_order(why)
 
     def forget(self, run: int, cycle: int) -> None:
         """Take a cycle, and those after it, for never released: what told of them was wrong."""
@@ -287,7 +195,7 @@ class LiveWindows:
             del self._by_key[known]
         last = max(self._by_key.values(), key=lambda known: known.key, default=None)
         self._newest = None if last is None else (last, last.stamped_ns)
-        self._newest_done = min(self._newest_done, (run, cycle - 1))
+        self.record.newest_done = min(self.record.newest_done, (run, cycle - 1))
         self._beginning = None
 
     def _note(self, stamp: Stamp, at_ns: int | None) -> LiveCycle | None:
@@ -309,10 +217,9 @@ class LiveWindows:
 
     def _identify(self, cycle: LiveCycle, stamp: Stamp) -> None:
         cycle.identify(stamp)
-        if cycle.row >= 0:
-            self._touch(cycle)
-        else:
+        if cycle.row < 0:
             self._beginning = None
+        self.record.touch(cycle)
 
     def _append(self, stamp: Stamp, at_ns: int | None) -> LiveCycle:
         if self.origin_ns is None or (self._newest is None and stamp.released_ns < self.origin_ns):
@@ -463,10 +370,7 @@ class LiveWindows:
             used=self._controller.utilisation(closed),
             closed_unix_ns=unix_ns,
         )
-        self._windows[self.last.number] = self.last
-        if self._keeps_jobs:
-            self._unwritten.append(self.last)
-        self._changed_windows.add(self.last.number)
+        self.record.close(self.last)
         self._next_window += 1
         self._lead = 0
         return closed
@@ -480,21 +384,11 @@ class LiveWindows:
 
     def _take_off(self, count: int) -> None:
         """Move cycles from the line to the record, and forget those of long ago."""
-        for cycle in self._line[:count]:
-            cycle.row = self._next_row
-            self._next_row += 1
-            self._changed[cycle.row] = cycle
-            self._recorded.append(cycle)
-        del self._line[:count]
-        self._beginning = None
-        while len(self._recorded) > self._kept:
-            old = self._recorded.popleft()
+        for old in self.record.add(self._line[:count]):
             if self._by_key.get(old.key) is old:
                 del self._by_key[old.key]
-            self._in_flight.pop(old.row, None)
-            if old.window is not None:
-                self._windows.pop(old.window, None)
-                self._controller.log.seen[old.window - self._first_window] = ()
+        del self._line[:count]
+        self._beginning = None
 
     def _core_ns(self, cycles: list[LiveCycle], close_ns: int) -> NDArray[np.float64]:
         """Core-nanoseconds of every node in a window, shape (3, nodes).
@@ -503,13 +397,10 @@ class LiveWindows:
         jobs took, where any tell: what their processes take beside that, messages and beats, is in
         no candidate's own work, and would be missing from the estimates of all.
         """
-        first, jobs_ns = cycles[0], self._ledger.spent_ns(cycles)
+        jobs_ns = self._ledger.spent_ns(cycles)
         used = np.zeros((3, len(self._loads)))
         for column, (node, load) in enumerate(self._loads.items()):
-            begin_ns, end_ns = (
-                self.offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
-                for at_ns in (first.at_ns, close_ns)
-            )
+            begin_ns, end_ns = self._ledger.span_ns(node, cycles[0], close_ns)
             busy_ns, own_ns, shadow_ns, accelerator_ns = load.at(end_ns) - load.at(begin_ns)
             if jobs_ns:
                 own_ns = jobs_ns[node]
@@ -518,80 +409,13 @@ class LiveWindows:
             load.forget(begin_ns)
         return used
 
-    # --------------------------------------------------------------------- the record
-
-    def rows(self, *, last: bool = False) -> Rows:
-        """Rows of the tables that are new, or have changed since the last call.
-
-        Parameters
-        ----------
-        last : bool
-            Whether no more will be asked for. Jobs, and what processes took, are told a window
-            late: of some it is not known earlier.
-        """
-        for row, cycle in self._in_flight.items():
-            if self._outcome(cycle) != cycle.outcome:
-                self._changed[row] = cycle
-        cycles = [self._cycle_values(self._changed[row]) for row in sorted(self._changed)]
-        windows = [
-            self._window_values(self._windows[number])
-            for number in sorted(self._changed_windows)
-            if number in self._windows
-        ]
-        log, begin = self._controller.log.decisions, self._decisions_taken
-        undecided = None if last else self._open_decision
-        self._decisions_taken = end = len(log) if undecided is None else undecided
-        decisions = [
-            decision_values(
-                self._controller, log[row], self._refused.pop(row, None), self._first_window
-            )
-            for row in range(begin, end)
-        ]
-        # What is recorded is not kept: a controller runs for months.
-        log[begin:end] = [()] * len(decisions)
-        self._changed.clear()
-        self._changed_windows.clear()
-        values: dict[str, Iterable[Values]] = {
-            "cycles": cycles,
-            "windows": windows,
-            "decisions": decisions,
-            **(self._job_values(last=last) if self._keeps_jobs else {}),
-        }
-        return {name: rows_of(self._columns[name], of) for name, of in values.items()}
-
-    def _job_values(self, *, last: bool) -> Mapping[str, Iterable[Values]]:
-        end = self._next_row if last else self._next_row - self._size
-        ready = [cycle for cycle in self._recorded if self._next_jobs <= cycle.row < end]
-        self._next_jobs = max(self._next_jobs, end)
-        processes: list[Values] = []
-        while self._unwritten and (last or self._unwritten[0].cycles[-1].row < end):
-            processes += self._process_values(self._unwritten.popleft())
-        jobs = [values for cycle in ready for values in self._ledger.jobs(cycle)]
-        return {"jobs": jobs, "processes": processes}
-
-    def _process_values(self, window: LiveWindow) -> Iterable[Values]:
-        first = window.cycles[0]
-        for node in self.problem.fabric.nodes:
-            begin_ns, end_ns = (
-                self.offsets.from_reference(node, first.origin_ns + at_ns).instant_ns
-                for at_ns in (first.at_ns, window.close_ns)
-            )
-            spent = self._processes.between(node, begin_ns, end_ns)
-            for who in sorted(spent):
-                yield {
-                    "window": window.number,
-                    "process": who,
-                    "node": node,
-                    "cpu_ns": round(spent[who]),
-                }
-
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""
         last = self.last
         status: dict[str, object] = {
             "windows": self._next_window,
             "origin_ns": self.origin_ns,
-            "cycles": self._next_row + len(self._line),
+            "cycles": self.record.next_row + len(self._line),
             "ignored_messages": self.ignored,
             "clock_breaks": self.offsets.breaks,
         }
@@ -602,40 +426,3 @@ class LiveWindows:
             status["heard_cycles"] = last.heard
             status["done_cycles"] = sum(self._ledger.complete(c) or c.told for c in last.cycles)
         return status
-
-    def _touch(self, cycle: LiveCycle) -> None:
-        self._changed[cycle.row] = cycle
-        if cycle.window is not None:
-            self._changed_windows.add(cycle.window)
-
-    def _outcome(self, cycle: LiveCycle) -> str:
-        if self._ledger.complete(cycle) or cycle.told:
-            return "done"
-        if cycle.replaced:
-            return "replaced"
-        return "dropped" if cycle.key < self._newest_done else "in_flight"
-
-    def _cycle_values(self, cycle: LiveCycle) -> Values:
-        cycle.outcome = self._outcome(cycle)
-        if cycle.outcome == "in_flight":
-            self._in_flight[cycle.row] = cycle
-        else:
-            self._in_flight.pop(cycle.row, None)
-        return cycle_values(cycle, missed=cycle.missed(self._deadline_ns))
-
-    def _window_values(self, window: LiveWindow) -> Values:
-        cycles = window.cycles
-        place = window.number - self._first_window
-        seen = self._controller.log.seen
-        latency_ns = np.array([cycle.latency_ns for cycle in cycles], np.int64)
-        return window_values(
-            window,
-            self._controller.nodes,
-            warmup=window.number < self.problem.warmup_windows,
-            l95_ms=float(final_l95_ms(latency_ns)),
-            missed=sum(cycle.missed(self._deadline_ns) for cycle in cycles),
-            seen=seen[place] if place < len(seen) else (None, None, None),
-            shadows=(
-                self._ledger.shadow_bytes(cycles) if sends_shadows(self._controller) else None
-            ),
-        )

@@ -11,8 +11,7 @@ from pathlib import Path
 from dwell import __version__
 from dwell.control import Controller
 from dwell.errors import RunError, UnwritableError, installing
-from dwell.live.live_windows import Resume, Rows
-from dwell.live.run_rows import columns_of
+from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.record import seal_run

@@ -9,17 +9,76 @@ that of its readiness.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias, cast
 
-from dwell.control import Controller
-from dwell.live.cycle_ledger import LiveCycle
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control import Controller, final_l95_ms
+from dwell.live.cycle_ledger import Ledger, LiveCycle
+from dwell.live.loads import ProcessLoads
 from dwell.live.offsets import UNBOUNDED_NS
 from dwell.model.instants import NEVER_NS
-from dwell.record import Columns, Feature, Row, Types, Values, column_types, row_of
+from dwell.record import Columns, Feature, Row, Values, column_types, row_of
 
-if TYPE_CHECKING:
-    from dwell.live.live_windows import LiveWindow
+Rows: TypeAlias = dict[str, list[Row]]
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Where a run is gone on with, after its controller has been restarted.
+
+    Parameters
+    ----------
+    window, cycle : int
+        Numbers of the first window and cycle that will be recorded.
+    origin_ns : int, optional
+        First release of the run, on the stamper's clock; that of the first stamp heard where None.
+    jobs : bool
+        Whether the jobs, and what each process took of the CPUs, are recorded, too.
+    """
+
+    window: int = 0
+    cycle: int = 0
+    origin_ns: int | None = None
+    jobs: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class LiveWindow:
+    """A closed window as it is recorded.
+
+    Parameters
+    ----------
+    close_ns : int
+        Since the origin.
+    lead : int
+        Cycles between the window before and this one.
+    heard : int
+        Cycles of which anything was heard. Of a window with none nothing is known, and it is none
+        to decide on (`Controller.miss`).
+    bound_ns : int
+        Bound of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
+    unproven : bool
+        Whether that is more than 20 % of D.
+    used : float64 array, shape (3, nodes)
+        Busy, own and shadow share of the cores.
+    closed_unix_ns : int, optional
+        Time of day of its close.
+    """
+
+    number: int
+    cycles: list[LiveCycle]
+    close_ns: int
+    lead: int
+    heard: int
+    bound_ns: int
+    unproven: bool
+    used: NDArray[np.float64]
+    closed_unix_ns: int | None
 
 
 def sends_shadows(controller: Controller) -> bool:
@@ -44,87 +103,222 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
     return {name: column_types(name, controller.problem, features) for name in tables}
 
 
-def rows_of(types: Types, values: Iterable[Values]) -> list[Row]:
-    """Return rows in the order of a table's columns."""
-    return [row_of(types, of) for of in values]
-
-
-def cycle_values(cycle: LiveCycle, *, missed: bool) -> Values:
-    """Return a row of ``cycles``."""
-    compute_ns, queue_ns, network_ns = cycle.parts_ns or (None, None, None)
-    return {
-        "cycle": cycle.row,
-        "release_ns": cycle.at_ns,
-        "placement": cycle.placement,
-        "latency_ns": None if cycle.latency_ns >= NEVER_NS else cycle.latency_ns,
-        "missed": missed,
-        "outcome": cycle.outcome,
-        "compute_ns": compute_ns,
-        "queue_ns": queue_ns,
-        "network_ns": network_ns,
-        "run": cycle.run,
-        "number": cycle.number,
-        "term": cycle.term,
-        "lead": cycle.window is None,
-        "heard": cycle.heard,
-        "actuated": cycle.actuated,
-        "interval_ns": cycle.interval_ns,
-        "stamper_interval_ns": cycle.stamper_interval_ns,
-        "bound_ns": None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
-    }
-
-
-def window_values(
-    window: LiveWindow,
-    nodes: Sequence[str],
-    *,
-    warmup: bool,
-    l95_ms: float,
-    missed: int,
-    seen: Sequence[float | None],
-    shadows: tuple[int, int] | None,
-) -> Values:
-    """Return a row of ``windows``.
+class RunRows:
+    """Keeps what is to be recorded of a run, and tells which rows are new or have changed.
 
     Parameters
     ----------
-    nodes : sequence of str
-        In the order of the columns of its `used`.
-    l95_ms : float
-        L95 of final latencies.
-    missed : int
-        Cycles.
-    seen : sequence of 3 float or None
-        L95 (ms), violation rate and cost as the controller saw them.
-    shadows : tuple of int, optional
-        Cycles that were sent twice, and their bytes, where cycles may be.
+    processes : ProcessLoads
+        CPU time of the cell's processes.
+    kept : int
+        Cycles that are remembered, so that late completions may change their rows.
     """
-    cycles = window.cycles
-    busy, _, by_shadows = window.used.tolist()
-    seen_l95_ms, seen_violation_rate, cost = (_known(value) for value in seen)
-    values: dict[str, object] = {
-        "window": window.number,
-        "first_cycle": cycles[0].row,
-        "warmup": warmup,
-        "placement": cycles[0].placement,
-        "mixed": any(cycle.placement != cycles[0].placement for cycle in cycles),
-        "l95_ms": l95_ms,
-        "violation_rate": missed / len(cycles),
-        "seen_l95_ms": seen_l95_ms,
-        "seen_violation_rate": seen_violation_rate,
-        **{f"u_{node}": share for node, share in zip(nodes, busy, strict=True)},
-        "cost": cost,
-        "term": cycles[-1].term,
-        "lead": window.lead,
-        "heard": window.heard,
-        "bound_ms": None if window.bound_ns >= UNBOUNDED_NS else window.bound_ns / 1e6,
-        "unproven": window.unproven,
-        "closed_unix_ns": window.closed_unix_ns,
-    }
-    if shadows is not None:
-        values["shadow_cycles"], values["shadow_bytes"] = shadows
-        values |= {f"shadow_{node}": share for node, share in zip(nodes, by_shadows, strict=True)}
-    return values
+
+    def __init__(
+        self,
+        controller: Controller,
+        ledger: Ledger,
+        processes: ProcessLoads,
+        *,
+        resume: Resume,
+        kept: int,
+    ) -> None:
+        self._controller, self._ledger, self._processes = controller, ledger, processes
+        problem = controller.problem
+        self._nodes, self._size = tuple(problem.fabric.nodes), problem.window_cycles
+        self._warmup_windows, self._kept = problem.warmup_windows, kept
+        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._sends_shadows = sends_shadows(controller)
+        self._jobs = resume.jobs
+        self._columns = columns_of(controller, jobs=resume.jobs)
+        #: Row of the next cycle, and last cycle that is known to have completed.
+        self.next_row, self.newest_done = resume.cycle, (-1, -1)
+        self._first_window = resume.window
+        # First cycle whose jobs are not recorded yet, and windows whose processes are not.
+        self._next_jobs = resume.cycle
+        self._unwritten: deque[LiveWindow] = deque()
+        self._recorded: deque[LiveCycle] = deque()
+        self._windows: dict[int, LiveWindow] = {}
+        self._changed: dict[int, LiveCycle] = {}
+        self._changed_windows: set[int] = set()
+        self._in_flight: dict[int, LiveCycle] = {}
+        self._decisions_taken = 0
+        # Of the log's decisions: the one whose order is under way, and why some were not followed.
+        self._open_decision: int | None = None
+        self._refused: dict[int, str] = {}
+
+    def add(self, cycles: Iterable[LiveCycle]) -> Iterator[LiveCycle]:
+        """Record cycles; yields those of long ago, which are forgotten."""
+        for cycle in cycles:
+            cycle.row = self.next_row
+            self.next_row += 1
+            self._changed[cycle.row] = cycle
+            self._recorded.append(cycle)
+        while len(self._recorded) > self._kept:
+            old = self._recorded.popleft()
+            self._in_flight.pop(old.row, None)
+            if old.window is not None:
+                self._windows.pop(old.window, None)
+                self._controller.log.seen[old.window - self._first_window] = ()
+            yield old
+
+    def close(self, window: LiveWindow) -> None:
+        """Record a window."""
+        self._windows[window.number] = window
+        self._changed_windows.add(window.number)
+        if self._jobs:
+            self._unwritten.append(window)
+
+    def touch(self, cycle: LiveCycle) -> None:
+        """Take note that more is known of a cycle; its row changes where it has one."""
+        if cycle.row >= 0:
+            self._changed[cycle.row] = cycle
+            if cycle.window is not None:
+                self._changed_windows.add(cycle.window)
+
+    # ---------------------------------------------------------------------- decisions
+
+    def order_last(self) -> None:
+        """Hold the last decision back until it is known what has become of its order."""
+        self._open_decision = len(self._controller.log.decisions) - 1
+
+    def end_order(self, refused: str | None = None) -> None:
+        """Record the decision that was held back, with why it has not come about."""
+        if self._open_decision is not None and refused is not None:
+            self._refused[self._open_decision] = refused
+        self._open_decision = None
+
+    def overrule(self, why: str) -> None:
+        """Record why the last decision will not be ordered."""
+        self._refused[len(self._controller.log.decisions) - 1] = why
+
+    # --------------------------------------------------------------------------- rows
+
+    def rows(self, *, last: bool = False) -> Rows:
+        """Return the rows that are new, or have changed since the last call.
+
+        Parameters
+        ----------
+        last : bool
+            Whether no more will be asked for. Jobs, and what processes took, are told a window
+            late: of some it is not known earlier.
+        """
+        for row, cycle in self._in_flight.items():
+            if self._outcome(cycle) != cycle.outcome:
+                self._changed[row] = cycle
+        log, begin = self._controller.log.decisions, self._decisions_taken
+        undecided = None if last else self._open_decision
+        self._decisions_taken = end = len(log) if undecided is None else undecided
+        values: dict[str, Iterable[Values]] = {
+            "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
+            "windows": [
+                self._window_values(self._windows[number])
+                for number in sorted(self._changed_windows)
+                if number in self._windows
+            ],
+            "decisions": [
+                decision_values(
+                    self._controller, log[row], self._refused.pop(row, None), self._first_window
+                )
+                for row in range(begin, end)
+            ],
+            **(self._job_values(last=last) if self._jobs else {}),
+        }
+        # What is recorded is not kept: a controller runs for months.
+        log[begin:end] = [()] * (end - begin)
+        self._changed.clear()
+        self._changed_windows.clear()
+        return {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
+
+    def _outcome(self, cycle: LiveCycle) -> str:
+        if self._ledger.complete(cycle) or cycle.told:
+            return "done"
+        if cycle.replaced:
+            return "replaced"
+        return "dropped" if cycle.key < self.newest_done else "in_flight"
+
+    def _cycle_values(self, cycle: LiveCycle) -> Values:
+        cycle.outcome = self._outcome(cycle)
+        if cycle.outcome == "in_flight":
+            self._in_flight[cycle.row] = cycle
+        else:
+            self._in_flight.pop(cycle.row, None)
+        compute_ns, queue_ns, network_ns = cycle.parts_ns or (None, None, None)
+        return {
+            "cycle": cycle.row,
+            "release_ns": cycle.at_ns,
+            "placement": cycle.placement,
+            "latency_ns": None if cycle.latency_ns >= NEVER_NS else cycle.latency_ns,
+            "missed": cycle.missed(self._deadline_ns),
+            "outcome": cycle.outcome,
+            "compute_ns": compute_ns,
+            "queue_ns": queue_ns,
+            "network_ns": network_ns,
+            "run": cycle.run,
+            "number": cycle.number,
+            "term": cycle.term,
+            "lead": cycle.window is None,
+            "heard": cycle.heard,
+            "actuated": cycle.actuated,
+            "interval_ns": cycle.interval_ns,
+            "stamper_interval_ns": cycle.stamper_interval_ns,
+            "bound_ns": None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
+        }
+
+    def _window_values(self, window: LiveWindow) -> Values:
+        cycles, nodes, log = window.cycles, self._controller.nodes, self._controller.log
+        busy, _, by_shadows = window.used.tolist()
+        place = window.number - self._first_window
+        seen = log.seen[place] if place < len(log.seen) else (None, None, None)
+        seen_l95_ms, seen_violation_rate, cost = map(_known, seen)
+        latency_ns = np.array([cycle.latency_ns for cycle in cycles], np.int64)
+        values: dict[str, object] = {
+            "window": window.number,
+            "first_cycle": cycles[0].row,
+            "warmup": window.number < self._warmup_windows,
+            "placement": cycles[0].placement,
+            "mixed": any(cycle.placement != cycles[0].placement for cycle in cycles),
+            "l95_ms": float(final_l95_ms(latency_ns)),
+            "violation_rate": sum(c.missed(self._deadline_ns) for c in cycles) / len(cycles),
+            "seen_l95_ms": seen_l95_ms,
+            "seen_violation_rate": seen_violation_rate,
+            **{f"u_{node}": share for node, share in zip(nodes, busy, strict=True)},
+            "cost": cost,
+            "term": cycles[-1].term,
+            "lead": window.lead,
+            "heard": window.heard,
+            "bound_ms": None if window.bound_ns >= UNBOUNDED_NS else window.bound_ns / 1e6,
+            "unproven": window.unproven,
+            "closed_unix_ns": window.closed_unix_ns,
+        }
+        if self._sends_shadows:
+            sent, sent_bytes = self._ledger.shadow_bytes(cycles)
+            values |= {"shadow_cycles": sent, "shadow_bytes": sent_bytes}
+            values |= {
+                f"shadow_{node}": share for node, share in zip(nodes, by_shadows, strict=True)
+            }
+        return values
+
+    def _job_values(self, *, last: bool) -> Mapping[str, Iterable[Values]]:
+        end = self.next_row if last else self.next_row - self._size
+        ready = [cycle for cycle in self._recorded if self._next_jobs <= cycle.row < end]
+        self._next_jobs = max(self._next_jobs, end)
+        processes: list[Values] = []
+        while self._unwritten and (last or self._unwritten[0].cycles[-1].row < end):
+            processes += self._process_values(self._unwritten.popleft())
+        jobs = [values for cycle in ready for values in self._ledger.jobs(cycle)]
+        return {"jobs": jobs, "processes": processes}
+
+    def _process_values(self, window: LiveWindow) -> Iterable[Values]:
+        for node in self._nodes:
+            span_ns = self._ledger.span_ns(node, window.cycles[0], window.close_ns)
+            for who, cpu_ns in sorted(self._processes.between(node, *span_ns).items()):
+                yield {
+                    "window": window.number,
+                    "process": who,
+                    "node": node,
+                    "cpu_ns": round(cpu_ns),
+                }
 
 
 def decision_values(
@@ -135,24 +329,18 @@ def decision_values(
     Parameters
     ----------
     row : sequence
-        Of its log.
+        Row of the controller's log.
     why : str, optional
         Why it was not followed; None where it was.
     first_window : int
         Number of the controller's first window.
     """
     values = dict(zip(controller.decision_columns, map(_known, row), strict=True))
-    values["window"] = first_window + _count(values["window"])
+    values["window"] = first_window + cast("int", values["window"])
     if why is not None and values["migrated"]:
         why = f"{values['placement']}: {why}"
         values |= {"placement": values["incumbent"], "migrated": False}
     return {**values, "refused": why}
-
-
-def _count(value: object) -> int:
-    if not isinstance(value, int):
-        raise TypeError(f"{value!r} is no number of a window")
-    return value
 
 
 def _known(value: object) -> object:
