@@ -14,6 +14,7 @@ import pytest
 
 from dwell.report import comparison_html, run_html
 from dwell.report.charts import cumulative
+from dwell.report.figure import Figure
 from dwell.report.page import Fact, Page, Section, page_html
 from dwell.report.palette import ramp_styles
 from dwell.report.table import Table, Text
@@ -131,7 +132,8 @@ def test_what_stands_in_place_of_policies_is_not_theirs_to_choose(tmp_path: Path
     rows = [("a", "R1->E", float(n), n / 10) for n in range(10)]
     names = ["scenario", "policy", "value", "share"]
     frame = pl.DataFrame(rows, schema=names, orient="row")
-    figure = cumulative("delays", frame, ramp_styles(["R1->E"]), ("ms", "share"))
+    draw = cumulative(frame, ramp_styles(["R1->E"]), ("ms", "share"))
+    figure = Figure("delays", "", {"rows": frame}, draw)
     page = Page("t", "s", [Section("", [figure])], policies={"LOC": "#0072b2"})
     shown = dom(page_html(page), tmp_path)
     assert 'class="drawing live"' in shown

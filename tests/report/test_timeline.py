@@ -69,3 +69,17 @@ def test_of_too_many_windows_the_worst_of_several_is_a_mark(run: dwell.Run) -> N
     marks = timeline(dwell.Run(run.meta, tables)).frames["windows"]
     assert 0 < marks.height <= MOST_MARKS
     assert marks["v_d"].max() == pytest.approx(100 * run.windows["violation_rate"].to_numpy().max())
+
+
+def test_a_mark_of_several_windows_has_the_placement_that_most_had_or_the_first(
+    run: dwell.Run,
+) -> None:
+    count = 2 * MOST_MARKS
+    windows = pl.concat([run.windows.head(1)] * count).with_columns(
+        window=pl.int_range(0, count, dtype=pl.Int64),
+        first_cycle=pl.int_range(0, count, dtype=pl.Int64) * PROBLEM.window_cycles,
+        placement=pl.Series(["SO", "LOC"] * MOST_MARKS),
+    )
+    tables = {"cycles": run.cycles, "windows": windows, "decisions": run.decisions}
+    marks = timeline(dwell.Run(run.meta, tables)).frames["windows"]
+    assert marks["placement"].to_list() == ["SO"] * MOST_MARKS

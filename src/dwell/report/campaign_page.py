@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from dwell.report.charts import NO_LIMIT, Limit, cumulative
+from dwell.report.charts import NO_LIMIT, cumulative
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, percent, shown_contender, write_number
 from dwell.report.method import method_blocks
@@ -153,14 +153,10 @@ def _windows(measured: MeasuredCampaign, blocks: PolicyBlocks, name: str) -> Fig
         scenario, policy = (pl.lit(str(label)) for label in labels)
         line = pl.DataFrame({"value": across, "share": share})
         parts.append(line.with_columns(scenario=scenario, policy=policy))
-    return cumulative(
-        f"windows-{name}",
-        named(pl.concat(parts)),
-        blocks.styles,
-        (f"{measure.name} of a window ({measure.unit})", "windows at or below"),
-        limit=Limit(deadline_ms, "deadline") if latency else NO_LIMIT,
-        title=f"Windows by their {measure.name}",
-    )
+    frame = named(pl.concat(parts))
+    headings = (f"{measure.name} of a window ({measure.unit})", "windows at or below")
+    draw = cumulative(frame, blocks.styles, headings, blocks.deadline if latency else NO_LIMIT)
+    return Figure(f"windows-{name}", f"Windows by their {measure.name}", {"rows": frame}, draw)
 
 
 def _profiles(measured: MeasuredCampaign) -> Table:
@@ -191,14 +187,10 @@ def _profiles(measured: MeasuredCampaign) -> Table:
 
 def _delays(measured: MeasuredCampaign) -> Figure:
     frame = measured.delays.select("scenario", "share", policy="link", value="delay_ms")
-    links = [str(name) for name in frame["policy"].unique(maintain_order=True)]
-    return cumulative(
-        "delays",
-        named(frame, ("scenario",)),
-        ramp_styles(links),
-        ("what a message took (ms)", "messages within"),
-        title="Link delays by scenario",
-    )
+    frame = named(frame, ("scenario",))
+    links = ramp_styles(str(name) for name in frame["policy"].unique(maintain_order=True))
+    draw = cumulative(frame, links, ("what a message took (ms)", "messages within"))
+    return Figure("delays", "Link delays by scenario", {"rows": frame}, draw)
 
 
 def _links(measured: MeasuredCampaign) -> Table:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from dwell.report.figure import Figure, Spec
+from dwell.report.figure import Draw, Spec
 from dwell.report.palette import INK, MUTED, PARTS, Style
 
 if TYPE_CHECKING:
@@ -26,13 +26,16 @@ PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
 PART_COLOURS = {PARTS_SHOWN[part]: colour for part, colour in PARTS.items()}
 #: Factor between numbers above which an axis is logarithmic.
 WIDE = 30.0
-#: Least width of a panel, and what a panel of named rows has beside it, pixels.
-PANEL_PX, NAMES_PX, GAP_PX = 170, 150, 16
+#: Least width of a panel, room beside panels of named rows and of numbers, and between, pixels.
+PANEL_PX, NAMES_PX, AXIS_PX, GAP_PX = 170, 150, 60, 16
 ROW_PX = 17
 #: Width of a legend's symbol with what is beside it, and of a letter.
 SYMBOL_PX, LETTER_PX = 34, 6.2
 #: Share of cycles below which a distribution is not drawn.
 LEAST_SHARE = 1e-4
+#: Tests of rows: whether a reader has chosen their policy, and whether their interval is known.
+CHOSEN = "indexof(policies, datum.policy) >= 0"
+BOUNDED = "isValid(datum.low) && isValid(datum.high)"
 
 
 class Limit(NamedTuple):
@@ -55,6 +58,45 @@ def name_of(field: str, **more: Any) -> Spec:
     return {"field": field, "type": "nominal", "title": None, **more}
 
 
+def names(*fields: str) -> list[Spec]:
+    """Return how several names are shown under the pointer."""
+    return [name_of(field, title=field) for field in fields]
+
+
+def coloured(field: str, colours: Mapping[str, str], **more: Any) -> Spec:
+    """Return the encoding of a name as one of several colours."""
+    return name_of(field, scale={"domain": list(colours), "range": list(colours.values())}, **more)
+
+
+def layer(
+    mark: str,
+    encoding: Mapping[str, Any],
+    *,
+    rows: str = "",
+    where: Sequence[str] = (),
+    **style: Any,
+) -> Spec:
+    """Return a layer of a chart.
+
+    Parameters
+    ----------
+    encoding : mapping of str to Spec
+        What it has of its own: what a group of layers shares is the group's.
+    rows : str
+        Name of its data, where these are not the chart's.
+    where : sequence of str
+        Tests that rows must pass, as Vega expressions.
+    **style : Any
+        Properties of the mark.
+    """
+    drawn: Spec = {"mark": {"type": mark, **style}, "encoding": dict(encoding)}
+    if rows:
+        drawn["data"] = {"name": rows}
+    if where:
+        drawn["transform"] = [{"filter": test} for test in where]
+    return drawn
+
+
 def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
     """Return the encodings of colour, dashes and marker of named series.
 
@@ -65,31 +107,29 @@ def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
     width : float
         Of their legend, pixels; none where it is 0.
     """
-    names = list(styles)
-    each = SYMBOL_PX + LETTER_PX * max(map(len, names), default=0)
+    each = SYMBOL_PX + LETTER_PX * max(map(len, styles), default=0)
     shown = {"columns": max(1, int(width / each)), "symbolSize": 60} if width else None
-
-    def scale(values: Sequence[Any]) -> Spec:
-        return {"domain": names, "range": list(values)}
-
-    def encoded(values: Sequence[Any]) -> Spec:
-        return name_of("policy", scale=scale(values), legend=shown)
-
+    channels = {
+        "color": [one.colour for one in styles.values()],
+        "shape": [one.marker for one in styles.values()],
+        "strokeDash": [list(one.dashes) for one in styles.values()],
+    }
     return {
-        "color": encoded([one.colour for one in styles.values()]),
-        "shape": encoded([one.marker for one in styles.values()]),
-        "strokeDash": encoded([list(one.dashes) for one in styles.values()]),
+        channel: name_of("policy", scale={"domain": list(styles), "range": values}, legend=shown)
+        for channel, values in channels.items()
     }
 
 
-def limit_rule(axis: str, limit: float, name: str) -> list[Spec]:
+def limit_rule(axis: str, limit: float, name: str, **style: Any) -> list[Spec]:
     """Return the line of a limit on an axis, and its name; nothing where it is infinite."""
     if not math.isfinite(limit):
         return []
-    rule = {"type": "rule", "color": INK, "strokeDash": [4, 3], "strokeWidth": 1}
+    style = {"color": INK, "strokeDash": [4, 3], "strokeWidth": 1, "tooltip": name, **style}
+    other, end = ("y", "height") if axis == "x" else ("x", "width")
+    along = {other: {"value": 0}, f"{other}2": {"value": end}}
     # Data of its own: one line, and not one for every row of the chart's.
-    once: Spec = {"values": [{}]}
-    return [{"data": once, "mark": {**rule, "tooltip": name}, "encoding": {axis: {"datum": limit}}}]
+    rule = layer("rule", {axis: {"datum": limit}, **along}, **style)
+    return [{"data": {"values": [{}]}, **rule}]
 
 
 def is_wide(values: Sequence[float]) -> bool:
@@ -106,50 +146,9 @@ def thinned(count: int, points: int = 200) -> np.ndarray[Any, np.dtype[np.int64]
     return (count - from_end)[::-1]
 
 
-def panels(width: float, count: int, *, beside: float = NAMES_PX, most: int = 4) -> tuple[int, int]:
-    """Return how many panels stand beside one another, and how wide each is, pixels."""
-    room = width - beside
-    columns = max(1, min(most, count, int((room + GAP_PX) // (PANEL_PX + GAP_PX))))
-    return columns, max(60, int((room - (columns - 1) * GAP_PX) / columns))
-
-
-def faceted(
-    layers: Sequence[Spec], facets: Sequence[str], columns: int, size: Mapping[str, float]
-) -> Spec:
-    """Return layers, a panel for each value of ``scenario``; a single one has no heading."""
-    spec = {**size, "layer": list(layers)}
-    if len(facets) < 2:
-        return {"data": {"name": "rows"}, **spec}
-    return {
-        "data": {"name": "rows"},
-        "facet": name_of(
-            "scenario", sort=list(facets), header={"labelLimit": size["width"] + GAP_PX}
-        ),
-        "columns": columns,
-        "spacing": {"row": 14, "column": GAP_PX},
-        "spec": spec,
-    }
-
-
-def chosen(policies: Sequence[str], seeds: bool = False) -> list[Spec]:
-    """Return what a reader can choose: policies, and with `seeds` one of these."""
-    found: list[Spec] = [{"name": "policies", "value": list(policies)}]
-    return [*found, {"name": "seed", "value": None}] if seeds else found
-
-
-SHOWN: Spec = {"filter": "indexof(policies, datum.policy) >= 0"}
-
-
 def intervals(
-    slug: str,
-    frame: pl.DataFrame,
-    measure: Measure,
-    styles: Mapping[str, Style],
-    *,
-    limit: Limit = NO_LIMIT,
-    title: str = "",
-    caption: str = "",
-) -> Figure:
+    frame: pl.DataFrame, measure: Measure, styles: Mapping[str, Style], limit: Limit = NO_LIMIT
+) -> Draw:
     """Draw a measure of policies, a panel a scenario: means with intervals, and every seed.
 
     Parameters
@@ -162,71 +161,48 @@ def intervals(
     """
     shown = [frame[name].drop_nulls().to_list() for name in ("value", "mean", "low")]
     scale: Spec = {"nice": True}
-    ticks = {"tickCount": 4, "labelOverlap": "greedy", "labelSeparation": 4}
     # Of a utilisation nobody asks how often it is another one.
     if is_wide([*shown[0], *shown[1]]) and not measure.column.startswith("u_"):
         # An interval may reach below what any run has shown.
         zero = min(itertools.chain(*shown)) <= 0
         scale = {"type": "symlog", "constant": 1} if zero else {"type": "log"}
-    across = quantity("mean", measure.heading, scale=scale, axis=ticks)
-    down = name_of("policy", sort=list(styles))
+    ticks = {"tickCount": 4, "labelOverlap": "greedy", "labelSeparation": 4}
     colours = styled(styles)
-    about = [name_of("policy", title="policy"), name_of("scenario", title="scenario")]
-    faded = {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22}
-    layers: list[Spec] = [
-        *limit_rule("x", *limit),
-        {
-            "transform": [SHOWN, {"filter": "isValid(datum.value)"}],
-            "mark": {"type": "tick", "thickness": 1.2, "size": 9},
-            "encoding": {
-                "x": {**across, "field": "value"},
-                "y": down,
-                "color": colours["color"],
-                "opacity": faded,
-                "tooltip": [*about, quantity("seed", "seed"), quantity("value", measure.heading)],
-            },
-        },
-        {
-            "transform": [SHOWN, {"filter": "isValid(datum.low) && isValid(datum.high)"}],
-            "mark": {"type": "rule", "strokeWidth": 2},
-            "encoding": {
-                "x": {**across, "field": "low"},
-                "x2": {"field": "high"},
-                "y": down,
-                "color": colours["color"],
-            },
-        },
-        {
-            "transform": [SHOWN, {"filter": "isValid(datum.mean)"}],
-            "mark": {"type": "point", "filled": True, "size": 55, "opacity": 1},
-            "encoding": {
-                "x": across,
-                "y": down,
-                "color": colours["color"],
-                "shape": colours["shape"],
-                "tooltip": [
-                    *about,
-                    quantity("mean", measure.heading),
-                    quantity("low", "from"),
-                    quantity("high", "to"),
-                ],
-            },
-        },
+    shared = {
+        "x": quantity("mean", measure.heading, scale=scale, axis=ticks),
+        "y": name_of("policy", sort=list(styles)),
+        "color": colours["color"],
+    }
+    about = names("policy", "scenario")
+    seed = {
+        "x": {"field": "value"},
+        "opacity": {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22},
+        "tooltip": [*about, quantity("seed", "seed"), quantity("value", measure.heading)],
+    }
+    mean = {"shape": colours["shape"], "tooltip": [*about, *_mean_and_ends(measure)]}
+    marks = [
+        layer("tick", seed, where=[CHOSEN, "isValid(datum.value)"], thickness=1.2, size=9),
+        layer(
+            "rule",
+            {"x": {"field": "low"}, "x2": {"field": "high"}},
+            where=[CHOSEN, BOUNDED],
+            strokeWidth=2,
+        ),
+        layer(
+            "point", mean, where=[CHOSEN, "isValid(datum.mean)"], filled=True, size=55, opacity=1
+        ),
     ]
-    return _rows(slug, frame, layers, list(styles), title, caption, seeds=True)
+    layers = [*limit_rule("x", *limit), {"encoding": shared, "layer": marks}]
+    return _named_rows(frame, list(styles), layers, seeds=True)
 
 
 def stacked(
-    slug: str,
     frame: pl.DataFrame,
     policies: Sequence[str],
     parts: Mapping[str, str],
     heading: str,
-    *,
     limit: Limit = NO_LIMIT,
-    title: str = "",
-    caption: str = "",
-) -> Figure:
+) -> Draw:
     """Draw parts of a whole as bars, a row a policy and a panel a scenario.
 
     Parameters
@@ -240,125 +216,102 @@ def stacked(
     heading : str
         Of the axis, with its unit.
     """
-    names = list(parts)
-    order = {"calculate": f"indexof({names!r}, datum.part)", "as": "place"}
-    bars: Spec = {
-        "transform": [SHOWN, order],
-        "mark": {"type": "bar", "height": {"band": 0.7}},
-        "encoding": {
-            "x": quantity("value", heading, stack="zero", axis={"tickCount": 4}),
-            "y": name_of("policy", sort=list(policies)),
-            "order": {"field": "place", "type": "quantitative"},
-            "color": name_of(
-                "part",
-                scale={"domain": names, "range": list(parts.values())},
-                legend={"symbolType": "square"},
-            ),
-            "tooltip": [
-                name_of("policy", title="policy"),
-                name_of("part", title="part"),
-                quantity("value", heading),
-            ],
-        },
+    encoding = {
+        "x": quantity("value", heading, stack="zero", axis={"tickCount": 4}),
+        "y": name_of("policy", sort=list(policies)),
+        "color": coloured("part", parts, legend={"symbolType": "square"}),
+        "tooltip": [*names("policy", "part"), quantity("value", heading)],
     }
-    return _rows(slug, frame, [bars, *limit_rule("x", *limit)], policies, title, caption)
+    bars = in_order(layer("bar", encoding, where=[CHOSEN], height={"band": 0.7}), parts)
+    return _named_rows(frame, policies, [bars, *limit_rule("x", *limit)])
 
 
-def distributions(
-    slug: str,
-    frame: pl.DataFrame,
-    styles: Mapping[str, Style],
-    deadline_ms: float,
-    *,
-    title: str = "",
-    caption: str = "",
-) -> Figure:
+def in_order(bars: Spec, parts: Mapping[str, str]) -> Spec:
+    """Return bars that have their parts in the order of these."""
+    place = {"calculate": f"indexof({list(parts)!r}, datum.part)", "as": "place"}
+    order = {"field": "place", "type": "quantitative"}
+    return {
+        **bars,
+        "transform": [*bars.get("transform", ()), place],
+        "encoding": {**bars["encoding"], "order": order},
+    }
+
+
+def distributions(frame: pl.DataFrame, styles: Mapping[str, Style], deadline_ms: float) -> Draw:
     """Draw the share of cycles that took longer than a latency, a panel a scenario.
 
     Parameters
     ----------
     frame : DataFrame
         ``scenario``, ``policy``, ``latency_ms``, ``longer``: share of the cycles, above 0.
-    styles : mapping of str to Style
     """
-    five = {
-        "data": {"values": [{}]},
-        "mark": {"type": "rule", "color": MUTED, "strokeDash": [1, 3], "tooltip": "5 %"},
-        "encoding": {"y": {"datum": 0.05}},
-    }
-    across = quantity("latency_ms", "latency (ms)", axis={"tickCount": 5})
     up = quantity(
         "longer",
         "cycles that took longer",
         scale={"type": "log", "domain": [LEAST_SHARE, 1], "clamp": True},
         axis={"values": [1, 0.1, 0.01, 0.001, LEAST_SHARE], "format": "~%"},
     )
-
-    def layers(encoded: Mapping[str, Spec]) -> list[Spec]:
-        deadline = limit_rule("x", deadline_ms, "deadline")
-        return [_steps(across, up, encoded, "policy"), *deadline, five]
-
-    return _plots(slug, frame, styles, layers, 180, title, caption)
+    across = quantity("latency_ms", "latency (ms)", axis={"tickCount": 5})
+    rules = [
+        *limit_rule("x", deadline_ms, "deadline"),
+        *limit_rule("y", 0.05, "5 %", color=MUTED, strokeDash=[1, 3]),
+    ]
+    return _steps(frame, styles, across, up, rules, what="policy", tallest_px=180)
 
 
 def cumulative(
-    slug: str,
     frame: pl.DataFrame,
     styles: Mapping[str, Style],
     headings: tuple[str, str],
-    *,
     limit: Limit = NO_LIMIT,
-    title: str = "",
-    caption: str = "",
-) -> Figure:
+) -> Draw:
     """Draw empirical distributions, a line a policy and a panel a scenario.
 
     Parameters
     ----------
     frame : DataFrame
         ``scenario``, ``policy``, ``value``, ``share`` at or below it.
-    styles : mapping of str to Style
     headings : (str, str)
         Of the axes: values, shares.
     """
     across = quantity("value", headings[0], axis={"tickCount": 4})
     up = quantity("share", headings[1], axis={"format": "~%", "tickCount": 4})
-
-    def layers(encoded: Mapping[str, Spec]) -> list[Spec]:
-        return [_steps(across, up, encoded, "line"), *limit_rule("x", *limit)]
-
-    return _plots(slug, frame, styles, layers, 150, title, caption)
+    rules = limit_rule("x", *limit)
+    return _steps(frame, styles, across, up, rules, what="line", tallest_px=150)
 
 
-def _steps(across: Spec, up: Spec, encoded: Mapping[str, Spec], what: str) -> Spec:
-    """Return the lines of distributions, a step at each value; `what` a line stands for."""
-    return {
-        "transform": [SHOWN],
-        "mark": {"type": "line", "interpolate": "step-after", "strokeWidth": 1.5, "clip": True},
-        "encoding": {
-            "x": across,
-            "y": up,
-            **_of(encoded, "color", "strokeDash"),
-            "tooltip": [
-                name_of("policy", title=what),
-                quantity(across["field"], across["title"]),
-                quantity(up["field"], up["field"], format=".3~%"),
-            ],
-        },
-    }
+def _steps(
+    frame: pl.DataFrame,
+    styles: Mapping[str, Style],
+    across: Spec,
+    up: Spec,
+    rules: Sequence[Spec],
+    *,
+    what: str,
+    tallest_px: int,
+) -> Draw:
+    """Draw distributions, a step at each value; `what` a line stands for."""
+    about = [
+        name_of("policy", title=what),
+        quantity(across["field"], across["title"]),
+        quantity(up["field"], up["field"], format=".3~%"),
+    ]
+
+    def layers(look: Mapping[str, Spec]) -> list[Spec]:
+        line = {"x": across, "y": up, **_of(look, "color", "strokeDash"), "tooltip": about}
+        style: Spec = {"interpolate": "step-after", "strokeWidth": 1.5, "clip": True}
+        return [layer("line", line, where=[CHOSEN], **style), *rules]
+
+    return _plots(frame, styles, layers, tallest_px)
 
 
 def curves(
-    slug: str,
     frame: pl.DataFrame,
     measure: Measure,
     styles: Mapping[str, Style],
     heading: str,
-    *,
     limit: Limit = NO_LIMIT,
-    title: str = "",
-    caption: str = "",
-) -> Figure:
+) -> Draw:
     """Draw a measure over a parameter, a line a policy and a panel a scenario.
 
     Parameters
@@ -366,111 +319,108 @@ def curves(
     frame : DataFrame
         ``scenario``, ``policy``, ``at`` (the parameter's values, texts or numbers), ``mean``,
         ``low``, ``high`` in the measure's shown unit.
-    styles : mapping of str to Style
     heading : str
         Of the parameter.
     """
     numeric = frame["at"].dtype.is_numeric()
     values = frame["at"].unique(maintain_order=True).to_list()
-    across: Spec = {
-        "field": "at",
-        "type": "quantitative" if numeric else "ordinal",
-        "title": heading,
-        "axis": {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric},
-        "sort": None,
-    }
+    at = {"field": "at", "type": "quantitative" if numeric else "ordinal", "title": heading}
+    axis = {"values": values, "labelOverlap": True, "labelAngle": 0, "grid": numeric}
+    across: Spec = {**at, "axis": axis, "sort": None}
     if numeric:
-        across["scale"] = {"type": "log" if min(values) > 0 and is_wide(values) else "linear"}
-        across["scale"]["zero"] = False
-        across["axis"]["format"] = ".6~g"
+        scale = "log" if min(values) > 0 and is_wide(values) else "linear"
+        across |= {"scale": {"type": scale, "zero": False}, "axis": {**axis, "format": ".6~g"}}
     up = quantity("mean", measure.heading, axis={"tickCount": 5})
+    about = [*names("policy"), at, *_mean_and_ends(measure)]
 
-    def layers(encoded: Mapping[str, Spec]) -> list[Spec]:
-        return [
-            *limit_rule("y", *limit),
-            {
-                "transform": [SHOWN, {"filter": "isValid(datum.low) && isValid(datum.high)"}],
-                "mark": {"type": "rule", "strokeWidth": 1.3},
-                "encoding": {
-                    "x": across,
-                    "y": {**up, "field": "low"},
-                    "y2": {"field": "high"},
-                    "color": encoded["color"],
-                },
-            },
-            {
-                "transform": [SHOWN],
-                "mark": {"type": "line", "strokeWidth": 1.3},
-                "encoding": {"x": across, "y": up, **_of(encoded, "color", "strokeDash")},
-            },
-            {
-                "transform": [SHOWN, {"filter": "isValid(datum.mean)"}],
-                "mark": {"type": "point", "filled": True, "size": 40, "opacity": 1},
-                "encoding": {
-                    "x": across,
-                    "y": up,
-                    **_of(encoded, "color", "shape"),
-                    "tooltip": [
-                        name_of("policy", title="policy"),
-                        {"field": "at", "type": across["type"], "title": heading},
-                        quantity("mean", measure.heading),
-                        quantity("low", "from"),
-                        quantity("high", "to"),
-                    ],
-                },
-            },
+    def layers(look: Mapping[str, Spec]) -> list[Spec]:
+        ends = {"y": {"field": "low"}, "y2": {"field": "high"}}
+        point = {**_of(look, "shape"), "tooltip": about}
+        marks = [
+            layer("rule", ends, where=[CHOSEN, BOUNDED], strokeWidth=1.3),
+            layer("line", _of(look, "strokeDash"), where=[CHOSEN], strokeWidth=1.3),
+            layer(
+                "point",
+                point,
+                where=[CHOSEN, "isValid(datum.mean)"],
+                filled=True,
+                size=40,
+                opacity=1,
+            ),
         ]
+        shared = {"x": across, "y": up, **_of(look, "color")}
+        return [*limit_rule("y", *limit), {"encoding": shared, "layer": marks}]
 
-    return _plots(slug, frame, styles, layers, 170, title, caption, most=3)
+    return _plots(frame, styles, layers, 170, most=3)
 
 
-def _rows(
-    slug: str,
-    frame: pl.DataFrame,
-    layers: Sequence[Spec],
-    policies: Sequence[str],
-    title: str,
-    caption: str,
-    *,
-    seeds: bool = False,
-) -> Figure:
-    """Return a figure with a row for each policy, a panel a scenario."""
-    facets = _facets(frame)
+def _mean_and_ends(measure: Measure) -> list[Spec]:
+    return [quantity("mean", measure.heading), quantity("low", "from"), quantity("high", "to")]
+
+
+def _of(look: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:
+    return {channel: look[channel] for channel in channels}
+
+
+def _named_rows(
+    frame: pl.DataFrame, policies: Sequence[str], layers: list[Spec], *, seeds: bool = False
+) -> Draw:
+    """Draw layers with a row for each policy; with `seeds`, a reader can choose one of these."""
 
     def draw(width: float) -> Spec:
-        columns, across_px = panels(width, len(facets))
-        size = {"width": across_px, "height": ROW_PX * max(len(policies), 1)}
-        return {**faceted(layers, facets, columns, size), "params": chosen(policies, seeds)}
+        height = ROW_PX * max(len(policies), 1)
+        return _panels(frame, policies, layers, lambda _: height, width - NAMES_PX, seeds=seeds)
 
-    return Figure(slug, title, {"rows": frame}, draw, caption)
+    return draw
 
 
 def _plots(
-    slug: str,
     frame: pl.DataFrame,
     styles: Mapping[str, Style],
     layers: Callable[[Mapping[str, Spec]], list[Spec]],
     tallest_px: int,
-    title: str,
-    caption: str,
     *,
     most: int = 4,
-) -> Figure:
-    """Return a figure of layers over two numbers, made of encodings; a panel a scenario."""
-    facets = _facets(frame)
+) -> Draw:
+    """Draw layers over two numbers, made of the encodings of how policies look."""
 
     def draw(width: float) -> Spec:
-        columns, across_px = panels(width, len(facets), beside=60, most=most)
-        size = {"width": across_px, "height": min(tallest_px, round(0.6 * across_px))}
-        drawn = faceted(layers(styled(styles, width)), facets, columns, size)
-        return {**drawn, "params": chosen(list(styles))}
+        return _panels(
+            frame,
+            list(styles),
+            layers(styled(styles, width)),
+            lambda across_px: min(tallest_px, round(0.6 * across_px)),
+            width - AXIS_PX,
+            most=most,
+        )
 
-    return Figure(slug, title, {"rows": frame}, draw, caption)
+    return draw
 
 
-def _of(encoded: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:
-    return {channel: encoded[channel] for channel in channels}
-
-
-def _facets(frame: pl.DataFrame) -> list[str]:
-    return [str(name) for name in frame["scenario"].unique(maintain_order=True)]
+def _panels(
+    frame: pl.DataFrame,
+    policies: Sequence[str],
+    layers: list[Spec],
+    height_px: Callable[[int], int],
+    room_px: float,
+    *,
+    most: int = 4,
+    seeds: bool = False,
+) -> Spec:
+    """Draw layers, a panel for each value of ``scenario``; a single one has no heading."""
+    facets = [str(name) for name in frame["scenario"].unique(maintain_order=True)]
+    columns = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
+    across_px = max(60, int((room_px - (columns - 1) * GAP_PX) / columns))
+    spec: Spec = {"width": across_px, "height": height_px(across_px), "layer": layers}
+    if len(facets) > 1:
+        header = {"labelLimit": across_px + GAP_PX}
+        spec = {
+            "facet": name_of("scenario", sort=facets, header=header),
+            "columns": columns,
+            "spacing": {"row": 14, "column": GAP_PX},
+            "spec": spec,
+        }
+    params: list[Spec] = [{"name": "policies", "value": list(policies)}]
+    if seeds:
+        params.append({"name": "seed", "value": None})
+    return {"data": {"name": "rows"}, **spec, "params": params}

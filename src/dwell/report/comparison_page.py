@@ -207,15 +207,10 @@ def _tenants(result: StudyResult) -> Figure:
     table = scaled(result.table([RATE.column]), RATE).with_columns(
         at=pl.col(column).cast(pl.String).replace_strict(shares, return_dtype=pl.Float64)
     )
-    return curves(
-        "tenants",
-        named(table.select("scenario", "policy", "at", "mean", "low", "high")).sort("at"),
-        RATE,
-        PolicyBlocks(result).styles,
-        "share of the time (%)",
-        limit=THE_AIM,
-        caption="Means over seeds with their 95 % intervals.",
-    )
+    frame = named(table.select("scenario", "policy", "at", "mean", "low", "high")).sort("at")
+    draw = curves(frame, RATE, PolicyBlocks(result).styles, "share of the time (%)", THE_AIM)
+    caption = "Means over seeds with their 95 % intervals."
+    return Figure("tenants", "", {"rows": frame}, draw, caption)
 
 
 def _share_of_bursts(node: Node) -> float:

@@ -6,6 +6,7 @@ them resolved. Drawings are made for a width, so that text keeps its size in bot
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 Spec: TypeAlias = "dict[str, Any]"
+#: Takes a width in pixels and returns a Vega-Lite drawing about as wide, without data.
+Draw: TypeAlias = "Callable[[float], Spec]"
 
 #: Width of a figure in a page, pixels, and in a paper's column, points.
 PAGE_PX, COLUMN_PT = 940, 252
@@ -37,12 +40,8 @@ class Figure:
     ----------
     slug : str
         Its name in files and links; different for every figure of a page.
-    title : str
-        What it shows.
     frames : mapping of str to DataFrame
         Data by the names that the drawing has for them.
-    draw : callable
-        Takes a width in pixels and returns a Vega-Lite drawing about as wide, without data.
     caption : str
         Plain text.
     """
@@ -50,7 +49,7 @@ class Figure:
     slug: str
     title: str
     frames: Mapping[str, pl.DataFrame]
-    draw: Callable[[float], Spec]
+    draw: Draw
     caption: str = ""
 
     def spec(self, width: float = PAGE_PX, *, letters: float = LETTERS_PX) -> Spec:
@@ -137,15 +136,13 @@ def _printed(figure: Figure, width_pt: float) -> Spec:
     return spec
 
 
-def _resolved(value: Any) -> Any:
-    """Return a drawing with the colours of paper."""
-    if isinstance(value, dict):
-        return {key: _resolved(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_resolved(item) for item in value]
-    if value == FONT:
-        return PRINTED_FONT
-    return PRINTED.get(value, value) if isinstance(value, str) else value
+def _resolved(drawing: Spec) -> Spec:
+    """Return a drawing with the colours and letters of paper."""
+    text = json.dumps(drawing)
+    for name, value in {**PRINTED, FONT: PRINTED_FONT}.items():
+        text = text.replace(name, value)
+    resolved: Spec = json.loads(text)
+    return resolved
 
 
 @cache

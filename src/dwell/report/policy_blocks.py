@@ -75,6 +75,7 @@ class PolicyBlocks:
     def __init__(self, found: StudyRuns, prefix: str = "") -> None:
         self.problem, self.runs, self.latencies = found.problem, found.runs, found.latencies
         self.prefix = prefix
+        self.deadline = Limit(found.problem.pipeline.deadline_ms, "deadline")
         # References are no contenders, and have runs.
         self.scenarios, self.policies = (
             [str(name) for name in self.runs[column].unique(maintain_order=True)]
@@ -97,15 +98,9 @@ class PolicyBlocks:
         )
         means = scaled(over_seeds(self.runs, KEYS, [measure.column]), measure)
         rows = [means.select(*KEYS, "mean", "low", "high"), seeds]
-        return intervals(
-            f"{self.prefix}{measure.column}",
-            named(pl.concat(rows, how="diagonal_relaxed")),
-            measure,
-            self.styles,
-            limit=limit,
-            title=title,
-            caption=caption,
-        )
+        frame = named(pl.concat(rows, how="diagonal_relaxed"))
+        draw = intervals(frame, measure, self.styles, limit)
+        return Figure(f"{self.prefix}{measure.column}", title, {"rows": frame}, draw, caption)
 
     def rate(self) -> Figure:
         """Draw V_D beside the aim."""
@@ -123,7 +118,7 @@ class PolicyBlocks:
         """Draw L95 beside the deadline."""
         return self.measure(
             L95,
-            limit=Limit(self.problem.pipeline.deadline_ms, "deadline"),
+            limit=self.deadline,
             title="L95, the 95th percentile of a window’s latencies, mean over windows",
             caption=(
                 "As the controller sees it: a cycle that has not finished counts with its age. "
@@ -142,17 +137,15 @@ class PolicyBlocks:
             keep = np.flatnonzero(np.diff(bins, prepend=math.inf))
             line = mine[keep].select(*KEYS, "latency_ms", longer=1 - pl.col("share"))
             parts.append(line.filter(pl.col("longer") > 0))
-        return distributions(
+        frame = named(pl.concat(parts))
+        return Figure(
             f"{self.prefix}latencies",
-            named(pl.concat(parts)),
-            self.styles,
-            self.problem.pipeline.deadline_ms,
-            title="Cycles that took longer than a latency",
-            caption=(
-                "All cycles after the warm-up, all seeds together, on a logarithmic scale. Dashed: "
-                "deadline, where one reads V_D; dotted: 5 %. A line that ends on a plateau lost "
-                "that share of its cycles."
-            ),
+            "Cycles that took longer than a latency",
+            {"rows": frame},
+            distributions(frame, self.styles, self.problem.pipeline.deadline_ms),
+            "All cycles after the warm-up, all seeds together, on a logarithmic scale. Dashed: "
+            "deadline, where one reads V_D; dotted: 5 %. A line that ends on a plateau lost "
+            "that share of its cycles.",
         )
 
     def placed(self) -> list[Figure]:
@@ -162,28 +155,23 @@ class PolicyBlocks:
         columns = {f"share_{name}": name for name in candidates}
         if not moving or not set(columns) <= set(self.runs.columns):
             return []
-        figure = stacked(
-            f"{self.prefix}shares",
-            self._parts({name: (shown, 100.0) for name, shown in columns.items()}, moving),
-            [shown_contender(name) for name in moving],
-            self.palette.placements,
-            "share of the windows (%)",
-            title="Where the policies that move spent their windows",
-        )
-        return [figure]
+        frame = self._parts({name: (shown, 100.0) for name, shown in columns.items()}, moving)
+        shown = [shown_contender(name) for name in moving]
+        draw = stacked(frame, shown, self.palette.placements, "share of the windows (%)")
+        title = "Where the policies that move spent their windows"
+        return [Figure(f"{self.prefix}shares", title, {"rows": frame}, draw)]
 
     def split(self) -> Figure:
         """Draw where the time of finished cycles goes."""
         columns = {f"{part}_ms": (shown, 1.0) for part, shown in PARTS_SHOWN.items()}
-        return stacked(
+        frame = self._parts(columns, self.policies)
+        heading = "mean latency of finished cycles (ms)"
+        return Figure(
             f"{self.prefix}split",
-            self._parts(columns, self.policies),
-            [shown_contender(name) for name in self.policies],
-            PART_COLOURS,
-            "mean latency of finished cycles (ms)",
-            limit=Limit(self.problem.pipeline.deadline_ms, "deadline"),
-            title="Where the time goes along the critical path",
-            caption="Lost cycles are not in it. Dashed: deadline.",
+            "Where the time goes along the critical path",
+            {"rows": frame},
+            stacked(frame, list(self.styles), PART_COLOURS, heading, self.deadline),
+            "Lost cycles are not in it. Dashed: deadline.",
         )
 
     def _parts(

@@ -16,14 +16,17 @@ from dwell.report.charts import (
     PART_COLOURS,
     PARTS_SHOWN,
     Limit,
+    coloured,
     distributions,
+    in_order,
+    layer,
     limit_rule,
-    name_of,
+    names,
     quantity,
     stacked,
     thinned,
 )
-from dwell.report.figure import Figure, Spec
+from dwell.report.figure import Figure
 from dwell.report.formatting import (
     Measure,
     percent,
@@ -262,49 +265,32 @@ class _RunPage:
             value_name="time_ms",
         )
         lost = frame.filter(pl.col("latency_ms").is_null()).select("cycle", "outcome")
-        deadline_ms = self.header.deadline_ms
-        names = list(PART_COLOURS)
-
-        def draw(width: float) -> Spec:
-            across = {"field": "cycle", "type": "ordinal", "title": "cycle"}
-            across["axis"] = {"labelOverlap": True, "labelAngle": 0}  # type: ignore[assignment]
-            bars: Spec = {
-                "data": {"name": "parts"},
-                "transform": [{"calculate": f"indexof({names!r}, datum.part)", "as": "place"}],
-                "mark": {"type": "bar"},
-                "encoding": {
-                    "x": across,
-                    "y": quantity("time_ms", "latency (ms)", axis={"tickCount": 4}),
-                    "order": {"field": "place", "type": "quantitative"},
-                    "color": name_of(
-                        "part", scale={"domain": names, "range": list(PART_COLOURS.values())}
-                    ),
-                    "tooltip": [
-                        quantity("cycle", "cycle"),
-                        name_of("part", title="part"),
-                        quantity("time_ms", "ms"),
-                        quantity("latency_ms", "in all (ms)"),
-                        name_of("outcome", title="outcome"),
-                    ],
-                },
-            }
-            crosses: Spec = {
-                "data": {"name": "lost"},
-                "mark": {"type": "point", "shape": "triangle-down", "filled": True, "color": BAD},
-                "encoding": {
-                    "x": across,
-                    "y": {"value": 6},
-                    "tooltip": [quantity("cycle", "cycle"), name_of("outcome", title="outcome")],
-                },
-            }
-            layers = [bars, *limit_rule("y", deadline_ms, "deadline"), crosses]
-            return {"width": width - 90, "height": 110, "layer": layers}
-
+        axis = {"labelOverlap": True, "labelAngle": 0}
+        across = {"field": "cycle", "type": "ordinal", "title": "cycle", "axis": axis}
+        cycle, outcome = quantity("cycle", "cycle"), *names("outcome")
+        time = {
+            "x": across,
+            "y": quantity("time_ms", "latency (ms)", axis={"tickCount": 4}),
+            "color": coloured("part", PART_COLOURS),
+            "tooltip": [
+                cycle,
+                *names("part"),
+                quantity("time_ms", "ms"),
+                quantity("latency_ms", "in all (ms)"),
+                outcome,
+            ],
+        }
+        top = {"x": across, "y": {"value": 6}, "tooltip": [cycle, outcome]}
+        layers = [
+            in_order(layer("bar", time, rows="parts"), PART_COLOURS),
+            *limit_rule("y", self.header.deadline_ms, "deadline"),
+            layer("point", top, rows="lost", shape="triangle-down", filled=True, color=BAD),
+        ]
         return Figure(
             f"cycles-{window['window']}",
             "",
             {"parts": parts, "lost": lost},
-            draw,
+            lambda width: {"width": width - 90, "height": 110, "layer": layers},
             "Time along the critical path of every cycle that finished; dashed: deadline. A mark "
             "at the top: a cycle that was lost.",
         )
@@ -330,30 +316,26 @@ class _RunPage:
                 parts.append((name, shown, _number(mean) / 1e6))
         tail = pl.concat(lines).filter(pl.col("longer") > 0).with_columns(scenario=pl.lit(""))
         split = pl.DataFrame(parts, schema=["policy", "part", "value"], orient="row")
+        split = split.with_columns(scenario=pl.lit(""))
         styles = Palette.of(self.palette.placements, used).policies
-        deadline_ms = self.header.deadline_ms
+        deadline = Limit(self.header.deadline_ms, "deadline")
+        heading = "mean latency of finished cycles (ms)"
         return [
-            distributions(
+            Figure(
                 "latencies",
-                tail,
-                styles,
-                deadline_ms,
-                title="Cycles that took longer than a latency, by placement",
-                caption=(
-                    "Of the cycles that were released under each placement, on a logarithmic "
-                    "scale. Dashed: deadline; dotted: 5 %. A line that ends on a plateau lost that "
-                    "share of its cycles."
-                ),
+                "Cycles that took longer than a latency, by placement",
+                {"rows": tail},
+                distributions(tail, styles, self.header.deadline_ms),
+                "Of the cycles that were released under each placement, on a logarithmic "
+                "scale. Dashed: deadline; dotted: 5 %. A line that ends on a plateau lost that "
+                "share of its cycles.",
             ),
-            stacked(
+            Figure(
                 "split",
-                split.with_columns(scenario=pl.lit("")),
-                used,
-                PART_COLOURS,
-                "mean latency of finished cycles (ms)",
-                limit=Limit(deadline_ms, "deadline"),
-                title="Where the time goes along the critical path",
-                caption="Dashed: deadline.",
+                "Where the time goes along the critical path",
+                {"rows": split},
+                stacked(split, used, PART_COLOURS, heading, deadline),
+                "Dashed: deadline.",
             ),
         ]
 

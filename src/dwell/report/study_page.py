@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from dwell.report.charts import NO_LIMIT, Limit, curves
+from dwell.report.charts import NO_LIMIT, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
 from dwell.report.method import method_blocks, ranges
@@ -104,21 +104,16 @@ def _curve(
 ) -> Figure:
     import polars as pl
 
-    deadline = Limit(blocks.problem.pipeline.deadline_ms, "deadline")
-    limits = {RATE.column: THE_AIM, L95.column: deadline}
+    limits = {RATE.column: THE_AIM, L95.column: blocks.deadline}
+    shown = parameter.partition(".")[2]
     table = scaled(means, measure)
     at = table[parameter]
-    frame = table.with_columns(at=at if at.dtype.is_numeric() else at.cast(pl.String))
-    rows = frame.select("scenario", "policy", "at", "mean", "low", "high")
-    return curves(
-        f"{measure.column}-{place}",
-        named(rows.sort("at", maintain_order=True) if at.dtype.is_numeric() else rows),
-        measure,
-        blocks.styles,
-        parameter.partition(".")[2],
-        limit=limits.get(measure.column, NO_LIMIT),
-        title=f"{measure.name} by {parameter.partition('.')[2]}",
-    )
+    rows = table.with_columns(at=at if at.dtype.is_numeric() else at.cast(pl.String))
+    frame = named(rows.select("scenario", "policy", "at", "mean", "low", "high"))
+    if at.dtype.is_numeric():
+        frame = frame.sort("at", maintain_order=True)
+    draw = curves(frame, measure, blocks.styles, shown, limits.get(measure.column, NO_LIMIT))
+    return Figure(f"{measure.column}-{place}", f"{measure.name} by {shown}", {"rows": frame}, draw)
 
 
 def _pivot(

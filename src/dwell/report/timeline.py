@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.report.charts import is_wide, limit_rule, name_of, quantity
+from dwell.report.charts import coloured, is_wide, layer, limit_rule, name_of, names, quantity
 from dwell.report.figure import Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
@@ -28,6 +28,28 @@ DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 OWN = ("color", "strokeDash")
 L95 = "L95 (ms)"
 WARMUP, UNPROVEN = "warm-up", "clocks unproven"
+AT = quantity("time", "at (s)", format=".1f")
+#: Layers of every panel.
+SHADES = layer(
+    "rect",
+    {
+        "x": {"field": "begin"},
+        "x2": {"field": "end"},
+        "opacity": {"condition": {"test": f"datum.what === '{WARMUP}'", "value": 0.5}, "value": 1},
+    },
+    rows="spans",
+    color=SHADE,
+)
+MIGRATIONS = layer(
+    "rule",
+    {
+        "color": {"condition": {"test": "datum.reason === 'guard'", "value": BAD}, "value": INK},
+        "opacity": {"value": 0.35},
+        "tooltip": [name_of("move", title="moved"), *names("reason"), AT],
+    },
+    rows="moves",
+    strokeWidth=0.7,
+)
 
 
 def begins_by_number(windows: pl.DataFrame, period_ms: float) -> NDArray[np.float64]:
@@ -108,27 +130,31 @@ def run_timeline(
     shown = [name for name in candidates if name in set(frame["placement"])]
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
-    rows: list[tuple[int, Callable[[Spec], list[Spec]]]] = [
-        (PANEL_PX, lambda time: [*aim, _marks(time, "v_d", "V_D (%)", palette, shown)]),
-        (PANEL_PX, lambda time: [*due, _marks(time, "l95", L95, palette, shown, log=wide)]),
-        (
-            PANEL_PX,
-            lambda time: [_others(time, palette), _marks(time, "j", "J", palette, shown)],
-        ),
-        (USE_PX, lambda time: [_use(time, nodes)]),
+    colours = {name: palette.placements[name] for name in shown}
+    panels: list[tuple[int, list[Spec]]] = [
+        (PANEL_PX, [*aim, _marks("v_d", "V_D (%)", colours)]),
+        (PANEL_PX, [*due, _marks("l95", L95, colours, log=wide)]),
+        (PANEL_PX, [_others(palette), _marks("j", "J", colours)]),
+        (USE_PX, [_use(nodes)]),
     ]
     if tracking is not None:
-        error = "tracking error (mm)"
-        rows.append((PANEL_PX, lambda time: [_marks(time, "error", error, palette, shown)]))
+        panels.append((PANEL_PX, [_marks("error", "tracking error (mm)", colours)]))
+
+    time: Spec = {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}}
+    axes = [*[None] * (len(panels) - 1), {"title": "time (s)", "grid": False, "tickCount": 10}]
 
     def draw(width: float) -> Spec:
-        panels = []
-        for place, (height, marks) in enumerate(rows):
-            time = _time(end_s, shown=place == len(rows) - 1)
-            layers = [_shade(time), *marks(time), _migrations(time)]
-            panels.append({"width": width - 90, "height": height, "layer": layers})
+        drawn = [
+            {
+                "width": width - 90,
+                "height": height,
+                "encoding": {"x": {"field": "time", **time, "axis": axis}},
+                "layer": [SHADES, *layers, MIGRATIONS],
+            }
+            for (height, layers), axis in zip(panels, axes, strict=True)
+        ]
         return {
-            "vconcat": [_named_spans(width - 90, _time(end_s)), *panels],
+            "vconcat": [_named_spans(width - 90, time), *drawn],
             "spacing": 8,
             "resolve": {"scale": {"x": "shared", **dict.fromkeys(OWN, "independent")}},
         }
@@ -153,7 +179,7 @@ def _binned(frame: pl.DataFrame) -> pl.DataFrame:
         .agg(
             pl.col("window").first(),
             pl.col("time").mean(),
-            pl.col("placement").mode().first(),
+            pl.col("placement").mode(maintain_order=True).first(),
             *(pl.col(name).max() for name in numbers),
             pl.col("link").drop_nulls().first(),
         )
@@ -239,122 +265,55 @@ def _spans(
 # ---------------------------------------------------------------------------------- drawings
 
 
-def _time(end_s: float, *, shown: bool = False) -> Spec:
-    axis = {"title": "time (s)", "grid": False, "tickCount": 10} if shown else None
-    return {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}, "axis": axis}
-
-
 def _named_spans(width: float, time: Spec) -> Spec:
     """Return a row for everything that went on, with its name."""
-    return {
-        "data": {"name": "spans"},
-        "width": width,
-        "height": {"step": 15},
-        "mark": {"type": "bar", "height": 4, "color": MUTED, "cornerRadius": 2},
-        "encoding": {
-            "x": {**time, "field": "begin"},
-            "x2": {"field": "end"},
-            "y": name_of("what", sort=None, axis={"domain": False, "ticks": False}),
-            "tooltip": [
-                name_of("what", title="what"),
-                quantity("begin", "from (s)", format=".1f"),
-                quantity("end", "to (s)", format=".1f"),
-            ],
-        },
+    encoding = {
+        "x": {"field": "begin", **time, "axis": None},
+        "x2": {"field": "end"},
+        "y": name_of("what", sort=None, axis={"domain": False, "ticks": False}),
+        "tooltip": [
+            *names("what"),
+            quantity("begin", "from (s)", format=".1f"),
+            quantity("end", "to (s)", format=".1f"),
+        ],
     }
+    bars = layer("bar", encoding, rows="spans", height=4, color=MUTED, cornerRadius=2)
+    return {"width": width, "height": {"step": 15}, **bars}
 
 
-def _shade(time: Spec) -> Spec:
-    return {
-        "data": {"name": "spans"},
-        "mark": {"type": "rect", "color": SHADE},
-        "encoding": {
-            "x": {**time, "field": "begin"},
-            "x2": {"field": "end"},
-            "opacity": {
-                "condition": {"test": f"datum.what === '{WARMUP}'", "value": 0.5},
-                "value": 1,
-            },
-        },
-    }
-
-
-def _migrations(time: Spec) -> Spec:
-    return {
-        "data": {"name": "moves"},
-        "mark": {"type": "rule", "strokeWidth": 0.7},
-        "encoding": {
-            "x": {**time, "field": "time"},
-            "color": {
-                "condition": {"test": "datum.reason === 'guard'", "value": BAD},
-                "value": INK,
-            },
-            "opacity": {"value": 0.35},
-            "tooltip": [
-                name_of("move", title="moved"),
-                name_of("reason", title="reason"),
-                quantity("time", "at (s)", format=".1f"),
-            ],
-        },
-    }
-
-
-def _marks(
-    time: Spec, field: str, title: str, palette: Palette, shown: Sequence[str], *, log: bool = False
-) -> Spec:
+def _marks(field: str, title: str, colours: Mapping[str, str], *, log: bool = False) -> Spec:
     scale: Spec = {"type": "log", "nice": False} if log else {"zero": field == "v_d"}
-    return {
-        "data": {"name": "windows"},
-        "mark": {"type": "point", "filled": True, "size": 18, "opacity": 0.9},
-        "encoding": {
-            "x": {**time, "field": "time"},
-            "y": quantity(field, title, scale=scale, axis={"tickCount": 4}),
-            "color": name_of(
-                "placement",
-                scale={"domain": list(shown), "range": [palette.placements[one] for one in shown]},
-                legend={"symbolSize": 60} if field == "v_d" else None,
-            ),
-            # What leads nowhere would lead away from the page.
-            "href": {"condition": {"test": "datum.link !== null", "field": "link"}},
-            "tooltip": [
-                quantity("window", "window"),
-                quantity("time", "at (s)", format=".1f"),
-                name_of("placement", title="placement"),
-                quantity(field, title),
-            ],
-        },
+    legend = {"symbolSize": 60} if field == "v_d" else None
+    encoding = {
+        "y": quantity(field, title, scale=scale, axis={"tickCount": 4}),
+        "color": coloured("placement", colours, legend=legend),
+        # What leads nowhere would lead away from the page.
+        "href": {"condition": {"test": "datum.link !== null", "field": "link"}},
+        "tooltip": [
+            quantity("window", "window"),
+            AT,
+            *names("placement"),
+            quantity(field, title),
+        ],
     }
+    return layer("point", encoding, rows="windows", filled=True, size=18, opacity=0.9)
 
 
-def _others(time: Spec, palette: Palette) -> Spec:
-    names = list(palette.placements)
-    return {
-        "data": {"name": "estimates"},
-        "mark": {"type": "line", "strokeWidth": 1, "opacity": 0.75},
-        "encoding": {
-            "x": {**time, "field": "time"},
-            "y": quantity("j", "J", scale={"zero": False}, axis={"tickCount": 4}),
-            "color": name_of(
-                "placement",
-                scale={"domain": names, "range": list(palette.placements.values())},
-                legend=None,
-            ),
-        },
+def _others(palette: Palette) -> Spec:
+    encoding = {
+        "y": quantity("j", "J", scale={"zero": False}, axis={"tickCount": 4}),
+        "color": coloured("placement", palette.placements, legend=None),
     }
+    return layer("line", encoding, rows="estimates", strokeWidth=1, opacity=0.75)
 
 
-def _use(time: Spec, nodes: Sequence[str]) -> Spec:
-    shades = [INK if place % 2 == 0 else MUTED for place in range(len(nodes))]
+def _use(nodes: Sequence[str]) -> Spec:
+    shades = {node: (INK, MUTED)[place % 2] for place, node in enumerate(nodes)}
     dashes = [DASHES[place % len(DASHES)] for place in range(len(nodes))]
-    return {
-        "data": {"name": "nodes"},
-        "mark": {"type": "line", "strokeWidth": 1.1},
-        "encoding": {
-            "x": {**time, "field": "time"},
-            "y": quantity(
-                "used", "U (%)", scale={"domain": [0, 104]}, axis={"values": [0, 50, 100]}
-            ),
-            "color": name_of("node", scale={"domain": list(nodes), "range": shades}),
-            "strokeDash": name_of("node", scale={"domain": list(nodes), "range": dashes}),
-        },
+    axis, scale = {"values": [0, 50, 100]}, {"domain": [0, 104]}
+    encoding = {
+        "y": quantity("used", "U (%)", scale=scale, axis=axis),
+        "color": coloured("node", shades),
+        "strokeDash": name_of("node", scale={"domain": list(nodes), "range": dashes}),
     }
+    return layer("line", encoding, rows="nodes", strokeWidth=1.1)

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from dwell.model import Problem, Trace
+from dwell.report.charts import layer, quantity
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import write_number
 from dwell.report.palette import INK, MUTED, PAPER, SHADE
@@ -46,75 +47,63 @@ def topology(problem: Problem) -> Figure:
     pairs: dict[frozenset[str], Link] = {}
     for link in problem.fabric.links.values():
         pairs.setdefault(frozenset((link.source, link.target)), link)
-    lines = [
-        {
-            "x": places[link.source][0],
-            "y": places[link.source][1],
-            "x2": places[link.target][0],
-            "y2": places[link.target][1],
-            "mx": (places[link.source][0] + places[link.target][0]) / 2,
-            "my": (places[link.source][1] + places[link.target][1]) / 2,
-            "text": _link(link),
-        }
-        for link in pairs.values()
-    ]
+    lines = []
+    for link in pairs.values():
+        (x, y), (x2, y2) = places[link.source], places[link.target]
+        ends = {"x": x, "y": y, "x2": x2, "y2": y2}
+        lines.append({**ends, "mx": (x + x2) / 2, "my": (y + y2) / 2, "text": _link(link)})
     schema = dict.fromkeys(("x", "y", "x2", "y2", "mx", "my"), pl.Float64) | {"text": pl.String}
     frames = {"boxes": pl.DataFrame(boxes), "links": pl.DataFrame(lines, schema=schema)}
-    tall = LINE_PX * max(len(lines) for lines in texts.values()) + 14
+    most = max(map(len, texts.values()))
+    tall = LINE_PX * most + 14
     height = tall if len(nodes) == 1 else max(2.6 * tall, 75 * len(nodes))
+    low, high = min(y for _, y in places.values()), max(y for _, y in places.values())
+    at = {
+        "x": quantity("x", None, axis=None, scale={"domain": [-1.0, 1.0]}),
+        "y": quantity("y", None, axis=None, scale={"domain": [low, high or 1.0]}),
+    }
+    middle = {"x": {"field": "mx"}, "y": {"field": "my"}, "text": {"field": "text"}}
+    halo: Spec = {"stroke": PAPER, "strokeWidth": 6, "strokeJoin": "round"}
+    box: Spec = {
+        "width": NODE_PX,
+        "height": tall,
+        "cornerRadius": 4,
+        "fill": SHADE,
+        "stroke": MUTED,
+    }
+    first = -(tall - LINE_PX) / 2 + 7
+    layers = [
+        layer(
+            "rule",
+            {"x2": {"field": "x2"}, "y2": {"field": "y2"}},
+            rows="links",
+            color=MUTED,
+            strokeWidth=1.2,
+        ),
+        layer("text", middle, rows="links", color=MUTED, **halo),
+        layer("text", middle, rows="links", color=MUTED, stroke=None),
+        layer("rect", {}, rows="boxes", where=["datum.head"], **box),
+    ]
+    layers += [
+        layer(
+            "text",
+            {"text": {"field": "text"}},
+            rows="boxes",
+            where=[f"datum.line == {line}"],
+            dy=first + line * LINE_PX,
+            color=MUTED if line else INK,
+            fontWeight="normal" if line else 600,
+        )
+        for line in range(most)
+    ]
 
     def draw(width: float) -> Spec:
-        across = min(width, 620.0)
-        x = {"type": "quantitative", "axis": None, "scale": {"domain": [-1.0, 1.0]}}
-        low, high = min(y for _, y in places.values()), max(y for _, y in places.values())
-        y = {"type": "quantitative", "axis": None, "scale": {"domain": [low, high or 1.0]}}
-        at = {"x": {"field": "x", **x}, "y": {"field": "y", **y}}
-        ends = {**at, "x2": {"field": "x2"}, "y2": {"field": "y2"}}
-        middle = {"x": {"field": "mx", **x}, "y": {"field": "my", **y}}
-        box = {"type": "rect", "width": NODE_PX, "height": tall, "cornerRadius": 4}
-        label = {"type": "text", "color": MUTED, "stroke": None}
-        halo = {**label, "stroke": PAPER, "strokeWidth": 6, "strokeJoin": "round"}
-        first = -(tall - LINE_PX) / 2 + 7
-        written: list[Spec] = [
-            {
-                "data": {"name": "boxes"},
-                "transform": [{"filter": f"datum.line == {line}"}],
-                "mark": {
-                    "type": "text",
-                    "dy": first + line * LINE_PX,
-                    "color": MUTED if line else INK,
-                    "fontWeight": "normal" if line else 600,
-                },
-                "encoding": {**at, "text": {"field": "text"}},
-            }
-            for line in range(max(len(lines) for lines in texts.values()))
-        ]
         return {
-            "width": across - NODE_PX,
+            "width": min(width, 620.0) - NODE_PX,
             "height": height - tall,
             "padding": {"left": NODE_PX / 2, "right": NODE_PX / 2, "top": tall, "bottom": tall},
-            "layer": [
-                {
-                    "data": {"name": "links"},
-                    "mark": {"type": "rule", "color": MUTED, "strokeWidth": 1.2},
-                    "encoding": ends,
-                },
-                *(
-                    {
-                        "data": {"name": "links"},
-                        "mark": mark,
-                        "encoding": {**middle, "text": {"field": "text"}},
-                    }
-                    for mark in (halo, label)
-                ),
-                {
-                    "data": {"name": "boxes"},
-                    "transform": [{"filter": "datum.head"}],
-                    "mark": {**box, "fill": SHADE, "stroke": MUTED},
-                    "encoding": at,
-                },
-                *written,
-            ],
+            "encoding": at,
+            "layer": layers,
         }
 
     return Figure("topology", f"Topology of {problem.name}", frames, draw)
@@ -127,10 +116,7 @@ def _tasks(problem: Problem, node: str) -> list[str]:
 
 
 def _link(link: Link) -> str:
-    delay = "as recorded" if isinstance(link.delay_ms, Trace) else _mean(link)
+    replayed = isinstance(link.delay_ms, Trace)
+    delay = "as recorded" if replayed else f"{write_number(link.delay_ms.expectation, 1)} ms"
     rate = "" if math.isinf(link.rate_mbps) else f", {write_number(link.rate_mbps, 0)} Mbit/s"
     return f"{delay}{rate}"
-
-
-def _mean(link: Link) -> str:
-    return f"{write_number(link.delay_ms.expectation, 1)} ms"

@@ -13,8 +13,11 @@ from dwell.report.charts import (
     PART_COLOURS,
     PARTS_SHOWN,
     Limit,
+    coloured,
     cumulative,
+    layer,
     name_of,
+    names,
     quantity,
     stacked,
 )
@@ -305,52 +308,24 @@ def _scatter(
     domain = {"domain": [0, high], "nice": False}
     across = quantity("measured", f"{title}, measured", scale=domain, axis={"tickCount": 4})
     up = quantity("predicted", "predicted", scale=domain, axis={"tickCount": 4})
-    colour = name_of("policy", scale={"domain": list(policies), "range": list(policies.values())})
-    shape = name_of("scenario")
-    return {
-        "width": size,
-        "height": size,
-        "layer": [
-            {
-                "data": {"values": band},
-                "mark": {"type": "area", "color": SHADE, "clip": True},
-                "encoding": {
-                    "x": {**across, "field": "at"},
-                    "y": {**up, "field": "low"},
-                    "y2": {"field": "high"},
-                },
-            },
-            {
-                "data": {"name": "rows"},
-                "transform": [{"filter": f"datum.goal === '{goal}'"}],
-                "mark": {"type": "rule", "opacity": 0.6},
-                "encoding": {
-                    "x": {**across, "field": "low"},
-                    "x2": {"field": "high"},
-                    "y": up,
-                    "color": colour,
-                },
-            },
-            {
-                "data": {"name": "rows"},
-                "transform": [{"filter": f"datum.goal === '{goal}'"}],
-                "mark": {"type": "point", "size": 45, "strokeWidth": 1.6},
-                "encoding": {
-                    "x": across,
-                    "y": up,
-                    "color": colour,
-                    "shape": shape,
-                    "tooltip": [
-                        name_of("policy", title="policy"),
-                        name_of("scenario", title="scenario"),
-                        name_of("metric", title="metric"),
-                        quantity("measured", "measured"),
-                        quantity("predicted", "predicted"),
-                    ],
-                },
-            },
-        ],
+    allowed = {"x": {**across, "field": "at"}, "y": {**up, "field": "low"}, "y2": {"field": "high"}}
+    about = names("policy", "scenario", "metric")
+    about += [quantity("measured", "measured"), quantity("predicted", "predicted")]
+    marks = [
+        layer("rule", {"x": {"field": "low"}, "x2": {"field": "high"}}, opacity=0.6),
+        layer("point", {"shape": name_of("scenario"), "tooltip": about}, size=45, strokeWidth=1.6),
+    ]
+    groups = {
+        "data": {"name": "rows"},
+        "transform": [{"filter": f"datum.goal === '{goal}'"}],
+        "encoding": {"x": across, "y": up, "color": coloured("policy", policies)},
+        "layer": marks,
     }
+    shade = {
+        "data": {"values": band},
+        **layer("area", allowed, color=SHADE, clip=True),
+    }
+    return {"width": size, "height": size, "layer": [shade, groups]}
 
 
 def _panel(group: Group) -> str:
@@ -360,23 +335,17 @@ def _panel(group: Group) -> str:
 def _latencies(validation: Validation) -> Figure:
     import polars as pl
 
-    deadline_ms = validation.problem.pipeline.deadline_ms
-    across = np.linspace(0.0, DEADLINES * deadline_ms, POINTS)
+    across = np.linspace(0.0, DEADLINES * _deadline(validation).value, POINTS)
     parts = []
     for group in validation.groups:
         for name, sample in ((MEASURED, group.measured), (PREDICTED, group.predicted)):
             line = pl.DataFrame({"value": across, "share": sample.share_within(across)})
             scenario, policy = pl.lit(_panel(group)), pl.lit(name)
             parts.append(line.with_columns(scenario=scenario, policy=policy))
-    return cumulative(
-        "latencies",
-        pl.concat(parts),
-        BOTH,
-        ("latency (ms)", "cycles within"),
-        limit=Limit(deadline_ms, "deadline"),
-        title="Latencies of all cycles",
-        caption="A line that stays below 100 % shows that cycles were lost. Dashed: deadline.",
-    )
+    frame = pl.concat(parts)
+    draw = cumulative(frame, BOTH, ("latency (ms)", "cycles within"), _deadline(validation))
+    caption = "A line that stays below 100 % shows that cycles were lost. Dashed: deadline."
+    return Figure("latencies", "Latencies of all cycles", {"rows": frame}, draw, caption)
 
 
 def _split(validation: Validation) -> Figure:
@@ -389,16 +358,13 @@ def _split(validation: Validation) -> Figure:
         for part, shown in PARTS_SHOWN.items()
     ]
     frame = pl.DataFrame(rows, schema=["scenario", "policy", "part", "value"], orient="row")
-    return stacked(
-        "split",
-        frame,
-        [MEASURED, PREDICTED],
-        PART_COLOURS,
-        "mean (ms)",
-        limit=Limit(validation.problem.pipeline.deadline_ms, "deadline"),
-        title="Time along the critical path of the cycles that finished",
-        caption="Dashed: deadline.",
-    )
+    draw = stacked(frame, list(BOTH), PART_COLOURS, "mean (ms)", _deadline(validation))
+    title = "Time along the critical path of the cycles that finished"
+    return Figure("split", title, {"rows": frame}, draw, "Dashed: deadline.")
+
+
+def _deadline(validation: Validation) -> Limit:
+    return Limit(validation.problem.pipeline.deadline_ms, "deadline")
 
 
 # ------------------------------------------------------------------------------------ tables
