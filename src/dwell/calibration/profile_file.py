@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dwell.errors import ProfileError
 from dwell.files import write_whole
-from dwell.model.semantics import LONGEST_NAME, NAME
+from dwell.model.semantics import bad_name
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -81,11 +81,8 @@ def link_name(source: str, target: str) -> str:
 
 def _require_names(**names: str) -> None:
     for what, name in names.items():
-        if NAME.fullmatch(name) is None or len(name) > LONGEST_NAME:
-            raise ProfileError(
-                f"{what}: {name!r} is not a name; use letters, digits, _ - . + : and single "
-                f"spaces, a letter, a digit or _ first, at most {LONGEST_NAME} characters"
-            )
+        if message := bad_name(name):
+            raise ProfileError(f"{what}: {message}")
 
 
 def stamp() -> dict[str, str]:

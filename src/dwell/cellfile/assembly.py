@@ -14,12 +14,12 @@ from dwell.cellfile.entries import (
     DisturbanceEntry,
     Entry,
     EpisodesEntry,
+    HostEntry,
     LinkEntry,
     LiveEntry,
     NodeEntry,
     ObjectiveEntry,
     ProcessEntry,
-    QuotaEntry,
     ServoEntry,
     TaskEntry,
 )
@@ -67,11 +67,6 @@ LINK_KEYS = ("both_ways", "add_delay_ms", "loss", "rate_mbps")
 
 # Stands for a process at fault; it passes every check of meaning.
 STAND_IN = Constant(1.0)
-
-
-def _given(**values: object) -> dict[str, Any]:
-    """Return the arguments that the file gives; the model knows the defaults of the others."""
-    return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(slots=True)
@@ -184,10 +179,28 @@ class Assembly:
             servo=servo,
             live=live,
             folder=self.home,
-            **_given(window_cycles=entry.window_cycles, warmup_windows=entry.warmup_windows),
+            **_present(window_cycles=entry.window_cycles, warmup_windows=entry.warmup_windows),
         )
 
-    # ------------------------------------------------------------------------- processes
+    # ------------------------------------------------------------- arguments and processes
+
+    def _given(self, path: str, entry: Entry | None, *but: str, **made: object) -> dict[str, Any]:
+        """Return the arguments that an entry gives, processes made of theirs, and what is `made`.
+
+        The model knows the defaults of what is absent.
+
+        Parameters
+        ----------
+        but : str
+            Fields of the entry that are no arguments.
+        """
+        values: dict[str, object] = {}
+        for name in type(entry).model_fields if entry is not None else ():
+            if name not in but and name not in made:
+                value = getattr(entry, name)
+                process = isinstance(value, ProcessEntry)
+                values[name] = self._process(value, f"{path}.{name}") if process else value
+        return _present(**values, **made)
 
     def _process(self, entry: ProcessEntry, path: str) -> Process:
         if entry.constant is not None:
@@ -200,53 +213,24 @@ class Assembly:
         for name, kind in DRAWN.items():
             values: Entry | None = getattr(entry, name)
             if values is not None:
-                arguments = values.model_dump(exclude_none=True)
-                return self.faults.attempt(path, kind, **arguments) or STAND_IN
+                return self.faults.attempt(path, kind, **self._given(path, values)) or STAND_IN
         return STAND_IN
 
-    def _maybe(self, entry: ProcessEntry | None, path: str) -> Process | None:
-        return self._process(entry, path) if entry is not None else None
+    # ---------------------------------------------------------------------------- fabric
 
-    def _bursts(self, entry: BurstsEntry | None, path: str, **more: object) -> Bursts | None:
+    def _bursts(self, path: str, entry: BurstsEntry | None) -> Bursts | None:
         if entry is None:
             return None
-        every_ms = self._process(entry.every_ms, f"{path}.every_ms")
-        for_ms = self._process(entry.for_ms, f"{path}.for_ms")
-        return self.faults.attempt(path, Bursts, every_ms, for_ms, **_given(**more))
-
-    # ---------------------------------------------------------------------------- fabric
+        return self.faults.attempt(path, Bursts, **self._given(path, entry))
 
     def _node(self, name: str, entry: NodeEntry | None) -> Node | None:
         if entry is None:
             return None
         path = f"nodes.{name}"
-        burst = entry.bursts
-        bursts = self._bursts(burst, f"{path}.bursts", threads=burst.threads) if burst else None
-        return self.faults.attempt(
-            path,
-            Node,
-            name,
-            entry.tier,
-            **_given(
-                cores=entry.cores,
-                scheduler=entry.scheduler,
-                accelerators=entry.accelerators,
-                bursts=bursts,
-                quota=self._quota(path, entry.quota),
-                background=entry.background,
-                background_beside=entry.background_beside,
-                background_hz=entry.background_hz,
-                interference=entry.interference,
-                contention=entry.contention,
-                contention_stressed=entry.contention_stressed,
-            ),
-        )
-
-    def _quota(self, path: str, entry: QuotaEntry | None) -> Quota | None:
-        if entry is None:
-            return None
-        more = _given(slack_ms=entry.slack_ms, tick_ms=entry.tick_ms)
-        return self.faults.attempt(path, Quota, entry.cpu, entry.period_ms, **more)
+        bursts = self._bursts(f"{path}.bursts", entry.bursts)
+        quota = entry.quota and self.faults.attempt(path, Quota, **self._given(path, entry.quota))
+        given = self._given(path, entry, bursts=bursts, quota=quota)
+        return self.faults.attempt(path, Node, name, **given)
 
     def _links(self) -> Iterator[tuple[str, Link]]:
         for index, entry in enumerate(self.entry.links or ()):
@@ -258,25 +242,12 @@ class Assembly:
                     yield path, replace(link, source=link.target, target=link.source)
 
     def _link(self, path: str, entry: LinkEntry) -> Link | None:
-        delay_ms = self._process(entry.delay_ms, f"{path}.delay_ms")
-        burst, bursts = entry.bursts, None
-        if burst is not None:
-            extra = self._maybe(burst.add_delay_ms, f"{path}.bursts.add_delay_ms")
-            bursts = self._bursts(burst, f"{path}.bursts", add_delay_ms=extra)
-        return self.faults.attempt(
-            path,
-            Link,
-            entry.source,
-            entry.target,
-            delay_ms,
-            **_given(
-                rate_mbps=entry.rate_mbps,
-                loss=entry.loss,
-                retransmit_ms=entry.on_loss.retransmit_ms if entry.on_loss else None,
-                in_order=entry.in_order,
-                bursts=bursts,
-            ),
+        retransmit_ms = entry.on_loss.retransmit_ms if entry.on_loss else None
+        bursts = self._bursts(f"{path}.bursts", entry.bursts)
+        given = self._given(
+            path, entry, "both_ways", "on_loss", retransmit_ms=retransmit_ms, bursts=bursts
         )
+        return self.faults.attempt(path, Link, **given)
 
     # -------------------------------------------------------------------------- pipeline
 
@@ -285,49 +256,29 @@ class Assembly:
             return None
         path = f"tasks.{name}"
         on = {node: self._execution(f"{path}.on.{node}", entry, node) for node in entry.on}
-        return self.faults.attempt(
-            path,
-            Task,
-            name,
-            on,
-            **_given(
-                depth=entry.input.depth if entry.input else None,
-                priority=entry.priority,
-                scale=entry.scale,
-                offset_ms=entry.offset_ms,
-                start_ms=entry.start_ms,
-                state_bytes=entry.state_bytes,
-                run=entry.run,
-            ),
-        )
+        depth = entry.input.depth if entry.input else None
+        given = self._given(path, entry, "input", "workers", on=on, depth=depth)
+        return self.faults.attempt(path, Task, name, **given)
 
     def _execution(self, path: str, task: TaskEntry, node: str) -> Execution:
         entry = task.on[node]
         if entry is None:  # at fault; the task may run there all the same
             return Execution(STAND_IN)
-        return Execution(
-            self._process(entry.exec_ms, f"{path}.exec_ms"),
-            **_given(
-                threads=entry.threads,
-                workers=entry.workers if entry.workers is not None else task.workers,
-                accelerator=entry.accelerator,
-                standby=entry.standby,
-                before_ms=entry.before_ms,
-                after_ms=entry.after_ms,
-            ),
-        )
+        workers = entry.workers if entry.workers is not None else task.workers
+        return Execution(**self._given(path, entry, workers=workers))
 
     def _flows(self) -> Iterator[tuple[str, Flow]]:
         for index, entry in enumerate(self.entry.flows or ()):
             if entry is not None:
-                payload = _given(payload_bytes=entry.payload_bytes)
-                yield f"flows[{index}]", Flow(entry.source, entry.target, **payload)
+                path = f"flows[{index}]"
+                yield path, Flow(**self._given(path, entry))
 
     def _timing(self) -> Pipeline | None:
         """Return the pipeline without its tasks and flows."""
         entry = self.entry
         period_ms, deadline_ms = entry.period_ms, entry.deadline_ms
-        jitter = self._maybe(entry.release_jitter_ms, "release_jitter_ms")
+        jitter = entry.release_jitter_ms
+        jitter_ms = self._process(jitter, "release_jitter_ms") if jitter is not None else None
         scales = {
             name: self._process(scale, f"scales.{name}") if scale is not None else STAND_IN
             for name, scale in (entry.scales or {}).items()
@@ -340,7 +291,7 @@ class Assembly:
             period_ms=period_ms,
             deadline_ms=period_ms if deadline_ms is None else deadline_ms,
             scales=scales,
-            **_given(release_jitter_ms=jitter),
+            **_present(release_jitter_ms=jitter_ms),
         )
 
     # --------------------------------------------------- scenarios, objective, controller
@@ -358,8 +309,7 @@ class Assembly:
                     self.faults.add(path, f"needs `node` or `link` and has {has}; give one of them")
                 continue
             self._only(path, entry, LINK_KEYS if entry.link is None else NODE_KEYS)
-            make = self._node_disturbance if entry.link is None else self._link_disturbance
-            first = self.faults.attempt(path, make, path, entry)
+            first = self.faults.attempt(path, self._disturbance, path, entry)
             if first is None:
                 continue
             yield path, first
@@ -376,51 +326,36 @@ class Assembly:
         # What is at fault must not be said to differ from what shares its name, too.
         if entry is None or self.faults.touches(path):
             return None
-        every_s = self._process(entry.every_s, f"{path}.every_s")
-        for_s = self._process(entry.for_s, f"{path}.for_s")
-        return Episodes(entry.name, every_s, for_s)
+        return Episodes(**self._given(path, entry))
 
-    def _node_disturbance(self, path: str, entry: DisturbanceEntry) -> Disturbance:
-        return NodeDisturbance(
-            entry.node or "",
-            **_given(
-                at_s=entry.at_s,
-                for_s=entry.for_s,
-                stress_threads=entry.stress_threads,
-                down=entry.down,
-                episodes=self._episodes(entry.episodes, f"{path}.episodes"),
-                ramp_s=entry.ramp_s,
-            ),
-        )
-
-    def _link_disturbance(self, path: str, entry: DisturbanceEntry) -> Disturbance:
-        source, arrow, target = (entry.link or "").partition("->")
+    def _disturbance(self, path: str, entry: DisturbanceEntry) -> Disturbance:
+        if entry.link is None:
+            episodes = self._episodes(entry.episodes, f"{path}.episodes")
+            return NodeDisturbance(**self._given(path, entry, *LINK_KEYS, episodes=episodes))
+        source, arrow, target = entry.link.partition("->")
         good = bool(arrow and source.strip() and target.strip())
         require(good, "link", entry.link, "two node names and an arrow, as `R1->E`")
-        return LinkDisturbance(
-            source.strip(),
-            target.strip(),
-            **_given(
-                at_s=entry.at_s,
-                for_s=entry.for_s,
-                add_delay_ms=self._maybe(entry.add_delay_ms, f"{path}.add_delay_ms"),
-                loss=entry.loss,
-                rate_mbps=entry.rate_mbps,
-                down=entry.down,
-                episodes=self._episodes(entry.episodes, f"{path}.episodes"),
-                ramp_s=entry.ramp_s,
-            ),
+        given = self._given(
+            path,
+            entry,
+            *("link", "both_ways", *NODE_KEYS),
+            source=source.strip(),
+            target=target.strip(),
+            episodes=self._episodes(entry.episodes, f"{path}.episodes"),
         )
+        return LinkDisturbance(**given)
 
     def _objective(
         self, entry: ObjectiveEntry, nodes: Mapping[str, Node | None]
     ) -> Objective | None:
         deadline_ms = self.entry.deadline_ms or self.entry.period_ms
-        values = {"latency_ms": deadline_ms, **_values(entry.targets)}
         tiers = {name: node.tier for name, node in nodes.items() if node is not None}
-        weights = self.faults.attempt("objective", Weights, **_values(entry.weights))
+        values = {"latency_ms": deadline_ms, **self._given("objective", entry.targets)}
+        weights = self.faults.attempt(
+            "objective", Weights, **self._given("objective", entry.weights)
+        )
         targets = self.faults.attempt("objective", Targets, **values)
-        caps = self.faults.attempt("objective", Caps, **_values(entry.caps))
+        caps = self.faults.attempt("objective", Caps, **self._given("objective", entry.caps))
         if targets is None:
             return None
         return self.faults.attempt(
@@ -433,36 +368,29 @@ class Assembly:
         )
 
     def _controller(self, entry: ControllerEntry) -> ControllerSettings | None:
-        values = _values(entry)
-        if entry.fallbacks is not None:
-            values["fallbacks"] = tuple(entry.fallbacks)
-        return self.faults.attempt("controller", ControllerSettings, **values)
+        given = self._given("controller", entry)
+        return self.faults.attempt("controller", ControllerSettings, **given)
 
     def _servo(self, entry: ServoEntry | None) -> Servo | None:
         if entry is None:
             return None
-        target = MovingTarget(entry.target.amplitude_mm, entry.target.period_s)
-        values = {**_values(entry), "target": target}
-        servo = self.faults.attempt("servo", Servo, **values)
+        target = MovingTarget(**self._given("servo.target", entry.target))
+        given = self._given("servo", entry, target=target)
+        servo = self.faults.attempt("servo", Servo, **given)
         if servo is not None and not self.faults.at("period_ms"):
             self.faults.attempt("", servo.require_seen, self.entry.period_ms)
         return servo
 
     def _live(self, entry: LiveEntry) -> LiveSettings | None:
-        values = _values(entry)
-        values["hosts"] = {
-            name: Host(
-                **{
-                    **_values(host),
-                    "seen_from": {
-                        node: Endpoint(seen.address, seen.port)
-                        for node, seen in (host.seen_from or {}).items()
-                    },
-                }
-            )
-            for name, host in (entry.hosts or {}).items()
+        hosts = {name: self._host(host) for name, host in (entry.hosts or {}).items()}
+        return self.faults.attempt("", LiveSettings, **self._given("live", entry, hosts=hosts))
+
+    def _host(self, entry: HostEntry) -> Host:
+        seen_from = {
+            node: Endpoint(**self._given("", seen))
+            for node, seen in (entry.seen_from or {}).items()
         }
-        return self.faults.attempt("", LiveSettings, **values)
+        return Host(**self._given("", entry, seen_from=seen_from))
 
     # --------------------------------------------------------------------------- meaning
 
@@ -537,5 +465,6 @@ def _complete(moves: Mapping[str, str], tasks: Mapping[str, Task]) -> Placement:
     return Placement((name, moves.get(name) or next(iter(task.on))) for name, task in tasks.items())
 
 
-def _values(entry: Entry | None) -> dict[str, Any]:
-    return entry.model_dump(exclude_none=True) if entry is not None else {}
+def _present(**values: object) -> dict[str, Any]:
+    """Leave out what is absent."""
+    return {name: value for name, value in values.items() if value is not None}

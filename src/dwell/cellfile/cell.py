@@ -41,18 +41,11 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
         TraceError where the traces alone are at fault.
     """
     source = fspath(path)
-    faults = Faults(source)
-    text = _read_text(source, faults)
-    folder = Path(source).parent if traces is None else Path(traces)
-    return read_problem(text, faults, folder, Path(source).stem or "cell", home=_home(source))
+    return _load(source, Path(source).parent if traces is None else Path(traces))
 
 
 def load_without_traces(path: str | PathLike[str]) -> Problem:
     """Read a cell file and none of the traces that it names: a live cell draws nothing from them.
-
-    Parameters
-    ----------
-    path : str or path
 
     Returns
     -------
@@ -64,34 +57,21 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
     ProblemError
         With every fault found in the file, each with its line and field path.
     """
-    source = fspath(path)
-    faults = Faults(source)
-    text = _read_text(source, faults)
-    return _without_traces(text, faults, Path(source).stem or "cell", home=_home(source))
+    return _load(fspath(path), None)
 
 
-def _home(source: str) -> str:
-    """Return the folder in which a cell file's own modules lie."""
-    return str(Path(source).resolve().parent)
-
-
-def _read_text(source: str, faults: Faults) -> object:
-    """Return what a cell file says.
-
-    Raises
-    ------
-    ProblemError
-        If it is no YAML, or no cell.
-    """
+def _load(source: str, folder: Path | None) -> Problem:
     from dwell.cellfile.yaml_text import read_yaml
 
+    faults = Faults(source)
     text = read_yaml(source, faults)
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
     if isinstance(text, dict) and "dwell-study" in text and "dwell" not in text:
         faults.add("dwell-study", "this is a study, not a cell; run it by `dwell study FILE`")
         raise faults.error()
-    return text
+    home = str(Path(source).resolve().parent)
+    return read_problem(text, faults, folder, Path(source).stem or "cell", home=home)
 
 
 def from_document(
@@ -135,7 +115,7 @@ def from_record(document: Mapping[str, object]) -> Problem:
     Parameters
     ----------
     document : mapping
-        Of this version of Dwell, or of an older one, whose candidates name anchored tasks, too.
+        Written by this version of Dwell, or by an older one, whose candidates name anchored tasks.
 
     Returns
     -------
@@ -147,34 +127,18 @@ def from_record(document: Mapping[str, object]) -> Problem:
     ProblemError
         With every fault found.
     """
-    return _without_traces(document, Faults(), "cell", anchored=True, judged=False)
-
-
-def _without_traces(
-    document: object,
-    faults: Faults,
-    name: str,
-    *,
-    anchored: bool = False,
-    judged: bool = True,
-    home: str | None = None,
-) -> Problem:
-    """Read a document into a Problem whose traces are named only; see `Assembly`."""
-    from dwell.cellfile.assembly import Assembly
-    from dwell.cellfile.structure import CELL, read_structure
-
-    entry = read_structure(document, faults, CELL)
-    return Assembly(entry, None, faults, anchored, judged, home).problem(name)
+    return read_problem(document, Faults(), None, "cell", anchored=True, judged=False)
 
 
 def read_problem(
     document: object,
     faults: Faults,
-    folder: Path,
+    folder: Path | None,
     name: str,
     known: dict[object, Tables] | None = None,
     *,
     anchored: bool = False,
+    judged: bool = True,
     home: str | None = None,
 ) -> Problem:
     """Read a document into a Problem.
@@ -185,14 +149,16 @@ def read_problem(
         Plain values.
     faults : Faults
         Those of the document so far, and the lines of its values.
-    folder : Path
-        Where the traces that it names are.
+    folder : Path, optional
+        Where the traces that it names are; where None, they are named and not read.
     name : str
         For a cell that does not name itself.
     known : dict, optional
         Traces that were read for documents like this one; takes those that are read now.
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
+    judged : bool
+        Whether policies and estimators must be known here; a record names what its machine had.
     home : str, optional
         Folder of the modules that it names, for `Problem.folder`.
 
@@ -206,9 +172,12 @@ def read_problem(
     from dwell.cellfile.structure import CELL, read_structure
     from dwell.cellfile.traces import declared_traces, read_traces
 
-    known = {} if known is None else known
     entry = read_structure(document, faults, CELL)
-    declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
-    if declared not in known:
-        known[declared] = read_traces(entry, folder, faults)
-    return Assembly(entry, known[declared], faults, anchored=anchored, home=home).problem(name)
+    tables: Tables | None = None
+    if folder is not None:
+        known = {} if known is None else known
+        declared = tuple((dotted(steps), trace) for steps, trace in declared_traces(entry, ()))
+        if declared not in known:
+            known[declared] = read_traces(entry, folder, faults)
+        tables = known[declared]
+    return Assembly(entry, tables, faults, anchored, judged, home).problem(name)

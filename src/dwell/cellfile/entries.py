@@ -117,6 +117,11 @@ class Entry(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, defer_build=True)
 
 
+def optional(description: str, **more: Any) -> Any:
+    """Declare a key that may be left out: it is None then, and the model knows its default."""
+    return Field(None, description=description, **more)
+
+
 Value = Annotated[float, Number(bounds.VALUE)]
 Mean = Annotated[float, Number(bounds.MEAN)]
 Real = Annotated[float, Number(bounds.REAL)]
@@ -145,7 +150,7 @@ class NormalEntry(Entry):
 
     mean: Real = Field(description="Mean before clipping.")
     std: Value = Field(description="Standard deviation before clipping.")
-    min: Value | None = Field(None, description="What smaller values are raised to; default 0.")
+    min: Value | None = optional("What smaller values are raised to; default 0.")
 
 
 class LogNormalEntry(Entry):
@@ -187,32 +192,26 @@ class TraceEntry(Entry):
         description="A .parquet or .csv file, relative to the cell file's folder.", min_length=1
     )
     column: str = Field(description="Column with the values: milliseconds, or bare factors.")
-    by: Literal["row", "time"] | None = Field(
-        None,
-        description="`row` (default): each cycle takes the next row. `time`: each cycle takes the "
-        "latest row sent at or before its release.",
+    by: Literal["row", "time"] | None = optional(
+        "`row` (default): each cycle takes the next row. `time`: each cycle takes the latest row "
+        "sent at or before its release."
     )
-    time: str | None = Field(
-        None,
-        description="Column with the instant of each row, ms; only with `by: time`; default "
-        "`sent_ms`.",
+    time: str | None = optional(
+        "Column with the instant of each row, ms; only with `by: time`; default `sent_ms`."
     )
-    group: Annotated[str | tuple[str, ...], Columns()] | None = Field(
-        None,
-        description="Column, or columns, whose values tell recordings apart; a run without `wrap` "
-        "stays within one.",
+    group: Annotated[str | tuple[str, ...], Columns()] | None = optional(
+        "Column, or columns, whose values tell recordings apart; a run without `wrap` stays "
+        "within one."
     )
-    on_negative: Literal["error", "drop", "clip"] | None = Field(
-        None,
-        description="What to do with rows whose value is negative, missing or not finite: `error` "
-        "(default), `drop` the row for all columns, or `clip` negative values to 0.",
+    on_negative: Literal["error", "drop", "clip"] | None = optional(
+        "What to do with rows whose value is negative, missing or not finite: `error` (default), "
+        "`drop` the row for all columns, or `clip` negative values to 0."
     )
-    wrap: bool | None = Field(
-        None, description="Whether to go on at the beginning when the rows end; default false."
+    wrap: bool | None = optional(
+        "Whether to go on at the beginning when the rows end; default false."
     )
-    sha256: str | None = Field(
-        None,
-        description="Digest of the data that a recorded problem used; other data are refused.",
+    sha256: str | None = optional(
+        "Digest of the data that a recorded problem used; other data are refused.",
         pattern=r"^[0-9a-f]{64}$",
     )
 
@@ -220,7 +219,7 @@ class TraceEntry(Entry):
 class ProcessEntry(Entry):
     """A number, or one named random process."""
 
-    constant: Value | None = Field(None, description="Always this value.")
+    constant: Value | None = optional("Always this value.")
     uniform: UniformEntry | None = None
     normal: NormalEntry | None = None
     lognormal: LogNormalEntry | None = None
@@ -278,15 +277,12 @@ class QuotaEntry(Entry):
     period_ms: Annotated[float, Number(bounds.QUOTA_PERIOD_MS)] = Field(
         description="Period after which the budget is filled again, ms."
     )
-    slack_ms: Annotated[float, Number(bounds.QUOTA_SLACK_MS)] | None = Field(
-        None,
-        description="Run time that is kept beyond the period when nothing runs, ms; default 0. "
-        "Linux keeps 1.",
+    slack_ms: Annotated[float, Number(bounds.QUOTA_SLACK_MS)] | None = optional(
+        "Run time that is kept beyond the period when nothing runs, ms; default 0. Linux keeps 1."
     )
-    tick_ms: Annotated[float, Number(bounds.QUOTA_TICK_MS)] | None = Field(
-        None,
-        description="Time between the ticks at which a used-up budget is noticed and threads take "
-        "turns, ms; default 0, at once. Linux: 1000 / HZ. One core, `fair`.",
+    tick_ms: Annotated[float, Number(bounds.QUOTA_TICK_MS)] | None = optional(
+        "Time between the ticks at which a used-up budget is noticed and threads take turns, ms; "
+        "default 0, at once. Linux: 1000 / HZ. One core, `fair`."
     )
 
 
@@ -300,16 +296,14 @@ class BurstsEntry(Entry):
 class NodeBurstsEntry(BurstsEntry):
     """Foreign work on a node, of other tenants."""
 
-    threads: ForeignThreads | None = Field(
-        None, description="Threads of foreign work during a burst; default 0."
-    )
+    threads: ForeignThreads | None = optional("Threads of foreign work during a burst; default 0.")
 
 
 class LinkBurstsEntry(BurstsEntry):
     """Episodes of extra delay on a link."""
 
-    add_delay_ms: ProcessEntry | None = Field(
-        None, description="Added to the delay of every message during a burst, ms; default 0."
+    add_delay_ms: ProcessEntry | None = optional(
+        "Added to the delay of every message during a burst, ms; default 0."
     )
 
 
@@ -319,48 +313,38 @@ class NodeEntry(Entry):
     tier: Literal["robot", "edge", "cloud"] = Field(
         description="Kind of computer: robot, edge or cloud."
     )
-    cores: Annotated[int, Number(bounds.CORES)] | None = Field(
-        None, description="Cores of its CPU; default 1."
+    cores: Annotated[int, Number(bounds.CORES)] | None = optional("Cores of its CPU; default 1.")
+    scheduler: Literal["fair", "fifo", "priority"] | None = optional(
+        "How jobs share the cores: `fair` (default, processor sharing), `fifo` (one after "
+        "another) or `priority` (preemptive, by the tasks' `priority`)."
     )
-    scheduler: Literal["fair", "fifo", "priority"] | None = Field(
-        None,
-        description="How jobs share the cores: `fair` (default, processor sharing), `fifo` (one "
-        "after another) or `priority` (preemptive, by the tasks' `priority`).",
+    accelerators: dict[str, Annotated[int, Number(bounds.ACCELERATORS)]] | None = optional(
+        "How many accelerators of each kind it has, as `{gpu: 1}`."
     )
-    accelerators: dict[str, Annotated[int, Number(bounds.ACCELERATORS)]] | None = Field(
-        None, description="How many accelerators of each kind it has, as `{gpu: 1}`."
+    quota: QuotaEntry | None = optional("CPU bandwidth limit; none by default.")
+    background: Annotated[float, Number(bounds.BACKGROUND)] | None = optional(
+        "Cores that others than the jobs always take, in small pieces; default 0."
     )
-    quota: QuotaEntry | None = Field(None, description="CPU bandwidth limit; none by default.")
-    background: Annotated[float, Number(bounds.BACKGROUND)] | None = Field(
-        None,
-        description="Cores that others than the jobs always take, in small pieces; default 0.",
+    background_beside: Annotated[float, Number(bounds.BACKGROUND)] | None = optional(
+        "What of `background` is taken while jobs run and no foreign thread does, on a node with "
+        "a quota; all of it by default."
     )
-    background_beside: Annotated[float, Number(bounds.BACKGROUND)] | None = Field(
-        None,
-        description="What of `background` is taken while jobs run and no foreign thread does, on a "
-        "node with a quota; all of it by default.",
+    background_hz: Annotated[float, Number(bounds.BACKGROUND_HZ)] | None = optional(
+        "How often in a second something of `background` wakes, in the mean, on a node whose "
+        "quota has `tick_ms`: the kernel looks at the quota then, too; default 0."
     )
-    background_hz: Annotated[float, Number(bounds.BACKGROUND_HZ)] | None = Field(
-        None,
-        description="How often in a second something of `background` wakes, in the mean, on a node "
-        "whose quota has `tick_ms`: the kernel looks at the quota then, too; default 0.",
+    interference: Annotated[float, Number(bounds.INTERFERENCE)] | None = optional(
+        "How many times as much core time jobs take while foreign threads run; default 1."
     )
-    interference: Annotated[float, Number(bounds.INTERFERENCE)] | None = Field(
-        None,
-        description="How many times as much core time jobs take while foreign threads run; "
-        "default 1.",
+    contention: Annotated[float, Number(bounds.CONTENTION)] | None = optional(
+        "Share of a CPU's time that others take from what runs there, and that the node's quota "
+        "does not count; default 0."
     )
-    contention: Annotated[float, Number(bounds.CONTENTION)] | None = Field(
-        None,
-        description="Share of a CPU's time that others take from what runs there, and that the "
-        "node's quota does not count; default 0.",
+    contention_stressed: dict[str, Annotated[float, Number(bounds.CONTENTION)]] | None = optional(
+        "What `contention` is while another node, on the same CPUs, has foreign threads, as `{R1: "
+        "0.4}`; of several the largest counts."
     )
-    contention_stressed: dict[str, Annotated[float, Number(bounds.CONTENTION)]] | None = Field(
-        None,
-        description="What `contention` is while another node, on the same CPUs, has foreign "
-        "threads, as `{R1: 0.4}`; of several the largest counts.",
-    )
-    bursts: NodeBurstsEntry | None = Field(None, description="Foreign work, in every scenario.")
+    bursts: NodeBurstsEntry | None = optional("Foreign work, in every scenario.")
 
 
 class RetransmitEntry(Entry):
@@ -394,26 +378,21 @@ class LinkEntry(Entry):
 
     source: str = Field(alias="from", description="Node that sends.")
     target: str = Field(alias="to", description="Node that receives.")
-    both_ways: bool | None = Field(
-        None,
-        description="Whether there is the same link back too, drawn independently; default false.",
+    both_ways: bool | None = optional(
+        "Whether there is the same link back too, drawn independently; default false."
     )
     delay_ms: ProcessEntry = Field(description="Propagation delay of a message, ms.")
-    rate_mbps: RateMbps | None = Field(
-        None, description="Serialisation rate, megabits a second; unlimited by default."
+    rate_mbps: RateMbps | None = optional(
+        "Serialisation rate, megabits a second; unlimited by default."
     )
-    loss: Annotated[float, Number(bounds.LOSS)] | None = Field(
-        None, description="Probability that an attempt to send a message is lost; default 0."
+    loss: Annotated[float, Number(bounds.LOSS)] | None = optional(
+        "Probability that an attempt to send a message is lost; default 0."
     )
-    on_loss: RetransmitEntry | None = Field(
-        None, description="What happens to a lost message: `drop` (default) or retransmission."
+    on_loss: RetransmitEntry | None = optional(
+        "What happens to a lost message: `drop` (default) or retransmission."
     )
-    in_order: bool | None = Field(
-        None, description="Whether no message overtakes another; default false."
-    )
-    bursts: LinkBurstsEntry | None = Field(
-        None, description="Episodes of extra delay, in every scenario."
-    )
+    in_order: bool | None = optional("Whether no message overtakes another; default false.")
+    bursts: LinkBurstsEntry | None = optional("Episodes of extra delay, in every scenario.")
 
 
 # -------------------------------------------------------------------------------- pipeline
@@ -425,27 +404,21 @@ class ExecutionEntry(Entry):
     exec_ms: ProcessEntry = Field(
         description="Time that one job needs when nothing disturbs it, with all its threads, ms."
     )
-    threads: Annotated[int, Number(bounds.THREADS)] | None = Field(
-        None, description="Cores that one job can use at once; default 1."
+    threads: Annotated[int, Number(bounds.THREADS)] | None = optional(
+        "Cores that one job can use at once; default 1."
     )
-    workers: Workers | None = Field(
-        None, description="Jobs of this task that may run there at a time; default: the task's."
+    workers: Workers | None = optional(
+        "Jobs of this task that may run there at a time; default: the task's."
     )
-    accelerator: str | None = Field(
-        None, description="Kind of accelerator that it runs on instead of the CPU."
+    accelerator: str | None = optional("Kind of accelerator that it runs on instead of the CPU.")
+    standby: Annotated[int, Number(bounds.STANDBY)] | None = optional(
+        "Further workers that a live node keeps, to take over when the first is silent; default 0."
     )
-    standby: Annotated[int, Number(bounds.STANDBY)] | None = Field(
-        None,
-        description="Further workers that a live node keeps, to take over when the first is "
-        "silent; default 0.",
+    before_ms: Annotated[float, Number(bounds.HANDED_MS)] | None = optional(
+        "What of `exec_ms` another thread of its worker does before it; default 0."
     )
-    before_ms: Annotated[float, Number(bounds.HANDED_MS)] | None = Field(
-        None,
-        description="What of `exec_ms` another thread of its worker does before it; default 0.",
-    )
-    after_ms: Annotated[float, Number(bounds.HANDED_MS)] | None = Field(
-        None,
-        description="What of `exec_ms` another thread of its worker does after it; default 0.",
+    after_ms: Annotated[float, Number(bounds.HANDED_MS)] | None = optional(
+        "What of `exec_ms` another thread of its worker does after it; default 0."
     )
 
 
@@ -482,32 +455,27 @@ class TaskEntry(Entry):
         description="Nodes it can run on, and how; one anchors it, more make it relocatable.",
         json_schema_extra={"minProperties": 1},
     )
-    input: InputEntry | None = Field(
-        None,
-        description="What waits for a worker: `queue` (default) without a bound, `latest` only, or "
-        "a bounded queue.",
+    input: InputEntry | None = optional(
+        "What waits for a worker: `queue` (default) without a bound, `latest` only, or a bounded "
+        "queue."
     )
-    workers: Workers | None = Field(
-        None, description="Jobs that may run at a time on each node that does not say; default 1."
+    workers: Workers | None = optional(
+        "Jobs that may run at a time on each node that does not say; default 1."
     )
-    priority: Annotated[int, Number(bounds.PRIORITY)] | None = Field(
-        None, description="Larger runs first on a node with the priority scheduler; default 0."
+    priority: Annotated[int, Number(bounds.PRIORITY)] | None = optional(
+        "Larger runs first on a node with the priority scheduler; default 0."
     )
-    scale: str | None = Field(
-        None, description="Name under `scales` of what multiplies its execution times."
+    scale: str | None = optional("Name under `scales` of what multiplies its execution times.")
+    offset_ms: TimeMs | None = optional(
+        "Start of a source after the cycle's release, ms; default 0."
     )
-    offset_ms: TimeMs | None = Field(
-        None, description="Start of a source after the cycle's release, ms; default 0."
+    start_ms: TimeMs | None = optional(
+        "Time that a new worker needs before its first job, ms; default 0."
     )
-    start_ms: TimeMs | None = Field(
-        None, description="Time that a new worker needs before its first job, ms; default 0."
+    state_bytes: Annotated[int, Number(bounds.STATE_BYTES)] | None = optional(
+        "State that a cold migration carries, bytes; default 0."
     )
-    state_bytes: Annotated[int, Number(bounds.STATE_BYTES)] | None = Field(
-        None, description="State that a cold migration carries, bytes; default 0."
-    )
-    run: str | None = Field(
-        None, description="Class or function of a live worker, as `package.module:Name`."
-    )
+    run: str | None = optional("Class or function of a live worker, as `package.module:Name`.")
 
 
 class FlowEntry(Entry):
@@ -515,8 +483,8 @@ class FlowEntry(Entry):
 
     source: str = Field(alias="from", description="Task that sends.")
     target: str = Field(alias="to", description="Task that receives.")
-    payload_bytes: Annotated[int, Number(bounds.BYTES)] | None = Field(
-        None, alias="bytes", description="Payload of a message, bytes; default 0."
+    payload_bytes: Annotated[int, Number(bounds.BYTES)] | None = optional(
+        "Payload of a message, bytes; default 0.", alias="bytes"
     )
 
 
@@ -538,153 +506,128 @@ class DisturbanceEntry(Entry):
         json_schema_extra={"oneOf": [{"required": ["node"]}, {"required": ["link"]}]}
     )
 
-    at_s: Annotated[float, Number(bounds.AT_S)] | None = Field(
-        None, description="Begin, seconds from the start of the run; default 0."
+    at_s: Annotated[float, Number(bounds.AT_S)] | None = optional(
+        "Begin, seconds from the start of the run; default 0."
     )
-    for_s: Annotated[float, Number(bounds.FOR_S)] | None = Field(
-        None, description="Duration, seconds; default: to the end."
+    for_s: Annotated[float, Number(bounds.FOR_S)] | None = optional(
+        "Duration, seconds; default: to the end."
     )
-    episodes: EpisodesEntry | None = Field(
-        None, description="When it is on within that time; default: all the time."
+    episodes: EpisodesEntry | None = optional(
+        "When it is on within that time; default: all the time."
     )
-    ramp_s: Annotated[float, Number(bounds.RAMP_S)] | None = Field(
-        None,
-        description="Time in which it grows from nothing, and in which it falls again at its end, "
-        "in 31 equal steps each, seconds; default 0.",
+    ramp_s: Annotated[float, Number(bounds.RAMP_S)] | None = optional(
+        "Time in which it grows from nothing, and in which it falls again at its end, in 31 equal "
+        "steps each, seconds; default 0."
     )
-    node: str | None = Field(None, description="Node that it happens to.")
-    link: str | None = Field(None, description="Link that it happens to, as `R1->E`.")
-    down: bool | None = Field(
-        None, description="Whether the node or the link is down meanwhile; default false."
+    node: str | None = optional("Node that it happens to.")
+    link: str | None = optional("Link that it happens to, as `R1->E`.")
+    down: bool | None = optional("Whether the node or the link is down meanwhile; default false.")
+    stress_threads: ForeignThreads | None = optional("Foreign threads on the node; default 0.")
+    both_ways: bool | None = optional("Whether it happens to the link back as well; default false.")
+    add_delay_ms: ProcessEntry | None = optional(
+        "Added to the delay of every message on the link, ms."
     )
-    stress_threads: ForeignThreads | None = Field(
-        None, description="Foreign threads on the node; default 0."
+    loss: Annotated[float, Number(bounds.ADDED_LOSS)] | None = optional(
+        "Probability of loss on the link, besides its own; default 0."
     )
-    both_ways: bool | None = Field(
-        None, description="Whether it happens to the link back as well; default false."
-    )
-    add_delay_ms: ProcessEntry | None = Field(
-        None, description="Added to the delay of every message on the link, ms."
-    )
-    loss: Annotated[float, Number(bounds.ADDED_LOSS)] | None = Field(
-        None, description="Probability of loss on the link, besides its own; default 0."
-    )
-    rate_mbps: RateMbps | None = Field(
-        None, description="Rate of the link meanwhile, where its own is not lower, Mbit/s."
+    rate_mbps: RateMbps | None = optional(
+        "Rate of the link meanwhile, where its own is not lower, Mbit/s."
     )
 
 
 class WeightsEntry(Entry):
     """Weights of the terms of the cost J; at least one above 0."""
 
-    latency: Weight | None = Field(None, description="Of L95 / target; default 1.")
-    violations: Weight | None = Field(None, description="Of the violation rate; default 3.")
-    robot: Weight | None = Field(None, description="Of robot utilisation / target; default 0.5.")
-    edge: Weight | None = Field(None, description="Of edge utilisation / target; default 0.3.")
-    switching: Weight | None = Field(None, description="Of the share of moved tasks; default 0.5.")
-    cloud: Weight | None = Field(
-        None,
-        description="Of cloud utilisation / target; by default, cloud nodes count as edge nodes.",
+    latency: Weight | None = optional("Of L95 / target; default 1.")
+    violations: Weight | None = optional("Of the violation rate; default 3.")
+    robot: Weight | None = optional("Of robot utilisation / target; default 0.5.")
+    edge: Weight | None = optional("Of edge utilisation / target; default 0.3.")
+    switching: Weight | None = optional("Of the share of moved tasks; default 0.5.")
+    cloud: Weight | None = optional(
+        "Of cloud utilisation / target; by default, cloud nodes count as edge nodes."
     )
 
 
 class TargetsEntry(Entry):
     """Design targets that normalise latency and utilisation."""
 
-    latency_ms: Target | None = Field(None, description="Of L95, ms; default: the deadline.")
-    robot: Target | None = Field(None, description="Of robot utilisation; default 0.7.")
-    edge: Target | None = Field(None, description="Of edge utilisation; default 0.7.")
-    cloud: Target | None = Field(
-        None, description="Of cloud utilisation; needed where `weights` has `cloud`."
-    )
+    latency_ms: Target | None = optional("Of L95, ms; default: the deadline.")
+    robot: Target | None = optional("Of robot utilisation; default 0.7.")
+    edge: Target | None = optional("Of edge utilisation; default 0.7.")
+    cloud: Target | None = optional("Of cloud utilisation; needed where `weights` has `cloud`.")
 
 
 class CapsEntry(Entry):
     """Hard caps; a candidate above one is not eligible."""
 
-    latency_ms: Cap | None = Field(None, description="On L95, ms; none by default.")
-    utilisation: Cap | None = Field(
-        None, description="On the utilisation of every node, as 0.98; none by default."
+    latency_ms: Cap | None = optional("On L95, ms; none by default.")
+    utilisation: Cap | None = optional(
+        "On the utilisation of every node, as 0.98; none by default."
     )
 
 
 class ObjectiveEntry(Entry):
     """What makes one placement better than another."""
 
-    weights: WeightsEntry | None = Field(None, description="Weights of the terms of J.")
-    targets: TargetsEntry | None = Field(None, description="Design targets.")
-    caps: CapsEntry | None = Field(None, description="Hard caps.")
-    tiers: dict[str, Literal["robot", "edge", "cloud"]] | None = Field(
-        None,
-        description="Nodes whose utilisation counts, and as which tier; default: all, as their own "
-        "tier.",
+    weights: WeightsEntry | None = optional("Weights of the terms of J.")
+    targets: TargetsEntry | None = optional("Design targets.")
+    caps: CapsEntry | None = optional("Hard caps.")
+    tiers: dict[str, Literal["robot", "edge", "cloud"]] | None = optional(
+        "Nodes whose utilisation counts, and as which tier; default: all, as their own tier."
     )
 
 
 class ControllerEntry(Entry):
     """The controller: where it sits, what it runs, and how its orders travel."""
 
-    on: str | None = Field(
-        None, description="Node it sits on; default: the first edge node, else the first node."
-    )
-    policy: str | None = Field(
-        None,
-        description="A policy (`dtp`, default), `package.module:Class` of your own, or a "
-        "candidate: the placement that never moves.",
+    on: str | None = optional("Node it sits on; default: the first edge node, else the first node.")
+    policy: str | None = optional(
+        "A policy (`dtp`, default), `package.module:Class` of your own, or a candidate: the "
+        "placement that never moves.",
         examples=list(POLICIES),
     )
-    initial: str | None = Field(None, description="Candidate to start with; default: the first.")
-    min_dwell: Annotated[int, Number(bounds.MIN_DWELL)] | None = Field(
-        None, description="Windows that a placement stays at least (N_min); default 3."
+    initial: str | None = optional("Candidate to start with; default: the first.")
+    min_dwell: Annotated[int, Number(bounds.MIN_DWELL)] | None = optional(
+        "Windows that a placement stays at least (N_min); default 3."
     )
-    min_improvement: Annotated[float, Number(bounds.MIN_IMPROVEMENT)] | None = Field(
-        None, description="Improvement of J that a migration must promise; default 0.05."
+    min_improvement: Annotated[float, Number(bounds.MIN_IMPROVEMENT)] | None = optional(
+        "Improvement of J that a migration must promise; default 0.05."
     )
-    escape: bool | None = Field(
-        None,
-        description="Whether an incumbent over a cap may leave before the hysteresis is met; "
-        "default false.",
+    escape: bool | None = optional(
+        "Whether an incumbent over a cap may leave before the hysteresis is met; default false."
     )
-    estimator: str | None = Field(
-        None,
-        description="How the QoS of candidates is estimated; default `profile`; also "
-        "`package.module:Class` of your own.",
+    estimator: str | None = optional(
+        "How the QoS of candidates is estimated; default `profile`; also `package.module:Class` "
+        "of your own.",
         examples=list(ESTIMATORS),
     )
-    shadow_fraction: Annotated[float, Number(bounds.SHADOW_FRACTION)] | None = Field(
-        None,
-        description="Share of cycles that are also sent through each alternative, where the "
-        "estimator uses shadow jobs; default 0.05.",
+    shadow_fraction: Annotated[float, Number(bounds.SHADOW_FRACTION)] | None = optional(
+        "Share of cycles that are also sent through each alternative, where the estimator uses "
+        "shadow jobs; default 0.05."
     )
-    half_life_windows: Annotated[float, Number(bounds.HALF_LIFE_WINDOWS)] | None = Field(
-        None, description="Windows after which a measurement counts half; default 2."
+    half_life_windows: Annotated[float, Number(bounds.HALF_LIFE_WINDOWS)] | None = optional(
+        "Windows after which a measurement counts half; default 2."
     )
-    migration: str | None = Field(
-        None,
-        description="`warm` (default): a moved task is ready at once; `cold`: after its "
-        "`start_ms` and the transfer of its `state_bytes`.",
+    migration: str | None = optional(
+        "`warm` (default): a moved task is ready at once; `cold`: after its `start_ms` and the "
+        "transfer of its `state_bytes`."
     )
-    guard_cycles: Annotated[int, Number(bounds.GUARD_CYCLES)] | None = Field(
-        None,
-        description="Periods without a completion after which the guard moves to a fallback; "
-        "default 3.",
+    guard_cycles: Annotated[int, Number(bounds.GUARD_CYCLES)] | None = optional(
+        "Periods without a completion after which the guard moves to a fallback; default 3."
     )
-    probe_cycles: Annotated[int, Number(bounds.PROBE_CYCLES)] | None = Field(
-        None,
-        description="Cycles that must complete through another placement, too, before the guard's "
-        "is left for it, and that the guard rests for after its own move; default 30.",
+    probe_cycles: Annotated[int, Number(bounds.PROBE_CYCLES)] | None = optional(
+        "Cycles that must complete through another placement, too, before the guard's is left for "
+        "it, and that the guard rests for after its own move; default 30."
     )
-    fallbacks: list[str] | None = Field(
-        None, description="Candidates that the guard may move to, best first; none: no guard."
+    fallbacks: list[str] | None = optional(
+        "Candidates that the guard may move to, best first; none: no guard."
     )
-    order_delay_ms: TimeMs | None = Field(
-        None, description="Time that an order travels, ms; default 0."
+    order_delay_ms: TimeMs | None = optional("Time that an order travels, ms; default 0.")
+    order_lead_cycles: Annotated[int, Number(bounds.LEAD_CYCLES)] | None = optional(
+        "Cycles between a window's close and its order's first; default 0."
     )
-    order_lead_cycles: Annotated[int, Number(bounds.LEAD_CYCLES)] | None = Field(
-        None, description="Cycles between a window's close and its order's first; default 0."
-    )
-    close_grace_ms: TimeMs | None = Field(
-        None, description="Time that a window stays open for stragglers, ms; default 0."
+    close_grace_ms: TimeMs | None = optional(
+        "Time that a window stays open for stragglers, ms; default 0."
     )
 
 
@@ -708,10 +651,9 @@ class ServoEntry(Entry):
     gain: Annotated[float, Number(bounds.SERVO_GAIN)] = Field(
         description="Command for an error of 1: 1/s, for a `double-integrator` 1/s²."
     )
-    damping: Annotated[float, Number(bounds.DAMPING)] | None = Field(
-        None,
-        description="Command for an error that grows by 1 a second, 1/s; for a "
-        "`double-integrator`, which needs it.",
+    damping: Annotated[float, Number(bounds.DAMPING)] | None = optional(
+        "Command for an error that grows by 1 a second, 1/s; for a `double-integrator`, which "
+        "needs it."
     )
     target: MovingTargetEntry = Field(description="What the robot follows.")
 
@@ -726,56 +668,49 @@ class EndpointEntry(Entry):
 class HostEntry(Entry):
     """Where a node's processes listen."""
 
-    address: str | None = Field(
-        None, description="Name or address of the host; default 127.0.0.1.", min_length=1
+    address: str | None = optional("Name or address of the host; default 127.0.0.1.", min_length=1)
+    port: Annotated[int, Number(bounds.PORT)] | None = optional(
+        "First port, default 7450; each process of the node takes three."
     )
-    port: Annotated[int, Number(bounds.PORT)] | None = Field(
-        None, description="First port, default 7450; each process of the node takes three."
-    )
-    seen_from: dict[str, EndpointEntry] | None = Field(
-        None, description="Where it is reached from nodes that do not reach it there."
+    seen_from: dict[str, EndpointEntry] | None = optional(
+        "Where it is reached from nodes that do not reach it there."
     )
 
 
 class LiveEntry(Entry):
     """What the live runtime needs to know beside the problem."""
 
-    hosts: dict[str, HostEntry] | None = Field(
-        None, description="Where each node is reached; by default all are this machine."
+    hosts: dict[str, HostEntry] | None = optional(
+        "Where each node is reached; by default all are this machine."
     )
-    release: str | None = Field(
-        None,
-        description="A cycle begins by the clock (`timer`, default), or when the first source has "
-        "a picture (`frames`).",
+    release: str | None = optional(
+        "A cycle begins by the clock (`timer`, default), or when the first source has a picture "
+        "(`frames`)."
     )
-    clock: str | None = Field(
-        None,
-        description="Clocks are compared by messages (`estimated`, default), or taken for "
-        "synchronous (`system`: PTP, chrony).",
+    clock: str | None = optional(
+        "Clocks are compared by messages (`estimated`, default), or taken for synchronous "
+        "(`system`: PTP, chrony)."
     )
-    mode: str | None = Field(
-        None, description="Decisions are carried out (`control`, default) or recorded (`advise`)."
+    mode: str | None = optional(
+        "Decisions are carried out (`control`, default) or recorded (`advise`)."
     )
-    relay: str | None = Field(
-        None,
-        description="Node that carries small messages where a direct link fails; default: the "
-        "controller's.",
+    relay: str | None = optional(
+        "Node that carries small messages where a direct link fails; default: the controller's."
     )
-    max_age_ms: Annotated[float, Number(bounds.AGE_MS)] | None = Field(
-        None, description="Age from which a command is not applied, ms; default: two periods."
+    max_age_ms: Annotated[float, Number(bounds.AGE_MS)] | None = optional(
+        "Age from which a command is not applied, ms; default: two periods."
     )
-    silence: str | None = Field(
-        None, description="What the actuator is told without commands: `hold` (default) or `zero`."
+    silence: str | None = optional(
+        "What the actuator is told without commands: `hold` (default) or `zero`."
     )
-    checkpoint_cycles: Annotated[int, Number(bounds.CHECKPOINT_CYCLES)] | None = Field(
-        None, description="Cycles between copies of a state to its fallback; default 25, 0: none."
+    checkpoint_cycles: Annotated[int, Number(bounds.CHECKPOINT_CYCLES)] | None = optional(
+        "Cycles between copies of a state to its fallback; default 25, 0: none."
     )
-    actuators: dict[str, str] | None = Field(
-        None, description="What applies the commands of a sink task, as `package.module:Name`."
+    actuators: dict[str, str] | None = optional(
+        "What applies the commands of a sink task, as `package.module:Name`."
     )
-    observer: str | None = Field(
-        None,
-        description="What looks on where `dwell live run` runs the cell, as `package.module:Name`.",
+    observer: str | None = optional(
+        "What looks on where `dwell live run` runs the cell, as `package.module:Name`."
     )
 
 
@@ -786,51 +721,46 @@ class CellEntry(Entry):
     """A pipeline on its robots: tasks, flows, nodes, links, candidates, scenarios, objective."""
 
     dwell: Literal[1] = Field(description="Version of this format.")
-    name: str | None = Field(None, description="Name of the cell; default: the file's.")
+    name: str | None = optional("Name of the cell; default: the file's.")
     period_ms: Annotated[float, Number(bounds.PERIOD_MS)] = Field(
         description="Time between two releases (P), ms."
     )
-    deadline_ms: Annotated[float, Number(bounds.DEADLINE_MS)] | None = Field(
-        None, description="Latency beyond which a cycle is missed (D <= P), ms; default: P."
+    deadline_ms: Annotated[float, Number(bounds.DEADLINE_MS)] | None = optional(
+        "Latency beyond which a cycle is missed (D <= P), ms; default: P."
     )
-    release_jitter_ms: ProcessEntry | None = Field(
-        None, description="Added to the instant of every release, ms; default 0."
+    release_jitter_ms: ProcessEntry | None = optional(
+        "Added to the instant of every release, ms; default 0."
     )
-    window_cycles: Annotated[int, Number(bounds.WINDOW_CYCLES)] | None = Field(
-        None, description="Cycles of a window (W); default 50."
+    window_cycles: Annotated[int, Number(bounds.WINDOW_CYCLES)] | None = optional(
+        "Cycles of a window (W); default 50."
     )
-    warmup_windows: Annotated[int, Number(bounds.WARMUP_WINDOWS)] | None = Field(
-        None, description="First windows of a run that statistics leave out; default 0."
+    warmup_windows: Annotated[int, Number(bounds.WARMUP_WINDOWS)] | None = optional(
+        "First windows of a run that statistics leave out; default 0."
     )
     nodes: dict[str, NodeEntry | None] = Field(
         description="Computers by name.", json_schema_extra={"minProperties": 1}
     )
-    links: list[LinkEntry | None] | None = Field(
-        None, description="Connections between nodes; none by default."
-    )
+    links: list[LinkEntry | None] | None = optional("Connections between nodes; none by default.")
     tasks: dict[str, TaskEntry | None] = Field(
         description="Stages of the pipeline by name.", json_schema_extra={"minProperties": 1}
     )
-    flows: list[FlowEntry | None] | None = Field(
-        None, description="What tasks send to one another, a directed acyclic graph."
+    flows: list[FlowEntry | None] | None = optional(
+        "What tasks send to one another, a directed acyclic graph."
     )
-    scales: dict[str, ProcessEntry | None] | None = Field(
-        None, description="Per-cycle factors that tasks may name, as the scene's complexity."
+    scales: dict[str, ProcessEntry | None] | None = optional(
+        "Per-cycle factors that tasks may name, as the scene's complexity."
     )
     candidates: dict[str, dict[str, str] | None] = Field(
         description="Placements the policy may choose, by name: relocatable task to node; anchored "
         "tasks follow.",
         json_schema_extra={"minProperties": 1},
     )
-    scenarios: dict[str, list[DisturbanceEntry | None] | None] | None = Field(
-        None,
-        description="What happens to the cell, by name: a list of disturbances. `baseline: []` "
-        "exists always.",
+    scenarios: dict[str, list[DisturbanceEntry | None] | None] | None = optional(
+        "What happens to the cell, by name: a list of disturbances. `baseline: []` exists always."
     )
-    objective: ObjectiveEntry | None = Field(None, description="Cost, targets and caps.")
-    controller: ControllerEntry | None = Field(None, description="Policy and protocol.")
-    servo: ServoEntry | None = Field(
-        None,
-        description="A loop on which the tracking error of every run is computed; none by default.",
+    objective: ObjectiveEntry | None = optional("Cost, targets and caps.")
+    controller: ControllerEntry | None = optional("Policy and protocol.")
+    servo: ServoEntry | None = optional(
+        "A loop on which the tracking error of every run is computed; none by default."
     )
-    live: LiveEntry | None = Field(None, description="Hosts and habits of the live runtime.")
+    live: LiveEntry | None = optional("Hosts and habits of the live runtime.")

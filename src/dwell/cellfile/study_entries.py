@@ -10,7 +10,7 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from dwell.cellfile.document_faults import Step
-from dwell.cellfile.entries import Entry, Number, wrong
+from dwell.cellfile.entries import Entry, Number, optional, wrong
 from dwell.cellfile.rendering import as_read
 from dwell.cellfile.structure import Form
 from dwell.model.bounds import MAX_COUNT, Bound
@@ -107,33 +107,29 @@ class StudyEntry(Entry):
     """Scenarios, policies, parameters and seeds, of which every combination is simulated."""
 
     version: Literal[1] = Field(alias="dwell-study", description="Version of this format.")
-    name: str | None = Field(None, description="Name of the study; default: the file's.")
+    name: str | None = optional("Name of the study; default: the file's.")
     cell: str = Field(description="The cell file, relative to this file's folder.")
-    traces: str | None = Field(
-        None,
-        description="Folder where the cell's trace files are, relative to this file's; default: "
-        "the cell's.",
+    traces: str | None = optional(
+        "Folder where the cell's trace files are, relative to this file's; default: the cell's.",
         min_length=1,
     )
-    scenarios: Annotated[dict[str, object], _Read(_scenarios)] | None = Field(
-        None,
-        description="Scenarios of the cell, or a mapping of names to disturbances; default: all "
-        "of the cell's.",
+    scenarios: Annotated[dict[str, object], _Read(_scenarios)] | None = optional(
+        "Scenarios of the cell, or a mapping of names to disturbances; default: all of the cell's."
     )
-    windows: Annotated[int, Number(WINDOWS)] | None = Field(
-        None, description="Length of every run, the warm-up included; default 300."
+    windows: Annotated[int, Number(WINDOWS)] | None = optional(
+        "Length of every run, the warm-up included; default 300."
     )
-    seeds: Annotated[tuple[int, ...], _Read(_seeds)] | None = Field(
-        None, description="A number of seeds, or which; default 20."
+    seeds: Annotated[tuple[int, ...], _Read(_seeds)] | None = optional(
+        "A number of seeds, or which; default 20."
     )
-    references: bool | None = Field(
-        None, description="Whether to play the references in hindsight as well; default false."
+    references: bool | None = optional(
+        "Whether to play the references in hindsight as well; default false."
     )
     policies: Annotated[dict[str, object], _Read(_policies)] = Field(
         description="Policies and candidates, or a mapping of names to what they are."
     )
-    parameters: Annotated[dict[str, object], _Read(_parameters)] | None = Field(
-        None, description="Values by their path in the cell; every combination is a point."
+    parameters: Annotated[dict[str, object], _Read(_parameters)] | None = optional(
+        "Values by their path in the cell; every combination is a point."
     )
 
 

@@ -22,7 +22,7 @@ from dwell.cellfile.study_paths import SETTINGS, put, steps_of
 from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
-from dwell.model.semantics import LONGEST_NAME, NAME, nearest, nearest_of
+from dwell.model.semantics import bad_name, nearest, nearest_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies.registry import names as policy_names
 
@@ -181,12 +181,8 @@ class _Reading:
         )
 
     def _check_name(self, path: str, name: str) -> None:
-        if NAME.fullmatch(name) is None or len(name) > LONGEST_NAME:
-            self.faults.add(
-                path,
-                f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, a "
-                f"letter, a digit or _ first, at most {LONGEST_NAME} characters",
-            )
+        if message := bad_name(name):
+            self.faults.add(path, message)
 
     def _check_windows(self, windows: int, points: Sequence[tuple[object, _Cell]]) -> None:
         warmup = max((cell.problem.warmup_windows for _, cell in points), default=0)

@@ -6,19 +6,19 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import MISSING, fields, is_dataclass
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.fabric import Bursts, Link, Node, Quota
+from dwell.model.fabric import Link, Node
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
-from dwell.model.pipeline import Execution, Task
+from dwell.model.pipeline import Flow, Task
 from dwell.model.placement import Placement
-from dwell.model.problem import ControllerSettings, Problem
+from dwell.model.problem import Problem
 from dwell.model.process import DRAWN, Constant, Process, Trace, UnreadTrace
-from dwell.model.scenario import Disturbance, Episodes, NodeDisturbance
-from dwell.model.servo import Servo
+from dwell.model.scenario import Disturbance, LinkDisturbance
 
 # Version of the cell file.
 VERSION = 1
@@ -26,6 +26,23 @@ VERSION = 1
 Document: TypeAlias = dict[str, Any]
 
 NAMES: dict[type, str] = {kind: name for name, kind in DRAWN.items()}
+
+#: Keys that are no names of fields.
+KEYS: Mapping[type, Mapping[str, str]] = {
+    Flow: {"source": "from", "target": "to", "payload_bytes": "bytes"},
+    Link: {"source": "from", "target": "to"},
+    Task: {"depth": "input"},
+}
+#: Fields that a document has only where they say something else than their default.
+UNLESS_USUAL = frozenset(
+    {
+        *("slack_ms", "tick_ms", "background", "background_hz", "interference"),
+        *("contention", "contention_stressed", "standby", "before_ms", "after_ms"),
+    }
+)
+PLAIN = (float, int, str, bool)
+#: Keys of every disturbance, which come last.
+INTERVAL = ("at_s", "for_s", "down", "episodes", "ramp_s")
 
 
 def to_document(problem: Problem) -> Document:
@@ -57,10 +74,7 @@ def to_document(problem: Problem) -> Document:
             "nodes": {name: _node(node) for name, node in fabric.nodes.items()},
             "links": [_link(i, link) for i, link in enumerate(fabric.links.values())],
             "tasks": {name: _task(task) for name, task in pipeline.tasks.items()},
-            "flows": [
-                {"from": flow.source, "to": flow.target, "bytes": flow.payload_bytes}
-                for flow in pipeline.flows
-            ],
+            "flows": [_part(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
             "scales": {
                 name: _process(f"scales.{name}", scale) for name, scale in pipeline.scales.items()
             },
@@ -73,9 +87,9 @@ def to_document(problem: Problem) -> Document:
                 for name, items in problem.scenarios.items()
             },
             "objective": _objective(problem),
-            "controller": _controller(problem.controller),
-            "servo": _servo(problem.servo),
-            "live": _live(problem.live),
+            "controller": _part("controller", problem.controller),
+            "servo": _part("servo", problem.servo) if problem.servo else None,
+            "live": _part("live", problem.live) if problem.live != LiveSettings() else None,
         }
     )
 
@@ -103,6 +117,39 @@ def _filled(values: Document) -> Document:
     return {key: value for key, value in values.items() if value not in (None, math.inf)}
 
 
+def _part(path: str, part: Any, *but: str, **more: object) -> Document:
+    """Return a dataclass by its fields, but some; `more` comes last."""
+    document: Document = {}
+    kind: Any = type(part)
+    for name, key, usual in _fields(kind):
+        value = getattr(part, name)
+        if name not in but and name not in more and value != usual:
+            document[key] = value if type(value) in PLAIN else _value(f"{path}.{key}", value)
+    return _filled({**document, **more})
+
+
+@lru_cache(maxsize=64)
+def _fields(kind: type) -> tuple[tuple[str, str, object], ...]:
+    """Return name, key and, where a document leaves that out, default of every field."""
+    keys = KEYS.get(kind, {})
+    declared: list[tuple[str, str, object]] = []
+    for item in fields(kind):
+        made = item.default if item.default_factory is MISSING else item.default_factory()
+        usual = made if item.name in UNLESS_USUAL else None
+        declared.append((item.name, keys.get(item.name, item.name), usual))
+    return tuple(declared)
+
+
+def _value(path: str, value: Any) -> Any:
+    if hasattr(type(value), "marginal"):
+        return _process(path, value)
+    if is_dataclass(value):
+        return _part(path, value)
+    if isinstance(value, dict):
+        return {name: _value(f"{path}.{name}", item) for name, item in value.items()}
+    return list(value) if isinstance(value, tuple) else value
+
+
 def _process(path: str, process: Process) -> float | Document:
     if isinstance(process, Constant):
         return process.value
@@ -115,7 +162,7 @@ def _process(path: str, process: Process) -> float | Document:
         known = ", ".join(("constant", *NAMES.values(), "trace"))
         message = f"a cell file has no word for {type(process).__name__}; it knows {known}"
         raise ProblemError([Fault(path, message)])
-    return {name: _dataclass(process)}
+    return {name: _part(path, process)}
 
 
 def _trace(trace: Trace) -> Document:
@@ -135,91 +182,35 @@ def _trace(trace: Trace) -> Document:
     )
 
 
-def _bursts(path: str, bursts: Bursts | None, **more: object) -> Document | None:
-    if bursts is None:
-        return None
-    every_ms = _process(f"{path}.every_ms", bursts.every_ms)
-    return {"every_ms": every_ms, "for_ms": _process(f"{path}.for_ms", bursts.for_ms), **more}
-
-
-def _quota(quota: Quota) -> Document:
-    more = {"slack_ms": quota.slack_ms or None, "tick_ms": quota.tick_ms or None}
-    return _filled({"cpu": quota.cpu, "period_ms": quota.period_ms, **more})
-
-
 def relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
     """Return the part of a placement that a document has: anchored tasks are left out."""
     return {name: node for name, node in placement.items() if not tasks[name].anchored}
 
 
 def _node(node: Node) -> Document:
-    quota, bursts = node.quota, node.bursts
-    return _filled(
-        {
-            "tier": node.tier,
-            "cores": node.cores,
-            "scheduler": node.scheduler,
-            "accelerators": dict(node.accelerators),
-            "quota": _quota(quota) if quota else None,
-            "background": node.background or None,
-            "background_beside": node.background_beside,
-            "background_hz": node.background_hz or None,
-            "interference": node.interference if node.interference > 1.0 else None,
-            "contention": node.contention or None,
-            "contention_stressed": dict(node.contention_stressed) or None,
-            "bursts": _bursts(
-                f"nodes.{node.name}.bursts", bursts, threads=bursts.threads if bursts else 0
-            ),
-        }
-    )
+    path, bursts = f"nodes.{node.name}", node.bursts
+    foreign = _part(f"{path}.bursts", bursts, "add_delay_ms") if bursts else None
+    return _part(path, node, "name", bursts=foreign)
 
 
 def _link(index: int, link: Link) -> Document:
-    path, bursts = f"links[{index}]", link.bursts
-    extra = _process(f"{path}.bursts.add_delay_ms", bursts.add_delay_ms) if bursts else 0
-    retransmit_ms = link.retransmit_ms
-    return _filled(
-        {
-            "from": link.source,
-            "to": link.target,
-            "delay_ms": _process(f"{path}.delay_ms", link.delay_ms),
-            "rate_mbps": link.rate_mbps,
-            "loss": link.loss,
-            "on_loss": "drop" if retransmit_ms is None else {"retransmit_ms": retransmit_ms},
-            "in_order": link.in_order,
-            "bursts": _bursts(f"{path}.bursts", bursts, add_delay_ms=extra),
-        }
+    path, bursts, retransmit_ms = f"links[{index}]", link.bursts, link.retransmit_ms
+    delayed = _part(f"{path}.bursts", bursts, "threads") if bursts else None
+    return _part(
+        path,
+        link,
+        "retransmit_ms",
+        "in_order",
+        on_loss="drop" if retransmit_ms is None else {"retransmit_ms": retransmit_ms},
+        in_order=link.in_order,
+        bursts=delayed,
     )
 
 
 def _task(task: Task) -> Document:
     words: dict[int, str | Document] = {0: "queue", 1: "latest"}
-    return _filled(
-        {
-            "on": {node: _execution(task, node, execution) for node, execution in task.on.items()},
-            "input": words.get(task.depth, {"queue": task.depth}),
-            "priority": task.priority,
-            "scale": task.scale,
-            "offset_ms": task.offset_ms,
-            "start_ms": task.start_ms,
-            "state_bytes": task.state_bytes,
-            "run": task.run,
-        }
-    )
-
-
-def _execution(task: Task, node: str, execution: Execution) -> Document:
-    return _filled(
-        {
-            "exec_ms": _process(f"tasks.{task.name}.on.{node}.exec_ms", execution.exec_ms),
-            "threads": execution.threads,
-            "workers": execution.workers,
-            "accelerator": execution.accelerator,
-            "standby": execution.standby or None,
-            "before_ms": execution.before_ms or None,
-            "after_ms": execution.after_ms or None,
-        }
-    )
+    document = _part(f"tasks.{task.name}", task, "name")
+    return {**document, "input": words.get(task.depth, {"queue": task.depth})}
 
 
 def disturbance_document(item: Disturbance) -> Document:
@@ -228,45 +219,15 @@ def disturbance_document(item: Disturbance) -> Document:
 
 
 def _disturbance(path: str, item: Disturbance) -> Document:
-    interval = {
-        "at_s": item.at_s,
-        "for_s": item.for_s,
-        "down": item.down,
-        "episodes": _episodes(f"{path}.episodes", item.episodes),
-        "ramp_s": item.ramp_s,
-    }
-    if isinstance(item, NodeDisturbance):
-        return _filled({"node": item.node, "stress_threads": item.stress_threads, **interval})
-    extra = item.add_delay_ms
-    return _filled(
-        {
-            "link": item.link,
-            "add_delay_ms": None if extra is None else _process(f"{path}.add_delay_ms", extra),
-            "loss": item.loss,
-            "rate_mbps": item.rate_mbps,
-            **interval,
-        }
-    )
-
-
-def _episodes(path: str, episodes: Episodes | None) -> Document | None:
-    if episodes is None:
-        return None
-    every_s = _process(f"{path}.every_s", episodes.every_s)
-    for_s = _process(f"{path}.for_s", episodes.for_s)
-    return {"name": episodes.name, "every_s": every_s, "for_s": for_s}
+    link = {"link": item.link} if isinstance(item, LinkDisturbance) else {}
+    document = {**link, **_part(path, item, "source", "target")}
+    last = {key: document.pop(key) for key in INTERVAL if key in document}
+    return {**document, **last}
 
 
 def objective_document(objective: Objective) -> Document:
     """Return an objective as a cell file's ``objective`` says it, every tier named."""
-    return _filled(
-        {
-            "weights": _dataclass(objective.weights),
-            "targets": _dataclass(objective.targets),
-            "caps": _dataclass(objective.caps),
-            "tiers": dict(objective.tiers),
-        }
-    )
+    return _part("objective", objective)
 
 
 def _objective(problem: Problem) -> Document:
@@ -275,34 +236,6 @@ def _objective(problem: Problem) -> Document:
     if problem.objective.tiers == usual:
         document.pop("tiers", None)
     return document
-
-
-def _controller(settings: ControllerSettings) -> Document:
-    return {**_dataclass(settings), "fallbacks": list(settings.fallbacks)}
-
-
-def _servo(servo: Servo | None) -> Document | None:
-    if servo is None:
-        return None
-    return {**_dataclass(servo), "target": _dataclass(servo.target)}
-
-
-def _live(settings: LiveSettings) -> Document | None:
-    if settings == LiveSettings():
-        return None
-    hosts = {
-        name: {
-            "address": host.address,
-            "port": host.port,
-            "seen_from": {node: _dataclass(seen) for node, seen in host.seen_from.items()},
-        }
-        for name, host in settings.hosts.items()
-    }
-    return {**_dataclass(settings), "hosts": hosts, "actuators": dict(settings.actuators)}
-
-
-def _dataclass(part: Any) -> Document:
-    return _filled({item.name: getattr(part, item.name) for item in fields(part)})
 
 
 def fingerprint(problem: Problem) -> str:

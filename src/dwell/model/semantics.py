@@ -113,11 +113,11 @@ def _names(parts: CellParts) -> Iterator[Fault]:
     }
     for section, names in sections.items():
         for name in names:
-            if message := _bad_name(name):
+            if message := bad_name(name):
                 yield Fault(f"{section}.{name or repr(name)}", message)
 
 
-def _bad_name(name: str) -> str:
+def bad_name(name: str) -> str:
     """Return what is wrong with a name, or nothing."""
     if NAME.fullmatch(name) is not None and len(name) <= LONGEST_NAME:
         return ""
@@ -308,8 +308,8 @@ def _episodes(items: Sequence[tuple[str, Disturbance]]) -> Iterator[Fault]:
         if item.episodes is None:
             continue
         name = item.episodes.name
-        if _bad_name(name):
-            yield Fault(f"{path}.episodes.name", _bad_name(name))
+        if bad_name(name):
+            yield Fault(f"{path}.episodes.name", bad_name(name))
         where, other = first.setdefault(name, (path, item))
         if (item.at_s, item.episodes) != (other.at_s, other.episodes):
             yield Fault(
