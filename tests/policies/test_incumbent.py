@@ -33,12 +33,12 @@ def test_somebody_else_moves_it() -> None:
 
 
 def test_candidates_place_the_same_tasks() -> None:
-    assert CandidatePolicy(CANDIDATES, None).initial == "LOC"
+    assert CandidatePolicy(candidates=CANDIDATES).initial == "LOC"
     with pytest.raises(PolicyError, match="every candidate must place the same tasks"):
-        CandidatePolicy({"LOC": LOC, "X": Placement({"perception": "E"})}, None)
+        CandidatePolicy(candidates={"LOC": LOC, "X": Placement({"perception": "E"})})
     with pytest.raises(PolicyError, match="candidates is empty"):
-        CandidatePolicy({}, None)
+        CandidatePolicy(candidates={})
     with pytest.raises(PolicyError, match="initial is 'OFF', which is no candidate"):
-        CandidatePolicy(CANDIDATES, "OFF")
+        CandidatePolicy(candidates=CANDIDATES, initial="OFF")
     with pytest.raises(PlacementError):
-        CandidatePolicy({"LOC": {}}, None)  # type: ignore[dict-item]
+        CandidatePolicy(candidates={"LOC": {}})  # type: ignore[dict-item]

@@ -21,6 +21,7 @@ from dwell.model.semantics import too_many_shadows
 from dwell.model.user_classes import is_class_path
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
+from dwell.policies.pricing import Pricing
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
@@ -142,12 +143,7 @@ class Controller:
         self._names = tuple(problem.candidates)
         self.log = DecisionLog()
         self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
-        self._tiers = tier_nodes(problem.objective)
-        self._moved = {
-            (one, other): hamming(problem.candidates[one], problem.candidates[other])
-            for one in problem.candidates
-            for other in problem.candidates
-        }
+        self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._censor_ns = round(problem.censor_ms * 1e6)
         #: By which caps candidates are eligible: the policy's own, where it has any.
@@ -260,7 +256,8 @@ class Controller:
     def decide(self, observed: QoS, own: Mapping[str, float], *, proven: str | None = None) -> str:
         """Decide on metrics that are already aggregated (see `close`)."""
         incumbent = self.incumbent
-        measured = self._price(observed, incumbent)
+        # With the switching term of the decision that led to it.
+        measured = self._pricing.observed(observed, incumbent, self.previous)
         estimates = dict(self.estimator.estimate(observed=observed, incumbent=incumbent, own=own))
         estimates[incumbent] = observed
         before = copy.deepcopy(self.policy) if self.on_fallback else self.policy
@@ -360,16 +357,6 @@ class Controller:
         adopt = getattr(self.policy, "adopt", None)
         if adopt is not None:
             adopt(name)
-
-    def _price(self, observed: QoS, incumbent: str) -> float:
-        """J of what was observed, with the switching term of the decision that led to it."""
-        used = observed.utilisation
-        robot, edge, cloud = [
-            max([used[node] for node in nodes], default=0.0) for nodes in self._tiers
-        ]
-        switching = self._moved[incumbent, self.previous]
-        l95_ms, violation_rate = observed.l95_ms, observed.violation_rate
-        return price(l95_ms, violation_rate, robot, edge, cloud, switching, self.problem.objective)
 
     def _record(
         self,
@@ -507,8 +494,8 @@ def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
 
 def static_columns(
     controller: Controller, profile: Profile, window: ClosedWindow
-) -> tuple[dict[str, Floats], dict[str, dict[str, NDArray[np.generic]]]]:
-    """Metrics, costs and estimates of all windows of a run that never moves, in one go.
+) -> tuple[dict[str, Floats], dict[str, object]]:
+    """Metrics and decisions of all windows of a run that never moves, in one go.
 
     Bit for bit what `Controller.close` gives window by window (tested).
 
@@ -523,9 +510,8 @@ def static_columns(
     -------
     seen : dict of str to float64 array, shape (windows,)
         ``l95_ms``, ``violation_rate``, ``cost`` and ``u_<node>``.
-    estimated : dict of candidate to dict of str to array, shape (windows,)
-        ``l95_ms``, ``violation_rate``, ``u_<node>``, ``j``, ``eligible`` and ``excess`` (NaN
-        without caps).
+    decisions : dict of str to list, or array of shape (windows,)
+        By `Controller.decision_columns`; NaN for null.
     """
     problem, name = controller.problem, controller.incumbent
     age_ns = window.close_ns - window.release_ns
@@ -540,12 +526,23 @@ def static_columns(
     seen["cost"] = _priced(problem, seen["l95_ms"], seen["violation_rate"], by_node, 0.0)
     # No other candidate is ever active, so that none is known to leave a full node less than full.
     foreign = np.where(censored(used, own), 1.0, np.maximum(used - own, 0.0))
-    estimated: dict[str, dict[str, NDArray[np.generic]]] = {}
+    count = len(used)
+    null = np.full(count, np.nan)
+    priced = getattr(controller.policy, "objective", None) is not None
+    decisions: dict[str, object] = {
+        "window": np.arange(count),
+        "incumbent": [name] * count,
+        "placement": [name] * count,
+        "migrated": np.zeros(count, np.bool_),
+        "reason": ["hold"] * count,
+        "dwell": np.arange(1, count + 1),
+        "delta_j": null,
+    }
     for candidate, placement in problem.candidates.items():
         l95_ms, violation_rate, busy = seen["l95_ms"], seen["violation_rate"], by_node
         if candidate != name:
-            l95_ms = np.full(len(used), profile.l95_ms[candidate])
-            violation_rate = np.full(len(used), profile.violation_rate[candidate])
+            l95_ms = np.full(count, profile.l95_ms[candidate])
+            violation_rate = np.full(count, profile.violation_rate[candidate])
             work = profile.own[candidate]
             busy = {
                 node: np.minimum(foreign[:, i] + work[node], 1.0)
@@ -553,16 +550,18 @@ def static_columns(
             }
         switching = hamming(placement, problem.candidates[name])
         over = _excess(controller.objective.caps, l95_ms, busy)
-        estimated[candidate] = {
-            "l95_ms": l95_ms,
-            "violation_rate": violation_rate,
-            **{f"u_{node}": values for node, values in busy.items()},
-            "j": _priced(problem, l95_ms, violation_rate, busy, switching),
+        j = _priced(problem, l95_ms, violation_rate, busy, switching) if priced else null
+        estimated = {
+            "j": j,
+            "est_l95_ms": l95_ms,
+            "est_violation_rate": violation_rate,
+            **{f"est_u_{node}": values for node, values in busy.items()},
             "eligible": over <= 0,
-            "excess": over if controller._has_caps else np.full(len(used), np.nan),
+            "excess": over if controller._has_caps else null,
         }
+        decisions.update({f"{what}_{candidate}": values for what, values in estimated.items()})
     seen.update({f"u_{node}": values for node, values in by_node.items()})
-    return seen, estimated
+    return seen, decisions
 
 
 def _excess(caps: Caps, l95_ms: Floats, by_node: Mapping[str, Floats]) -> Floats:

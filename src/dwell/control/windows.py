@@ -12,15 +12,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.estimators.paths import l95_rank
 from dwell.model.instants import NEVER_NS
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
-
-
-def l95_rank(cycles: int) -> int:
-    """Rank of L95 among the latencies of a window: ceil(0.95 W), from 1."""
-    return (19 * cycles + 19) // 20
 
 
 def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:

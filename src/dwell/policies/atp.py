@@ -44,7 +44,7 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.atp_thresholds import ATPThresholds
-from dwell.policies.incumbent import NOT_PRICED, check_parameter
+from dwell.policies.incumbent import check_parameter
 
 
 class _Shown(NamedTuple):
@@ -71,11 +71,6 @@ class ATP(ATPThresholds):
     every_ms : float
         Time between two decisions, milliseconds; rounded to whole windows when a run starts. A
         policy that was never started decides at every close.
-
-    Raises
-    ------
-    PolicyError
-        As in `dwell.policies.ATPThresholds`.
     """
 
     def __init__(
@@ -156,10 +151,9 @@ class ATP(ATPThresholds):
         incumbent = self._incumbent
         used = self._pricing.used(observed)
         here = _Shown(observed.l95_ms, used)
-        costs = NOT_PRICED
+        costs = self._costs(estimates)
         there: Mapping[str, _Shown] | None = None
         if estimates is not None:
-            costs = self._pricing.estimated(estimates, incumbent.name)
             there = {
                 name: _Shown(estimates[name].l95_ms, self._pricing.used(estimates[name]))
                 for name in self.candidates

@@ -26,8 +26,7 @@ from dwell.model.objective import Objective, Tier
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy, check_name, check_parameter
-from dwell.policies.pricing import Pricing
+from dwell.policies.incumbent import PricingPolicy, check_name, check_parameter
 
 THRESHOLD = Bound(0)
 
@@ -55,7 +54,7 @@ def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -
     return tuple(pairs)
 
 
-class ATPThresholds(CandidatePolicy):
+class ATPThresholds(PricingPolicy):
     """Toggles one task between a robot and the edge by thresholds (our reconstruction).
 
     Parameters
@@ -100,10 +99,8 @@ class ATPThresholds(CandidatePolicy):
         edge: float | None = None,
         min_dwell: int = 3,
     ) -> None:
-        super().__init__(candidates, initial)
-        self.objective = objective
+        super().__init__(candidates=candidates, initial=initial, objective=objective)
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
-        self._pricing = Pricing(self.candidates, objective)
         self.pair = self._choose(local, offload)
         targets = objective.targets
         outside_tier = objective.tiers[self.candidates[self.pair.offload][self.pair.task]]
@@ -206,9 +203,7 @@ class ATPThresholds(CandidatePolicy):
         """
         incumbent = self._incumbent
         used = self._pricing.used(observed)
-        costs = NOT_PRICED
-        if estimates is not None:
-            costs = self._pricing.estimated(estimates, incumbent.name)
+        costs = self._costs(estimates)
         if incumbent.dwell < self.min_dwell:
             return incumbent.stay("dwell", costs)
         other, over = self._question(observed.l95_ms, used)

@@ -23,7 +23,7 @@ advantage, there are fewer than A / threshold migrations.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Self
+from types import MappingProxyType
 
 from dwell.model.bounds import CUSUM_MEMORY, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
@@ -31,11 +31,10 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.dtp import cheapest
-from dwell.policies.incumbent import CandidatePolicy, check_parameter
-from dwell.policies.pricing import Pricing
+from dwell.policies.incumbent import PricingPolicy, check_parameter
 
 
-class Cusum(CandidatePolicy):
+class Cusum(PricingPolicy):
     """Moves to the cheapest candidate whose advantage over the incumbent has added up.
 
     A candidate over a cap is not eligible, as in DTP, and the reasons are the same; if none is
@@ -43,12 +42,8 @@ class Cusum(CandidatePolicy):
 
     Parameters
     ----------
-    candidates : mapping of str to Placement
-        Pi_cand, over the same tasks; the order breaks ties.
-    initial : str, optional
-        The candidate it starts on; the first where None.
-    objective : Objective
-        Weights, targets, caps and tiers of J.
+    candidates, initial, objective
+        As in `dwell.policies.DTP`.
     threshold : float
         Sum that an advantage must exceed, in units of J.
     slack : float
@@ -63,6 +58,8 @@ class Cusum(CandidatePolicy):
         different tasks.
     """
 
+    SETTINGS = MappingProxyType({"slack": "min_improvement"})
+
     def __init__(
         self,
         *,
@@ -73,23 +70,11 @@ class Cusum(CandidatePolicy):
         slack: float = 0.05,
         memory: float = 0.7,
     ) -> None:
-        super().__init__(candidates, initial)
-        self.objective = objective
+        super().__init__(candidates=candidates, initial=initial, objective=objective)
         self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
         self.slack = check_parameter("slack", slack, MIN_IMPROVEMENT)
         self.memory = check_parameter("memory", memory, CUSUM_MEMORY)
-        self._pricing = Pricing(self.candidates, objective)
         self._sums = dict.fromkeys(self.candidates, 0.0)
-
-    @classmethod
-    def from_problem(cls, problem: Problem) -> Self:
-        """Make the policy with the parameters of ``problem.controller``."""
-        return cls(
-            candidates=problem.candidates,
-            initial=problem.initial,
-            objective=problem.objective,
-            slack=problem.controller.min_improvement,
-        )
 
     def __repr__(self) -> str:
         return (

@@ -23,20 +23,18 @@ bounds on migrations do not hold then.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Self
+from types import MappingProxyType
 
 from dwell.cost import excess
 from dwell.errors import MetricError
 from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy, check_parameter
-from dwell.policies.pricing import Pricing
+from dwell.policies.incumbent import PricingPolicy, check_parameter
 
 
-class DTP(CandidatePolicy):
+class DTP(PricingPolicy):
     """Moves to the cheapest candidate once it is cheap enough and the dwell is over.
 
     Parameters
@@ -61,6 +59,10 @@ class DTP(CandidatePolicy):
         different tasks.
     """
 
+    SETTINGS = MappingProxyType(
+        {"min_dwell": "min_dwell", "min_improvement": "min_improvement", "escape": "escape"}
+    )
+
     def __init__(
         self,
         *,
@@ -71,24 +73,10 @@ class DTP(CandidatePolicy):
         min_improvement: float = 0.05,
         escape: bool = False,
     ) -> None:
-        super().__init__(candidates, initial)
-        self.objective = objective
+        super().__init__(candidates=candidates, initial=initial, objective=objective)
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self.min_improvement = check_parameter("min_improvement", min_improvement, MIN_IMPROVEMENT)
         self.escape = escape
-        self._pricing = Pricing(self.candidates, objective)
-
-    @classmethod
-    def from_problem(cls, problem: Problem) -> Self:
-        """Make the policy with the parameters of ``problem.controller``."""
-        return cls(
-            candidates=problem.candidates,
-            initial=problem.initial,
-            objective=problem.objective,
-            min_dwell=problem.controller.min_dwell,
-            min_improvement=problem.controller.min_improvement,
-            escape=problem.controller.escape,
-        )
 
     def __repr__(self) -> str:
         return (
@@ -119,9 +107,7 @@ class DTP(CandidatePolicy):
         """
         incumbent, pricing = self._incumbent, self._pricing
         measured = pricing.observed(observed, incumbent.name, incumbent.previous)
-        costs = NOT_PRICED
-        if estimates is not None:
-            costs = pricing.estimated(estimates, incumbent.name)
+        costs = self._costs(estimates)
         if self.escape and estimates is not None and excess(observed, self.objective) > 0:
             eligible, within_caps = pricing.eligible({**estimates, incumbent.name: observed})
             if within_caps:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
 
 from dwell.errors import PolicyError
 from dwell.model.bounds import Bound
 from dwell.model.frozen import FrozenDict
+from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.qos import Decision, Reason
+from dwell.model.qos import Decision, QoS, Reason
 from dwell.model.semantics import nearest_of
+from dwell.policies.pricing import Pricing
 
 if TYPE_CHECKING:
     from dwell.model.problem import Problem
@@ -137,14 +139,16 @@ class Incumbent:
 
 
 class CandidatePolicy:
-    """What policies of ours have in common: their candidates, and which of them is active.
+    """What policies of ours have in common: candidates, the active one among them, and their J.
 
     Parameters
     ----------
     candidates : mapping of str to Placement
-        Over the same tasks.
+        Over the same tasks; the order breaks ties.
     initial : str, optional
         The candidate it starts on; the first where None.
+    objective : Objective, optional
+        Weights, targets, caps and tiers of J; where None, nothing is priced.
 
     Raises
     ------
@@ -152,10 +156,32 @@ class CandidatePolicy:
         If `initial` is no candidate, or candidates place different tasks.
     """
 
-    def __init__(self, candidates: Mapping[str, Placement], initial: str | None) -> None:
+    #: Arguments beside these that `from_problem` gives, with their names in ``problem.controller``.
+    SETTINGS: ClassVar[Mapping[str, str]] = {}
+
+    def __init__(
+        self,
+        *,
+        candidates: Mapping[str, Placement],
+        initial: str | None = None,
+        objective: Objective | None = None,
+    ) -> None:
         self.candidates = check_candidates(candidates)
         self.initial = check_name("initial", initial, self.candidates)
+        self.objective = objective
+        self._pricing = None if objective is None else Pricing(self.candidates, objective)
         self._incumbent = Incumbent(self.candidates, self.initial)
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        settings = {name: getattr(problem.controller, key) for name, key in cls.SETTINGS.items()}
+        return cls(
+            candidates=problem.candidates,
+            initial=problem.initial,
+            objective=problem.objective,
+            **settings,
+        )
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(initial={self.initial!r})"
@@ -172,3 +198,33 @@ class CandidatePolicy:
     def adopt(self, name: str) -> None:
         """Take over `name` as the incumbent with n_d = 0: somebody else moved the cell there."""
         self._incumbent.adopt(name)
+
+    def _costs(self, estimates: Mapping[str, QoS] | None) -> FrozenDict[str, float]:
+        """J of every candidate against the incumbent, where it is priced and estimated.
+
+        Raises
+        ------
+        MetricError
+            If a metric, or the estimate of a candidate, is missing.
+        """
+        if self._pricing is None or estimates is None:
+            return NOT_PRICED
+        return self._pricing.estimated(estimates, self._incumbent.name)
+
+
+class PricingPolicy(CandidatePolicy):
+    """A policy that needs J."""
+
+    objective: Objective
+    _pricing: Pricing
+
+    def __init__(
+        self,
+        *,
+        candidates: Mapping[str, Placement],
+        initial: str | None = None,
+        objective: Objective,
+    ) -> None:
+        super().__init__(candidates=candidates, initial=initial)
+        self.objective = objective
+        self._pricing = Pricing(self.candidates, objective)

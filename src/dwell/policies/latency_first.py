@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Self
 
-from dwell.model.objective import Objective
-from dwell.model.placement import Placement
-from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import NOT_PRICED, CandidatePolicy
-from dwell.policies.pricing import Pricing, check_metrics, explain_estimate
+from dwell.policies.incumbent import CandidatePolicy
+from dwell.policies.pricing import check_metrics, explain_estimate
 
 
 class LatencyFirst(CandidatePolicy):
@@ -22,37 +18,11 @@ class LatencyFirst(CandidatePolicy):
 
     Parameters
     ----------
-    candidates : mapping of str to Placement
-    initial : str, optional
-        The candidate it starts on; the first where None.
+    candidates, initial
+        As in `dwell.policies.DTP`.
     objective : Objective, optional
         Where given, J of every candidate is recorded; it decides nothing.
-
-    Raises
-    ------
-    PolicyError
-        If `initial` is no candidate, or candidates place different tasks.
     """
-
-    def __init__(
-        self,
-        *,
-        candidates: Mapping[str, Placement],
-        initial: str | None = None,
-        objective: Objective | None = None,
-    ) -> None:
-        super().__init__(candidates, initial)
-        self.objective = objective
-        self._pricing = None if objective is None else Pricing(self.candidates, objective)
-
-    @classmethod
-    def from_problem(cls, problem: Problem) -> Self:
-        """Make the policy with the parameters of ``problem.controller``."""
-        return cls(
-            candidates=problem.candidates,
-            initial=problem.initial,
-            objective=problem.objective,
-        )
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
         """Choose the candidate with the lowest estimated L95.
@@ -74,9 +44,7 @@ class LatencyFirst(CandidatePolicy):
         except (AttributeError, KeyError, TypeError):
             explain_estimate(estimates, name, self.candidates)
             raise
-        costs = NOT_PRICED
-        if self._pricing is not None:
-            costs = self._pricing.estimated(estimates, incumbent.name)
+        costs = self._costs(estimates)
         if best == incumbent.name:
             return incumbent.stay("hold", costs)
         return incumbent.move(best, "migrate", costs)

@@ -35,21 +35,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from operator import add
-from typing import Self
 
 from dwell.model.frozen import FrozenDict
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
-from dwell.policies.incumbent import CandidatePolicy
-from dwell.policies.pricing import Pricing
+from dwell.policies.incumbent import PricingPolicy
 
 #: Sums whose relative difference is at most this are a tie: w_k carries rounding errors.
 TIE_TOLERANCE = 1e-9
 
 
-class WorkFunction(CandidatePolicy):
+class WorkFunction(PricingPolicy):
     """Moves once the optimum in hindsight justifies it, with neither threshold nor dwell.
 
     * A tie is a move: staying where the optimum would as soon have left is what an adversary
@@ -64,17 +62,8 @@ class WorkFunction(CandidatePolicy):
 
     Parameters
     ----------
-    candidates : mapping of str to Placement
-        Pi_cand, over the same tasks.
-    initial : str, optional
-        The candidate it starts on; the first where None.
-    objective : Objective
-        Weights, targets, caps and tiers of J.
-
-    Raises
-    ------
-    PolicyError
-        If `initial` is no candidate, or candidates place different tasks.
+    candidates, initial, objective
+        As in `dwell.policies.DTP`.
     """
 
     def __init__(
@@ -84,9 +73,7 @@ class WorkFunction(CandidatePolicy):
         initial: str | None = None,
         objective: Objective,
     ) -> None:
-        super().__init__(candidates, initial)
-        self.objective = objective
-        self._pricing = Pricing(self.candidates, objective)
+        super().__init__(candidates=candidates, initial=initial, objective=objective)
         self._index = {name: i for i, name in enumerate(self.candidates)}
         weight = objective.weights.switching
         self._distances = tuple(
@@ -94,15 +81,6 @@ class WorkFunction(CandidatePolicy):
             for name in self.candidates
         )
         self._work = self._distances[self._index[self.initial]]
-
-    @classmethod
-    def from_problem(cls, problem: Problem) -> Self:
-        """Make the policy with the parameters of ``problem.controller``."""
-        return cls(
-            candidates=problem.candidates,
-            initial=problem.initial,
-            objective=problem.objective,
-        )
 
     @property
     def work(self) -> FrozenDict[str, float]:

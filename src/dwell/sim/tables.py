@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import (
-    ClosedWindow,
-    Controller,
-    final_l95_ms,
-    static_columns,
-)
+from dwell.control import ClosedWindow, Controller, final_l95_ms, static_columns
 from dwell.kernels import layout as k
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
@@ -117,19 +113,20 @@ def make_tables(
     """Functions that make each table when it is first asked for; `jobs` asks for that of jobs."""
     controller = played.controller
     profile = None if controller.log.seen else controller.fixed_profile
-    seen: tuple[dict[str, Floats], dict[str, dict[str, NDArray[np.generic]]]] | None = None
 
-    def columns() -> tuple[dict[str, Floats], dict[str, dict[str, NDArray[np.generic]]]]:
-        nonlocal seen
-        if seen is None and profile is not None:
-            seen = static_columns(controller, profile, played.closed_windows())
-        return seen or (_seen(played), {})
+    @cache
+    def columns() -> tuple[dict[str, Floats], dict[str, object]]:
+        if profile is None:
+            return _seen(played), {}
+        return static_columns(controller, profile, played.closed_windows())
 
     tables = {
         "cycles": lambda: _cycles(played),
         "windows": lambda: _windows(played, columns()[0]),
         "decisions": lambda: (
-            _decisions(controller) if profile is None else _static_decisions(played, columns()[1])
+            _decisions(controller)
+            if profile is None
+            else frame_of("decisions", played.problem, columns()[1])
         ),
     }
     if jobs:
@@ -254,33 +251,6 @@ def _decisions(controller: Controller) -> pl.DataFrame:
     columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
     features: tuple[Feature, ...] = ("support",) if controller.supports else ()
     return frame_of("decisions", controller.problem, columns, features)
-
-
-def _static_decisions(
-    played: PlayedRealisation, estimated: dict[str, dict[str, NDArray[np.generic]]]
-) -> pl.DataFrame:
-    controller = played.controller
-    candidates = tuple(controller.problem.candidates)
-    count = len(played.first)
-    priced = getattr(controller.policy, "objective", None) is not None
-    columns: dict[str, object] = {
-        "window": np.arange(count),
-        "incumbent": [controller.incumbent] * count,
-        "placement": [controller.incumbent] * count,
-        "migrated": np.zeros(count, np.bool_),
-        "reason": ["hold"] * count,
-        "dwell": np.arange(1, count + 1),
-        "delta_j": np.full(count, np.nan),
-    }
-    for name in candidates:
-        columns[f"j_{name}"] = estimated[name]["j"] if priced else np.full(count, np.nan)
-    for metric in ("l95_ms", "violation_rate", *(f"u_{node}" for node in controller.nodes)):
-        for name in candidates:
-            columns[f"est_{metric}_{name}"] = estimated[name][metric]
-    for column in ("eligible", "excess"):
-        for name in candidates:
-            columns[f"{column}_{name}"] = estimated[name][column]
-    return frame_of("decisions", controller.problem, columns)
 
 
 def _log_running(played: PlayedRealisation, log: Ints) -> None:
