@@ -130,6 +130,16 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
 
 
+def test_the_extra_report_alone_reports_a_run(
+    environment: Callable[[str], Path], tmp_path: Path
+) -> None:
+    python = environment("report")
+    run_folder = shutil.copytree(ROOT / "tests/regression/data/old-runs/simulated", tmp_path / "r")
+    done = run(python, "-m", "dwell", "report", run_folder, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (run_folder / "report.html").is_file()
+
+
 def test_the_doctor_and_completion_work_without_any_extra(
     environment: Callable[[str], Path], tmp_path: Path
 ) -> None:
