@@ -2,104 +2,111 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import dwell
 from dwell.cli.exit_codes import ExitCode
-from dwell.cli.output import print_json, working, write_report
-from dwell.model import Problem
-from dwell.report.campaign_page import campaign_page, campaign_text
-from dwell.study.measured_campaign import MeasuredCampaign, read_measured
-from dwell.testbed.campaign import (
-    Campaign,
-    default_entrants,
-    default_scenarios,
-    entrant,
+from dwell.cli.options import (
+    CellArgument,
+    Json,
+    Seconds,
+    Seed,
+    TestbedName,
+    Windows,
+    seconds_of_runs,
 )
-from dwell.testbed.execution import Play, State, run_campaign
-from dwell.testbed.playing import interruptible
-from dwell.testbed.timeline import require_playable_scenario
+from dwell.cli.output import file_name, print_json, working, write_report
 
-PAGE = "report.html"
+if TYPE_CHECKING:
+    from dwell.model import Problem
+    from dwell.study.measured_campaign import MeasuredCampaign
+    from dwell.testbed.campaign import Campaign
+    from dwell.testbed.execution import Play, State
 
 
-def run_campaign_file(
-    cell: Path,
-    *,
-    scenarios: Sequence[str],
-    policies: Sequence[str],
-    repetitions: int,
-    seconds: float,
-    seed: int,
-    out: Path | None,
-    name: str,
-    minutes: float | None,
-    inventory: Path | None,
-    report: bool,
-    as_json: bool,
-) -> bool:
-    """Measure, write the report, and print what it comes to; None is the default.
+def campaign(
+    cell: CellArgument,
+    scenarios: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,NAME", help="The paper's four if not given."),
+    ] = None,
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,NAME",
+            help="Policies, candidates, or policies with an estimator, as cusum+corrected; all "
+            "candidates, atp, dtp and cusum+corrected if not given.",
+        ),
+    ] = None,
+    repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    seed: Seed = 1,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Of the campaign; campaigns/CELL if not given."),
+    ] = None,
+    name: TestbedName = "campaign",
+    minutes: Annotated[
+        float | None, typer.Option(min=0, help="Begin no run that would end after these.")
+    ] = None,
+    inventory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Real hosts (YAML), instead of this machine's testbed."),
+    ] = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Measure nothing: report on what is there.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Measure every policy in every scenario again and again, in random order, and report.
 
-    Parameters
-    ----------
-    scenarios, policies : sequence of str
-        Empty for the default ones.
-    seconds : float
-        Of each run.
-    name : str
-        Of the testbed.
-    inventory : Path or None
-        Of real hosts, in place of the testbed.
-    report : bool
-        Whether nothing is measured: only the report of what is there is written.
-
-    Returns
-    -------
-    bool
-        Whether no run was given up.
-
-    Raises
-    ------
-    DwellError
-        If something asked for is wrong, this machine cannot do it, the folder holds something else,
-        or the cell does not come up.
-    typer.Exit
-        If it was interrupted.
+    What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
+    120 s, if neither --windows nor --seconds is given.
     """
+    length_s = seconds_of_runs(cell, windows, seconds)
     problem = dwell.load(cell)
-    folder = out or Path("campaigns", re.sub(r"[^\w.-]", "_", problem.name))
+    folder = out or Path("campaigns", file_name(problem.name))
+    page = folder / "report.html"
     if report:
-        report_campaign(folder, folder / PAGE, as_json=as_json)
-        return True
-    scenarios = tuple(scenarios) or default_scenarios(problem)
-    entrants = tuple(entrant(problem, policy) for policy in policies)
-    play, where = _player(inventory, problem, scenarios)
-    campaign = Campaign(
+        report_campaign(folder, page, as_json=as_json)
+        return
+    from dwell.testbed.campaign import Campaign, default_entrants, default_scenarios, entrant
+
+    played = _names(scenarios) or default_scenarios(problem)
+    entrants = tuple(entrant(problem, policy) for policy in _names(policies))
+    play, where = _player(inventory, problem, played)
+    plan = Campaign(
         problem,
-        scenarios,
+        played,
         entrants or default_entrants(problem),
         repetitions,
-        seconds,
+        length_s,
         seed,
         where,
     )
-    state = _run(campaign, folder, play, name, minutes)
+    state = _run(plan, folder, play, name, minutes)
     if state.done:
-        measured = _write_page(folder, folder / PAGE)
-        _print(measured, folder, folder / PAGE, state, as_json=as_json)
+        _print(_write_page(folder, page), folder, page, state, as_json=as_json)
     else:
         typer.echo(f"no run is done; see {folder}", err=True)
-    return not state.given_up and bool(state.done or state.left)
+    if state.given_up or not (state.done or state.left):
+        raise typer.Exit(ExitCode.FAILED)
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
 def _player(hosts: Path | None, problem: Problem, scenarios: Sequence[str]) -> tuple[Play, str]:
     """Return what makes a run, and where; refuse what can be played in no run."""
+    from dwell.testbed.timeline import require_playable_scenario
+
     outages = hosts is None
     for name in scenarios:
         require_playable_scenario(problem, name, outages=outages)
@@ -117,6 +124,9 @@ def _player(hosts: Path | None, problem: Problem, scenarios: Sequence[str]) -> t
 
 
 def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float | None) -> State:
+    from dwell.testbed.execution import run_campaign
+    from dwell.testbed.playing import interruptible
+
     try:
         with interruptible():
             return run_campaign(
@@ -166,6 +176,9 @@ def report_campaign(
 def _write_page(
     folder: Path, page: Path, *, figures: Path | None = None, static: bool = False
 ) -> MeasuredCampaign:
+    from dwell.report.campaign_page import campaign_page
+    from dwell.study.measured_campaign import read_measured
+
     with working("writing the report"):
         measured = read_measured(folder)
         write_report(campaign_page(measured), page, figures=figures, static=static)
@@ -176,25 +189,23 @@ def _print(
     measured: MeasuredCampaign, folder: Path, page: Path, state: State | None, *, as_json: bool
 ) -> None:
     if as_json:
-        print_json(_told(measured, folder, page, state))
+        print_json(_document(measured, folder, page, state))
         return
+    from dwell.report.campaign_page import campaign_text
+
     typer.echo(f"{campaign_text(measured)}\n\nruns: {folder}/runs\nreport: {page}")
     if state is not None and state.given_up:
-        typer.echo(f"given up: {_listed(state.given_up)}", err=True)
+        typer.echo(f"given up: {', '.join(state.given_up)}", err=True)
     if state is not None and state.left:
         typer.echo(f"{state.left} runs are left; the same command goes on", err=True)
 
 
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(names)
-
-
-def _told(
+def _document(
     measured: MeasuredCampaign, folder: Path, page: Path, state: State | None
 ) -> dict[str, Any]:
     from dwell.study.campaign_questions import questions
 
-    found: dict[str, Any] = {
+    return {
         "folder": folder,
         "report": page,
         "planned": measured.planned,
@@ -216,4 +227,3 @@ def _told(
         "profiles": measured.profiles.to_dicts(),
         "links": measured.links.to_dicts(),
     }
-    return found

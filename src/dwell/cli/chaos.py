@@ -6,33 +6,43 @@ import shutil
 import tempfile
 import time
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from dwell.cli.exit_codes import ExitCode
+from dwell.cli.options import Json, Seed
 from dwell.cli.output import json_text, print_json, write_file
 
 #: A folder with this file is a campaign's, and may be replaced by the next.
 MARK = ".dwell-chaos"
 
 
-def run_chaos(
-    cell: Path | None,
-    minutes: float | None,
-    faults: int | None,
-    seed: int,
-    only: int | None,
-    out: Path | None,
-    *,
-    hosts: bool,
-    as_json: bool,
+def chaos(
+    cell: Annotated[
+        Path | None,
+        typer.Argument(metavar="[CELL]", help="Cell file; a light cell if not given."),
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
+    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
+    seed: Seed = 1,
+    only: Annotated[
+        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
+    ] = None,
+    hosts: Annotated[
+        bool,
+        typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
+    ] = False,
+    as_json: Json = False,
 ) -> None:
-    """Run a campaign, and say what came of it.
+    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
 
-    Raises
-    ------
-    DwellError
-        If the cell does not come up, or the folder holds something else.
+    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
+    after the other, by a seed, for two minutes if nothing else is said.
     """
     from dwell.testbed.chaos.disk import unmount_leftovers
     from dwell.testbed.chaos.fault_campaign import FaultCampaign, on_hosts, on_loopback, summary

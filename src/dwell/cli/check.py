@@ -2,67 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-import numpy as np
 import typer
 
-from dwell.cellfile import load
+import dwell
+from dwell.cli.exit_codes import ExitCode
+from dwell.cli.options import CellArgument, Insecure, Json, Keys, Traces
 from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, PolicyError, ProblemError
-from dwell.estimators import Profile
-from dwell.estimators import by_name as make_estimator
-from dwell.estimators.profile import mean_ms
-from dwell.live.lint import lint
-from dwell.model import Problem, Trace
-from dwell.model.user_classes import is_class_path
-from dwell.policies import by_name as make_policy
+
+if TYPE_CHECKING:
+    from dwell.estimators import Profile
+    from dwell.model import Problem
 
 #: Draws of a process that a percentile is taken of, and their seed.
 DRAWS, SEED = 10_000, 1
 
 
-def check_cell(
-    cell: Path,
-    traces: Path | None,
-    *,
-    node: str | None = None,
-    keys: Path | None = None,
-    insecure: bool = False,
-    as_json: bool,
-) -> bool:
-    """Check a cell, or whether this computer can be one of its nodes, and print what was found.
+def check(
+    cell: CellArgument,
+    traces: Traces = None,
+    node: Annotated[
+        str | None,
+        typer.Option(
+            help="Check instead that this computer can be that node of the live cell: import and "
+            "make its stages and actuators."
+        ),
+    ] = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+    as_json: Json = False,
+) -> None:
+    """Find every fault in a cell, or say what it amounts to.
 
-    Returns
-    -------
-    bool
-        Whether it has no fault.
+    Faults go to stderr, one a line as file:line: path: message, and the exit code is 2. Warnings
+    go there too, but do not change it.
     """
     try:
-        problem = load(cell, traces=traces)
+        problem = dwell.load(cell, traces=traces)
     except ProblemError as error:
-        if as_json:
-            faults = [_fault(fault) | {"line": fault.line} for fault in error.faults]
-            print_json({"valid": False, "faults": faults})
-        else:
-            typer.echo(str(error), err=True)
-        return False
+        _refuse(error.faults, str(error), as_json=as_json)
     if node is not None:
         from dwell.cli.check_node import check_node
 
-        return check_node(problem, cell, node, keys, insecure=insecure, as_json=as_json)
-    wrong = tuple(_own_classes(problem))
-    if wrong:
-        if as_json:
-            told = [_fault(fault) | {"line": None} for fault in wrong]
-            print_json({"valid": False, "faults": told})
-        else:
-            typer.echo("\n".join(f"{cell}: {fault}" for fault in wrong), err=True)
-        return False
+        if not check_node(problem, cell, node, keys, insecure=insecure, as_json=as_json):
+            raise typer.Exit(ExitCode.WRONG)
+        return
+    if faults := tuple(_class_faults(problem)):
+        _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
+    from dwell.estimators import Profile
+
     profile = Profile(problem)
-    warnings = tuple(find_warnings(problem, profile))
+    warnings = tuple(_warnings(problem, profile))
     if as_json:
         found = [_fault(warning) for warning in warnings]
         print_json({"valid": True, **_contents(problem, profile), "warnings": found})
@@ -70,11 +63,24 @@ def check_cell(
         typer.echo(_summary(problem, profile))
         for warning in warnings:
             typer.echo(f"{cell}: warning: {warning}", err=True)
-    return True
 
 
-def _own_classes(problem: Problem) -> Iterator[Fault]:
-    """Yield what is wrong with the policy and the estimator where these are a user's classes."""
+def _refuse(faults: Iterable[Fault], text: str, *, as_json: bool) -> NoReturn:
+    """Print the faults of a cell, and exit."""
+    if as_json:
+        rows = [_fault(fault) | {"line": fault.line} for fault in faults]
+        print_json({"valid": False, "faults": rows})
+    else:
+        typer.echo(text, err=True)
+    raise typer.Exit(ExitCode.WRONG)
+
+
+def _class_faults(problem: Problem) -> Iterator[Fault]:
+    """Yield the faults of the policy and the estimator where these are a user's classes."""
+    from dwell.estimators import by_name as make_estimator
+    from dwell.model.user_classes import is_class_path
+    from dwell.policies import by_name as make_policy
+
     settings = problem.controller
     try:
         if is_class_path(settings.policy) and settings.policy not in problem.candidates:
@@ -88,8 +94,10 @@ def _own_classes(problem: Problem) -> Iterator[Fault]:
         yield Fault("controller.estimator", str(error))
 
 
-def find_warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
+def _warnings(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield what is allowed in a cell but seldom meant."""
+    from dwell.live.lint import lint
+
     yield from _overloads(problem, profile)
     yield from _slow_stages(problem, profile)
     yield from _full_links(problem)
@@ -113,6 +121,8 @@ def _overloads(problem: Problem, profile: Profile) -> Iterator[Fault]:
 
 def _slow_stages(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield stages that take longer for a job than their workers have."""
+    from dwell.estimators.profile import mean_ms
+
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
     for candidate, placement in problem.candidates.items():
         for task in pipeline.tasks.values():
@@ -190,6 +200,10 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
 
 def _late_releases(problem: Problem) -> Iterator[Fault]:
     """Yield a jitter of releases that exceeds the period: many then fall on the same instant."""
+    import numpy as np
+
+    from dwell.model import Trace
+
     jitter, period_ms = problem.pipeline.release_jitter_ms, problem.pipeline.period_ms
     rng = np.random.default_rng(SEED)
     draws = jitter.values if isinstance(jitter, Trace) else jitter.marginal(rng, DRAWS)

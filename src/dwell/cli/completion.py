@@ -12,7 +12,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 #: Variable of the environment with the line up to the cursor.
 LINE = "DWELL_COMPLETE"
@@ -92,6 +94,17 @@ complete --command dwell --no-files --keep-order --arguments '(__dwell_complete)
 """
 
 
+def completion(
+    shell: Annotated[Shell, typer.Argument(metavar="SHELL", help="bash, zsh or fish.")],
+) -> None:
+    """Print the script that has a shell complete commands, options and their values.
+
+    Read it where your shell begins: source <(dwell completion bash) in ~/.bashrc, the same with zsh
+    in ~/.zshrc after compinit, dwell completion fish | source in ~/.config/fish/config.fish.
+    """
+    typer.echo(script(shell), nl=False)
+
+
 def script(shell: Shell) -> str:
     """Return the script that has a shell complete the words of `dwell`."""
     return {Shell.BASH: BASH, Shell.ZSH: ZSH, Shell.FISH: FISH}[shell].lstrip("\n")
@@ -99,8 +112,6 @@ def script(shell: Shell) -> str:
 
 def answer(line: str) -> None:
     """Print what the last word of a line may become, for a script."""
-    import typer
-
     from dwell.cli.commands import app
 
     for value, about in completions(typer.main.get_command(app), line):

@@ -2,55 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dwell.cellfile import load
+import dwell
 from dwell.cli.examples import find_examples
-from dwell.cli.first_answer import compile_first
-from dwell.cli.options import windows_of
+from dwell.cli.options import (
+    Json,
+    Processes,
+    Seconds,
+    Windows,
+    require_one_length,
+    windows_of,
+)
 from dwell.cli.output import print_json, progress, working, write_file
-from dwell.report import comparison_html, comparison_text
-from dwell.study import Comparison, StudyResult, canonical_demo, real_demo, tenants_demo
-from dwell.study.demo import CANONICAL, REAL, WINDOWS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from dwell.study import Comparison, StudyResult
 
 
-def run_demo(
-    real: Path | None,
-    *,
-    seeds: int,
-    windows: int | None,
-    seconds: float | None,
-    out: Path,
-    examples: Path | None,
-    processes: int | None,
-    as_json: bool,
+def demo(
+    real: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Replay the measurements in this folder instead."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 to N of every run.")] = 20,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html goes.")] = Path(
+        "demo-out"
+    ),
+    examples: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where the example cells are, if not found."),
+    ] = None,
+    processes: Processes = None,
+    as_json: Json = False,
 ) -> None:
-    """Compare, print the tables, write the page.
+    """Compare all policies in all scenarios of an example, and write the report.
 
-    Parameters
-    ----------
-    real : Path or None
-        Folder with the measurements to replay; None takes the canonical cell.
-    seeds, processes
-        See `dwell.study.canonical_demo`.
-    windows : int, optional
-        Length of every run; 150 if neither it nor `seconds` is given.
-    seconds : float, optional
-        The length in seconds instead.
-    out : Path
-        Folder for ``report.html``.
-    examples : Path or None
-        Folder with the cells; None looks for it.
-    as_json : bool
-        Print the tables as JSON.
+    Runs are 150 windows long, if neither --windows nor --seconds is given.
     """
+    from dwell.cli.first_answer import compile_first
+    from dwell.report import comparison_html, comparison_text
+    from dwell.study import canonical_demo, real_demo, tenants_demo
+    from dwell.study.demo import CANONICAL, REAL, WINDOWS
+
+    require_one_length(windows, seconds)
     folder = find_examples(examples)
     if seconds is not None:
         cells = (CANONICAL,) if real is None else REAL
-        windows = windows_of(seconds, *(load(folder / name, traces=real) for name in cells))
+        windows = windows_of(seconds, *(dwell.load(folder / name, traces=real) for name in cells))
     windows = windows or WINDOWS
     compile_first()
     with progress("simulating") as shown:

@@ -6,6 +6,7 @@ import re
 import shutil
 from enum import StrEnum
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -56,43 +57,37 @@ STAGES_HEAD = {
 }
 
 
-def new_cell(path: Path, origin: Origin) -> None:
-    """Make the folder of a new cell, and say what to do next.
+def new(
+    folder: Annotated[Path, typer.Argument(metavar="NAME", help="Folder to make.")],
+    origin: Annotated[
+        Origin, typer.Option("--from", help="Example to begin as: simulated, or live.")
+    ] = Origin.CANONICAL,
+) -> None:
+    """Make a folder with a cell of your own: cell.yaml, policy.py, stages.py, test_cell.py.
 
-    Parameters
-    ----------
-    path : Path
-        The folder; its last part names the cell.
-
-    Raises
-    ------
-    ProblemError
-        If there is something of that name already, it cannot name a folder, or the folder around it
-        is not there.
-    OSError
-        If it cannot be written; nothing of it is left then.
+    All of it works as it is; comments say what to change.
     """
-    if FOLDER.fullmatch(path.name) is None:
+    if FOLDER.fullmatch(folder.name) is None:
         raise ProblemError(
-            f"{str(path)!r} is no name for a cell's folder; use letters, digits, _ - . and +, a "
+            f"{str(folder)!r} is no name for a cell's folder; use letters, digits, _ - . and +, a "
             "letter, a digit or _ first, at most 63 characters"
         )
-    if not path.parent.is_dir():
-        raise ProblemError(f"there is no folder {path.parent} to make {path.name} in")
-    files = _files(find_examples(None), path.name, origin)
+    if not folder.parent.is_dir():
+        raise ProblemError(f"there is no folder {folder.parent} to make {folder.name} in")
+    files = _files(find_examples(None), folder.name, origin)
     try:
-        path.mkdir()
+        folder.mkdir()
     except FileExistsError:
-        raise ProblemError(f"{path} is there already; choose another name") from None
+        raise ProblemError(f"{folder} is there already; choose another name") from None
     try:
         for name, text in files.items():
-            (path / name).write_text(text, encoding="utf-8")
+            (folder / name).write_text(text, encoding="utf-8")
     except OSError:
-        shutil.rmtree(path, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
         raise
     typer.echo(
-        f"made {path}: {', '.join(files)}\n\n"
-        f"cd {path}\n"
+        f"made {folder}: {', '.join(files)}\n\n"
+        f"cd {folder}\n"
         "dwell check cell.yaml\n"
         "python test_cell.py\n"
         f"{RUN[origin]} --policy policy:Patient"

@@ -78,6 +78,9 @@ Insecure = Annotated[
         help="Without keys: leave this computer all the same, in a network that you trust.",
     ),
 ]
+TestbedName = Annotated[
+    str, typer.Option("--name", help="Of the testbed, among others on this machine.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 #: Old spellings, which work until the next minor version, by the command that has them.
@@ -127,3 +130,20 @@ def windows_of(seconds: float, *problems: Problem) -> int:
             f"--seconds {seconds:g}: windows last {lengths} s here; give --windows"
         )
     return max(1, math.ceil(round(seconds / each_s[0], 9)))
+
+
+def seconds_of_runs(cell: Path, windows: int | None, seconds: float | None) -> float:
+    """Return how long each run on a testbed takes; 120 s where neither length is given.
+
+    Raises
+    ------
+    typer.BadParameter
+        If both are given.
+    """
+    require_one_length(windows, seconds)
+    if windows is None:
+        return 120.0 if seconds is None else seconds
+    import dwell
+    from dwell.testbed.run import length_s
+
+    return length_s(dwell.load(cell), windows)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -50,6 +51,17 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def file_name(name: str, *, more: str = "") -> str:
+    """Return a name as part of a file's name: other signs than letters, digits, _ . - become _.
+
+    Parameters
+    ----------
+    more : str
+        Signs that stay, too.
+    """
+    return re.sub(rf"[^\w.{more}-]", "_", name)
 
 
 def write_file(path: Path, text: str) -> None:

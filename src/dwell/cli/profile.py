@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import redirect_stdout
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dwell.cli.options import Json, Samples, Warmup
-from dwell.cli.output import aligned, print_json
+from dwell.cli.output import aligned, file_name, print_json
 from dwell.errors import ProfileError
 
 if TYPE_CHECKING:
@@ -74,17 +73,23 @@ def measure(
         raise ProfileError(
             "measuring needs --node and at least one --task; see `dwell profile --help`"
         )
-    _measure_tasks(
-        node,
-        task,
-        inputs or (),
-        samples=samples,
-        warmup=warmup,
-        core=core,
-        period_ms=period_ms,
-        out=out or FOLDER / f"{_file_name(node)}.parquet",
-        as_json=as_json,
-    )
+    from dwell.calibration.pinning import choose_cores, pinned
+
+    path = out or FOLDER / f"{file_name(node)}.parquet"
+    sources = _sources(task)
+    factories = _factories(inputs or (), sources)
+    # First the cores, then everything else: numerical packages start as many threads as they see
+    # cores when they are imported. What the tasks print must not get into the results.
+    with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
+        from dwell.calibration.measure import Settings
+        from dwell.calibration.memory import keep_memory
+        from dwell.calibration.profile_file import require_free, task_name, write_profile
+
+        require_free(path, [task_name(name, node) for name in sources])
+        keep_memory()  # as the processes of a live cell do
+        measured = _measured(node, sources, factories, Settings(samples, warmup, period_ms))
+    write_profile(path, measured)
+    _print_measured(path, measured, as_json=as_json)
 
 
 @profile.command()
@@ -144,7 +149,7 @@ def link(
     from dwell.calibration.round_trips import measure_link, parse_address
 
     host, port = parse_address(peer)
-    path = out or FOLDER / f"{_file_name(source)}-{_file_name(target)}.parquet"
+    path = out or FOLDER / f"{file_name(source)}-{file_name(target)}.parquet"
     name = link_name(source, target)
     require_free(path, [name])
     _say(f"measuring {name}")
@@ -167,38 +172,6 @@ def _refuse_options(context: typer.Context, command: str) -> None:
         if source is not None and source.name == "COMMANDLINE":
             option = parameter.opts[0]
             raise ProfileError(f"{option} stands before {command!r}; give it after that, if at all")
-
-
-def _measure_tasks(
-    node: str,
-    declared: Sequence[str],
-    inputs: Sequence[str],
-    *,
-    samples: int,
-    warmup: int,
-    core: str | None,
-    period_ms: float | None,
-    out: Path,
-    as_json: bool,
-) -> None:
-    """Measure one task after another, then write them all."""
-    from dwell.calibration.pinning import choose_cores, pinned
-
-    sources = _sources(declared)
-    factories = _factories(inputs, sources)
-    # First the cores, then everything else: numerical packages start as many threads as they see
-    # cores when they are imported. What the tasks print must not get into the results.
-    with pinned(choose_cores(core)), redirect_stdout(sys.stderr):
-        from dwell.calibration.measure import Settings
-        from dwell.calibration.memory import keep_memory
-        from dwell.calibration.profile_file import require_free, task_name, write_profile
-
-        settings = Settings(samples, warmup, period_ms)
-        require_free(out, [task_name(task, node) for task in sources])
-        keep_memory()  # as the processes of a live cell do
-        measured = _measured(node, sources, factories, settings)
-    write_profile(out, measured)
-    _print_measured(out, measured, as_json=as_json)
 
 
 def _measured(
@@ -253,11 +226,6 @@ def _sources(declared: Sequence[str]) -> dict[str, str]:
             raise ProfileError(f"--task: {task!r} is given twice; measure one at a time")
         sources[task] = name
     return sources
-
-
-def _file_name(name: str) -> str:
-    """Return a name as part of a file's name; it may hold what that may not."""
-    return re.sub(r"[^\w.-]", "_", name)
 
 
 def _say(what: str) -> None:

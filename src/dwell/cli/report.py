@@ -5,43 +5,52 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import dwell
+from dwell.cli.options import Json
 from dwell.cli.output import print_json, working, write_file, write_report
 from dwell.errors import RunError
-from dwell.record import Run, open_run
-from dwell.record.campaign_folder import is_campaign
-from dwell.report.formatting import listed
-from dwell.study.study_folder import is_study, open_study
+
+if TYPE_CHECKING:
+    from dwell.record import Run
 
 
-def report_folder(
-    folder: Path,
-    page: Path,
-    *,
-    trace: Path | None,
-    figures: Path | None,
-    static: bool,
-    as_json: bool,
+def report(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="FOLDER", help="Of a saved run, of a study, or of a campaign."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Page to write [default: FOLDER/report.html]."),
+    ] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write every job as a trace for Perfetto; the run must have kept its jobs.",
+        ),
+    ] = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Also write figures and tables for a paper: PDF, SVG, LaTeX, CSV.",
+        ),
+    ] = None,
+    static: Annotated[
+        bool, typer.Option("--static", help="A page without scripts: nothing to hover or choose.")
+    ] = False,
+    as_json: Json = False,
 ) -> None:
-    """Write the page of a run, a study or a campaign, and what else is asked for.
+    """Write the report of a run, a study or a campaign: one HTML file that needs nothing else."""
+    from dwell.record.campaign_folder import is_campaign
+    from dwell.study.study_folder import is_study, open_study
 
-    Parameters
-    ----------
-    trace : Path or None
-        File for a run's jobs.
-    figures : Path or None
-        Folder for figures and tables as files.
-    static : bool
-        Whether the page is without scripts.
-
-    Raises
-    ------
-    RunError
-        If the folder is none of these, or a trace is asked for and there are no jobs.
-    """
+    page = out or folder / "report.html"
     for kind, is_one in (("campaign", is_campaign), ("study", is_study)):
         if trace is not None and is_one(folder):
             raise RunError(f"{folder} is a {kind}; name one of its runs for a trace")
@@ -50,31 +59,31 @@ def report_folder(
 
         report_campaign(folder, page, figures=figures, static=static, as_json=as_json)
         return
-    told: dict[str, Any] = {}
+    extras: dict[str, Any] = {}
     events = None
     with working("writing the report"):
         if is_study(folder):
             from dwell.report.study_page import study_page
 
-            found = study_page(open_study(folder))
+            document = study_page(open_study(folder))
         else:
             from dwell.report import trace_events
             from dwell.report.run_page import run_page
 
-            run = open_run(folder)
+            run = dwell.open_run(folder)
             events = None if trace is None else trace_events(run)
-            told = {"trace": trace, **_recovered(run)}
-            found = run_page(run)
-        write_report(found, page, figures=figures, static=static)
+            extras = {"trace": trace, **_recovered(run)}
+            document = run_page(run)
+        write_report(document, page, figures=figures, static=static)
     if trace is not None:
         write_file(trace, json.dumps(events))
     if figures is not None:
-        told["figures"] = figures
+        extras["figures"] = figures
     if as_json:
-        print_json({"report": page, **told})
+        print_json({"report": page, **extras})
         return
     typer.echo(f"report: {page}")
-    for sentence in told.get("lost", ()):
+    for sentence in extras.get("lost", ()):
         typer.echo(f"note: {sentence}")
     if trace is not None:
         typer.echo(f"trace: {trace} (open it at https://ui.perfetto.dev)")
@@ -97,6 +106,8 @@ def _what_was_lost(told: Mapping[str, Any]) -> Iterator[str]:
     told : mapping
         What its meta say under ``recovered``.
     """
+    from dwell.report.formatting import listed
+
     opened = int(told.get("opened", 1))
     if opened > 1:
         yield f"The controller was started {opened} times while the run went on."

@@ -4,58 +4,82 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import dwell
-from dwell.cli.output import print_json, working
+from dwell.cli.exit_codes import ExitCode
+from dwell.cli.options import (
+    CellArgument,
+    Estimator,
+    Json,
+    Policy,
+    Scenario,
+    Seconds,
+    Seed,
+    Traces,
+    Windows,
+    require_one_length,
+    windows_of,
+)
+from dwell.cli.output import file_name, print_json, working
 from dwell.errors import RunError
-from dwell.model import Problem
-from dwell.record import require_free
-from dwell.sim import describe
-from dwell.study.summary import STRETCHES, Row, summarise
+
+if TYPE_CHECKING:
+    from dwell.model import Problem
+    from dwell.study.summary import Row
 
 
-def run_cell(
-    problem: Problem,
-    *,
-    scenario: str,
-    policy: str | None,
-    estimator: str | None,
-    seed: int,
-    windows: int,
-    out: Path | None,
-    jobs: bool,
-    guard: bool,
-    force: bool,
-    how: str | None,
-    as_json: bool,
-) -> bool:
-    """Simulate, save and print; None is what the cell says, or the default folder.
+def run(
+    cell: CellArgument,
+    scenario: Scenario = "baseline",
+    policy: Policy = None,
+    estimator: Estimator = None,
+    seed: Seed = 1,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Where to save the run; runs/CELL-SCENARIO-POLICY-SEED if not given.",
+        ),
+    ] = None,
+    traces: Traces = None,
+    jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
+    guard: Annotated[
+        bool, typer.Option("--guard", help="Let the robots' guard move to a fallback by itself.")
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace another run in the folder.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Simulate a policy on a scenario, save the run, sum it up.
 
-    Parameters
-    ----------
-    how : str or None
-        How it is played, where that is worth a word (see `dwell.cli.first_answer`).
-
-    Returns
-    -------
-    bool
-        Whether the run could be saved.
-
-    Raises
-    ------
-    DwellError
-        If anything named is unknown, or the folder holds something else than a run.
+    300 windows, if neither --windows nor --seconds is given.
     """
+    from dwell.cli.first_answer import prepare
+
+    require_one_length(windows, seconds)
+    problem = dwell.load(cell, traces=traces)
+    if seconds is not None:
+        windows = windows_of(seconds, problem)
+    windows = windows or 300
+    # Before the kernels are imported.
+    how = prepare(windows * problem.window_cycles)
+    from dwell.record import require_free
+    from dwell.sim import describe
+    from dwell.study.summary import summarise
+
     policy = policy or problem.controller.policy
-    folder = out or _folder(problem, scenario, policy, seed)
+    name = f"{problem.name}-{scenario}-{policy}-{seed}"
+    folder = out or Path("runs", file_name(name, more="+"))
     require_free(folder)
-    asked: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "scenario": scenario,
         "policy": policy,
         "estimator": estimator,
@@ -64,15 +88,15 @@ def run_cell(
         "guard": guard,
     }
     if not force:
-        _require_same(folder, describe(problem, **asked))
-    said = f" ({how})" if how else ""
-    with working(f"simulating {windows} windows{said}"):
-        result = dwell.simulate(problem, **asked, jobs=jobs)
+        _require_same(folder, describe(problem, **settings))
+    remark = f" ({how})" if how else ""
+    with working(f"simulating {windows} windows{remark}"):
+        result = dwell.simulate(problem, **settings, jobs=jobs)
         try:
             result.save(folder)
         except RunError as error:
             typer.echo(f"error: {error}", err=True)
-            return False
+            raise typer.Exit(ExitCode.FAILED) from None
     labels: dict[str, str | int] = {"scenario": scenario, "policy": policy, "seed": seed}
     measured = None
     if not result.windows["warmup"].all():
@@ -83,7 +107,6 @@ def run_cell(
     else:
         typer.echo(_summary(problem, labels, windows, measured))
         typer.echo(f"\nsaved to {folder}")
-    return True
 
 
 def _require_same(folder: Path, asked: Mapping[str, Any]) -> None:
@@ -96,12 +119,6 @@ def _require_same(folder: Path, asked: Mapping[str, Any]) -> None:
         raise RunError(
             f"{folder} holds another run; choose another folder, or say --force to replace it"
         )
-
-
-def _folder(problem: Problem, scenario: str, policy: str, seed: int) -> Path:
-    """Return the folder of a run that names none; a name may hold what a file name may not."""
-    name = f"{problem.name}-{scenario}-{policy}-{seed}"
-    return Path("runs", re.sub(r"[^\w.+-]", "_", name))
 
 
 def _summary(
@@ -151,6 +168,8 @@ def _unfinished(row: Row) -> Iterator[tuple[str, str]]:
 
 def _control(row: Row) -> Iterator[tuple[str, str]]:
     """Yield what the actuator got: misses in any K cycles, ages, and how the servo tracked."""
+    from dwell.study.summary import STRETCHES
+
     most = ", ".join(f"{row[f'misses_in_{stretch}']} in {stretch}" for stretch in STRETCHES)
     yield "most misses", f"{most} consecutive cycles"
     ages = (row[f"aoi_{name}_ms"] for name in ("mean", "p95", "peak"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -12,6 +13,24 @@ from dwell.errors import ProblemError
 
 #: What a cell file's first line calls its schema.
 SCHEMA_FILE = "cell.schema.json"
+
+
+def schema(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="What to write; cell.schema.json if not given."),
+    ] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="Write it, for an editor, instead of printing it.")
+    ] = False,
+) -> None:
+    """Print the JSON Schema of the cell file, or write it."""
+    if write:
+        write_schema(file or Path(SCHEMA_FILE))
+    elif file is not None:
+        raise typer.BadParameter(f"say --write to write {file}")
+    else:
+        typer.echo(schema_text(), nl=False)
 
 
 def schema_text() -> str:

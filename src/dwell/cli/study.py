@@ -2,68 +2,91 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dwell.cli.exit_codes import ExitCode
-from dwell.cli.first_answer import compile_first
-from dwell.cli.options import windows_of
-from dwell.cli.output import Progress, aligned, print_json, progress, working
-from dwell.report.formatting import Measure, shown_policy, shown_scenario, write_interval
-from dwell.study import Interval, Study, StudyResult, load_study, run_study
-from dwell.study.over_seeds import over_seeds
+from dwell.cli.options import (
+    Json,
+    Processes,
+    Seconds,
+    Windows,
+    require_one_length,
+    windows_of,
+)
+from dwell.cli.output import Progress, aligned, file_name, print_json, progress, working
+
+if TYPE_CHECKING:
+    from dwell.report.formatting import Measure
+    from dwell.study import Study, StudyResult
 
 # Groups of a point and a scenario that the terminal shows; the tables have all.
 SHOWN = 40
 
-RATE = Measure("violation_rate", "V_D", "%", 100.0)
-COST = Measure("cost", "J", decimals=2)
-MIGRATIONS = Measure("migrations", "migrations")
-REGRET = Measure("regret", "regret", "%", 100.0)
 
-
-def run_study_file(
-    file: Path,
-    *,
-    out: Path | None,
-    processes: int | None,
-    dask: str | None,
-    seeds: int | None,
-    windows: int | None,
-    seconds: float | None,
-    as_json: bool,
+def study(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="Study file (YAML)."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Where parts and tables go; studies/NAME if not given."
+        ),
+    ] = None,
+    processes: Processes = None,
+    dask: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that does the work."),
+    ] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Seeds 1 to N of every run; the file's if not given."
+        ),
+    ] = None,
+    windows: Windows = None,
+    seconds: Seconds = None,
+    # Options of what was `dwell study paper`; they say where that is.
+    quick: Annotated[bool, typer.Option("--quick", hidden=True)] = False,
+    chapter: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
+    real: Annotated[Path | None, typer.Option(hidden=True)] = None,
+    examples: Annotated[Path | None, typer.Option(hidden=True)] = None,
+    as_json: Json = False,
 ) -> None:
-    """Run a study, or go on with it, and print what it comes to.
+    """Simulate every scenario, policy, parameter and seed of a study.
 
-    None is what the study file says, or the default.
-
-    Raises
-    ------
-    DwellError
-        If the file is wrong, the folder holds something else or cannot be written, or the cluster
-        is out of reach.
-    typer.Exit
-        If it was interrupted.
+    What is finished stays in the folder, whatever ends the work: the same command goes on. Runs are
+    as long as the file says, if neither --windows nor --seconds is given.
     """
-    study = load_study(file)
+    if str(file) == "paper" or quick or chapter or real or examples:
+        raise typer.BadParameter(
+            "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
+            "(reproduction/README.md)"
+        )
+    from dwell.cli.first_answer import compile_first
+    from dwell.study import load_study, run_study
+
+    require_one_length(windows, seconds)
+    plan = load_study(file)
     if seeds is not None:
-        study = replace(study, seeds=tuple(range(1, seeds + 1)))
+        plan = replace(plan, seeds=tuple(range(1, seeds + 1)))
     if seconds is not None:
-        windows = windows_of(seconds, *(point.problem for point in study.points))
+        windows = windows_of(seconds, *(point.problem for point in plan.points))
     if windows is not None:
-        study = replace(study, windows=windows)
-    folder = out or Path("studies", re.sub(r"[^\w.-]", "_", study.name))
+        plan = replace(plan, windows=windows)
+    folder = out or Path("studies", file_name(plan.name))
     if dask is None:
         compile_first()
-    with _interruptible(folder, study) as shown:
+    with _interruptible(folder, plan) as shown:
         result = run_study(
-            study,
+            plan,
             folder=folder,
             processes=processes,
             dask=dask,
@@ -71,12 +94,12 @@ def run_study_file(
         )
     if as_json:
         with working("intervals"):
-            table = result.table([measure.column for measure in _measures(study)]).to_dicts()
-        head: dict[str, Any] = {"study": study.name, "folder": folder}
+            table = result.table([measure.column for measure in _measures(plan)]).to_dicts()
+        head: dict[str, Any] = {"study": plan.name, "folder": folder}
         print_json({**head, "runs": result.runs.height, "table": table})
         return
     with working("intervals"):
-        text = study_text(result)
+        text = _text(result)
     typer.echo(f"{text}\n\ntables: {folder}")
 
 
@@ -103,13 +126,22 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
         raise typer.Exit(ExitCode.INTERRUPTED) from None
 
 
-def _measures(study: Study) -> tuple[Measure, ...]:
-    more = (REGRET,) if study.references else ()
-    return (RATE, COST, MIGRATIONS, *more)
+def _measures(study: Study) -> list[Measure]:
+    from dwell.report.formatting import Measure
+
+    measures = [
+        Measure("violation_rate", "V_D", "%", 100.0),
+        Measure("cost", "J", decimals=2),
+        Measure("migrations", "migrations"),
+    ]
+    return measures + [Measure("regret", "regret", "%", 100.0)] * bool(study.references)
 
 
-def study_text(result: StudyResult) -> str:
+def _text(result: StudyResult) -> str:
     """Return the tables of a study as text: one a point and scenario, as many as a screen takes."""
+    from dwell.report.formatting import shown_policy, shown_scenario
+    from dwell.study.over_seeds import over_seeds
+
     study = result.study
     measures = _measures(study)
     groups = len(study.points) * len(study.scenarios)
@@ -138,6 +170,9 @@ def study_text(result: StudyResult) -> str:
 
 
 def _written(row: dict[str, Any], measure: Measure) -> str:
+    from dwell.report.formatting import write_interval
+    from dwell.study import Interval
+
     ends = (row[f"{measure.column}{end}"] for end in ("", "_low", "_high"))
     known = Interval(*(float("nan") if end is None else end for end in ends))
     return str(write_interval(known, measure))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from dwell.cli.campaign import campaign
+from dwell.cli.chaos import chaos
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import (
     CellArgument,
@@ -17,12 +18,12 @@ from dwell.cli.options import (
     Scenario,
     Seconds,
     Seed,
+    TestbedName,
     Windows,
     require_one_length,
+    seconds_of_runs,
 )
-from dwell.cli.output import aligned, print_json
-
-Name = Annotated[str, typer.Option(help="Of the testbed, among others on this machine.")]
+from dwell.cli.output import aligned, file_name, print_json
 
 testbed = typer.Typer(
     no_args_is_help=True,
@@ -45,7 +46,7 @@ def run(
             help="Where logs and the run go; below testbed-out if not given.",
         ),
     ] = None,
-    name: Name = "bed",
+    name: TestbedName = "bed",
     jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job of the run.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -58,7 +59,8 @@ def run(
 
     require_one_length(windows, seconds)
     problem = dwell.load(cell)
-    folder = out or _folder(problem.name, scenario, policy or problem.controller.policy, seed)
+    parts = (problem.name, scenario, policy or problem.controller.policy, str(seed))
+    folder = out or Path("testbed-out", file_name("-".join(parts)))
     found = run_once(
         problem,
         scenario=scenario,
@@ -71,11 +73,6 @@ def run(
         tell=_say,
     )
     _sum_up(found, as_json=as_json)
-
-
-def _folder(*parts: object) -> Path:
-    """Return the folder of a run that names none; a name may hold what a file name may not."""
-    return Path("testbed-out", re.sub(r"[^\w.-]", "_", "-".join(map(str, parts))))
 
 
 def _sum_up(folder: Path, *, as_json: bool) -> None:
@@ -148,80 +145,7 @@ def doctor(
         raise typer.Exit(ExitCode.FAILED)
 
 
-@testbed.command()
-def campaign(
-    cell: CellArgument,
-    scenarios: Annotated[
-        str | None,
-        typer.Option(metavar="NAME,NAME", help="The paper's four if not given."),
-    ] = None,
-    policies: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME,NAME",
-            help="Policies, candidates, or policies with an estimator, as cusum+corrected; all "
-            "candidates, atp, dtp and cusum+corrected if not given.",
-        ),
-    ] = None,
-    repetitions: Annotated[int, typer.Option(min=1, help="Of everything.")] = 5,
-    windows: Windows = None,
-    seconds: Seconds = None,
-    seed: Seed = 1,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Of the campaign; campaigns/CELL if not given."),
-    ] = None,
-    name: Name = "campaign",
-    minutes: Annotated[
-        float | None, typer.Option(min=0, help="Begin no run that would end after these.")
-    ] = None,
-    inventory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Real hosts (YAML), instead of this machine's testbed."),
-    ] = None,
-    report: Annotated[
-        bool, typer.Option("--report", help="Measure nothing: report on what is there.")
-    ] = False,
-    as_json: Json = False,
-) -> None:
-    """Measure every policy in every scenario again and again, in random order, and report.
-
-    What is done stays in the folder, whatever ends the work: the same command goes on. A run takes
-    120 s, if neither --windows nor --seconds is given.
-    """
-    from dwell.cli.campaign import run_campaign_file
-
-    done = run_campaign_file(
-        cell,
-        scenarios=_names(scenarios),
-        policies=_names(policies),
-        repetitions=repetitions,
-        seconds=_run_s(cell, windows, seconds),
-        seed=seed,
-        out=out,
-        name=name,
-        minutes=minutes,
-        inventory=inventory,
-        report=report,
-        as_json=as_json,
-    )
-    if not done:
-        raise typer.Exit(ExitCode.FAILED)
-
-
-def _run_s(cell: Path, windows: int | None, seconds: float | None) -> float:
-    """Return how long each run of several takes, seconds."""
-    import dwell
-    from dwell.testbed.run import length_s
-
-    require_one_length(windows, seconds)
-    if windows is not None:
-        return length_s(dwell.load(cell), windows)
-    return 120.0 if seconds is None else seconds
-
-
-def _names(text: str | None) -> tuple[str, ...]:
-    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+testbed.command()(campaign)
 
 
 @testbed.command()
@@ -239,7 +163,7 @@ def calibrate(
     windows: Windows = None,
     seconds: Seconds = None,
     seed: Seed = 1,
-    name: Name = "calibrate",
+    name: TestbedName = "calibrate",
     real: Annotated[
         bool,
         typer.Option("--real-links", help="Links are real: their delays are what was measured."),
@@ -254,8 +178,8 @@ def calibrate(
 
     if not runs:
         folder = out.with_name(f"{out.stem}.runs")
-        length = _run_s(cell, windows, seconds)
-        runs = make_runs(cell, folder, seconds=length, seed=seed, name=name, tell=_say)
+        length_s = seconds_of_runs(cell, windows, seconds)
+        runs = make_runs(cell, folder, seconds=length_s, seed=seed, name=name, tell=_say)
     write_calibrated(cell, runs, out, emulated=not real, say=typer.echo)
     typer.echo(f"written to {out}")
 
@@ -264,33 +188,4 @@ def _say(line: str) -> None:
     typer.echo(line, err=True)
 
 
-@testbed.command()
-def chaos(
-    cell: Annotated[
-        Path | None,
-        typer.Argument(metavar="[CELL]", help="Cell file; a light cell if not given."),
-    ] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="No fault begins later.")] = None,
-    faults: Annotated[int | None, typer.Option(min=1, help="How many.")] = None,
-    seed: Seed = 1,
-    only: Annotated[
-        int | None, typer.Option(min=1, help="Nothing but this fault of the timeline.")
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Where logs, runs and what was seen go, to be kept."),
-    ] = None,
-    hosts: Annotated[
-        bool,
-        typer.Option("--hosts", help="Every node on a host of its own of a testbed; needs root."),
-    ] = False,
-    as_json: Json = False,
-) -> None:
-    """Have faults befall a cell on this machine, and watch whether it keeps its promises.
-
-    Processes are killed and frozen, links cut, clocks set wrong, CPUs and disks taken away, one
-    after the other, by a seed, for two minutes if nothing else is said.
-    """
-    from dwell.cli.chaos import run_chaos
-
-    run_chaos(cell, minutes, faults, seed, only, out, hosts=hosts, as_json=as_json)
+testbed.command()(chaos)

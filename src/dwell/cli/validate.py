@@ -5,45 +5,57 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import dwell
-from dwell.calibration.speeds import Usual
-from dwell.cli.first_answer import compile_first
+from dwell.cli.options import Json, Processes, Traces
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
-from dwell.record import Run, open_run
-from dwell.report.validation_page import validation_html, validation_text
-from dwell.study.validation import GOALS, Validation, validate
+
+if TYPE_CHECKING:
+    from dwell.calibration.speeds import Usual
+    from dwell.record import Run
+    from dwell.study.validation import Validation
 
 
-def validate_runs(
-    runs: Sequence[Path],
-    cell: Path,
-    *,
-    out: Path | None,
-    seeds: int,
-    traces: Path | None,
-    calibrated_from: Sequence[Path],
-    processes: int | None,
-    as_json: bool,
+def validate(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that were measured.")
+    ],
+    cell: Annotated[Path, typer.Option(metavar="FILE", help="Calibrated cell file (YAML).")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Where page and table go; validations/CELL if not given."
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=2, metavar="N", help="Seeds 1 to N of every run.")] = 20,
+    calibrated_from: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN",
+            help="A run that the cell was calibrated from, besides those that the file "
+            "CELL.calibration.json beside it names; may be repeated.",
+        ),
+    ] = None,
+    traces: Traces = None,
+    processes: Processes = None,
+    as_json: Json = False,
 ) -> None:
-    """Simulate, write the page and the table, and print.
+    """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
+    from dwell.cli.first_answer import compile_first
+    from dwell.report.validation_page import validation_html, validation_text
+    from dwell.study.validation import validate as validate_cell
 
-    Raises
-    ------
-    DwellError
-        If a folder is not a run, or a run is not one that the cell can be validated on.
-    """
     problem = dwell.load(cell, traces=traces)
     opened = _open(runs)
     ids, usual = _sidecar(cell)
-    used = [*ids, *(path.resolve().name for path in calibrated_from)]
+    used = [*ids, *(path.resolve().name for path in calibrated_from or ())]
     compile_first()
     with progress("simulating") as show:
-        validation = validate(
+        validation = validate_cell(
             opened,
             problem,
             seeds=seeds,
@@ -54,24 +66,21 @@ def validate_runs(
         )
     out = out or Path("validations", problem.name)
     page, table = out / "report.html", out / "validation.json"
-    told = _told(validation)
+    document = _document(validation)
     write_file(page, validation_html(validation))
-    write_file(table, json_text(told) + "\n")
+    write_file(table, json_text(document) + "\n")
     if as_json:
-        print_json({"report": page, "table": table, **told})
+        print_json({"report": page, "table": table, **document})
         return
     typer.echo(validation_text(validation))
     typer.echo(f"report: {page}")
 
 
-def sidecar_of(cell: Path) -> Path:
-    """Return the file beside a calibrated cell that says what it was made from."""
-    return cell.with_name(f"{cell.stem}.calibration.json")
-
-
 def _sidecar(cell: Path) -> tuple[list[str], Usual]:
     """Return the ids, or names, of the runs that a cell was calibrated from, and its speeds."""
-    file = sidecar_of(cell)
+    from dwell.calibration.speeds import Usual
+
+    file = cell.with_name(f"{cell.stem}.calibration.json")
     if not file.is_file():
         return [], Usual()
     try:
@@ -100,7 +109,7 @@ def _open(folders: Sequence[Path]) -> dict[str, Run]:
             continue
         known.add(whole)
         try:
-            run = open_run(folder)
+            run = dwell.open_run(folder)
         except RunError as error:
             faults.append(str(error))
             continue
@@ -110,7 +119,9 @@ def _open(folders: Sequence[Path]) -> dict[str, Run]:
     return found
 
 
-def _told(validation: Validation) -> dict[str, Any]:
+def _document(validation: Validation) -> dict[str, Any]:
+    from dwell.study.validation import GOALS
+
     return {
         "cell": validation.problem.name,
         "seeds": validation.seeds,
