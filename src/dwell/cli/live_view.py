@@ -7,19 +7,19 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import typer
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
 
 from dwell.cli.live import proof
 from dwell.model import Problem
 from dwell.report.palette import Palette
 from dwell.report.phases import Disturbed
-
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-    from rich.table import Table
-    from rich.text import Text
 
 MOST_COLUMNS = 100
 LABEL, VALUE = 10, 10
@@ -63,8 +63,8 @@ class Look:
     @property
     def window(self) -> Mapping[str, Any]:
         """The last closed window."""
-        found: Mapping[str, Any] = self.status.get("window") or {}
-        return found
+        window: Mapping[str, Any] = self.status.get("window") or {}
+        return window
 
     @property
     def silent_s(self) -> float:
@@ -95,9 +95,6 @@ def live_view(problem: Problem, seconds: float, plan: Sequence[Disturbed]) -> It
     if not sys.stderr.isatty():
         yield Lines()
         return
-    from rich.console import Console
-    from rich.live import Live
-
     console = Console(stderr=True)
     with Live(console=console, auto_refresh=False, transient=True) as screen:
         yield Screen(
@@ -141,7 +138,7 @@ class _Course:
 
     columns: int
     seconds: float
-    placed: list[tuple[str, bool] | None] = field(default_factory=list)
+    placed: list[tuple[str, bool]] = field(default_factory=list)
     values: dict[str, list[float]] = field(default_factory=dict)
 
     def column(self, at_s: float) -> int:
@@ -205,10 +202,6 @@ class Screen:
 
     def drawn(self) -> RenderableType:
         """Return all that is to be seen."""
-        from rich.console import Group
-        from rich.panel import Panel
-        from rich.text import Text
-
         look = self._looks[-1]
         width = min(self._console.width, MOST_COLUMNS)
         inner = width - 4
@@ -242,8 +235,6 @@ class Screen:
         return course
 
     def _head(self, look: Look, width: int) -> Text:
-        from rich.text import Text
-
         clock = f"{min(look.at_s, self.seconds):.0f} of {self.seconds:.0f} s"
         what = "; ".join(f"{one.kind} ({one.what})" for one in look.active)
         head = Text(what or "nothing disturbs it", style="bold", no_wrap=True)
@@ -269,8 +260,6 @@ class Screen:
 
     @staticmethod
     def _line(label: str, strip: Text, value: str, style: str | None = None) -> Text:
-        from rich.text import Text
-
         line = Text(label.ljust(LABEL), style=GREY, no_wrap=True)
         line.append_text(strip)
         room = " " * max(0, 1 - len(value) + VALUE - 1)
@@ -278,8 +267,6 @@ class Screen:
 
     def _planned(self, look: Look, course: _Course) -> Text:
         """Write when what is done to it, dim as long as it is to come."""
-        from rich.text import Text
-
         letters = ["·"] * course.columns
         for one in self.plan:
             first, last = course.column(one.begin_s), course.column(min(one.end_s, self.seconds))
@@ -291,29 +278,18 @@ class Screen:
         return text.append("".join(letters[now:]), style=GREY)
 
     def _placed(self, course: _Course) -> Text:
-        from rich.text import Text
-
         text = Text()
-        for one in course.placed:
-            if one is None:
-                text.append(" ")
-                continue
-            name, fallback = one
+        for name, fallback in course.placed:
             text.append("▒" if fallback else "█", style=self._colours.get(name, "default"))
         text.append("·" * (course.columns - len(text)), style=GREY)
         return text
 
     def _tables(self, look: Look) -> Table:
-        from rich.table import Table
-
         columns = Table.grid(padding=(0, 4))
         columns.add_row(self._stages(look), self._costs(look), self._load(look))
         return columns
 
     def _stages(self, look: Look) -> Table:
-        from rich.table import Table
-        from rich.text import Text
-
         stages = Table.grid(padding=(0, 1))
         placement = look.status.get("placement")
         placed: Mapping[str, str] = self.problem.candidates.get(placement or "", {})
@@ -326,9 +302,6 @@ class Screen:
 
     def _costs(self, look: Look) -> Table:
         """Write J of every candidate: measured, or estimated."""
-        from rich.table import Table
-        from rich.text import Text
-
         costs = Table.grid(padding=(0, 1))
         placement, moving = look.status.get("placement"), look.status.get("moving_to")
         for name in self.problem.candidates:
@@ -343,9 +316,6 @@ class Screen:
         return costs
 
     def _load(self, look: Look) -> Table:
-        from rich.table import Table
-        from rich.text import Text
-
         load = Table.grid(padding=(0, 1))
         used = look.window.get("utilisation") or {}
         for node in self.problem.fabric.nodes:
@@ -357,8 +327,6 @@ class Screen:
         return load
 
     def _foot(self, look: Look) -> Iterator[Text]:
-        from rich.text import Text
-
         status = look.status
         moved, guarded = status.get("migrations", 0), status.get("guard_moves", 0)
         foot = Text(no_wrap=True, overflow="ellipsis")
@@ -372,8 +340,8 @@ class Screen:
             remark.append(status["headline"], "bold red")
         elif status.get("fallback"):
             proving = status.get("proving")
-            told = f"; {proof(proving)}" if proving else ""
-            remark.append(f"where the guard has put it{told}", f"bold {HELD}")
+            progress = f"; {proof(proving)}" if proving else ""
+            remark.append(f"where the guard has put it{progress}", f"bold {HELD}")
         elif status.get("moving_to"):
             remark.append(f"moving to {status['moving_to']}", GREY)
         elif look.window.get("reason"):
@@ -382,7 +350,6 @@ class Screen:
 
 
 def _sparkline(values: Sequence[float], most: float, limit: float) -> Text:
-    from rich.text import Text
 
     text = Text()
     for value in values:
