@@ -236,6 +236,7 @@ class Looking:
         ({"without": ["camera"]}, "nothing to run for camera"),
         ({"live": {"observer": "looking"}}, "live.observer: 'looking' is not allowed"),
         ({"scenario": "storm"}, "storm"),
+        ({}, "tasks.camera.run (stages:Camera): there is no module 'stages'"),
     ],
 )
 def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
