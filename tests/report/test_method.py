@@ -22,7 +22,12 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from dwell.report.method import cell_definitions, placements_table, scenarios_table
+from dwell.report.method import (
+    cell_definitions,
+    describe_contenders,
+    placements_table,
+    scenarios_table,
+)
 from tests.cells.small import make_problem
 
 EPISODES = Episodes("edge", every_s=Exponential(30.0), for_s=Uniform(2.0, 10.0))
@@ -77,3 +82,12 @@ def test_placements_are_those_of_the_tasks_that_can_move() -> None:
     assert rows["SO"]["perception"] == "E"
     assert "control" not in rows["SO"] or rows["SO"]["control"]
     assert cell_definitions(make_problem())["cost"].startswith("J = ")
+
+
+def test_each_policy_and_estimator_is_told_once() -> None:
+    names = ("LOC", "SO", "HYB", "atp", "dtp", "latency-first", "dtp+corrected", "cusum+corrected")
+    told = describe_contenders(make_problem(), names)
+    assert set(told) == {
+        "LOC, SO, HYB", "DTP", "ATP", "Latency-first", "CUSUM", "… (corrected)"
+    }  # fmt: skip
+    assert told["ATP"].count("our reconstruction") == 1

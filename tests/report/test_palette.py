@@ -5,6 +5,7 @@ from __future__ import annotations
 from dwell.report.palette import INK, MUTED, PAPER, PARTS, RULE, Palette
 
 CANDIDATES = ("LOC", "SO", "HYB")
+NAMES = (*CANDIDATES, "atp", "dtp", "latency-first", "dtp+corrected", "cusum+corrected")
 
 
 def test_a_placement_has_its_colour_whoever_is_compared() -> None:
@@ -28,3 +29,15 @@ def test_no_colour_is_a_placeholder_of_the_page() -> None:
     many = Palette.of([f"c{i}" for i in range(9)], ["a", "b"])
     drawn = {*many.placements.values(), *PARTS.values()}
     assert not drawn & {INK, MUTED, PAPER, RULE}
+
+
+def test_no_two_contenders_are_drawn_alike() -> None:
+    styles = Palette.of(CANDIDATES, NAMES, "profile").policies
+    assert list(styles) == list(NAMES)
+    moving = [styles[name] for name in NAMES[3:]]
+    assert len({style.marker for style in moving}) == len(moving)
+    assert len({str(style.dashes) for style in moving}) == len(moving)
+
+
+def test_where_nobody_says_what_it_believes_nothing_changes() -> None:
+    assert Palette.of(CANDIDATES, NAMES[:6], "profile") == Palette.of(CANDIDATES, NAMES[:6])

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 import dwell
 from dwell.errors import RunError
-from dwell.report.run_header import RunHeader
+from dwell.report.run_header import RunHeader, Tracking
+from dwell.report.run_page import run_page
 from tests.cells.small import make_problem
-from tests.report.live_runs import live_run
+from tests.report.live_runs import TRACKING, live_run
 
 PROBLEM = make_problem()
 
@@ -23,11 +26,15 @@ def test_a_simulated_run_says_what_it_is_of() -> None:
     )
     header = RunHeader.of(run)
     assert (header.kind, header.live) == ("simulated", False)
-    assert (header.cell, header.scenario, header.seed) == (PROBLEM.name, "robot-cpu-stress", "7")
+    assert (header.problem.name, header.scenario, header.seed) == (
+        PROBLEM.name,
+        "robot-cpu-stress",
+        "7",
+    )
     assert header.policy_name == "Cusum"
     assert header.estimator == "Corrected"
-    assert header.candidates == PROBLEM.candidates
-    assert header.window_cycles == PROBLEM.window_cycles
+    assert header.problem.candidates == PROBLEM.candidates
+    assert header.problem.window_cycles == PROBLEM.window_cycles
     assert [one.kind for one in header.disturbed] == ["robot stress"]
 
 
@@ -45,3 +52,28 @@ def test_a_record_without_its_problem_cannot_be_reported() -> None:
     meta = {name: value for name, value in run.meta.items() if name != "problem"}
     with pytest.raises(RunError, match="its record of the problem is incomplete"):
         RunHeader.of(dwell.Run(meta, tables(run)))  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------------------- tracking error
+
+
+def test_a_run_without_one_has_none() -> None:
+    assert Tracking.of({}) is None
+
+
+@pytest.mark.parametrize(
+    "told",
+    [[], {"begin_s": 0}, {**TRACKING, "step_s": 0}, {**TRACKING, "rms_px": [1.0]}],
+)
+def test_an_error_that_cannot_be_read_is_refused(told: object) -> None:
+    with pytest.raises(RunError, match="tracking error cannot be read"):
+        run_page(live_run(tracking=told))
+
+
+def test_rms_is_of_the_stretches_between_two_instants() -> None:
+    tracking = Tracking.of({"tracking": TRACKING})
+    assert tracking is not None
+    mm, px = tracking.rms(0.33, 0.99)
+    assert mm == pytest.approx(math.sqrt((9 + 16) / 2))
+    assert px == pytest.approx(math.sqrt((36 + 64) / 2))
+    assert math.isnan(tracking.rms(10, 11)[0])

@@ -18,7 +18,8 @@ from tests.report.pages import small_run
 
 @pytest.fixture(scope="module")
 def events() -> list[TraceEvent]:
-    return trace_events(small_run())["traceEvents"]
+    events: list[TraceEvent] = trace_events(small_run())["traceEvents"]
+    return events
 
 
 def of(events: list[TraceEvent], phase: str) -> list[TraceEvent]:

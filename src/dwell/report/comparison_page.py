@@ -7,7 +7,6 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from dwell.report.charts import curves
-from dwell.report.contenders import palette_of
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, shown_policy, shown_scenario
 from dwell.report.method import method_blocks, ranges
@@ -80,7 +79,7 @@ def _sections(
     comparison: Comparison, blocks: PolicyBlocks, tenants: StudyResult | None
 ) -> Iterator[Section]:
     yield Section("", [blocks.rate(), blocks.counts()])
-    predictions = predictions_table(comparison, blocks.prefix)
+    predictions = predictions_table(comparison, blocks)
     if predictions.rows:
         yield Section("What the paper predicts", [predictions])
     yield Section("Results", [blocks.results()])
@@ -114,7 +113,7 @@ def _sections(
     yield Section("How it was made", [*method, Definitions(about)])
 
 
-def predictions_table(comparison: Comparison, prefix: str = "") -> Table:
+def predictions_table(comparison: Comparison, blocks: PolicyBlocks) -> Table:
     """Return the paper's predictions beside what the runs say; no rows for another cell."""
     policies = [DTP] if DTP in comparison.policies else []
     columns: Columns = [
@@ -126,14 +125,14 @@ def predictions_table(comparison: Comparison, prefix: str = "") -> Table:
         Measure("share", "share of the predicted", "%", 100.0),
     ]
     return Table(
-        f"{prefix}predictions",
+        f"{blocks.prefix}predictions",
         "The paper’s predictions, and where they fail",
         columns,
         paper_predictions(comparison, policies).to_dicts(),
         Text("scenario", "", "scenario"),
         "Its words are read as conditions on numbers. A condition holds, or fails, only where the "
         "95 % interval over seeds says so; else it is open.",
-        palette_of(comparison.problem, comparison.policies),
+        blocks.palette,
     )
 
 
@@ -230,5 +229,5 @@ def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
         Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
     """
     blocks = PolicyBlocks(comparison)
-    tables = [blocks.results(compact=True), predictions_table(comparison), blocks.counts()]
+    tables = [blocks.results(compact=True), predictions_table(comparison, blocks), blocks.counts()]
     return "\n".join(table_text(one, width=width) for one in tables if one.rows)

@@ -5,12 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem, Process, Trace
-from dwell.report.contenders import describe_contenders
-from dwell.report.formatting import Measure, percent, write_number
+from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_number
 from dwell.report.page import Block, Definitions
-from dwell.report.palette import Palette
+from dwell.report.palette import FAMILIES, Palette, contended
 from dwell.report.table import Columns, Table, Text
+
+#: By what stands in brackets behind a policy.
+BELIEFS = {
+    **{name: estimator.sentence for name, estimator in ESTIMATORS.items()},
+    "hindsight": "is told, one window late, what every placement would have cost: what the rule "
+    "does with estimates that are right.",
+}
+#: By what stands with a hyphen behind a policy.
+VARIANTS = {
+    "thresholds": "by the thresholds alone, without a cost.",
+    "tuned": "with settings that were chosen on seeds that nothing else is done on.",
+    "escape": "with the escape: it may move before the dwell time is over, where the placement it "
+    "is on is over a cap.",
+    "dwell": "under the dwell time of Algorithm 1.",
+}
 
 
 def method_blocks(
@@ -143,6 +158,30 @@ def _caps(problem: Problem) -> str:
     if math.isfinite(caps.utilisation):
         found.append(f"U {percent(caps.utilisation)}")
     return ", ".join(found) or "–"
+
+
+def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str]:
+    """Return every policy and every estimator once: a sentence each, by the name that is shown.
+
+    Parameters
+    ----------
+    names : iterable of str
+        As in tables; those that nothing is known of are left out.
+    """
+    names = tuple(names)
+    sentences: dict[str, str] = {}
+    statics = [name for name in problem.candidates if name in names]
+    if statics:
+        sentences[", ".join(statics)] = "Placements; as policies these never move."
+    known = [one for one in map(contended, names) if one is not None]
+    for family, policy in FAMILIES.items():
+        if any(one.family == family for one in known):
+            remark = f" {OURS}" if family == "atp" else ""
+            sentences[shown_contender(family)] = f"{policy.sentence}{remark}"
+    parts = {part for one in known for part in (one.variant, one.belief)}
+    for form, texts in (("… ({})", BELIEFS), ("…-{}", VARIANTS)):
+        sentences |= {form.format(name): text for name, text in texts.items() if name in parts}
+    return sentences
 
 
 def ranges(seeds: Sequence[int]) -> str:

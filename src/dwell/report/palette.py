@@ -129,32 +129,39 @@ class Palette:
     policies: Mapping[str, Style]
 
     @classmethod
-    def of(cls, candidates: Iterable[str], policies: Iterable[str] = ()) -> Palette:
+    def of(
+        cls, candidates: Iterable[str], policies: Iterable[str] = (), estimator: str = ""
+    ) -> Palette:
         """Give every candidate a colour and every policy a style.
 
         A policy with a candidate's name is that placement and has its colour.
 
         Parameters
         ----------
-        candidates : iterable of str
         policies : iterable of str
             With what they believe in brackets, where that tells them apart.
+        estimator : str
+            What the cell says that policies believe. Where any of them says so itself, the others
+            are drawn as who believes this: ``dtp`` is then another line than ``dtp+corrected``.
         """
         placements = {name: HUES[i % len(HUES)] for i, name in enumerate(candidates)}
         policies = tuple(dict.fromkeys(policies))
-        moving = [name for name in policies if name not in placements]
+        moving = {name: contended(name) for name in policies if name not in placements}
+        if any(known.belief for known in moving.values() if known):
+            for name, known in moving.items():
+                if known and known == Contended(known.family):
+                    moving[name] = known._replace(belief=estimator)
         spare = [hue for hue in reversed(HUES) if hue not in placements.values()]
         # Hues that a family has by its name are not given to others while there are more.
         spare.sort(key=lambda hue: hue in COLOURS.values())
-        styles: dict[str, Style] = {}
+        styles = {name: Style(hue, CIRCLE, SOLID, 1.3) for name, hue in placements.items()}
         variants: dict[str, int] = {}
         unknown = 0
-        for name in moving:
-            known = contended(name)
+        for name, known in moving.items():
             if known is None:
                 colour = (spare or [MUTED])[unknown % max(len(spare), 1)]
-                place = unknown = unknown + 1
-                styles[name] = _style(colour, place)
+                unknown += 1
+                styles[name] = _style(colour, unknown)
                 continue
             place = _place(known, variants)
             colour = COLOURS[known.family]
@@ -164,10 +171,7 @@ class Palette:
                 colour = MUTED
             shift = tuple(FAMILIES).index(known.family)
             styles[name] = _style(colour, place + shift, strong=known.family == "dtp")
-        for name in policies:
-            if name in placements:
-                styles[name] = Style(placements[name], CIRCLE, SOLID, 1.3)
-        return cls(placements, styles)
+        return cls(placements, {name: styles[name] for name in policies})
 
 
 def _place(known: Contended, variants: dict[str, int]) -> int:

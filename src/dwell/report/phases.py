@@ -176,7 +176,7 @@ class PhaseRow(NamedTuple):
     rms_px: float
 
 
-def phase_rows(run: Run, facts: RunHeader) -> list[PhaseRow]:
+def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
     """Return the phases of a run that have cycles; none where there are too many of them."""
     import polars as pl
 
@@ -184,7 +184,7 @@ def phase_rows(run: Run, facts: RunHeader) -> list[PhaseRow]:
     if cycles.is_empty():
         return []
     released_s = cycles["release_ns"].to_numpy() / 1e9
-    found = phases(facts.disturbed, float(released_s[-1]) + facts.period_ms / 1e3)
+    found = phases(header.disturbed, float(released_s[-1]) + header.period_ms / 1e3)
     if len(found) > MOST:
         return []
     moved_s = _moves(run)
@@ -199,8 +199,8 @@ def phase_rows(run: Run, facts: RunHeader) -> list[PhaseRow]:
         guards = sum(phase.begin_s <= at_s < phase.end_s for at_s in guard_s)
         counts = mine["placement"].cast(pl.String).value_counts(sort=True)
         rms_mm, rms_px = (math.nan, math.nan)
-        if facts.tracking is not None:
-            rms_mm, rms_px = facts.tracking.rms(phase.begin_s, phase.end_s)
+        if header.tracking is not None:
+            rms_mm, rms_px = header.tracking.rms(phase.begin_s, phase.end_s)
         rows.append(
             PhaseRow(
                 phase.name,

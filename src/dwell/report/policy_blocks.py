@@ -17,9 +17,9 @@ from dwell.report.charts import (
     intervals,
     stacked,
 )
-from dwell.report.contenders import palette_of
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, shown_contender, shown_scenario
+from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
 from dwell.study import AIM, over_seeds, under
 
@@ -81,7 +81,9 @@ class PolicyBlocks:
             [str(name) for name in self.runs[column].unique(maintain_order=True)]
             for column in ("scenario", "policy")
         )
-        self.palette = palette_of(self.problem, self.policies)
+        self.palette = Palette.of(
+            self.problem.candidates, self.policies, self.problem.controller.estimator
+        )
         #: By what the policies are called in figures.
         self.styles = {shown_contender(name): self.palette.policies[name] for name in self.policies}
 

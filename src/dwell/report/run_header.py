@@ -1,33 +1,31 @@
-"""Header of a run's page: cell, scenario, policy, seed, versions, from the run's record."""
+"""Header of a run's page: cell, scenario, policy, seed, tracking error, from the run's record."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dwell.errors import RunError
+from dwell.model import Problem
 from dwell.record import Run
 from dwell.report.phases import Disturbed, disturbed
-from dwell.report.tracking import Tracking
 from dwell.study.drawn_disturbances import disturbances_of
 
 
 class RunHeader(NamedTuple):
-    """Of what a run is the record.
+    """What a run is the record of.
 
     Parameters
     ----------
     kind : str
         ``simulated`` or ``live``.
-    cell, scenario, policy, estimator, seed : str
+    scenario, policy, estimator, seed : str
         As text; a dash where there is none.
-    candidates : mapping of str to mapping of str to str
-        Node of every task.
-    nodes : tuple of str
-    window_cycles : int
-        W.
-    versions : mapping of str to str
     disturbed : tuple of Disturbed
         What was done to nodes and links: as it was played, where the run says so, and as its
         scenario has it elsewhere.
@@ -35,25 +33,20 @@ class RunHeader(NamedTuple):
         What was lost of a live run's journal.
     """
 
+    problem: Problem
     kind: str
-    cell: str
     scenario: str
     policy: str
     estimator: str
     seed: str
-    candidates: Mapping[str, Mapping[str, str]]
-    nodes: tuple[str, ...]
-    period_ms: float
-    deadline_ms: float
-    window_cycles: int
     versions: Mapping[str, str]
-    disturbed: tuple[Disturbed, ...] = ()
-    tracking: Tracking | None = None
-    recovered: Mapping[str, Any] = {}
+    disturbed: tuple[Disturbed, ...]
+    tracking: Tracking | None
+    recovered: Mapping[str, Any]
 
     @classmethod
     def of(cls, run: Run) -> RunHeader:
-        """Read the facts of a run.
+        """Read the header of a run.
 
         Raises
         ------
@@ -68,22 +61,37 @@ class RunHeader(NamedTuple):
                 f"this run cannot be reported: its record of the problem is incomplete ({error})"
             ) from None
         return cls(
+            problem=problem,
             kind=str(meta.get("kind", "simulated")),
-            cell=problem.name,
             scenario=str(meta.get("scenario") or "–"),
             policy=str(meta.get("policy") or "–"),
             estimator=str(meta.get("estimator") or "–"),
             seed="–" if meta.get("seed") is None else str(meta["seed"]),
-            candidates=problem.candidates,
-            nodes=tuple(problem.fabric.nodes),
-            period_ms=problem.pipeline.period_ms,
-            deadline_ms=problem.pipeline.deadline_ms,
-            window_cycles=problem.window_cycles,
             versions=meta.get("versions", {}),
             disturbed=tuple(disturbed(disturbances, problem.fabric)),
             tracking=Tracking.of(meta),
             recovered=meta.get("recovered", {}),
         )
+
+    @property
+    def period_ms(self) -> float:
+        """Time between the releases of two cycles."""
+        return self.problem.pipeline.period_ms
+
+    @property
+    def deadline_ms(self) -> float:
+        """D."""
+        return self.problem.pipeline.deadline_ms
+
+    @property
+    def window_cycles(self) -> int:
+        """W."""
+        return self.problem.window_cycles
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the cell's nodes, in the order of its file."""
+        return tuple(self.problem.fabric.nodes)
 
     @property
     def policy_name(self) -> str:
@@ -94,3 +102,52 @@ class RunHeader(NamedTuple):
     def live(self) -> bool:
         """Whether real processes ran."""
         return self.kind == "live"
+
+
+class Tracking(NamedTuple):
+    """Root mean squares of the error of a run's loop, over short stretches of equal length.
+
+    Parameters
+    ----------
+    begin_s : float
+        From the first release of the run to the first stretch.
+    mm, px : float64 array, shape (stretches,)
+        NaN where the error is not known.
+    """
+
+    begin_s: float
+    step_s: float
+    mm: NDArray[np.float64]
+    px: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, meta: Mapping[str, Any]) -> Tracking | None:
+        """Read the error from a run's record; None where it has none.
+
+        Raises
+        ------
+        RunError
+            If it cannot be read.
+        """
+        kept = meta.get("tracking")
+        if kept is None:
+            return None
+        try:
+            mm, px = (np.array(kept[name], np.float64) for name in ("rms_mm", "rms_px"))
+            tracking = cls(float(kept["begin_s"]), float(kept["step_s"]), mm, px)
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"its tracking error cannot be read ({error!r})") from None
+        if tracking.step_s <= 0 or mm.shape != px.shape or mm.ndim != 1:
+            raise RunError("its tracking error cannot be read: its parts do not fit together")
+        return tracking
+
+    def rms(self, begin_s: float, end_s: float) -> tuple[float, float]:
+        """Return the root mean squares in mm and px between two instants; NaN where unknown."""
+        middle_s = self.begin_s + (np.arange(len(self.mm)) + 0.5) * self.step_s
+        inside = (begin_s <= middle_s) & (middle_s < end_s)
+        return _rms(self.mm[inside]), _rms(self.px[inside])
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else math.nan

@@ -94,7 +94,7 @@ class _RunPage:
         self.most = sections
         self.header = header
         self.counted = counted
-        self.palette = Palette.of(header.candidates)
+        self.palette = Palette.of(header.problem.candidates)
         self.begin_s = _begins(run, header)
         numbers = run.windows["window"].to_list()
         self.begin_of = dict(zip(numbers, self.begin_s.tolist(), strict=True))
@@ -106,7 +106,7 @@ class _RunPage:
         header, counted = self.header, self.counted
         minutes = counted.cycles.height * header.period_ms / 60e3
         return Page(
-            title=f"{self._policy()} on {header.cell}",
+            title=f"{self._policy()} on {header.problem.name}",
             subtitle=" · ".join(
                 (
                     header.kind if header.live else f"{header.kind}, seed {header.seed}",
@@ -499,7 +499,7 @@ class _RunPage:
         header = self.header
         return Definitions(
             {
-                "cell": header.cell,
+                "cell": header.problem.name,
                 "scenario": header.scenario,
                 "record": f"{header.kind}, seed {header.seed}",
                 "policy": header.policy,
@@ -526,11 +526,11 @@ def _undone(moves: pl.DataFrame) -> int:
 
 def _moving(header: RunHeader, name: str) -> str:
     """Return where a candidate puts the tasks that are not on one node in all of them."""
-    first = next(iter(header.candidates.values()))
+    first = next(iter(header.problem.candidates.values()))
     return ", ".join(
         f"{task} on {node}"
-        for task, node in header.candidates[name].items()
-        if any(other.get(task) != first.get(task) for other in header.candidates.values())
+        for task, node in header.problem.candidates[name].items()
+        if any(other.get(task) != first.get(task) for other in header.problem.candidates.values())
     )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from dwell.report.phases import Disturbed
-    from dwell.report.tracking import Tracking
+    from dwell.report.run_header import Tracking
 
 #: Marks of a panel at most; of longer runs several windows are one mark.
 MOST_MARKS = 600

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NotRequired, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.report.run_header import RunHeader
 
@@ -24,33 +24,11 @@ CELL = 0
 # Threads kept for the workers of a task on a node.
 LANES = 1000
 
-Arguments: TypeAlias = "dict[str, str | int | float | bool | None]"
+#: Of the Chrome JSON trace event format; times are microseconds.
+TraceEvent: TypeAlias = "dict[str, Any]"
 
 
-class TraceEvent(TypedDict):
-    """One event of the Chrome JSON trace event format; times are microseconds."""
-
-    name: str
-    ph: str
-    pid: int
-    tid: int
-    ts: NotRequired[float]
-    dur: NotRequired[float]
-    cat: NotRequired[str]
-    id: NotRequired[str]
-    s: NotRequired[str]
-    args: NotRequired[Arguments]
-
-
-class TraceDocument(TypedDict):
-    """A whole trace, ready for JSON."""
-
-    traceEvents: list[TraceEvent]
-    displayTimeUnit: str
-    otherData: dict[str, str]
-
-
-def trace_events(run: Run) -> TraceDocument:
+def trace_events(run: Run) -> dict[str, Any]:
     """Return the jobs, cycles and migrations of a run as trace events.
 
     Parameters
@@ -68,48 +46,48 @@ def trace_events(run: Run) -> TraceDocument:
     RunError
         If the run kept no jobs, or its record is incomplete.
     """
-    facts = RunHeader.of(run)
+    header = RunHeader.of(run)
     jobs = run.jobs
     return {
         "traceEvents": [
-            *_names(facts, jobs),
-            *_job_events(facts, jobs),
+            *_names(header, jobs),
+            *_job_events(header, jobs),
             *_cycle_events(run.cycles, jobs),
-            *_migration_events(run, facts),
+            *_migration_events(run, header),
         ],
         "displayTimeUnit": "ms",
         "otherData": {
-            "cell": facts.cell,
-            "scenario": facts.scenario,
-            "policy": facts.policy,
-            "seed": facts.seed,
+            "cell": header.problem.name,
+            "scenario": header.scenario,
+            "policy": header.policy,
+            "seed": header.seed,
         },
     }
 
 
-def _names(facts: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+def _names(header: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
     """Name the processes, and the first thread of every task."""
-    yield _name("process_name", CELL, 0, f"cell {facts.cell}")
-    for node, pid in _processes(facts).items():
+    yield _name("process_name", CELL, 0, f"cell {header.problem.name}")
+    for node, pid in _processes(header).items():
         yield _name("process_name", pid, 0, f"node {node}")
     for node, task in jobs.select("node", "task").unique(maintain_order=True).rows():
-        yield _name("thread_name", _processes(facts)[node], _threads(jobs)[task], task)
+        yield _name("thread_name", _processes(header)[node], _threads(jobs)[task], task)
 
 
-def _job_events(facts: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
+def _job_events(header: RunHeader, jobs: pl.DataFrame) -> Iterator[TraceEvent]:
     """Jobs as slices, their waiting as asynchronous ones."""
     threads = _threads(jobs)
     known = [jobs[column].max() for column in ("ready_ns", "start_ns", "end_ns")]
     # A job that runs when the run ends is shown up to there.
     last_ns = max((value for value in known if isinstance(value, int)), default=0)
     for (node, task), mine in jobs.group_by("node", "task", maintain_order=True):
-        pid, thread = _processes(facts)[str(node)], threads[str(task)]
+        pid, thread = _processes(header)[str(node)], threads[str(task)]
         free: list[tuple[int, int]] = []
         for job in mine.sort("start_ns", nulls_last=True).iter_rows(named=True):
             ready_ns, start_ns = job["ready_ns"], job["start_ns"]
             end_ns = last_ns if job["end_ns"] is None else job["end_ns"]
             begun_ns = end_ns if start_ns is None else start_ns
-            about: Arguments = {"cycle": job["cycle"], "outcome": str(job["outcome"])}
+            about = {"cycle": job["cycle"], "outcome": str(job["outcome"])}
             if begun_ns > ready_ns:
                 name, key = f"{task} waits", f"{pid}/{task}/{job['cycle']}"
                 yield from _span(name, "waiting", pid, key, (ready_ns, begun_ns), about)
@@ -140,7 +118,7 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
     for cycle in played.iter_rows(named=True):
         release_ns, latency_ns = cycle["release_ns"], cycle["latency_ns"]
         end_ns = cycle["last_ns"] if latency_ns is None else release_ns + latency_ns
-        about: Arguments = {
+        about = {
             "placement": str(cycle["placement"]),
             "outcome": str(cycle["outcome"]),
             "missed": cycle["missed"],
@@ -149,11 +127,11 @@ def _cycle_events(cycles: pl.DataFrame, jobs: pl.DataFrame) -> Iterator[TraceEve
         yield from _span(name, "cycle", CELL, key, (release_ns, end_ns), about)
 
 
-def _migration_events(run: Run, facts: RunHeader) -> Iterator[TraceEvent]:
+def _migration_events(run: Run, header: RunHeader) -> Iterator[TraceEvent]:
     """Decisions that migrate, at the close of the window they were made after."""
     import polars as pl
 
-    closes = run.windows.select("window", cycle=pl.col("first_cycle") + facts.window_cycles)
+    closes = run.windows.select("window", cycle=pl.col("first_cycle") + header.window_cycles)
     moves = run.decisions.filter(pl.col("migrated")).join(closes, on="window")
     for move in moves.join(run.cycles, on="cycle", suffix="_of_cycle").iter_rows(named=True):
         yield {
@@ -168,8 +146,8 @@ def _migration_events(run: Run, facts: RunHeader) -> Iterator[TraceEvent]:
         }
 
 
-def _processes(facts: RunHeader) -> dict[str, int]:
-    return {node: pid for pid, node in enumerate(facts.nodes, start=CELL + 1)}
+def _processes(header: RunHeader) -> dict[str, int]:
+    return {node: pid for pid, node in enumerate(header.nodes, start=CELL + 1)}
 
 
 def _threads(jobs: pl.DataFrame) -> dict[str, int]:
@@ -183,10 +161,10 @@ def _name(what: str, pid: int, tid: int, name: str) -> TraceEvent:
 
 
 def _span(
-    name: str, category: str, pid: int, key: str, ns: tuple[int, int], about: Arguments
+    name: str, category: str, pid: int, key: str, ns: tuple[int, int], about: TraceEvent
 ) -> Iterator[TraceEvent]:
     """Begin and end of an asynchronous slice."""
-    begin: TraceEvent = {
+    begin = {
         "name": name,
         "cat": category,
         "ph": "b",
