@@ -62,7 +62,9 @@ def paired(
         for place, sites in beside.items():
             have = {site: block[site] for site in sites & block.keys()}
             while missing := sites - have.keys():
-                donor = max(runs, key=lambda run: _use(blocks[run], missing, have))
+                # The run that has most of the missing tasks, and then of those that are there.
+                wanted = missing, have.keys()
+                donor = max(blocks, key=lambda run: [len(w & blocks[run].keys()) for w in wanted])
                 of = blocks[donor]
                 if common := sorted(have.keys() & of.keys()):
                     taken = _as_slow([have[site] for site in common], [of[site] for site in common])
@@ -76,29 +78,17 @@ def paired(
     return {site: np.concatenate(values) for site, values in columns.items()}
 
 
-def _use(
-    donor: Mapping[SiteName, Floats], missing: set[SiteName], have: Mapping[SiteName, Floats]
-) -> tuple[int, int]:
-    """How many tasks a run has that are missing, and how many that are there."""
-    return len(missing & donor.keys()), len(have.keys() & donor.keys())
-
-
 def _as_slow(ours: Sequence[Floats], theirs: Sequence[Floats]) -> NDArray[np.intp]:
-    """Return for every row of some tasks that of another run that has the same place in it."""
-    own, other = (_slowness(columns) for columns in (ours, theirs))
+    """Return for every row of some tasks that of another run that has the same place in it.
+
+    A row's place among all is by how long its tasks took together: short ones, whose noise is as
+    large as what slows them, have little say.
+    """
+    own, other = (np.sum(columns, axis=0) for columns in (ours, theirs))
     place = np.empty(len(own))
     place[np.argsort(own, kind="stable")] = (np.arange(len(own)) + 0.5) / len(own)
     ordered = np.argsort(other, kind="stable")
     return ordered[(place * len(other)).astype(np.intp)]
-
-
-def _slowness(columns: Sequence[Floats]) -> Floats:
-    """How slow each row is among all: how long its tasks took together.
-
-    Short ones, whose noise is as large as what slows them, have little say.
-    """
-    slowness: Floats = np.sum(columns, axis=0)
-    return slowness
 
 
 def _block(of: Mapping[SiteName, Part]) -> dict[SiteName, Floats]:

@@ -137,33 +137,31 @@ def _on_the_way_ms(
 
 def messaging(measured: Sequence[Measured], problem: Problem) -> dict[SiteName, float]:
     """CPU time, ms, that every worker takes for a job besides its stage's, by task and node."""
-    of: dict[tuple[str, str, str], list[tuple[float, float]]] = {}
+    of: dict[SiteName, list[tuple[float, float]]] = {}
     for one in measured:
         for (node, process), rate in one.rates.items():
-            task, at, rest = process.partition("@")
-            worker = at and task in problem.pipeline.tasks and rest == node
+            task, _, rest = process.partition("@")
+            worker = task in problem.pipeline.tasks and rest == node
             if not worker or node in one.disturbed.nodes:
                 continue
-            key = task, node, False
-            jobs = one.starts.get(key, 0.0)
+            jobs = one.starts.get((task, node, False), 0.0)
             # Cores besides those of the stage, and jobs a millisecond.
-            besides = rate - jobs * one.spent_ms.get(key, 0.0) / 1e3
-            of.setdefault((process, task, node), []).append((jobs / 1e3, besides))
+            besides = rate - jobs * one.spent_ms.get((task, node, False), 0.0) / 1e3
+            of.setdefault((task, node), []).append((jobs / 1e3, besides))
     idle: list[float] = []
-    open_ones: list[tuple[str, str, str]] = []
+    always: dict[SiteName, tuple[Floats, Floats]] = {}
     overhead_ms: dict[SiteName, float] = {}
-    for (process, task, node), points in of.items():
+    for site, points in of.items():
         jobs, besides = np.array(points).T
         if jobs.max() == 0.0:
             idle.append(max(float(besides.mean()), 0.0))
         elif np.ptp(jobs) > 0.5 * jobs.max():
             slope, start = np.polyfit(jobs, besides, 1)
             idle.append(max(float(start), 0.0))
-            overhead_ms[task, node] = max(float(slope), 0.0)
+            overhead_ms[site] = max(float(slope), 0.0)
         else:
-            open_ones.append((process, task, node))
+            always[site] = jobs, besides
     usual = float(np.mean(idle)) if idle else 0.0
-    for process, task, node in open_ones:
-        jobs, besides = np.array(of[process, task, node]).T
-        overhead_ms[task, node] = max(float((besides - usual).mean() / jobs.mean()), 0.0)
+    for site, (started, spent) in always.items():
+        overhead_ms[site] = max(float((spent - usual).mean() / started.mean()), 0.0)
     return overhead_ms
