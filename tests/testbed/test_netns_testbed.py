@@ -63,7 +63,7 @@ def test_cells_that_share_a_link_have_to_agree_on_it(tmp_path: Path) -> None:
 
 
 def test_a_run_begins_anew_with_everybody_there(testbed: NetnsTestbed) -> None:
-    (watcher,) = testbed.watchers
+    (watcher,) = testbed.watchers.values()
     begun_ns = time.monotonic_ns()
     before = {testbed.begin()[0]}
     # Nothing of the time until everybody was there is part of it.
@@ -113,7 +113,7 @@ def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> No
 
 
 def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
-    (watcher,) = testbed.watchers
+    (watcher,) = testbed.watchers.values()
     if "controller@E" not in testbed.processes.running:
         testbed.begin()
     there = set(testbed._groups.pids("R2"))

@@ -111,8 +111,8 @@ class NetnsTestbed(LocalTestbed):
         `problem` is the first, and so are its run and what is said of it.
     links : dict of frozenset of str to TunLink
         By pair of nodes.
-    watchers : tuple of Watcher
-        One of each cell.
+    watchers : dict of str to Watcher
+        By the name of the cell.
 
     Raises
     ------
@@ -141,13 +141,12 @@ class NetnsTestbed(LocalTestbed):
         self.nodes: dict[str, Node] = nodes_of(self.problems)
         self.folder, self.name, self.seed = folder.resolve(), name, seed
         self.links: dict[frozenset[str], TunLink] = {}
-        self.watchers: tuple[Watcher, ...] = ()
+        self.watchers: dict[str, Watcher] = {}
         self.stress: dict[str, Burner] = {}
         self._usual = links_of(self.problems)
         self._more = tuple(more)
         self._environment, self._clocks = dict(environment or {}), clocks
         self._conditions = {name: usual_conditions(link) for name, link in self._usual.items()}
-        self._threads = dict.fromkeys(self.nodes, 0)
         self._down: set[str] = set()
         self._claim = Claim(name, list(self.nodes))
         # Run of each cell that is no part of any measurement any more.
@@ -224,7 +223,9 @@ class NetnsTestbed(LocalTestbed):
         )
         self.processes.write()
         self._stack.callback(self.processes.stop)
-        self.watchers = tuple(enter(self._watcher(problem)) for problem in self.problems)
+        for problem in self.problems:
+            watcher = Watcher(self.processes.file_of(problem), self.beside(problem.controller_node))
+            self.watchers[problem.name] = enter(watcher)
 
     @property
     def probing(self) -> list[str]:
@@ -256,10 +257,6 @@ class NetnsTestbed(LocalTestbed):
         seed = self.seed * len(self.nodes) ** 2 + number
         return TunLink(pair, devices, usual, retransmit_ms=retransmit_ms, seed=seed)
 
-    def _watcher(self, problem: Problem) -> Watcher:
-        prefix = self._hosts.inside(problem.controller_node, [])
-        return Watcher(self.processes.file_of(problem), prefix)
-
     def _start_stress(self, node: str) -> None:
         self.stress[node] = stress(self._groups.inside(node, []), self.shares[node].cpus)
         self.stress[node].start()
@@ -287,9 +284,8 @@ class NetnsTestbed(LocalTestbed):
                 self.processes.start_controller(node, out=self.folder / STARTING, more=more)
         # Interpreters that start would take most of a minute of what a small robot has.
         with self._groups.unlimited():
-            for problem, watcher in zip(self.problems, self.watchers, strict=True):
-                status = self._status(problem, watcher)
-                self._past[problem.name] = status["run"]
+            for problem in self.problems:
+                self._past[problem.name] = self._status(problem)["run"]
 
     def begin(self) -> list[int]:
         """Begin a new run of every cell, with controllers that know nothing of the time before.
@@ -308,10 +304,7 @@ class NetnsTestbed(LocalTestbed):
         for problem in self.problems:
             self._restart_stamper(problem)
         self.processes.start_controllers()
-        return [
-            self._origin(problem, watcher)
-            for problem, watcher in zip(self.problems, self.watchers, strict=True)
-        ]
+        return [self._origin(problem) for problem in self.problems]
 
     def _restart_stamper(self, problem: Problem) -> None:
         """Have a stamper begin anew, as if its cell had never run."""
@@ -325,10 +318,10 @@ class NetnsTestbed(LocalTestbed):
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
 
-    def _origin(self, problem: Problem, watcher: Watcher) -> int:
+    def _origin(self, problem: Problem) -> int:
         until = time.monotonic() + START_S
         while time.monotonic() < until:
-            status = self._status(problem, watcher)
+            status = self._status(problem)
             # A late answer of the controller before tells of the run before.
             new = status["run"] is not None and status["run"] != self._past.get(problem.name)
             if new and status.get("origin_ns") is not None:
@@ -337,37 +330,35 @@ class NetnsTestbed(LocalTestbed):
             time.sleep(0.05)
         raise LiveError(f"cell {problem.name!r} releases no cycles; see the logs in {self.folder}")
 
-    def _status(self, problem: Problem, watcher: Watcher) -> Mapping[str, Any]:
+    def _status(self, problem: Problem) -> Mapping[str, Any]:
         """Return how a cell is when everybody is there."""
-        return come_up(watcher.status, expected(problem), self.folder, patience_s=START_S)
+        ask = self.watchers[problem.name].status
+        return come_up(ask, expected(problem), self.folder, patience_s=START_S)
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
         """Return how the first cell is, as its controller says."""
-        return self.watchers[0].status(patience_s)
+        return self.watchers[self.problem.name].status(patience_s)
 
     # --------------------------------------------------------------------- disturbances
 
     def _apply_to_node(self, node: str, state: NodeState) -> None:
-        self._threads[node] = state.threads
-        if state.down and node not in self._down:
+        was_down = node in self._down
+        if state.down and not was_down:
             self._down.add(node)
-            self._take_down(node)
-        elif not state.down and node in self._down:
-            self._down.remove(node)
-            self._bring_up(node)
+            # All at once, as a loss of power does.
+            self._groups.kill(node)
+            self.processes.forget(node)
+            with suppress(LiveError):
+                self.stress.pop(node).stop()
         elif not state.down:
+            if was_down:
+                self._down.remove(node)
+                self._start_stress(node)
             self.stress[node].set(state.threads)
+            if was_down:
+                self._start_processes(node)
 
-    def _take_down(self, node: str) -> None:
-        """Kill everything on a node at once, as a loss of power does."""
-        self._groups.kill(node)
-        self.processes.forget(node)
-        with suppress(LiveError):
-            self.stress.pop(node).stop()
-
-    def _bring_up(self, node: str) -> None:
-        self._start_stress(node)
-        self.stress[node].set(self._threads[node])
+    def _start_processes(self, node: str) -> None:
         self.processes.start_agent(node)
         if any(problem.controller_node == node for problem in self.problems):
             self.processes.start_controller(node)
