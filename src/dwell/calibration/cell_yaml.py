@@ -1,4 +1,4 @@
-"""Cell YAML: what a cell says to replay the samples of a profile."""
+"""Cell YAML: the part of a cell that replays the samples of a profile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Says in one line what a user's code raised, and where."""
+"""Origin of an error in a user's code, in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory: what a process has been given by the kernel, and keeps."""
+"""Memory that a process has been given by the kernel, and keeps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SPARE = 1 << 30
 
 
 def keep_memory() -> bool:
-    """Have `malloc` keep what it has been given, as real-time programs do.
+    """Have `malloc` keep the memory that it has been given, as real-time programs do.
 
     Otherwise a stage that needs some arrays for each job may give them back each time, or may not:
     that depends on what else its process has allocated. Where it does, every page of every array is

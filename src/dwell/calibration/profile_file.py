@@ -86,7 +86,7 @@ def _require_names(**names: str) -> None:
 
 
 def stamp() -> dict[str, str]:
-    """Return what every measurement says of itself: when, and by which version."""
+    """Return the time and the version that every measurement is stamped with."""
     from dwell import __version__
 
     return {
@@ -191,7 +191,7 @@ def read_profile(path: Path) -> tuple[Measurement, ...]:
 
 
 def _parsed(path: Path, text: str) -> dict[str, dict[str, Any]]:
-    """Return what is known of every measurement, by its name."""
+    """Return the entry of every measurement, by its name."""
     try:
         found = json.loads(text)
         version, measurements = int(found["format"]), dict(found["measurements"])

@@ -1,4 +1,4 @@
-"""Link: round trips to a peer over one TCP connection.
+"""Round trips to a peer over one TCP connection.
 
 A message is a header of sixteen bytes (`HEADER`: magic, number, length of the payload) and its
 payload; the answer is the header alone, with the message's number and length 0. Nagle's algorithm

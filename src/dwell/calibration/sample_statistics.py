@@ -1,4 +1,4 @@
-"""Summary: what samples amount to, and what speaks against them."""
+"""Statistics of samples, and doubts about them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def percentile(samples: Floats, percent: int) -> float:
 
 
 def find_doubts(measurement: Measurement) -> Iterator[str]:
-    """Yield what speaks against a measurement; nothing where all is well."""
+    """Yield doubts about a measurement; none where all is well."""
     about = measurement.about
     yield from _disturbed(about.get("conditions") or {})
     if about.get("kind") == "task":
@@ -82,7 +82,7 @@ def find_doubts(measurement: Measurement) -> Iterator[str]:
 
 
 def _disturbed(conditions: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what else the machine did."""
+    """Yield doubts for the machine's other work."""
     if not conditions:
         return
     if (conditions["steal"] or 0.0) > STEAL:
@@ -106,7 +106,7 @@ def _preempted(conditions: Mapping[str, Any]) -> bool:
 
 
 def _unlike_a_job(measurement: Measurement) -> Iterator[str]:
-    """Yield why the samples may not be what `exec_ms` means."""
+    """Yield reasons why the samples may not be execution times as `exec_ms` means them."""
     about = measurement.about
     # Where others had its core, that is what it waited for.
     if about["cores_used"] < CORES_USED and not _preempted(about.get("conditions") or {}):

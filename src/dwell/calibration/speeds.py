@@ -43,7 +43,7 @@ class Usual:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Usual:
-        """Return what a calibration's report says.
+        """Read a calibration's report.
 
         Parameters
         ----------

@@ -28,7 +28,7 @@ def importable_from(folder: Path) -> Iterator[None]:
 
 
 def find_callable(name: str, option: str) -> Callable[..., object]:
-    """Import what `name` says.
+    """Import the callable that `name` says.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def _import(module_name: str, name: str, option: str) -> object:
 
 
 def _is_part(missing: str | None, module_name: str) -> bool:
-    """Whether the module that is missing is the one asked for, or a package around it."""
+    """Whether the missing module is the one asked for, or a package around it."""
     return missing is not None and f"{module_name}.".startswith(f"{missing}.")
 
 

@@ -23,12 +23,12 @@ T = TypeVar("T")
 
 @dataclass(slots=True)
 class _Cpus:
-    """CPUs, and what of each is left."""
+    """CPUs with the share of each that is left."""
 
     left: dict[int, float] = field(default_factory=dict)
 
     def take(self, node: Node) -> tuple[int, ...] | None:
-        """Take those that have most left: robots from the first on, all others from the last."""
+        """Take the CPUs with most left: robots from the first on, other nodes from the last."""
         count = min(node.cores, len(self.left))
         sign = 1 if node.tier == "robot" else -1
         best = sorted(self.left, key=lambda cpu: (-self.left[cpu], sign * cpu))[:count]

@@ -31,7 +31,7 @@ PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 class Burner(Child):
-    """Burns what it can get of some CPUs, on command.
+    """Foreign threads on some CPUs, as many as ordered; a context manager.
 
     Parameters
     ----------

@@ -89,7 +89,7 @@ def calibrate(
     emulated: bool = True,
     say: Callable[[str], None] = print,
 ) -> Calibrated:
-    """Put what runs have shown into a cell.
+    """Write a cell with the execution times, delays and backgrounds that runs have shown.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def _measured(runs: Sequence[Path], problem: Problem) -> list[Measured]:
 
 
 def _asked(problem: Problem) -> dict[tuple[str, str], Floats]:
-    """Delays that a cell asks of its links, but for those that are replayed."""
+    """Draw the delays that a cell asks of its links, but for delays that are replayed."""
     rng = np.random.default_rng(SEED)
     return {
         (link.source, link.target): link.delay_ms.marginal(rng, ASKED)
@@ -339,7 +339,7 @@ def _put_in(
     delays_ms: Mapping[str, Floats],
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Put into a cell's document what was found of tasks, of nodes by key, and of links."""
+    """Put findings on tasks, on nodes by key, and on links into a cell's document."""
 
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
@@ -422,7 +422,7 @@ def _short(value: Any) -> Any:
 
 
 def _check(one: Measured, problem: Problem, usual: Usual) -> dict[str, Any] | None:
-    """Set what the cell predicts of a run that it was made from beside what that run showed."""
+    """Return what the new cell predicts of a run beside what the run showed."""
     import polars as pl
 
     from dwell.sim import draw, simulate_realisation

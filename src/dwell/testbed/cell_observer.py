@@ -20,11 +20,11 @@ class CellObserver(Protocol):
     """
 
     def look(self, now_ns: int) -> Mapping[str, float]:
-        """Return what there is to see now, by names with units: ``error_mm``; NaN where unknown."""
+        """Return values seen now, by names with units: ``error_mm``; NaN where unknown."""
         ...
 
     def told(self, origin_ns: int) -> Mapping[str, object]:
-        """Return what the run's record shall say, ready for JSON.
+        """Return notes for the run's record, ready for JSON.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""A process that does what its parent asks it to, one JSON line a request, and dies with it."""
+"""Child processes that answer their parent's requests, one JSON line each, and end with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clocks that are wrong on purpose: for trials of what a cell does when they jump or drift.
+"""Clocks that are wrong on purpose: for trials in which nodes' clocks jump or drift.
 
 All nodes of a cell on one computer read one clock, which nobody may set. The processes of a node
 that `dwell.testbed.process` starts add to it what a file says of that node, and whoever made the
@@ -50,7 +50,7 @@ class ClockFile:
         self._map = make_file(path, _KIND, self.nodes, _NODE_BYTES * len(self.nodes))
 
     def set(self, node: str, *, jump_ns: int = 0, drift_ppb: int = 0) -> int:
-        """Have a node's clock jump now, and drift from now on; returns what it is ahead by.
+        """Have a node's clock jump now, and drift from now on; returns its offset, ns.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class ClockFile:
 
 
 def wrong_clock(clock: Callable[[], int], path: Path, node: str) -> Callable[[], int]:
-    """Return a node's clock: the one given, and what a `ClockFile` says that it is ahead by.
+    """Return a node's clock: the true one plus the offset in a `ClockFile`.
 
     Raises
     ------

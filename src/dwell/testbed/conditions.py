@@ -100,7 +100,7 @@ def to_json(changes: Mapping[str, object]) -> dict[str, object]:
 
 
 def changed(conditions: Conditions, changes: Mapping[str, object]) -> Conditions:
-    """Return conditions with what `to_json` returned.
+    """Return conditions with changes, as `to_json` has written them.
 
     Raises
     ------
@@ -202,7 +202,7 @@ class Draws:
             self._added = [delays_ns(process, rng) for process, rng in pairs]
 
     def lose(self) -> bool:
-        """Decide whether what comes next is lost."""
+        """Draw whether the next message is lost."""
         return self.conditions.loss > 0 and self._losses.random() < self.conditions.loss
 
     def delay_ns(self) -> int:

@@ -287,7 +287,7 @@ def _fifo() -> Finding:
 
 
 def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
-    """Watch CPUs that have nothing to do: what stops them then stops a run of a testbed, too."""
+    """Watch idle CPUs for standstills, which would stop a run of a testbed, too."""
     name, rule = "no standstills", Rule()
     window_s = min(
         (one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems), default=WINDOW_S

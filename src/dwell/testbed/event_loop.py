@@ -49,7 +49,7 @@ class Loop:
         self._selector.unregister(descriptor)
 
     def turn(self) -> None:
-        """Do what is due, wait for the next event or instant, and serve what is ready.
+        """Take due actions, wait for the next event or instant, and serve ready descriptors.
 
         The owner that was served longest ago goes first, so that nobody starves at a full queue.
         """

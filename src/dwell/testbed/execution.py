@@ -38,7 +38,7 @@ Wait: TypeAlias = Callable[[Quiet], Idle]
 
 
 class Play(Protocol):
-    """Makes one run; `dwell.testbed.run.run_once` does."""
+    """Makes a run, as `dwell.testbed.run.run_once` does."""
 
     def __call__(
         self,
@@ -184,7 +184,7 @@ class _Attempts:
         self._worked = any(self.has(one) for one in self.plan)
 
     def in_turn(self, repeats: int) -> Iterator[Planned]:
-        """Yield what is to be done: what has not been tried, then what failed, round by round."""
+        """Yield runs to make: those not tried yet, then those that failed, round by round."""
         for attempts in range(repeats + 1):
             for planned in self.plan:
                 if not self.has(planned) and self.failed(planned) <= attempts:
@@ -236,7 +236,7 @@ class _Attempts:
     def _keep(
         self, planned: Planned, number: int, record: Mapping[str, Any], run: Path | None
     ) -> None:
-        """Put a run where the done ones are, or all that is left of one where the failed are."""
+        """Move a run to the done ones, or the remains of an attempt to the failed ones."""
         source = self.folder / WORK if run is None else run
         place = self.folder / (FAILED if run is None else RUNS)
         target = place / (f"{planned.name}.{number}" if run is None else planned.name)

@@ -164,7 +164,7 @@ class _Direction:
         loop.watch(self._source, self)
 
     def ready(self) -> None:
-        """Take in what has come; it came when this was called, however long reading it takes."""
+        """Read packets; all count as having come when this was called."""
         self.served_ns = time.monotonic_ns()
         for _ in range(AT_ONCE):
             try:

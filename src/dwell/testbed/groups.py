@@ -37,7 +37,7 @@ class Share:
     quota: Quota | None = None
 
     def faults(self, node: str) -> list[str]:
-        """Return why no kernel takes its quota; nothing if one does."""
+        """Return why the kernel does not take the quota; empty if it does."""
         if self.quota is None:
             return []
         period_us, quota_us = _microseconds(self.quota)
@@ -261,7 +261,7 @@ class Groups(Started):
         _kill(self._cgroups.groups(self._parent, node))
 
     def stop(self) -> None:
-        """End what is in the groups, and remove them; safe to call twice."""
+        """End all processes in the groups, and remove the groups; safe to call twice."""
         if self._made:
             remove_group(self._parent, self._cgroups)
             self._made = False

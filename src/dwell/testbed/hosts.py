@@ -168,7 +168,7 @@ class Hosts(Started):
         return ["nsenter", f"--net={namespace_path(self.namespace(node))}", "--", *words]
 
     def stop(self) -> None:
-        """End what runs in the namespaces, and remove them; safe to call twice."""
+        """End all processes in the namespaces, and remove these; safe to call twice."""
         while self._tuns:
             os.close(self._tuns.popitem()[1])
         while self._made:
@@ -176,7 +176,7 @@ class Hosts(Started):
 
 
 def within(namespace: str, act: Callable[[], T]) -> T:
-    """Call something in a thread that is in a network namespace, and return what it returns.
+    """Call a function in a thread that is in a network namespace, and return its result.
 
     Sockets and devices that it opens stay there.
 
@@ -211,7 +211,7 @@ def within(namespace: str, act: Callable[[], T]) -> T:
 
 
 def remove_namespace(namespace: str) -> None:
-    """End what runs in a network namespace, and remove it; nothing if there is none.
+    """End all processes in a network namespace, and remove it; nothing if there is none.
 
     Raises
     ------

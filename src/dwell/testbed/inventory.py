@@ -161,7 +161,7 @@ def _keys(
     needed: Collection[str],
     faults: list[Fault],
 ) -> None:
-    """Note what is there and unknown, and what is needed and not there."""
+    """Note unknown keys, and needed keys that are missing."""
     before = f"{path}." if path else ""
     faults += [
         Fault(f"{before}{key}", f"is unknown here; there may be {', '.join(known)}")

@@ -1,4 +1,4 @@
-"""Names of testbeds: each belongs to one that lives, and what a dead one left is cleared away.
+"""Names of testbeds: each belongs to a living testbed, and remains of dead ones are removed.
 
 Two files in a folder that does not outlast the machine: ``NAME.lock``, locked as long as the owner
 lives, however it ends, and ``NAME.json``, what it was about to make, written before it makes any.
@@ -91,7 +91,7 @@ class Claim(Started):
             raise
 
     def stop(self) -> None:
-        """Give the name back; what is left in spite of all is removed first."""
+        """Give the name back, after removing any remains."""
         if self._handle is None:
             return
         try:
@@ -128,7 +128,7 @@ class Claim(Started):
             self._handle = None
 
     def _clear(self) -> None:
-        """Remove what the record tells of, and then the record."""
+        """Remove the hosts and groups that the record lists, and then the record."""
         try:
             record = cast("dict[str, list[str]]", json.loads(self._record.read_text()))
         except FileNotFoundError:
@@ -162,7 +162,7 @@ class Claim(Started):
 
 
 def _same(handle: int, path: Path) -> bool:
-    """Whether an open file is still the one of that name."""
+    """Whether a path still names an open file."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(handle), path.stat())
     return False

@@ -89,7 +89,7 @@ class TunLink(Child):
         return (first, second), (second, first)
 
     def set(self, source: str, target: str, *, at_ns: int | None = None, **changes: object) -> int:
-        """Change some conditions of a direction for what begins its way from then on.
+        """Change some conditions of a direction for messages that begin their way from then on.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class TunLink(Child):
         return self.set(source, target, at_ns=at_ns, cut="drop" if down else None)
 
     def read(self, *, reset: bool = True) -> dict[tuple[str, str], Passed]:
-        """Return what has passed each direction since this was last asked.
+        """Return counts of each direction since they were last read.
 
         Raises
         ------

@@ -51,7 +51,7 @@ def without_source(header: bytes) -> tuple[str, bytes]:
 
 @dataclass(slots=True)
 class _Stream:
-    """Messages that keep their order: of one sender, key and lane."""
+    """Messages of one sender, key and lane, which keep their order."""
 
     way: Way
     latest_ns: int = 0
@@ -158,7 +158,7 @@ class LinkedTransport:
             self._changed.notify()
 
     def _hand_on(self) -> None:
-        """Hand on what has arrived, as long as the transport is open."""
+        """Hand on messages at their arrival, as long as the transport is open."""
         while True:
             with self._changed:
                 if self._closed:
@@ -182,7 +182,7 @@ class LinkedTransport:
                 stream.moving -= 1
 
     def _release(self, stream: _Stream, now_ns: int) -> None:
-        """Let begin what waits for the end of a cut, if it has come."""
+        """Let messages that wait for the end of a cut begin their way, if it has come."""
         held = stream.held
         while held:
             size, act = held[0]

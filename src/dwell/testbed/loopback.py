@@ -171,7 +171,7 @@ class Loopback(LocalTestbed):
             self.links.set(link.source, link.target, **changes)
 
     def cut(self, source: str, target: str, at_ns: int) -> int:
-        """Lose what begins its way along a direction from an instant on; returns when that was."""
+        """Lose messages that begin their way along a direction from an instant on; returns when."""
         time.sleep(max(at_ns - time.monotonic_ns(), 0) / 1e9)
         self.links.set(source, target, cut="drop")
         return time.monotonic_ns()
@@ -181,7 +181,7 @@ class Loopback(LocalTestbed):
         self.links.set(source, target, cut=None)
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
-        """Return how the cell is, as its controller says."""
+        """Return the status of the cell, from its controller."""
         return self.client.ask("status", patience_s=patience_s)
 
     def taps(self) -> Mapping[tuple[str, ...], Sequence[str]]:

@@ -1,4 +1,4 @@
-"""Measured: what the windows of one run that kept its jobs show of its tasks, links and nodes."""
+"""Measured: times and loads of tasks, links and nodes in the windows of a run."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Measured:
 
 
 def look_at(name: str, run: Run, problem: Problem) -> Measured:
-    """Take out of a run what there is to measure.
+    """Measure a run that kept its jobs.
 
     Raises
     ------
@@ -276,7 +276,7 @@ def cycles_in(windows: pl.DataFrame, problem: Problem) -> pl.DataFrame:
 
 
 def _while_jobs_ran(own: pl.DataFrame, column: str) -> dict[str, tuple[float, float]]:
-    """CPU time that somebody took while jobs ran, and how long these ran, by node."""
+    """CPU time that others took while jobs ran, and how long these ran, s, by node."""
     import polars as pl
 
     if column not in own.columns:
@@ -323,7 +323,7 @@ def _beside_ms(of: pl.DataFrame) -> Floats:
 
 
 def _taken_ms(own: pl.DataFrame, column: str) -> dict[SiteName, float]:
-    """Mean of what nodes took around their jobs, by task and node, where it is often known."""
+    """Mean CPU time that nodes took around their jobs, where it is known of enough of them."""
     import polars as pl
 
     if column not in own.columns:

@@ -59,7 +59,7 @@ def hops(
     problem: Problem,
     asked_ms: Mapping[Link, Floats],
 ) -> OnTheWay:
-    """Find what of the workers' messaging lies on the way of messages.
+    """Find the part of the workers' messaging that lies on the way of messages.
 
     Parameters
     ----------

@@ -211,7 +211,7 @@ class Way:
         return self._later(_FREE_NS, now_ns, took_ns, round(LONGEST_WAIT_S * 1e9))
 
     def _arrived(self, arrival_ns: int) -> int:
-        """Return when the message arrives: not before the one before it, where order is kept."""
+        """Return when a message arrives: not before its predecessor, where order is kept."""
         return self._later(_LAST_NS, arrival_ns, 0) if self._in_order else arrival_ns
 
     def _later(self, field: int, at_ns: int, more_ns: int, most_ns: int | None = None) -> int:

@@ -272,7 +272,7 @@ class NetnsTestbed(LocalTestbed):
     # ------------------------------------------------------------------------- running
 
     def _come_up(self) -> None:
-        """Wait until everybody is there, with every cell on its initial placement.
+        """Wait until all processes are ready, with every cell on its initial placement.
 
         Controllers that never move anything look after the cells until then; the runs that they
         write are in `STARTING`, and no part of any measurement.
@@ -331,12 +331,12 @@ class NetnsTestbed(LocalTestbed):
         raise LiveError(f"cell {problem.name!r} releases no cycles; see the logs in {self.folder}")
 
     def _status(self, problem: Problem) -> Mapping[str, Any]:
-        """Return how a cell is when everybody is there."""
+        """Return the status of a cell once all its processes are ready."""
         ask = self.watchers[problem.name].status
         return come_up(ask, expected(problem), self.folder, patience_s=START_S)
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
-        """Return how the first cell is, as its controller says."""
+        """Return the status of the first cell, from its controller."""
         return self.watchers[self.problem.name].status(patience_s)
 
     # --------------------------------------------------------------------- disturbances
@@ -402,7 +402,7 @@ class NetnsTestbed(LocalTestbed):
         return sorted({cpu for share in self.shares.values() for cpu in share.cpus})
 
     def facts(self) -> dict[str, Any]:
-        """Return what a run ought to say of the testbed that it was made on, ready for JSON."""
+        """Return facts on the testbed for the record of a run, ready for JSON."""
         return {
             "name": self.name,
             "kernel": os.uname().release,

@@ -68,7 +68,7 @@ def _cores(of: Sequence[tuple[float, float]]) -> float | None:
 
 
 def contentions(measured: Sequence[Measured]) -> dict[str, float]:
-    """Share of the time of every node's jobs in which its CPUs did what is outside of it.
+    """Share of the time of every node's jobs in which its CPUs worked for others.
 
     From runs without any stress: nodes may share CPUs, and one that is stressed takes more of them.
     """

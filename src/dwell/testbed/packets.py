@@ -29,7 +29,7 @@ class Kind(NamedTuple):
 
 
 def kind_of(packet: bytes) -> Kind | None:
-    """Return a packet's kind; None for what is no cell's: the kernel's own, on every interface.
+    """Return a packet's kind; None for packets of no cell: the kernel's own, on every interface.
 
     That is all of IPv6 (router solicitations, neighbours, listeners), multicast, broadcast, and
     what is neither TCP, UDP nor ICMP.

@@ -1,4 +1,4 @@
-"""Playing a scenario on a cell that runs, and telling its run what was played when."""
+"""Playing: a scenario's changes are made to a cell that runs, and noted in its run."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Played:
         return None if made_ns is None else made_ns + step_ns(item)
 
     def active(self) -> list[Disturbance]:
-        """Return what is on now."""
+        """Return the disturbances that are on now."""
         return [
             item
             for item in self.timeline.items
@@ -88,7 +88,7 @@ class Played:
         return found
 
     def note(self, folder: Path, span: tuple[int, int] | None = None, **more: Any) -> Run:
-        """Tell the run, whose time begins with the first release.
+        """Note in a run, whose time begins with the first release, what was played.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ def undisturbed() -> AbstractContextManager[None]:
 
 
 def make_folder(out: Path, mark: str, whose: str) -> None:
-    """Make the folder of what is played; one with the mark is replaced.
+    """Make the folder of a run; a folder with the mark is replaced.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def make_folder(out: Path, mark: str, whose: str) -> None:
 def come_up(
     ask: Ask, awaited: Sequence[str], folder: Path, *, patience_s: float = START_S
 ) -> Mapping[str, Any]:
-    """Wait until everybody is there; returns how the cell is then.
+    """Wait until all processes are ready; returns the status of the cell then.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def play_on(
     seconds: float,
     look: Callable[[float], None] = lambda at_s: None,
 ) -> None:
-    """Play a timeline on a testbed that has been started, and note what was done when.
+    """Play a timeline on a testbed that has been started, and note when each change was made.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Counters of the machine at an instant, and what was late since the sample before.
+    """Counters of the machine at an instant, and lateness since the sample before.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def judged(samples: Sequence[Sample], spans: Sequence[Span], rule: Rule) -> dict
 
 
 def _why(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return what was broken how often, most frequent first."""
+    """Return how often each part of the rule was broken, most frequent first."""
     counts: dict[str, int] = {}
     for row in rows:
         for fault in row["broken"]:
@@ -158,7 +158,7 @@ def _why(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _row(inside: Sequence[Sample], span: Span, rule: Rule) -> dict[str, Any]:
-    """Return what was measured in a window, and what of it breaks the rule."""
+    """Return the measurements of a window, and which parts of the rule they break."""
     if len(inside) < 2:
         return {"window": span.number, "broken": ["not measured"]}
     first, last = inside[0], inside[-1]

@@ -49,7 +49,7 @@ class FaultyPlatform(Platform):
         self._links, self._clocks = links, clocks
 
     def clock(self, problem: Problem, node: str) -> Clock:
-        """Return what the processes of a node read the time from."""
+        """Return the clock of a node's processes."""
         clock = super().clock(problem, node)
         return clock if self._clocks is None else wrong_clock(clock, self._clocks, node)
 

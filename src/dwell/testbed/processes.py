@@ -1,4 +1,4 @@
-"""The processes of a cell that somebody has to start: an agent on every node, and the controller.
+"""Processes of a cell that a testbed starts: an agent on every node, and the controller.
 
 All others are started by the agents. They end with the process that made this, whatever
 becomes of those in between, and leave no shared memory.
@@ -231,7 +231,7 @@ class Processes:
         self.end([who for who in self.running if who.startswith("controller@")], CONTROLLER_STOP_S)
 
     def stop(self) -> None:
-        """End everything, the agents after the controllers, and remove what memory they left."""
+        """End all processes, the agents after the controllers, and remove their shared memory."""
         self.stop_controllers()
         self.end(list(self.running), STOP_S)
         if self._sweeper is not None:
@@ -241,7 +241,7 @@ class Processes:
         remove_orphans()
 
     def end(self, names: Iterable[str], patience_s: float) -> None:
-        """Tell some to end, and kill those that have not when patience is over."""
+        """Tell processes to end by name, and kill those that have not when patience is over."""
         end_all([self.running.pop(who) for who in names], patience_s)
 
 

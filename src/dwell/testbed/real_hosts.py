@@ -1,4 +1,4 @@
-"""Real hosts: a cell on the computers of an inventory, run as one on a testbed is.
+"""Real hosts: a cell on the computers of an inventory, run as on a testbed.
 
 Everything that is put on a host is in one folder of this testbed's name there, which is removed
 before the next run. Links are what they are; only what the inventory has commands for can be
@@ -120,7 +120,7 @@ class RealHosts(Testbed):
         self._stack.close()
 
     def sample(self, patience_s: float) -> Mapping[str, Any]:
-        """Return how the cell is, as its controller says."""
+        """Return the status of the cell, from its controller."""
         return self._client.ask("status", patience_s=patience_s)
 
     # ------------------------------------------------------------------------ commands
@@ -155,7 +155,7 @@ class RealHosts(Testbed):
         return word
 
     def shell(self, node: str, line: str, data: bytes = b"") -> bytes:
-        """Have a line done by a shell on a node's host; return what it says.
+        """Run a line in a shell on a node's host; return its output.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class RealHosts(Testbed):
     # ------------------------------------------------------------------------- running
 
     def _begin(self) -> None:
-        """Wait until everybody is there, and begin a run that knows nothing of the time before."""
+        """Wait until all processes are ready, and begin a run that knows nothing of the past."""
         problem = self.problem
         node = problem.controller_node
         more = ["--policy", problem.initial]
@@ -208,12 +208,12 @@ class RealHosts(Testbed):
             time.sleep(0.05)
 
     def _came_up(self) -> Mapping[str, Any]:
-        """Return how the cell is when everybody is there."""
+        """Return the status of the cell once all its processes are ready."""
         problem = self.problem
         return come_up(self.sample, expected(problem), self.folder, patience_s=START_S)
 
     def fetch_runs(self) -> None:
-        """Bring what the controller has written to this computer.
+        """Copy the runs that the controller has written to this computer.
 
         Raises
         ------
@@ -239,7 +239,7 @@ class RealHosts(Testbed):
             self.stress[node] = subprocess.Popen(words, process_group=0)  # noqa: S603 - as above
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
-        """Run a link's command for what is on, again where it changes, or for the end of it."""
+        """Run a link's command for the disturbance that is on, or for its end."""
         link, commands = self.problem.fabric.links[name], self.inventory.links[name]
         if asked := disturbance_of(link, now):
             self._disturbed.add(name)
@@ -263,7 +263,7 @@ class RealHosts(Testbed):
 
 
 def require_commands(inventory: Inventory, scenario: Iterable[Disturbance]) -> None:
-    """Refuse what an inventory has no commands for.
+    """Refuse a scenario with links that an inventory has no commands for.
 
     Raises
     ------
@@ -280,7 +280,7 @@ def require_commands(inventory: Inventory, scenario: Iterable[Disturbance]) -> N
 
 
 def disturbance_of(link: Link, now: Conditions) -> dict[str, float]:
-    """Return what is to be filled into a link's command; nothing where nothing is on.
+    """Return values to fill into a link's command; empty where no disturbance is on.
 
     Its loss is what makes the link's own the one that is asked for, and its rate the link's where
     that is the lower one.

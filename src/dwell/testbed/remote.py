@@ -1,4 +1,4 @@
-"""A process on another host, as if it ran here: it ends when this one is told to, or goes away.
+"""A process that stands here for a command on another host, and ends that when it is ended.
 
 A signal does not cross ssh. So the shell on the other side waits for the end of its standard input,
 which is this process's to close: on SIGTERM, when the owner of the cell has ended, and by ending
@@ -42,7 +42,7 @@ exit $code"""
 def script_of(
     words: Sequence[str], folder: str, environment: Mapping[str, str], *, whole: bool = False
 ) -> str:
-    """Return what the shell of another host is to do for a command.
+    """Return a script with which the shell of another host runs a command.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ def length_s(problem: Problem, windows: int) -> float:
 
 
 def require_machine(problems: Sequence[Problem]) -> None:
-    """Refuse to run what this machine cannot.
+    """Refuse cells that this machine cannot run.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _seal(
     *,
     interrupted: bool,
 ) -> None:
-    """Tell the run what was played, on what, and how the machine was."""
+    """Note in the run what was played, the testbed, and the machine's pressure."""
     more: dict[str, Any] = {"testbed": testbed.facts()}
     if interrupted:
         more["interrupted"] = True
@@ -212,7 +212,7 @@ def _stressed(played: Played, begin_ns: int, end_ns: int) -> dict[str, float]:
 
 
 def summary(run: Run) -> dict[str, Any]:
-    """Return what a run showed after its warm-up, in a few numbers."""
+    """Return a few numbers on a run after its warm-up."""
     windows = run.windows.filter(~run.windows["warmup"])
     pressure = run.meta.get("pressure") or {}
     excluded = set(pressure.get("excluded", ()))

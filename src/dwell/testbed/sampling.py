@@ -140,7 +140,7 @@ class Sampler(Started):
         return self._wakes_hz
 
     def links(self) -> dict[str, Any]:
-        """Return what the links have drawn for the messages of each direction, ready for JSON."""
+        """Return statistics of the delays drawn for each direction, ready for JSON."""
         found = {}
         for (source, target), total in self._totals.items():
             delay_ms = {

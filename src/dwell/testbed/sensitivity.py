@@ -61,7 +61,7 @@ def sensitivities(measured: Sequence[Measured]) -> dict[SiteName, float]:
 
 
 def _points(visit: Visit, probed: dict[int, float]) -> tuple[Floats, Floats]:
-    """Logarithms of what a probe's work and a stage took: medians of a few windows each."""
+    """Logarithms of the times of a probe's work and of a stage: medians of a few windows each."""
     numbers, place, jobs = np.unique(visit.windows, return_inverse=True, return_counts=True)
     stage_ms = np.bincount(place, visit.stage_ms) / jobs
     kept = [

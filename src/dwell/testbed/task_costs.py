@@ -1,4 +1,4 @@
-"""Task costs: what every task takes of every node, its share of messaging included.
+"""Task costs: time that every task takes of every node, its share of messaging included.
 
 A job costs its node more CPU than its stage takes: its worker reads and writes messages, and at
 both ends of the pipeline a stamp and a command are handed over. A simulator that knows nothing of
@@ -107,7 +107,7 @@ def sites(
 
 
 def _with_messaging(stages_ms: Floats, mean_ms: float, around_ms: float) -> Floats:
-    """Add what is done around a stage: what slows the stage down slows that."""
+    """Add the time around a stage, which is longer where the stage is."""
     if mean_ms <= 0:
         return stages_ms + around_ms
     return stages_ms + around_ms * np.clip(stages_ms / mean_ms, *SLOWER)

@@ -57,7 +57,7 @@ class Testbed(Started):
 
     @abstractmethod
     def sample(self, patience_s: float) -> Mapping[str, Any]:
-        """Return how the cell is, as its controller says.
+        """Return the status of the cell, from its controller.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class LocalTestbed(Testbed):
     _conditions: dict[str, Conditions]
 
     def _changes(self, name: str, now: Conditions) -> dict[str, Any]:
-        """Take the conditions of a link for those that hold now; returns what is other."""
+        """Note the conditions of a link that hold now; returns the fields that have changed."""
         before, self._conditions[name] = self._conditions[name], now
         return differing(before, now)
 

@@ -1,4 +1,4 @@
-"""Timeline: what a scenario's realisation does to nodes and links, and when.
+"""Timeline: the changes that a scenario's realisation makes to nodes and links.
 
 It is the simulator's: the node changes and link segments that the run's seed draws there, so that
 episodes, ramps and several disturbances at once mean the same on a testbed. Only bursts, which
@@ -33,7 +33,7 @@ class NodeState:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A node or a link is another one from an instant on.
+    """Change of a node or a link from an instant on.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Timeline:
 def timeline_of(
     problem: Problem, scenario: str, *, seed: int, seconds: float, outages: bool = False
 ) -> Timeline:
-    """Return what a scenario's realisation does, for as long as a cell runs.
+    """Return the changes of a scenario's realisation, for as long as a cell runs.
 
     Parameters
     ----------
