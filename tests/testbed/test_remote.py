@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import psutil
 
-from dwell.testbed.remote import SHELL_ID, local_words, script_of
+from dwell.testbed.remote import SHELL_ID, RemoteProcess, script_of
 from tests.waiting import wait_until
 
 SHELL = ("sh", "-c")
@@ -19,11 +18,12 @@ def test_a_command_ends_when_it_is_told_to(tmp_path: Path) -> None:
     code = "import signal, sys; signal.signal(15, lambda *_: sys.exit(7)); print('up', flush=True)"
     code += "; signal.pause(); signal.pause()"
     script = script_of([sys.executable, "-c", code], str(tmp_path), {"DWELL_X": "it's"})
-    with subprocess.Popen(local_words(SHELL, script), stdout=subprocess.PIPE) as process:
+    with RemoteProcess([*SHELL, script], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"up\n"
-        process.send_signal(signal.SIGTERM)
+        process.terminate()
         assert process.wait(10) == 7
+        process.terminate()
 
 
 def test_a_command_has_its_variables_and_its_code(tmp_path: Path) -> None:
@@ -31,18 +31,26 @@ def test_a_command_has_its_variables_and_its_code(tmp_path: Path) -> None:
     script = script_of(
         [sys.executable, "-c", f"{code}; sys.exit(3)", SHELL_ID], str(tmp_path), {"DWELL_X": "it's"}
     )
-    done = subprocess.run(local_words(SHELL, script), capture_output=True, text=True, check=False)
-    assert done.returncode == 3
-    value, owner, shell, folder = done.stdout.split()
+    with RemoteProcess([*SHELL, script], stdout=subprocess.PIPE) as process:
+        assert process.wait(60) == 3
+        assert process.stdout is not None
+        value, owner, shell, folder = process.stdout.read().decode().split()
     assert value == "it's"
     assert owner == shell
     assert Path(folder) == tmp_path
 
 
+CALLER = """
+import sys
+from dwell.testbed.remote import RemoteProcess
+RemoteProcess(sys.argv[1:]).wait()
+"""
+
+
 def test_what_it_started_ends_with_it_where_its_caller_is_killed(tmp_path: Path) -> None:
     line = "sleep 1000 & echo $! > child; sleep 1000"
     script = script_of(["sh", "-c", line], str(tmp_path), {"DWELL_X": "1"}, whole=True)
-    process = subprocess.Popen(local_words(SHELL, script))
+    process = subprocess.Popen([sys.executable, "-c", CALLER, *SHELL, script])
     child = tmp_path / "child"
     wait_until(lambda: child.is_file() and child.read_text().strip() != "")
     pid = int(child.read_text())

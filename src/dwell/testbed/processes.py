@@ -107,6 +107,8 @@ class Processes:
         Further arguments of the controllers.
     program : sequence of str
         Module, and its first arguments, that runs agents and controllers.
+    popen : callable
+        Starts a command, as `Popen`.
     owner : str, optional
         Process id, where they run, of the one that they end with; this process's own if left out.
 
@@ -126,6 +128,7 @@ class Processes:
         cpus: Mapping[str, int] | None = None,
         more: Sequence[str] = (),
         program: Sequence[str] = ("dwell",),
+        popen: Callable[..., subprocess.Popen[bytes]] = subprocess.Popen,
         owner: str | None = None,
     ) -> None:
         names = [problem.name for problem in problems]
@@ -135,6 +138,7 @@ class Processes:
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.environment = {**_module_path(self.problems), **(environment or {})}
         self._program = tuple(program)
+        self._popen = popen
         self._owner = str(os.getpid()) if owner is None else owner
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
         self._sweeper: subprocess.Popen[bytes] | None = None
@@ -208,7 +212,7 @@ class Processes:
         for problem in problems:
             command += ["--cell", str(self.file_of(problem))]
         with (self.folder / f"{who}.log").open("ab") as log:
-            self.running[who] = subprocess.Popen(  # noqa: S603 - our own command
+            self.running[who] = self._popen(
                 self._inside(node, command),
                 stdin=subprocess.DEVNULL,
                 stdout=log,

@@ -34,7 +34,7 @@ from dwell.testbed.conditions import Conditions
 from dwell.testbed.inventory import Inventory
 from dwell.testbed.playing import Played, come_up, make_folder, play_on, require_run, undisturbed
 from dwell.testbed.processes import Processes, end_all, expected
-from dwell.testbed.remote import SHELL_ID, local_words, script_of
+from dwell.testbed.remote import SHELL_ID, RemoteProcess, script_of
 from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import NodeState, timeline_of, usual_conditions
 
@@ -82,12 +82,17 @@ class RealHosts(Testbed):
         hosts = {node: Host(host.address, host.port) for node, host in inventory.hosts.items()}
         self.problem = replace(problem, live=replace(problem.live, hosts=hosts))
         self.inventory, self.folder, self.name = inventory, folder.resolve(), name
-        self.stress: dict[str, subprocess.Popen[bytes]] = {}
+        self.stress: dict[str, RemoteProcess] = {}
         self._threads: dict[str, int] = {}
         self._disturbed: set[str] = set()
         self._stack = ExitStack()
         self.processes = Processes(
-            [self.problem], self.folder, inside=self.inside, more=more, owner=SHELL_ID
+            [self.problem],
+            self.folder,
+            inside=self.inside,
+            more=more,
+            popen=RemoteProcess,
+            owner=SHELL_ID,
         )
 
     def start(self) -> None:
@@ -130,7 +135,7 @@ class RealHosts(Testbed):
         return f"{self.inventory.hosts[node].folder}/dwell-{self.name}-{node}"
 
     def inside(self, node: str, words: Sequence[str]) -> Sequence[str]:
-        """Return a command that runs words on a node's host, and ends them when it is ended.
+        """Return a command that runs words on a node's host, as a `RemoteProcess`.
 
         The interpreter, and the folder on this computer, become those there.
         """
@@ -143,8 +148,7 @@ class RealHosts(Testbed):
         }
         if "--cpus" not in words and host.cpus and "dwell" in words:
             words = [*words, "--cpus", host.cpus]
-        script = script_of(words, self.there(node), environment, whole=whole)
-        return local_words(host.run, script)
+        return [*host.run, script_of(words, self.there(node), environment, whole=whole)]
 
     def _translated(self, node: str, word: str) -> str:
         if word == sys.executable:
@@ -236,7 +240,7 @@ class RealHosts(Testbed):
         if state.threads:
             line = self.inventory.hosts[node].stress.format(threads=state.threads)
             words = self._words(node, ["sh", "-c", line], whole=True)
-            self.stress[node] = subprocess.Popen(words, process_group=0)  # noqa: S603 - as above
+            self.stress[node] = RemoteProcess(words, process_group=0)
 
     def _apply_to_link(self, name: str, now: Conditions) -> None:
         """Run a link's command for the disturbance that is on, or for its end."""

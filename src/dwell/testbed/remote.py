@@ -1,27 +1,16 @@
-"""A process that stands here for a command on another host, and ends that when it is ended.
+"""A process on another host, as if it ran here: it ends when it is told to, or its owner ends.
 
 A signal does not cross ssh. So the shell on the other side waits for the end of its standard input,
-which is this process's to close: on SIGTERM, when the owner of the cell has ended, and by ending
-itself, however it does. Then it tells its command to end, and this process ends with the same code
-once that has.
-
-Run as ``python -m dwell.testbed.remote SETTINGS``, JSON: ``run`` (words before a command line, as
-``ssh host``), ``script`` (that line) and ``owner`` (id of the process that this one ends with).
+which this process closes: when it tells the command to end, and by ending itself, however it does.
+Then the shell tells its command to end, and ends with the same code once that has.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import shlex
-import signal
 import subprocess
-import sys
-import threading
 from collections.abc import Mapping, Sequence
-from types import FrameType
-
-from dwell.live.parent_death import end_with_owner
+from typing import Any
 
 #: Word of a command that stands for the process id of the shell on the other side.
 SHELL_ID = "$$"
@@ -66,36 +55,21 @@ def script_of(
     )
 
 
-def local_words(run: Sequence[str], script: str) -> list[str]:
-    """Return the command that stands for it on this computer, and ends with this process."""
-    settings = json.dumps({"run": list(run), "script": script, "owner": os.getpid()})
-    return [sys.executable, "-P", "-m", "dwell.testbed.remote", settings]
+class RemoteProcess(subprocess.Popen[bytes]):
+    """A command on another host, which ends with this process.
 
+    Parameters
+    ----------
+    words : sequence of str
+        Words that run a script over there, as ``ssh host``, and that of `script_of`.
+    **options
+        As of `Popen`.
+    """
 
-def main() -> int:
-    """Run the script on the other side; return its code."""
-    settings = json.loads(sys.argv[1])
-    command = [*settings["run"], settings["script"]]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603 - the inventory's
-    assert process.stdin is not None  # noqa: S101 - it was asked for
-    handle = process.stdin.fileno()
-    ended = threading.Event()
+    def __init__(self, words: Sequence[str], **options: Any) -> None:
+        super().__init__(words, **{**options, "stdin": subprocess.PIPE})
 
-    def end(number: int, frame: FrameType | None) -> None:
-        ended.set()
-
-    signal.signal(signal.SIGTERM, end)
-    end_with_owner(ended, settings["owner"])
-
-    def close() -> None:
-        ended.wait()
-        os.close(handle)
-
-    threading.Thread(target=close, name="end", daemon=True).start()
-    return process.wait()
-
-
-if __name__ == "__main__":
-    code = main()
-    # The standard input may be closed already; nothing is to be flushed.
-    os._exit(code if code >= 0 else 128 - code)
+    def terminate(self) -> None:
+        """Tell the command to end."""
+        if self.stdin is not None:
+            self.stdin.close()
