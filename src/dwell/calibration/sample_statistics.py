@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dwell.calibration.profile_file import Measurement
-
-Floats: TypeAlias = NDArray[np.float64]
+from dwell.calibration.profile_file import Floats, Measurement
 
 # Above these a measurement is called into question. A busy loop on a core of its own was taken
 # off it some 4 times a second by the kernel's own threads, and 250 times where it shared the core.

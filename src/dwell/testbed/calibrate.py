@@ -12,10 +12,9 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.calibration.profile_file import Measurement, link_name, stamp, task_name, write_profile
 from dwell.calibration.speeds import Usual, at_speed_of
@@ -23,7 +22,7 @@ from dwell.errors import DwellError, RunError
 from dwell.estimators.registry import name_in_run
 from dwell.files import write_whole
 from dwell.model import Problem, Trace
-from dwell.testbed.measured import Measured, cycles_in, look_at, usable
+from dwell.testbed.measured import Floats, Measured, SiteName, cycles_in, look_at, usable
 from dwell.testbed.message_costs import OnTheWay, floors, hops, own_delays
 from dwell.testbed.node_loads import (
     backgrounds,
@@ -37,8 +36,6 @@ from dwell.testbed.paired import paired
 from dwell.testbed.sensitivity import usual_of
 from dwell.testbed.task_costs import Site, messaging, sites
 from dwell.testbed.trace_names import move_traces
-
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Seed of the delays that stand for a link's own process, and of the cell's own check.
 SEED = 20_260_101
@@ -295,8 +292,8 @@ def _links(
 
 def _write_samples(
     path: Path,
-    found: Mapping[tuple[str, str], Site],
-    columns: Mapping[tuple[str, str], Floats],
+    found: Mapping[SiteName, Site],
+    columns: Mapping[SiteName, Floats],
     delays_ms: Mapping[str, Floats],
     measured: Sequence[Measured],
     added_ms: Mapping[str, float],
@@ -335,7 +332,7 @@ def _document(cell: Path, out: Path) -> dict[str, Any]:
 def _put_in(
     document: dict[str, Any],
     file: str,
-    found: Mapping[tuple[str, str], Site],
+    found: Mapping[SiteName, Site],
     delays_ms: Mapping[str, Floats],
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
@@ -387,7 +384,7 @@ def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[
 
 
 def _missing(
-    problem: Problem, found: Mapping[tuple[str, str], Site], delays_ms: Mapping[str, Floats]
+    problem: Problem, found: Mapping[SiteName, Site], delays_ms: Mapping[str, Floats]
 ) -> tuple[str, ...]:
     tasks = (
         task_name(task.name, node)

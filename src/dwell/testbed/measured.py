@@ -13,7 +13,6 @@ from dwell.calibration.speeds import work_ms
 from dwell.errors import RunError
 from dwell.model import LinkDisturbance, Problem
 from dwell.model.scenario import is_always_on
-from dwell.testbed.message_costs import LEAST_JOBS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -23,6 +22,8 @@ if TYPE_CHECKING:
 Floats: TypeAlias = NDArray[np.float64]
 SiteName: TypeAlias = tuple[str, str]
 
+#: Least number of jobs from which anything is taken.
+LEAST_JOBS = 100
 #: Quantile of a waiting time at which a quota has hardly had a part in it.
 UNHINDERED = 0.05
 

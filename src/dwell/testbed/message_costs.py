@@ -10,23 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.model import Problem
+from dwell.testbed.measured import LEAST_JOBS, Floats, Measured, SiteName
 
-if TYPE_CHECKING:
-    from dwell.testbed.measured import Measured
-
-Floats: TypeAlias = NDArray[np.float64]
 #: Source, target, and the nodes of both.
 HopName: TypeAlias = tuple[str, str, str, str]
 Link: TypeAlias = tuple[str, str]
 
-#: Least number of jobs from which anything is taken.
-LEAST_JOBS = 100
 #: Quantile of a message's time at which nothing but itself has had a part in it.
 QUICK = 0.1
 #: Bytes that cost as much CPU as sending or receiving a message at all.
@@ -55,7 +49,7 @@ class OnTheWay(NamedTuple):
 
 def hops(
     measured: Sequence[Measured],
-    messaging_ms: Mapping[tuple[str, str], float],
+    messaging_ms: Mapping[SiteName, float],
     problem: Problem,
     asked_ms: Mapping[Link, Floats],
 ) -> OnTheWay:
@@ -118,7 +112,7 @@ def _gaps(
 
 
 def _whole(
-    hop: HopName, messaging_ms: Mapping[tuple[str, str], float], problem: Problem
+    hop: HopName, messaging_ms: Mapping[SiteName, float], problem: Problem
 ) -> tuple[float, float]:
     """CPU time that sender and receiver spend on a message, on its way or not, ms."""
     source, target, node, to = hop

@@ -13,8 +13,7 @@ import numpy as np
 from dwell.calibration.speeds import Usual
 from dwell.model import Problem
 from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
-from dwell.testbed.measured import Measured, SiteName
-from dwell.testbed.message_costs import LEAST_JOBS
+from dwell.testbed.measured import LEAST_JOBS, Measured, SiteName
 from dwell.testbed.task_costs import Site
 
 #: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a

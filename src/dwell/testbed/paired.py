@@ -10,15 +10,13 @@ Where there was none, from the cycles in their order. Tasks that were not there 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import FrozenDict
-
-Floats: TypeAlias = NDArray[np.float64]
-SiteName: TypeAlias = tuple[str, str]
+from dwell.testbed.measured import Floats, SiteName
 
 
 class Part(NamedTuple):

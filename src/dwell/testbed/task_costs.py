@@ -22,8 +22,8 @@ import numpy as np
 
 from dwell.calibration.speeds import Usual
 from dwell.model import Flow, Problem
-from dwell.testbed.measured import Floats, Measured, SiteName
-from dwell.testbed.message_costs import LEAST_JOBS, OnTheWay, share
+from dwell.testbed.measured import LEAST_JOBS, Floats, Measured, SiteName
+from dwell.testbed.message_costs import OnTheWay, share
 from dwell.testbed.paired import Part
 
 #: How many times as long as usual messaging takes where a stage takes longer: in the runs of the
