@@ -19,7 +19,7 @@ import json
 import re
 import shlex
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -172,35 +172,34 @@ def _keys(
 
 
 def _host(path: str, value: Any, faults: list[Fault]) -> RealHost:
-    told = dict(_mapping(value, path, faults))
-    _keys(path, told, [item.name for item in fields(RealHost)], ("run", "address"), faults)
-    run = told.get("run", "")
+    given = _mapping(value, path, faults)
+    _keys(path, given, [item.name for item in fields(RealHost)], ("run", "address"), faults)
+    usual = asdict(RealHost((), ""))
+    run, port = given.get("run", ""), given.get("port", usual["port"])
+    texts: dict[str, Any] = {
+        name: str(given.get(name, value)) for name, value in usual.items() if isinstance(value, str)
+    }
+    host = RealHost((), **texts)
     try:
         words = tuple(map(str, run)) if isinstance(run, list) else tuple(shlex.split(str(run)))
+        host = replace(host, run=words)
     except ValueError as error:
         faults.append(Fault(f"{path}.run", f"is {run!r}, which is no command line ({error})"))
-        words = ()
-    port = told.get("port", 7450)
     if type(port) is not int or not 1 <= port <= 65_000:
         faults.append(Fault(f"{path}.port", f"is {port!r}; it must be in [1, 65000]"))
-        port = 7450
-    folder = str(told.get("folder", FOLDER))
-    if not folder.startswith("/"):
-        faults.append(Fault(f"{path}.folder", f"is {folder!r}; it must begin with /"))
-    cpus = str(told.get("cpus", ""))
-    if cpus and not CPUS.fullmatch(cpus):
-        faults.append(Fault(f"{path}.cpus", f"is {cpus!r}; write 0,2-3"))
-    stress = str(told.get("stress", STRESS))
-    if "{threads}" not in stress:
+    if not host.folder.startswith("/"):
+        faults.append(Fault(f"{path}.folder", f"is {host.folder!r}; it must begin with /"))
+    if host.cpus and not CPUS.fullmatch(host.cpus):
+        faults.append(Fault(f"{path}.cpus", f"is {host.cpus!r}; write 0,2-3"))
+    if "{threads}" not in host.stress:
         faults.append(Fault(f"{path}.stress", "must say where the number goes: {threads}"))
-    address, python = str(told.get("address", "")), str(told.get("python", "python3"))
-    return RealHost(words, address, port, python, folder, cpus, stress)
+    return replace(host, port=port)
 
 
 def _link(path: str, value: Any, faults: list[Fault]) -> LinkCommands:
-    told, keys = dict(_mapping(value, path, faults)), [item.name for item in fields(LinkCommands)]
-    _keys(path, told, keys, keys, faults)
-    commands = LinkCommands(str(told.get("begin", "")), str(told.get("end", "")))
+    given, keys = _mapping(value, path, faults), [item.name for item in fields(LinkCommands)]
+    _keys(path, given, keys, keys, faults)
+    commands = LinkCommands(*(str(given.get(key, "")) for key in keys))
     try:
         commands.begin.format(mean_ms=0, std_ms=0, loss_percent=0, rate_mbps=0)
     except (KeyError, IndexError, ValueError) as error:

@@ -138,25 +138,22 @@ def crowded(run: Run, problem: Problem) -> list[str]:
     A node is full whose utilisation is 97 % or more in most of the windows without a disturbance;
     the run's meta say when it was disturbed.
     """
+    import polars as pl
+
     span_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
-    played = [(item.at_s, item.end_s) for item in run.played or ()]
-    released_s = dict(zip(run.cycles["cycle"], run.cycles["release_ns"] / 1e9, strict=True))
-    windows = run.windows.filter(~run.windows["warmup"])
-    # Of a window whose first cycle is missing from the record nothing is said.
-    begun_s = [released_s.get(cycle) for cycle in windows["first_cycle"]]
-    calm = [
-        at_s is not None
-        and all(at_s + span_s < begin_s or end_s < at_s for begin_s, end_s in played)
-        for at_s in begun_s
-    ]
+    # A window whose first cycle is missing from the record is left out.
+    begun = run.cycles.select(pl.col("release_ns") / 1e9, first_cycle="cycle")
+    windows = run.windows.filter(~pl.col("warmup")).join(begun, on="first_cycle")
+    at_s = pl.col("release_ns")
+    for item in run.played or ():
+        windows = windows.filter((at_s + span_s < item.at_s) | (item.end_s < at_s))
     found = []
     for node in problem.fabric.nodes:
-        used = [share for share, mine in zip(windows[f"u_{node}"], calm, strict=True) if mine]
-        full = sum(share >= FULL for share in used)
-        if 2 * full > len(used):
+        full = int((windows[f"u_{node}"] >= FULL).sum())
+        if 2 * full > windows.height:
             found.append(
-                f"{node} was full ({FULL:.0%} busy or more) in {full} of {len(used)} windows in "
-                "which nothing was to disturb it: this machine has too little for the cell, and "
+                f"{node} was full ({FULL:.0%} busy or more) in {full} of {windows.height} windows "
+                "in which nothing was to disturb it: this machine has too little for the cell, and "
                 "what was missed says little about placements"
             )
     return found
