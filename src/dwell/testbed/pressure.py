@@ -24,6 +24,7 @@ The rule was fixed before any campaign, and knows nothing of what a run has show
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
@@ -149,12 +150,8 @@ def judged(samples: Sequence[Sample], spans: Sequence[Span], rule: Rule) -> dict
 
 def _why(rows: Iterable[Mapping[str, Any]]) -> str:
     """Return how often each part of the rule was broken, most frequent first."""
-    counts: dict[str, int] = {}
-    for row in rows:
-        for fault in row["broken"]:
-            counts[fault] = counts.get(fault, 0) + 1
-    ordered = sorted(counts.items(), key=lambda item: -item[1])
-    return ", ".join(f"{fault} in {count}" for fault, count in ordered)
+    counts = Counter(fault for row in rows for fault in row["broken"])
+    return ", ".join(f"{fault} in {count}" for fault, count in counts.most_common())
 
 
 def _row(inside: Sequence[Sample], span: Span, rule: Rule) -> dict[str, Any]:

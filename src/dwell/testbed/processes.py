@@ -166,9 +166,10 @@ class Processes:
         for problem in self.problems:
             if node not in problem.fabric.nodes:
                 continue
+            who = f"agent@{node}"
+            who = who if len(self.problems) == 1 else f"{who} of {problem.name}"
             state = self.folder_of(problem) / node
-            words = ["agent", "--node", node, "--state", str(state), *self._on_cpus(node)]
-            self._start(self._name("agent", node, problem), node, words, [problem])
+            self._start(who, node, ["agent", "--node", node, "--state", str(state)], [problem])
 
     def start_controllers(self) -> None:
         """Start the controllers, one on every node that decides for cells."""
@@ -189,26 +190,17 @@ class Processes:
         """
         cells = [problem for problem in self.problems if problem.controller_node == node]
         runs = self.folder / "runs" if out is None else out
-        words = ["controller", "--out", str(runs), *self._on_cpus(node), *self._more, *more]
+        words = ["controller", "--out", str(runs), *self._more, *more]
         self._start(f"controller@{node}", node, words, cells)
 
-    def _on_cpus(self, node: str) -> list[str]:
-        return ["--cpus", str(self._cpus[node])] if node in self._cpus else []
-
-    def _name(self, kind: str, node: str, problem: Problem) -> str:
-        who = f"{kind}@{node}"
-        return who if len(self.problems) == 1 else f"{who} of {problem.name}"
-
     def _start(
-        self,
-        who: str,
-        node: str,
-        words: Sequence[str],
-        problems: Sequence[Problem],
+        self, who: str, node: str, words: Sequence[str], problems: Iterable[Problem]
     ) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
         command = [sys.executable, "-m", *self._program, *words, OPTION, self._owner]
+        if node in self._cpus:
+            command += ["--cpus", str(self._cpus[node])]
         for problem in problems:
             command += ["--cell", str(self.file_of(problem))]
         with (self.folder / f"{who}.log").open("ab") as log:
@@ -223,29 +215,27 @@ class Processes:
 
     def forget(self, node: str) -> None:
         """Take note that everything on a node has been killed."""
-        for who in [who for who in self.running if self._on(who) == node]:
-            self.running.pop(who).wait(KILL_S)
-
-    @staticmethod
-    def _on(who: str) -> str:
-        return who.partition("@")[2].partition(" of ")[0]
+        for who in list(self.running):
+            if who.partition("@")[2].partition(" of ")[0] == node:
+                self.running.pop(who).wait(KILL_S)
 
     def stop_controllers(self) -> None:
         """End the controllers and wait until they have written their runs."""
-        self.end([who for who in self.running if who.startswith("controller@")], CONTROLLER_STOP_S)
+        self._end("controller@", CONTROLLER_STOP_S)
 
     def stop(self) -> None:
         """End all processes, the agents after the controllers, and remove their shared memory."""
         self.stop_controllers()
-        self.end(list(self.running), STOP_S)
+        self._end("", STOP_S)
         if self._sweeper is not None:
             self._sweeper.kill()
             self._sweeper.wait()
             self._sweeper = None
         remove_orphans()
 
-    def end(self, names: Iterable[str], patience_s: float) -> None:
-        """Tell processes to end by name, and kill those that have not when patience is over."""
+    def _end(self, begin: str, patience_s: float) -> None:
+        """End the processes whose names begin so."""
+        names = [who for who in self.running if who.startswith(begin)]
         end_all([self.running.pop(who) for who in names], patience_s)
 
 
