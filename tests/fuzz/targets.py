@@ -204,7 +204,7 @@ def keep_deciding(data: bytes) -> None:
     A byte chooses the message; then come a byte for each field and eight for what it is to be.
     """
     world = _deciding()
-    cell = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
+    cell = world.cell
     key, true = _next_messages(world, cell)[data[0] % 3 if data else 0]
     found = msgspec.to_builtins(true)
     stamp = found[0] if isinstance(true, Completion) else found
@@ -243,7 +243,7 @@ def _next_messages(world: World, cell: ControlledCell) -> list[tuple[str, msgspe
     """What the controller may hear next: a stamp, a completion, an answer."""
     stamper, now_ns = world.stamper, world.network.now_ns
     who = stamper.run, stamper.cycle, stamper.term, stamper.placement
-    keys = Keys(world.problem.name)
+    keys = world.keys
     done = Completion(messages.Stamp(*who, now_ns), "control", now_ns, "actuated", (), "R2")
     told = cell._number, cell.name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle
     return [
@@ -282,7 +282,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 
 def _wholes() -> list[msgspec.Struct]:
     return [
-        *(STAMP, messages.Stamped(*STAMP.fields, ((4, 9),)), HOP),
+        *(STAMP, messages.Stamped(**msgspec.structs.asdict(STAMP), intervals=((4, 9),)), HOP),
         Header(STAMP, "sensing", "R1", "bytes", (HOP,)),
         Completion(STAMP, "control", 9, "actuated", (HOP,), "R2"),
         messages.Heard("stamper@R1", "R1", 1, 2),

@@ -12,13 +12,16 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import count
 from math import inf
 from random import Random
 from typing import Protocol, TypeAlias
 
+import zenoh
+
 from dwell.errors import LiveError
-from dwell.live.transport.expressions import matcher, require_key
+from dwell.live.transport.expressions import require_expression, require_key
 from dwell.live.transport.transport import Arrival, Lane, Receive
 
 #: Says who may hear whom: names of sender and receiver, lane, key.
@@ -26,6 +29,13 @@ Reach: TypeAlias = Callable[[str, str, Lane, str], bool]
 
 #: How many messages wait for a link that stalls, or a process that is frozen.
 STALLED_MESSAGES = 64
+
+
+def matcher(expression: str) -> Callable[[str], bool]:
+    """Return what tells whether a key is under an expression, as Zenoh says."""
+    require_expression(expression)
+    known = zenoh.KeyExpr(expression)
+    return lru_cache(lambda key: known.includes(zenoh.KeyExpr(key)))
 
 
 class Participant(Protocol):

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
+import dwell
 from dwell.control import Controller
 from dwell.live.agent import Agent, CpuCount
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
-from dwell.live.role import RolePlace, Sealing
+from dwell.live.role import RolePlace
 from dwell.live.run_rows import Resume, Rows
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Stamper, StamperState
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
+from dwell.live.trust.signing import Seals
 from dwell.live.wiring import roles, wire
 from dwell.live.worker import Worker
 from dwell.model import Host, Problem
@@ -26,6 +29,26 @@ from tests.live.memory_transport import Clock, MemoryTransport, Network, Network
 MS = 1_000_000
 #: What the stages of the canonical cell take.
 EXEC_MS = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
+
+
+def canonical(window_cycles: int | None = None, **settings: Any) -> Problem:
+    """Return the canonical cell with other windows, and settings of its controller."""
+    cell = dwell.load("examples/canonical.yaml")
+    if window_cycles is not None:
+        cell = replace(cell, window_cycles=window_cycles, warmup_windows=0)
+    return replace(cell, controller=replace(cell.controller, **settings))
+
+
+def on(problem: Problem, candidate: str) -> Problem:
+    """Return a cell that begins at a candidate."""
+    return replace(problem, controller=replace(problem.controller, initial=candidate))
+
+
+def stateful(problem: Problem, task: str, state_bytes: int) -> Problem:
+    """Return a cell with a task whose state has to move with it."""
+    tasks = dict(problem.pipeline.tasks)
+    tasks[task] = replace(tasks[task], state_bytes=state_bytes)
+    return replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
 
 
 class MemoryBook:
@@ -170,7 +193,7 @@ class World:
         How long a job takes.
     delay_ms : float
         Of every message.
-    seals : mapping of str to Sealing, optional
+    seals : mapping of str to Seals, optional
         By subject: each node and the controller.
     """
 
@@ -183,7 +206,7 @@ class World:
         clocks: Mapping[str, Clock] | None = None,
         stages: Mapping[str, Callable[[str], Passing]] | None = None,
         policy: str | MinimalPolicy | None = None,
-        seals: Mapping[str, Sealing] | None = None,
+        seals: Mapping[str, Seals] | None = None,
     ) -> None:
         hosts = {
             node: Host("127.0.0.1", 10_000 + 1_000 * i)
@@ -253,7 +276,7 @@ class World:
 
     def sample(self, order: Order) -> Arrival:
         """An order as it arrives."""
-        return Arrival(Keys(self.problem.name).order(), encode(order))
+        return Arrival(self.keys.order(), encode(order))
 
     def order(self, placement: str, *, run: int = 0, term: int = 0, controller: str = "me") -> str:
         """Order a placement; returns why it was refused, or nothing."""
@@ -271,9 +294,33 @@ class World:
 
     def pin(self, candidate: str) -> None:
         """Have the controller move the cell, as a person does."""
-        cell = next(role for role in self.roles.values() if isinstance(role, ControlledCell))
-        ask = Ask("me", "pin", candidate)
-        cell.receive(Arrival(Keys(self.problem.name).ask(), encode(ask)), self.network.now_ns)
+        self.ask("pin", candidate)
+
+    def ask(self, what: str, about: str = "") -> None:
+        """Ask the controller as a person does."""
+        self.tell(self.keys.ask(), encode(Ask("me", what, about)))
+
+    def tell(self, key: str, data: bytes) -> int:
+        """Hand the controller a message; returns how many it complains of."""
+        before = self.cell.place.complained
+        self.cell.receive(Arrival(key, data), self.network.now_ns)
+        return self.cell.place.complained - before
+
+    @property
+    def keys(self) -> Keys:
+        return Keys(self.problem.name)
+
+    @property
+    def cell(self) -> ControlledCell:
+        """What the controller's process runs now."""
+        role = self.roles[f"controller@{self.problem.controller_node}"]
+        assert isinstance(role, ControlledCell)
+        return role
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """What the controller says of the cell."""
+        return self.cell.status(self.network.now_ns)
 
     @property
     def stamper(self) -> Stamper:

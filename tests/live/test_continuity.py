@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import msgspec
 import pytest
 
-import dwell
 from dwell.live.continuity import CONFIRMATIONS, RESERVED, Continuity, OvershootDetector
-from dwell.live.controlled_cell import ControlledCell
 from dwell.live.failure_detector import FailureDetector
-from dwell.live.keys import Keys
 from dwell.live.latencies import Intervals
 from dwell.live.loads import NodeLoad
 from dwell.live.messages import (
@@ -30,7 +26,7 @@ from dwell.live.offsets import Offsets
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
-from tests.live.small_world import World
+from tests.live.small_world import World, canonical
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD_NS = 33 * MS
@@ -39,9 +35,7 @@ HUGE = 1 << 40
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    settings = replace(cell.controller, min_dwell=1, estimator="profile")
-    return replace(cell, window_cycles=10, warmup_windows=0, controller=settings)
+    return canonical(10, min_dwell=1, estimator="profile")
 
 
 class Staying:
@@ -65,22 +59,14 @@ def world(problem: Problem) -> World:
     return made
 
 
-def cell_of(world: World) -> ControlledCell:
-    return next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
-
-
-def status(world: World) -> dict[str, Any]:
-    return cell_of(world).status(world.network.now_ns)
-
-
 def windows(world: World) -> int:
-    found = status(world)["windows"]
+    found = world.status["windows"]
     assert isinstance(found, int)
     return found
 
 
 def hear(world: World, key: str, message: msgspec.Struct) -> None:
-    cell_of(world).receive(Arrival(key, encode(message)), world.network.now_ns)
+    world.cell.receive(Arrival(key, encode(message)), world.network.now_ns)
 
 
 def stamped(world: World, **false: object) -> None:
@@ -89,7 +75,7 @@ def stamped(world: World, **false: object) -> None:
     true = Stamped(
         stamper.run, stamper.cycle, stamper.term, stamper.placement, world.network.now_ns
     )
-    hear(world, Keys(world.problem.name).stamped(), msgspec.structs.replace(true, **false))
+    hear(world, world.keys.stamped(), msgspec.structs.replace(true, **false))
 
 
 def completed(world: World, outcome: str = "actuated", **false: object) -> None:
@@ -98,17 +84,24 @@ def completed(world: World, outcome: str = "actuated", **false: object) -> None:
         stamper.run, stamper.cycle, stamper.term, stamper.placement, world.network.now_ns
     )
     stamp = msgspec.structs.replace(true, **false)
-    done = Completion(Stamp(*stamp.fields), "control", world.network.now_ns, outcome, (), "R2")
-    keys = Keys(world.problem.name)
+    done = Completion(
+        Stamp(*msgspec.structs.astuple(stamp)[:7]),
+        "control",
+        world.network.now_ns,
+        outcome,
+        (),
+        "R2",
+    )
+    keys = world.keys
     hear(world, keys.done("control") if outcome == "actuated" else keys.ended(), done)
 
 
 def answered(world: World, **false: object) -> None:
     """The controller hears one answer that is as the next would be, but for what is false."""
-    stamper, cell = world.stamper, cell_of(world)
+    stamper, cell = world.stamper, world.cell
     number, name = cell._number, cell.name
     true = Accepted(number, name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle)
-    hear(world, Keys(world.problem.name).accepted(), msgspec.structs.replace(true, **false))
+    hear(world, world.keys.accepted(), msgspec.structs.replace(true, **false))
 
 
 def goes_on(world: World) -> None:
@@ -122,10 +115,10 @@ def goes_on(world: World) -> None:
     world.run(1_000)
     assert world.stamper.placement == target
     assert [why for _, _, why in world.stamper.moves[guard_moves:]] == ["order"]
-    found = status(world)
+    found = world.status
     assert found["placement"] == target
     assert (found["run"], found["term"]) == (world.stamper.run, world.stamper.term)
-    assert cell_of(world).controller.incumbent == target
+    assert world.cell.controller.incumbent == target
     before = windows(world)
     world.run(3_000)
     assert windows(world) - before >= 3 * per_s - 3
@@ -161,7 +154,7 @@ FALSE: dict[str, Callable[[World], dict[str, object]]] = {
 def test_one_false_stamp_ends_no_decisions(world: World, what: str) -> None:
     stamped(world, **FALSE[what](world))
     goes_on(world)
-    assert cell_of(world).guard_moves == 0
+    assert world.cell.guard_moves == 0
 
 
 @pytest.mark.parametrize("outcome", ["actuated", "shadow", "replaced"])
@@ -169,7 +162,7 @@ def test_one_false_stamp_ends_no_decisions(world: World, what: str) -> None:
 def test_one_false_completion_ends_no_decisions(world: World, what: str, outcome: str) -> None:
     completed(world, outcome, **FALSE[what](world))
     goes_on(world)
-    assert cell_of(world).guard_moves == 0
+    assert world.cell.guard_moves == 0
 
 
 @pytest.mark.parametrize(
@@ -190,12 +183,12 @@ def test_one_false_answer_ends_no_decisions(world: World, false: dict[str, objec
 
 def test_what_is_not_believed_is_counted_and_said_once(world: World) -> None:
     said: list[str] = []
-    cell_of(world).place.say = said.append
-    before = status(world)["disbelieved"]
+    world.cell.place.say = said.append
+    before = world.status["disbelieved"]
     for more in range(40):
         stamped(world, cycle=world.stamper.cycle + HUGE + 1_000_000 * more * more)
         world.run(50)
-    assert status(world)["disbelieved"] == before + 40
+    assert world.status["disbelieved"] == before + 40
     assert len(said) == 1
     assert "stamper@R1" in said[0]
     goes_on(world)
@@ -206,7 +199,7 @@ def test_a_stamper_that_left_numbers_out_is_believed_at_once(world: World) -> No
     world.start("stamper@R1")
     assert world.stamper.cycle >= RESERVED
     world.run(200)
-    assert status(world)["disbelieved"] == 0
+    assert world.status["disbelieved"] == 0
     before = windows(world)
     world.run(2_000)
     assert windows(world) >= before + 3
@@ -217,7 +210,7 @@ def test_a_controller_that_was_cut_off_believes_the_next_stamp_at_once(world: Wo
     world.network.advance(world.network.now_ns + 120 * S)
     world.network.heal(cut)
     world.run(400)
-    assert status(world)["disbelieved"] == 0
+    assert world.status["disbelieved"] == 0
     goes_on(world)
 
 
@@ -236,7 +229,7 @@ def test_a_stamper_that_was_away_for_an_hour_is_believed_at_once(problem: Proble
     unanswered = world.network.cut("stamper@R1", "*", key="dwell/*/accepted")
     world.network.heal(cut)
     world.run(20_000)
-    assert status(world)["disbelieved"] == 0
+    assert world.status["disbelieved"] == 0
     world.network.heal(unanswered)
     before = windows(world)
     world.run(300_000)
@@ -244,7 +237,7 @@ def test_a_stamper_that_was_away_for_an_hour_is_believed_at_once(problem: Proble
     target = "SO" if world.stamper.placement != "SO" else "LOC"
     world.pin(target)
     world.run(60_000)
-    assert status(world)["placement"] == world.stamper.placement == target
+    assert world.status["placement"] == world.stamper.placement == target
 
 
 @pytest.mark.parametrize("answers", [True, False])
@@ -266,7 +259,7 @@ def test_a_stamper_that_is_really_beyond_is_followed(
     before = windows(world)
     world.run(3_000)
     assert windows(world) >= before + 6
-    assert status(world)["run"] == world.stamper.run
+    assert world.status["run"] == world.stamper.run
 
 
 def test_a_guards_move_is_told_by_stamps_where_no_answer_comes(world: World) -> None:
@@ -276,8 +269,8 @@ def test_a_guards_move_is_told_by_stamps_where_no_answer_comes(world: World) -> 
     other = next(name for name in world.problem.candidates if name != stamper.placement)
     stamper._move(other, by_guard=True)
     world.run(400)
-    assert status(world)["placement"] == other
-    assert status(world)["guard_moves"] == 1
+    assert world.status["placement"] == other
+    assert world.status["guard_moves"] == 1
 
 
 # --------------------------------------------------------------------------- the rule itself

@@ -11,24 +11,19 @@ from typing import Any
 import pytest
 from msgspec.structs import replace as replaced
 
-import dwell
-from dwell.live.controlled_cell import ControlledCell
-from dwell.live.keys import Keys
 from dwell.live.messages import Answer, Ask, Order, decode, encode
 from dwell.live.run_rows import Rows
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
-from tests.live.small_world import EXEC_MS, World
+from tests.live.small_world import World, canonical
 
 CONTROLLER = "controller@E"
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    settings = replace(cell.controller, min_dwell=1, estimator="profile")
-    return replace(cell, window_cycles=20, warmup_windows=0, controller=settings)
+    return canonical(20, min_dwell=1, estimator="profile")
 
 
 class Alternating:
@@ -46,19 +41,15 @@ def alternating(problem: Problem) -> World:
     return World(problem, policy=Alternating("LOC", "SO"))
 
 
-def cell_of(world: World) -> ControlledCell:
-    return next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
-
-
 def ask(world: World, what: str, about: str = "") -> str:
     """Ask the controller as a person does; returns why it refuses, or nothing."""
-    keys, heard = Keys(world.problem.name), list[str]()
+    keys, heard = world.keys, list[str]()
     visitor = world.network.transport(f"visitor{world.network.now_ns}", "R1")
     visitor.subscribe(keys.answer("me"), lambda s: heard.append(decode(s.payload, Answer).refused))
     sample = Arrival(keys.ask(), encode(Ask("me", what, about)))
     # It has no wire of the cell's: it talks to the controller alone.
     reach, world.network.reach = world.network.reach, None
-    cell_of(world).receive(sample, world.network.now_ns)
+    world.cell.receive(sample, world.network.now_ns)
     world.run(5)
     world.network.reach = reach
     visitor.close()
@@ -69,7 +60,7 @@ def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
     """Columns of a table's rows, later rows of a number in the place of earlier ones."""
     from dwell.live.run_rows import columns_of
 
-    order = list(columns_of(cell_of(world).controller)[table])
+    order = list(columns_of(world.cell.controller)[table])
     rows = world.recorder.rows[table]
     if table != "decisions":
         rows = list({row[0]: row for row in rows}.values())
@@ -112,7 +103,7 @@ def test_what_is_not_moved_has_no_lead(problem: Problem) -> None:
 
 def test_what_else_is_due_comes_between_an_order_and_its_record(problem: Problem) -> None:
     world, events = alternating(problem), list[str]()
-    cell, recorder = cell_of(world), world.recorder
+    cell, recorder = world.cell, world.recorder
     wake, send, append = cell.wake, cell._send, recorder.append
 
     def woken(now_ns: int) -> int:
@@ -139,7 +130,7 @@ def test_what_else_is_due_comes_between_an_order_and_its_record(problem: Problem
 def test_what_is_remembered_is_none_of_the_garbage_collectors_business(problem: Problem) -> None:
     world = alternating(problem)
     world.run(8_000)
-    windows = cell_of(world).windows
+    windows = world.cell.windows
     assert windows is not None
     remembered = windows.record._recorded
     assert len(remembered) > 100
@@ -153,7 +144,7 @@ def test_what_is_remembered_is_none_of_the_garbage_collectors_business(problem: 
 def test_decisions_that_are_recorded_are_not_kept(problem: Problem) -> None:
     world = alternating(problem)
     world.run(8_000)
-    decisions = cell_of(world).controller.log.decisions
+    decisions = world.cell.controller.log.decisions
     assert len(decisions) > 8
     assert not any(decisions[:-2])
 
@@ -162,7 +153,7 @@ def test_an_order_that_was_asked_for_anew_before_its_answer_came_is_no_move_of_t
     problem: Problem,
 ) -> None:
     world = alternating(problem)
-    cell = cell_of(world)
+    cell = world.cell
     send = cell._send
 
     def sent(order: Order) -> None:
@@ -184,7 +175,7 @@ def test_an_order_that_was_asked_for_anew_before_its_answer_came_is_no_move_of_t
 def test_whom_the_stamper_tells_that_no_guard_moved_needs_no_proof(problem: Problem) -> None:
     world = alternating(problem)
     world.run(4_000)
-    cell = cell_of(world)
+    cell = world.cell
     # An order that was given up, and accepted after all; only its stamp was heard.
     cell.controller.on_fallback, cell.controller.wanted = True, "SO"
     before = len(world.stamper.moves)
@@ -217,7 +208,7 @@ def test_without_answers_the_controller_knows_where_the_cell_is(problem: Problem
     world.network.cut("stamper@R1", "*", key="dwell/*/accepted")
     world.network.cut("agent@E", "*", key="dwell/*/gathered")
     world.run(6_000)
-    cell = cell_of(world)
+    cell = world.cell
     assert cell.held is not None
     assert cell.held.placement == world.stamper.placement
     assert cell.controller.incumbent in problem.candidates
@@ -279,7 +270,7 @@ def test_a_pinned_cell_stays_and_an_unpinned_one_goes_on(problem: Problem) -> No
     term = world.stamper.term
     world.run(4_000)
     assert (world.stamper.placement, world.stamper.term) == ("HYB", term)
-    assert cell_of(world).controller.incumbent == "HYB"
+    assert world.cell.controller.incumbent == "HYB"
     assert not ask(world, "unpin")
     world.run(4_000)
     assert world.stamper.term > term
@@ -366,12 +357,12 @@ def test_advice_orders_nothing(problem: Problem) -> None:
 
 def test_moves_of_the_guard_are_told_to_the_policy_and_recorded(problem: Problem) -> None:
     settings = replace(problem.controller, initial="SO")
-    world = World(replace(problem, controller=settings), exec_ms=EXEC_MS, policy="dtp")
+    world = World(replace(problem, controller=settings), policy="dtp")
     world.run(3_000)
     world.network.freeze("perception@E")
     world.run(2_000)
     assert world.stamper.placement == "LOC"
-    cell = cell_of(world)
+    cell = world.cell
     assert cell.controller.incumbent == "LOC"
     rows = columns(world, "decisions", "incumbent", "placement", "migrated", "reason")
     assert ("SO", "LOC", True, "guard") in rows
@@ -380,9 +371,9 @@ def test_moves_of_the_guard_are_told_to_the_policy_and_recorded(problem: Problem
 
 def test_it_says_how_long_the_guard_rests_after_its_own_move(problem: Problem) -> None:
     settings = replace(problem.controller, initial="SO")
-    world = World(replace(problem, controller=settings), exec_ms=EXEC_MS, policy="SO")
+    world = World(replace(problem, controller=settings), policy="SO")
     world.run(1_000)
-    cell = cell_of(world)
+    cell = world.cell
     seen = [cell.status(world.network.now_ns)["resting"]]
     world.network.freeze("perception@E")
     for _ in range(60):

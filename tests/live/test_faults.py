@@ -12,25 +12,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import dwell
 from dwell.live.messages import Order, State, encode
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from tests.live.memory_transport import Clock
-from tests.live.small_world import MS, Counting, World
+from tests.live.small_world import MS, Counting, World, canonical, on, stateful
 
 EDGE = ("perception@E", "perception@E.shadow", "planning@E", "planning@E.shadow", "agent@E")
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    fallbacks = ("LOC", "HYB", "SO")
-    return replace(cell, controller=replace(cell.controller, fallbacks=fallbacks))
-
-
-def on(problem: Problem, candidate: str) -> Problem:
-    return replace(problem, controller=replace(problem.controller, initial=candidate))
+    return canonical(fallbacks=("LOC", "HYB", "SO"))
 
 
 def longest_gap(cycles: list[int], last: int) -> int:
@@ -48,13 +41,6 @@ def running(problem: Problem, candidate: str, ms: float = 1_000) -> World:
     world = World(on(problem, candidate))
     world.run(ms)
     return world
-
-
-def stateful(problem: Problem, task: str, state_bytes: int) -> Problem:
-    """The cell, with a task whose state has to move with it."""
-    tasks = dict(problem.pipeline.tasks)
-    tasks[task] = replace(tasks[task], state_bytes=state_bytes)
-    return replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
 
 
 def require_ordered(world: World) -> None:

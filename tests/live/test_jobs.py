@@ -121,7 +121,7 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
         assert took.filter(pl.col("task") == task)["took"].unique().to_list() == [exec_ms * MS]
 
     # The latency of a cycle runs from its release to the end of its last job.
-    order = [*columns_of(cell_of(world).controller)["cycles"]]
+    order = [*columns_of(world.cell.controller)["cycles"]]
     table = pl.DataFrame(world.recorder.rows["cycles"], schema=order, orient="row")
     table = table.unique("cycle", keep="last")
     ends = settled.group_by("cycle").agg(pl.col("end_ns").max())
@@ -213,7 +213,7 @@ def test_jobs_survive_in_the_folder(problem: Problem, tmp_path: Path) -> None:
 
     world = Kept(problem, policy="LOC")
     world.run(4_000)
-    cell = cell_of(world)
+    cell = world.cell
     assert cell.windows is not None
     folder = world.kept.finish(cell.windows.record.rows(last=True))
     assert folder is not None

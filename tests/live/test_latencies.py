@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
-import dwell
 from dwell.live.latencies import SPAN_NS, Intervals
 from dwell.live.messages import Beat, Completion, Heard, Stamp
 from dwell.live.run_rows import columns_of
 from dwell.model import Problem
 from tests.live.memory_transport import Clock, NetworkConditions
-from tests.live.small_world import World
-from tests.live.test_controlled_cell import cell_of, columns
+from tests.live.small_world import World, canonical
+from tests.live.test_controlled_cell import columns
 
 MS, S = 1_000_000, 1_000_000_000
 CLOCKS = {"R1": Clock(7 * S), "E": Clock(50 * S, 80.0), "R2": Clock(900 * S, -60.0)}
@@ -24,9 +21,7 @@ ROUNDING_NS = 20_000
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    settings = replace(cell.controller, min_dwell=1, estimator="profile")
-    return replace(cell, window_cycles=20, warmup_windows=0, controller=settings)
+    return canonical(20, min_dwell=1, estimator="profile")
 
 
 def measured(world: World) -> list[tuple[int | None, int]]:
@@ -70,7 +65,7 @@ def test_of_what_came_over_the_detour_nothing_is_said(problem: Problem) -> None:
     found = measured(world)
     assert len(found) > 40
     assert {own for own, _ in found} == {None}
-    assert "stamper_interval_ns" in columns_of(cell_of(world).controller)["cycles"]
+    assert "stamper_interval_ns" in columns_of(world.cell.controller)["cycles"]
 
 
 # --------------------------------------------------------------------------------- alone

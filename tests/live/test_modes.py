@@ -8,33 +8,25 @@ from itertools import pairwise
 
 import pytest
 
-import dwell
-from dwell.live.controlled_cell import ControlledCell
-from dwell.live.keys import Keys
 from dwell.live.messages import Ask, encode
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import roles
 from dwell.model import Problem
-from tests.live.small_world import EXEC_MS, World
+from tests.live.small_world import EXEC_MS, World, canonical
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    return replace(cell, controller=replace(cell.controller, fallbacks=("LOC",), initial="SO"))
+    return canonical(fallbacks=("LOC",), initial="SO")
 
 
 def ask(world: World, what: str, about: str = "") -> str:
     """Ask as a person does; returns the refusal."""
-    cell = controller(world)
-    sample = Arrival(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
+    cell = world.cell
+    sample = Arrival(world.keys.ask(), encode(Ask("me", what, about)))
     before = cell._do(Ask("me", what, about), world.network.now_ns)
     cell.receive(sample, world.network.now_ns)
     return before
-
-
-def controller(world: World) -> ControlledCell:
-    return next(role for role in world.roles.values() if isinstance(role, ControlledCell))
 
 
 def require_unbroken(cycles: Iterable[int], world: World) -> None:
@@ -60,7 +52,7 @@ def test_advice_is_recorded_and_not_followed(problem: Problem) -> None:
     assert not stayed.stamper.moves
     rows = stayed.recorder.rows["decisions"]
     assert len(rows) >= 3
-    names = controller(stayed).controller.decision_columns
+    names = stayed.cell.controller.decision_columns
     assert {dict(zip(names, row, strict=False))["placement"] for row in rows} - {"LOC"}
 
 
@@ -71,7 +63,7 @@ def test_a_pin_holds_against_the_policy_even_where_it_only_advises(problem: Prob
     assert not ask(world, "pin", "HYB")
     world.run(8_000)
     assert world.stamper.placement == "HYB"
-    assert controller(world).status(world.network.now_ns)["pinned"] == "HYB"
+    assert world.status["pinned"] == "HYB"
     require_unbroken(world.cycles, world)
 
 

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-import dwell
 from docs.protocol import gate, orders, states
 from docs.protocol.checker import Rules, Step, explore, stuck, without
 from dwell.model import Problem
-from tests.live.small_world import World
+from tests.live.small_world import World, canonical
 
 MODELS = {"gate": gate, "orders": orders, "states": states}
 WALKS = 6
@@ -59,10 +57,8 @@ def test_every_rule_is_needed(name: str, rule: str) -> None:
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
     fallbacks = orders.FALLBACK, orders.OTHER
-    settings = replace(cell.controller, fallbacks=fallbacks, initial=orders.WANTED)
-    return replace(cell, controller=settings)
+    return canonical(fallbacks=fallbacks, initial=orders.WANTED)
 
 
 #: What to kill so that the guard leaves a placement for the first of its other fallbacks.

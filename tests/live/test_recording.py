@@ -11,9 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -22,7 +20,6 @@ import dwell
 from dwell.cli.commands import app
 from dwell.control import Controller
 from dwell.errors import LiveError
-from dwell.live.controlled_cell import ControlledCell
 from dwell.live.node import run_controller
 from dwell.live.recording import RunRecorder
 from dwell.model import Problem
@@ -30,7 +27,7 @@ from dwell.record import open_run
 from dwell.record.journal import JOURNAL, MARK
 from dwell.report.run_page import run_page
 from dwell.testbed.chaos.disk import limit_file_size
-from tests.live.small_world import World
+from tests.live.small_world import World, canonical
 from tests.report.pages import table_of
 
 #: A cell in memory, at full speed; its controller records as that of real processes does.
@@ -53,7 +50,7 @@ problem = dwell.load("examples/canonical.yaml")
 problem = replace(problem, window_cycles=10, warmup_windows=0)
 exec_ms = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
 world = World(problem, exec_ms=exec_ms, policy="dtp")
-cell = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
+cell = world.cell
 cell._recorder = Telling(Path(sys.argv[1]), world.problem, cell.controller, lambda line: None)
 for _ in range(400):
     world.run(100)
@@ -88,12 +85,6 @@ class Recorded(World):
         super().start(who)
 
     @property
-    def cell(self) -> ControlledCell:
-        return next(
-            role for role in reversed(self.roles.values()) if isinstance(role, ControlledCell)
-        )
-
-    @property
     def windows(self) -> int:
         """How many have closed."""
         assert self.cell.windows is not None
@@ -110,8 +101,7 @@ class Recorded(World):
 
 @pytest.fixture
 def problem() -> Problem:
-    canonical = dwell.load("examples/canonical.yaml")
-    return replace(canonical, window_cycles=10, warmup_windows=0)
+    return canonical(10)
 
 
 @pytest.fixture
@@ -124,10 +114,6 @@ def limits() -> Iterator[Callable[[int | None], None]]:
 Limits = Callable[[int | None], None]
 
 
-def status_of(world: Recorded) -> dict[str, Any]:
-    return world.cell.status(world.network.now_ns)
-
-
 @pytest.mark.parametrize("room", [0, 100_000], ids=["from the start", "later"])
 def test_a_full_disk_costs_no_decision_and_once_it_has_room_no_row(
     problem: Problem, tmp_path: Path, limits: Limits, room: int
@@ -138,13 +124,13 @@ def test_a_full_disk_costs_no_decision_and_once_it_has_room_no_row(
     assert world.windows > 50
     world.pin("SO")
     world.run(2_000)
-    assert status_of(world)["placement"] == "SO"
-    assert "cannot be written (File too large)" in status_of(world)["record"]
-    assert "the run is not kept: " in status_of(world)["headline"]
+    assert world.status["placement"] == "SO"
+    assert "cannot be written (File too large)" in world.status["record"]
+    assert "the run is not kept: " in world.status["headline"]
     assert sum("cannot be written (File too large)" in line for line in world.log) == 1
     limits(None)
     world.run(1_000)
-    assert status_of(world)["record"] is None
+    assert world.status["record"] is None
     assert world.log[-1].endswith("canonical-1: can be written again")
     # Before anything is sealed, and afterwards.
     (folder,) = tmp_path.iterdir()
@@ -181,7 +167,7 @@ def test_a_folder_that_cannot_be_made_yet_is_made_later(problem: Problem, tmp_pa
     world = Recorded(problem, out)
     world.run(10_000)
     assert world.windows > 10
-    assert "cannot be written (" in status_of(world)["record"]
+    assert "cannot be written (" in world.status["record"]
     (tmp_path / "disk" / "not mounted" / "yet").mkdir(parents=True)
     world.run(1_000)
     assert open_run(world.finish()).windows.height == world.windows

@@ -9,10 +9,6 @@ from typing import Any
 import pytest
 
 import dwell
-from dwell.live.controlled_cell import ControlledCell
-from dwell.live.keys import Keys
-from dwell.live.messages import Ask, encode
-from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.live.small_world import World
@@ -61,19 +57,6 @@ def slow_cell(window_cycles: int, *fallbacks: str, mode: str = "control") -> Pro
     )
 
 
-def cell_of(world: World) -> ControlledCell:
-    return next(role for role in reversed(world.roles.values()) if isinstance(role, ControlledCell))
-
-
-def ask(world: World, what: str, about: str = "") -> None:
-    sample = Arrival(Keys(world.problem.name).ask(), encode(Ask("me", what, about)))
-    cell_of(world).receive(sample, world.network.now_ns)
-
-
-def status(world: World) -> dict[str, Any]:
-    return cell_of(world).status(world.network.now_ns)
-
-
 def cycles_until(world: World, placement: str, most: int) -> int:
     """Let time pass until a placement holds; returns how many cycles that took."""
     begun = world.stamper.cycle
@@ -81,7 +64,7 @@ def cycles_until(world: World, placement: str, most: int) -> int:
         if world.stamper.placement == placement:
             break
         world.run(PERIOD_MS)
-    assert world.stamper.placement == placement, status(world)
+    assert world.stamper.placement == placement, world.status
     return world.stamper.cycle - begun
 
 
@@ -101,7 +84,7 @@ def on_fallback(problem: Problem, policy: Any = None, *, ended: str = "perceptio
 def test_a_pin_is_carried_out_once_h_probes_have_come_through(window_cycles: int) -> None:
     world = on_fallback(slow_cell(window_cycles))
     needed = world.problem.controller.probe_cycles
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     # What it says of itself takes a quarter of a second, and so does what it is told.
     assert needed <= cycles_until(world, "SO", 2 * needed) <= needed + 8
     world.run(5_000)
@@ -120,12 +103,12 @@ def test_who_wants_to_be_elsewhere_is_there_at_the_first_close_after_the_proof(
     cycles_until(world, "SO", 2 * needed + 3 * window_cycles)
     world.run(5_000)
     assert [to for _, to, _ in world.stamper.moves] == ["LOC", "SO"]
-    assert status(world)["wanted"] is None
+    assert world.status["wanted"] is None
 
 
 def test_a_pin_goes_before_what_the_policy_wants() -> None:
     world = on_fallback(slow_cell(5), Wanting("SO"))
-    ask(world, "pin", "HYB")
+    world.ask("pin", "HYB")
     cycles_until(world, "HYB", 60)
     world.run(5_000)
     assert [to for _, to, _ in world.stamper.moves] == ["LOC", "HYB"]
@@ -134,40 +117,40 @@ def test_a_pin_goes_before_what_the_policy_wants() -> None:
 def test_a_pin_to_where_it_cannot_be_is_not_carried_out_before_it_can() -> None:
     world = on_fallback(slow_cell(15))
     world.kill("planning@E")
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     world.run(12_000)
     assert world.stamper.placement == "LOC"
-    found = status(world)
+    found = world.status
     assert (found["pinned"], found["moving_to"]) == ("SO", None)
     # The shadow has proven it, and its worker is not there.
     assert found["refused"].startswith("not ready: planning@E")
     windows = found["windows"]
     world.run(6_000)
-    assert status(world)["windows"] > windows
+    assert world.status["windows"] > windows
     world.start("planning@E")
     cycles_until(world, "SO", 60)
 
 
 def test_a_pin_that_is_taken_back_leaves_the_cell_where_it_is() -> None:
     world = on_fallback(slow_cell(15))
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     world.run(15 * PERIOD_MS)
-    assert status(world)["proving"]["candidate"] == "SO"
-    ask(world, "unpin")
+    assert world.status["proving"]["candidate"] == "SO"
+    world.ask("unpin")
     world.run(6_000)
-    assert status(world)["proving"] is None
+    assert world.status["proving"] is None
     assert world.stamper.placement == "LOC"
     assert world.stamper.probation.wanted is None
     # And another begins anew.
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     assert cycles_until(world, "SO", 60) >= world.problem.controller.probe_cycles
 
 
 def test_a_pin_to_the_fallback_itself_probes_nothing() -> None:
     world = on_fallback(slow_cell(5), Wanting("SO"))
-    ask(world, "pin", "LOC")
+    world.ask("pin", "LOC")
     world.run(8_000)
-    assert (world.stamper.placement, status(world)["proving"]) == ("LOC", None)
+    assert (world.stamper.placement, world.status["proving"]) == ("LOC", None)
 
 
 @pytest.mark.parametrize("window_cycles", [5, 15, 40])
@@ -178,7 +161,7 @@ def test_a_fallback_that_is_drained_is_left_for_what_is_proven(
     problem = slow_cell(window_cycles, "HYB", "LOC", mode=mode)
     world = on_fallback(problem, ended="planning@E")
     assert world.stamper.placement == "HYB"
-    ask(world, "drain", "E")
+    world.ask("drain", "E")
     needed = problem.controller.probe_cycles
     assert needed <= cycles_until(world, "LOC", 2 * needed) <= needed + 8
     world.run(5_000)
@@ -187,11 +170,11 @@ def test_a_fallback_that_is_drained_is_left_for_what_is_proven(
 
 def test_it_says_how_far_the_proof_is_and_calls_nothing_a_move_before() -> None:
     world = on_fallback(slow_cell(15))
-    assert status(world)["proving"] is None
-    ask(world, "pin", "SO")
+    assert world.status["proving"] is None
+    world.ask("pin", "SO")
     done, moving = [], []
     while world.stamper.placement == "LOC":
-        found = status(world)
+        found = world.status
         proving = found["proving"]
         moving.append(found["moving_to"])
         if proving is not None:
@@ -204,17 +187,17 @@ def test_it_says_how_far_the_proof_is_and_calls_nothing_a_move_before() -> None:
     assert max(done) >= 27
     assert set(moving[:-1]) == {None}
     world.run(1_000)
-    assert (status(world)["proving"], status(world)["moving_to"]) == (None, None)
+    assert (world.status["proving"], world.status["moving_to"]) == (None, None)
 
 
 def test_probes_that_are_lost_begin_the_count_anew_and_the_pin_holds() -> None:
     world = on_fallback(slow_cell(15))
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     world.run(20 * PERIOD_MS)
-    before = status(world)["proving"]["done"]
+    before = world.status["proving"]["done"]
     world.kill("planning@E.shadow")
     world.run(8 * PERIOD_MS)
-    assert before > status(world)["proving"]["done"] == 0
+    assert before > world.status["proving"]["done"] == 0
     world.start("planning@E.shadow")
     assert cycles_until(world, "SO", 60) >= world.problem.controller.probe_cycles
 
@@ -231,7 +214,7 @@ def test_a_static_policy_is_carried_out_though_a_process_starts_again(who: str) 
 
 def test_a_pin_is_carried_out_though_the_stamper_starts_again() -> None:
     world = on_fallback(slow_cell(15))
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     world.run(20 * PERIOD_MS)
     world.kill("stamper@R1")
     world.run(5 * PERIOD_MS)
@@ -241,12 +224,12 @@ def test_a_pin_is_carried_out_though_the_stamper_starts_again() -> None:
 
 def test_the_record_has_no_move_that_was_none() -> None:
     world = on_fallback(slow_cell(5))
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     cycles_until(world, "SO", 60)
     world.run(3_000)
     from dwell.live.run_rows import columns_of
 
-    names = list(columns_of(cell_of(world).controller)["decisions"])
+    names = list(columns_of(world.cell.controller)["decisions"])
     rows = [dict(zip(names, row, strict=True)) for row in world.recorder.rows["decisions"]]
     # The policy has wanted to stay all the time, and nothing of that was held back.
     assert [row["placement"] for row in rows if row["migrated"]] == ["LOC"]
@@ -258,5 +241,5 @@ def test_a_pin_is_carried_out_where_orders_and_answers_are_lost(lossy: float) ->
     world = on_fallback(slow_cell(15))
     for one, other in (("controller@E", "stamper@R1"), ("stamper@R1", "controller@E")):
         world.network.impair(world.losing(lossy), one, other)
-    ask(world, "pin", "SO")
+    world.ask("pin", "SO")
     cycles_until(world, "SO", 80)

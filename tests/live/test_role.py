@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 import dwell
@@ -13,13 +11,12 @@ from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from dwell.model.document import fingerprint
 from tests.live.memory_transport import Network
-from tests.live.small_world import MS, World
+from tests.live.small_world import MS, World, canonical
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    return replace(cell, controller=replace(cell.controller, fallbacks=("LOC",)))
+    return canonical(fallbacks=("LOC",))
 
 
 def test_other_cell_files_and_versions_are_named(problem: Problem) -> None:

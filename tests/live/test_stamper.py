@@ -7,17 +7,15 @@ from itertools import pairwise
 
 import pytest
 
-import dwell
 from dwell.live.stamper import Stamper
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from tests.live.small_world import MS, World
+from tests.live.small_world import MS, World, canonical
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    return replace(cell, controller=replace(cell.controller, fallbacks=("LOC",)))
+    return canonical(fallbacks=("LOC",))
 
 
 def test_the_stamper_beats_between_two_releases(

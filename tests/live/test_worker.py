@@ -10,7 +10,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-import dwell
 from dwell.live.hosting import work
 from dwell.live.messages import Beat, decode
 from dwell.live.role import RolePlace
@@ -18,7 +17,7 @@ from dwell.live.stage import Message
 from dwell.live.transport.transport import Receive
 from dwell.live.worker import Worker
 from dwell.model import Problem
-from tests.live.small_world import MS, Bench, Passing, World
+from tests.live.small_world import MS, Bench, Passing, World, canonical
 from tests.waiting import wait_until
 
 PATIENCE_S = 20.0
@@ -26,8 +25,7 @@ PATIENCE_S = 20.0
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    return replace(cell, controller=replace(cell.controller, fallbacks=("LOC",)))
+    return canonical(fallbacks=("LOC",))
 
 
 class Moody(Passing):

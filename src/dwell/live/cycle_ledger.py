@@ -382,8 +382,6 @@ class Ledger:
 
         Parameters
         ----------
-        cycles : sequence of LiveCycle
-        release_ns : int64 array, shape (W,)
         shadows : bool
             Whether cycles may have been sent through alternatives.
         """

@@ -193,7 +193,6 @@ def work(
     ----------
     note : callable, optional
         Told what job begins, and None when it is over.
-    clock : callable
     ready : callable, optional
         Called when the stage has started.
     """

@@ -57,7 +57,6 @@ class Intervals:
     ----------
     who : str
         The stamper.
-    sinks : collection of str
     """
 
     def __init__(self, who: str, sinks: Collection[str]) -> None:

@@ -100,7 +100,6 @@ class ForkServer(Launcher):
     ----------
     program : sequence of str
         Command of the fork server; it calls `serve` with its standard input.
-    environment : mapping of str to str, optional
     """
 
     def __init__(

@@ -16,12 +16,17 @@ from dwell.errors import LiveError
 #: Longer headers and control messages are refused before anything of them is read.
 MAX_HEADER_BYTES = 16_384
 MAX_CONTROL_BYTES = 262_144
+#: Signatures stand before what they are of (Ed25519).
+SIGNATURE_BYTES = 64
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 #: Number of an order that is believed to have been carried out: a quarter of the range is left for
 #: those that follow, whatever one message says.
 Passed: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=3 << 60)]
+#: Name of a candidate, or nothing.
+MaybeName: TypeAlias = Annotated[str, msgspec.Meta(max_length=120)]
+Hops: TypeAlias = "Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)]"
 #: CPU time; -1 where it is not known.
 Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)]
 Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-(1 << 62), lt=1 << 62)]
@@ -29,7 +34,11 @@ Forks: TypeAlias = Annotated[tuple[tuple[Name, Name], ...], msgspec.Meta(max_len
 Words: TypeAlias = Annotated[str, msgspec.Meta(max_length=2_000)]
 
 
-class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class _Array(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """A MessagePack array."""
+
+
+class Stamp(_Array, frozen=True):
     """What the stamper writes on a cycle, and everyone downstream routes by.
 
     Parameters
@@ -53,17 +62,11 @@ class Stamp(msgspec.Struct, array_like=True, frozen=True, gc=False):
     term: Count
     placement: Name
     released_ns: Instant
-    shadow: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    shadow: MaybeName = ""
     forks: Forks = ()
 
-    @property
-    def fields(self) -> tuple[int, int, int, str, int, str, Forks]:
-        """All of it, in order."""
-        who = self.run, self.cycle, self.term, self.placement
-        return (*who, self.released_ns, self.shadow, self.forks)
 
-
-class Stamped(Stamp, array_like=True, frozen=True, gc=False):
+class Stamped(Stamp, frozen=True):
     """A stamp as the controller is told it.
 
     Parameters
@@ -80,7 +83,7 @@ class Stamped(Stamp, array_like=True, frozen=True, gc=False):
     group_ns: Spent = -1
 
 
-class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Hop(_Array, frozen=True):
     """One job of a cycle, on the clock of the node it ran on.
 
     Parameters
@@ -115,7 +118,7 @@ class Hop(msgspec.Struct, array_like=True, frozen=True, gc=False):
     group_ns: tuple[Spent, Spent] = (-1, -1)
 
 
-class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Header(_Array, frozen=True):
     """Travels beside the payload of every message between stages.
 
     Parameters
@@ -138,12 +141,12 @@ class Header(msgspec.Struct, array_like=True, frozen=True, gc=False):
     source: Name
     node: Name
     kind: Annotated[str, msgspec.Meta(max_length=200)]
-    hops: Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)] = ()
+    hops: Hops = ()
     shadow: bool = False
     seal: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
 
 
-class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Completion(_Array, frozen=True):
     """What a sink says once of every cycle that reached it, and a task of one that ended there.
 
     Parameters
@@ -156,7 +159,6 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
         ``actuated``, ``behind`` (a later cycle had been actuated), ``stale`` (older than
         `max_age_ms`); ``shadow`` where a shadow ended; ``replaced`` where a later cycle took its
         place.
-    hops : tuple of Hop
     node : str
         Node of the sink, or where a shadow stopped.
     group_ns : int
@@ -168,12 +170,12 @@ class Completion(msgspec.Struct, array_like=True, frozen=True, gc=False):
     sink: Name
     done_ns: Instant
     outcome: Annotated[str, msgspec.Meta(max_length=20)]
-    hops: Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)]
+    hops: Hops
     node: Name
     group_ns: Spent = -1
 
 
-class Heard(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Heard(_Array, frozen=True):
     """The last beat that the sender of a beat has heard of somebody.
 
     Parameters
@@ -190,7 +192,7 @@ class Heard(msgspec.Struct, array_like=True, frozen=True, gc=False):
     at_ns: Instant
 
 
-class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Beat(_Array, frozen=True):
     """Heartbeat: I am there; and what I last heard of others, so that clocks can be compared.
 
     Parameters
@@ -201,7 +203,6 @@ class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
         Grows with every start of the process.
     ready : bool
         Whether it can do its work: its stage has started and does not hang.
-    heard : tuple of Heard
     term : int
         The stamper's current term; 0 from anybody else.
     placement : str
@@ -221,13 +222,13 @@ class Beat(msgspec.Struct, array_like=True, frozen=True, gc=False):
     ready: bool
     heard: Annotated[tuple[Heard, ...], msgspec.Meta(max_length=256)] = ()
     term: Count = 0
-    placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    placement: MaybeName = ""
     cell: Annotated[str, msgspec.Meta(max_length=64)] = ""
     note: Words = ""
     version: Annotated[str, msgspec.Meta(max_length=64)] = ""
 
 
-class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Order(_Array, frozen=True):
     """What the controller asks of the stamper; answered by one `Accepted`.
 
     Parameters
@@ -252,13 +253,13 @@ class Order(msgspec.Struct, array_like=True, frozen=True, gc=False):
     controller: Name
     run: Count
     term: Count
-    placement: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    placement: MaybeName = ""
     shadow_fraction: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0
     forks: Forks = ()
-    want: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    want: MaybeName = ""
 
 
-class Carried(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Carried(_Array, frozen=True):
     """Small messages that the detour carries on together.
 
     Parameters
@@ -273,7 +274,7 @@ class Carried(msgspec.Struct, array_like=True, frozen=True, gc=False):
     ]
 
 
-class Ask(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Ask(_Array, frozen=True):
     """What a person asks of a cell's controller.
 
     Parameters
@@ -288,10 +289,10 @@ class Ask(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
     number: Name
     what: Name
-    about: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    about: MaybeName = ""
 
 
-class Answer(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Answer(_Array, frozen=True):
     """The controller's answer.
 
     Parameters
@@ -307,7 +308,7 @@ class Answer(msgspec.Struct, array_like=True, frozen=True, gc=False):
     status: dict[str, Any]
 
 
-class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Load(_Array, frozen=True):
     """What a node's CPU has done since it started counting.
 
     Parameters
@@ -334,7 +335,7 @@ class Load(msgspec.Struct, array_like=True, frozen=True, gc=False):
     processes: Annotated[tuple[tuple[Name, Count], ...], msgspec.Meta(max_length=1_000)] = ()
 
 
-class Snapshot(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Snapshot(_Array, frozen=True):
     """Asks the worker of a task for its state, to be sent to another node's.
 
     Parameters
@@ -355,7 +356,7 @@ class Snapshot(msgspec.Struct, array_like=True, frozen=True, gc=False):
     cycle: Count
 
 
-class State(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class State(_Array, frozen=True):
     """Header of a task's state on its way; the payload is what the stage wrote.
 
     Parameters
@@ -375,7 +376,7 @@ class State(msgspec.Struct, array_like=True, frozen=True, gc=False):
     number: Count = 0
 
 
-class Restored(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Restored(_Array, frozen=True):
     """Says that a state has arrived and the inputs since then are replayed.
 
     Parameters
@@ -394,7 +395,7 @@ class Restored(msgspec.Struct, array_like=True, frozen=True, gc=False):
     failed: Words = ""
 
 
-class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Accepted(_Array, frozen=True):
     """The stamper's answer to an order.
 
     Parameters
@@ -431,10 +432,10 @@ class Accepted(msgspec.Struct, array_like=True, frozen=True, gc=False):
     placement: Name
     cycle: Count
     fallback: bool = False
-    proven: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    proven: MaybeName = ""
     newest: Passed = 0
     resting: bool = False
-    probed: Annotated[str, msgspec.Meta(max_length=120)] = ""
+    probed: MaybeName = ""
     probes: Count = 0
     needed: Count = 0
 
@@ -444,12 +445,9 @@ T = TypeVar("T", bound=msgspec.Struct)
 _ENCODER = msgspec.msgpack.Encoder()
 # All made here, by one thread: msgspec crashes where a message is decoded in one thread while
 # another makes a decoder of a type that is part of both.
+_KINDS: tuple[type[msgspec.Struct], ...] = (*_Array.__subclasses__(), Stamped)
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
-    kind: msgspec.msgpack.Decoder(kind)
-    for kind in (
-        *(Stamp, Stamped, Hop, Header, Completion, Heard, Beat, Order, Carried, Ask, Answer),
-        *(Load, Snapshot, State, Restored, Accepted),
-    )
+    kind: msgspec.msgpack.Decoder(kind) for kind in _KINDS
 }
 
 

@@ -158,7 +158,6 @@ def run_controller(
 
     Parameters
     ----------
-    problems : sequence of Problem
     out : Path
         Where the runs' folders go, one a cell and run.
     policy : str, optional

@@ -30,10 +30,6 @@ ARRAY = re.compile(r"([<>|=]?[biufc][0-9]{1,2}|\?):((?:[0-9]{1,18}(?:x[0-9]{1,18
 def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
     """Return the kind of a payload, and its bytes.
 
-    Parameters
-    ----------
-    payload : bytes-like, array, msgspec.Struct or None
-
     Returns
     -------
     kind : str

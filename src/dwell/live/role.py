@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import msgspec
 
@@ -16,6 +16,7 @@ from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.log import printable
 from dwell.live.messages import (
     MAX_HEADER_BYTES,
+    SIGNATURE_BYTES,
     Beat,
     Carried,
     Completion,
@@ -33,8 +34,6 @@ from dwell.model.document import fingerprint
 
 #: First words of the keys of what is sent twice: nothing else takes the detour.
 TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
-#: Signatures stand before what they are of.
-SIGNATURE_BYTES = 64
 #: What PTP and chrony on one network keep to.
 SYSTEM_BOUND_NS = 1_000_000
 #: Different complaints that are counted; a new one takes the place of the oldest.
@@ -46,19 +45,10 @@ REPEATED_NS = 10_000_000_000
 #: Beats of an earlier life, one after another, that no late message explains.
 RIVAL_BEATS = 5
 
+if TYPE_CHECKING:
+    from dwell.live.trust.signing import Seals
+
 T = TypeVar("T", bound=msgspec.Struct)
-
-
-class Sealing(Protocol):
-    """Signs messages and checks them; see `dwell.live.trust.signing.Seals`."""
-
-    def seal(self, word: str, data: bytes) -> bytes:
-        """Return a message with a signature before it."""
-        ...
-
-    def require(self, word: str, name: str, sealed: bytes) -> None:
-        """Raise a TrustError unless a subject has sealed a message."""
-        ...
 
 
 class RoleLogic(Protocol):
@@ -95,7 +85,7 @@ class RolePlace:
         How often something arrived that could not be used, by what was wrong with it.
     say : callable, optional
         Takes every complaint for the process's log.
-    seals : Sealing, optional
+    seals : Seals, optional
         Signs what it says and checks what it hears; without, nothing is signed.
     """
 
@@ -106,7 +96,7 @@ class RolePlace:
     life: int = 0
     complaints: dict[str, int] = field(default_factory=dict)
     say: Callable[[str], None] | None = None
-    seals: Sealing | None = None
+    seals: Seals | None = None
     complained: int = 0
     last_complaint: str = ""
 
@@ -188,7 +178,7 @@ class RolePlace:
             return b""
         return self.seals.seal("stamp", encode(stamp))[:SIGNATURE_BYTES]
 
-    def _require_stamped(self, seals: Sealing, header: Header) -> None:
+    def _require_stamped(self, seals: Seals, header: Header) -> None:
         """Raise a TrustError unless the stamper has stamped a cycle, or its source guessed it."""
         names = {self.stamper[0]}
         if not header.stamp.term:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+from msgspec.structs import asdict
+
 from dwell.control import shadow_stamps
 from dwell.control.guard import Guard, Presence, Probation
 from dwell.errors import LiveError
@@ -384,7 +386,8 @@ class Stamper:
         self._send(stamp, here=True, elsewhere=early is None)
         # A beat wakes every process, and would take the source's turn.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)
-        told = Stamped(*stamp.fields, self.intervals.take_unreported(), group_ns)
+        intervals = self.intervals.take_unreported()
+        told = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
         self.place.transport.put(self.place.keys.stamped(), encode(told))
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)

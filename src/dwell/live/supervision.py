@@ -46,7 +46,6 @@ class SupervisedProcess:
 
     Parameters
     ----------
-    command : sequence of str
     folder : Path
         Where it keeps its files.
     """

@@ -145,7 +145,6 @@ class Wiring:
     ----------
     entries : mapping of str to WiringEntry
         By who.
-    wires : tuple of Wire
     passages : tuple of Passage
         What has to be there that is no part of the cell.
     """

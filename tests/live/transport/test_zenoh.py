@@ -15,6 +15,7 @@ import pytest
 from dwell.errors import LiveError
 from dwell.live.transport.transport import Arrival, Lane, Transport
 from dwell.live.transport.zenoh import (
+    POOL_BYTES,
     ZenohSettings,
     ZenohTransport,
     _mark,
@@ -124,7 +125,7 @@ def test_of_large_payloads_that_wait_the_newest_are_sent() -> None:
         assert go_on.wait(PATIENCE_S)
         sent.put(content + header)
 
-    sender = _Sender(_Route(print, None, 0), send)
+    sender = _Sender(_Route(print, None), send)
     sender.send(b"1", b"a")
     assert begun.wait(PATIENCE_S)  # it is on its way, and hangs
     for number in (b"2", b"3", b"4", b"5"):
@@ -199,7 +200,7 @@ def test_a_process_without_sessions_for_images_sends_them_the_other_way(mesh: Ze
 
 
 def test_a_full_pool_falls_back_to_a_copy() -> None:
-    pool = _Pool.of(ZenohSettings(pool_bytes=1 << 20))
+    pool = _Pool.of(1 << 20)
     assert pool is not None
     payload = bytes(range(256)) * 1_024
     held = [pool.filled(payload) for _ in range(8)]
@@ -212,16 +213,16 @@ def test_a_full_pool_falls_back_to_a_copy() -> None:
 
 
 def test_no_pool_where_there_is_no_room_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert _Pool.of(ZenohSettings(pool_bytes=1 << 50)) is None
+    assert _Pool.of(1 << 50) is None
     monkeypatch.setattr("dwell.live.transport.zenoh._SHARED_MEMORY", "/nowhere/at/all")
-    assert _Pool.of(ZenohSettings()) is None
+    assert _Pool.of() is None
 
 
 def test_the_killed_leave_no_shared_memory_behind(mesh: ZenohMesh) -> None:
     # Zenoh clears up after the dead whenever somebody starts to share memory.
     def pools() -> set[str]:
         found = Path("/dev/shm").glob("*.zenoh")
-        return {file.name for file in found if file.stat().st_size == _POOL_FILE_BYTES}
+        return {file.name for file in found if file.stat().st_size == POOL_BYTES}
 
     before = pools()
     me = Correspondent(mesh)
@@ -233,9 +234,6 @@ def test_the_killed_leave_no_shared_memory_behind(mesh: ZenohMesh) -> None:
     me.spawn(NEAR)
     # Ours, that of the living process, and at most one of somebody who has just died.
     assert len(pools() - before) <= 3
-
-
-_POOL_FILE_BYTES = ZenohSettings().pool_bytes
 
 
 def test_a_message_that_is_too_long_is_dropped_on_arrival() -> None:

@@ -14,14 +14,13 @@ from hypothesis import strategies as st
 import dwell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.permissions import subjects
-from dwell.live.transport.expressions import matcher
 from dwell.live.trust.acl import access_control
 from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.qos import QoS
 from tests.cells.generated import random_problem
-from tests.live.memory_transport import MemoryTransport
+from tests.live.memory_transport import MemoryTransport, matcher
 from tests.live.small_world import Counting, World
 from tests.live.trust.rosters import roster_of
 

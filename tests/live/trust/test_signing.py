@@ -11,11 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import dwell
 from dwell.errors import TrustError
-from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import (
+    SIGNATURE_BYTES,
     Accepted,
     Beat,
     Carried,
@@ -29,7 +28,7 @@ from dwell.live.messages import (
     decode,
     encode,
 )
-from dwell.live.role import SIGNATURE_BYTES, RolePlace
+from dwell.live.role import RolePlace
 from dwell.live.transport.transport import Arrival
 from dwell.live.trust import signing
 from dwell.live.trust.authority import Authority
@@ -37,20 +36,14 @@ from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.signing import Seals
 from dwell.model import Problem
 from tests.live.memory_transport import MemoryTransport
-from tests.live.small_world import EXEC_MS, Counting, World
+from tests.live.small_world import Counting, World, canonical, on, stateful
 
 NODES = ("R1", "E", "R2")
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    settings = replace(cell.controller, min_dwell=1, estimator="profile", fallbacks=("LOC",))
-    return replace(cell, window_cycles=20, warmup_windows=0, controller=settings)
-
-
-def on(problem: Problem, candidate: str) -> Problem:
-    return replace(problem, controller=replace(problem.controller, initial=candidate))
+    return canonical(20, min_dwell=1, estimator="profile", fallbacks=("LOC",))
 
 
 def issue(folder: Path, cell: str) -> dict[str, Seals]:
@@ -68,7 +61,7 @@ def seals(problem: Problem, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 @pytest.fixture
 def world(problem: Problem, seals: dict[str, Seals]) -> World:
-    made = World(on(problem, "SO"), exec_ms=EXEC_MS, policy="SO", seals=seals)
+    made = World(on(problem, "SO"), policy="SO", seals=seals)
     made.run(1_000)
     assert made.stamper.placement == "SO"
     return made
@@ -76,7 +69,7 @@ def world(problem: Problem, seals: dict[str, Seals]) -> World:
 
 def ordered(world: World, order: Order, seals: Seals | None, word: str = "order") -> Arrival:
     data = encode(order)
-    key = Keys(world.problem.name).order()
+    key = world.keys.order()
     return Arrival(key, data if seals is None else seals.seal(word, data))
 
 
@@ -236,7 +229,7 @@ def test_a_controller_whose_clock_is_behind_learns_the_numbers(
     far = order_of(world, "", 1 << 61, shadow_fraction=0.5)
     assert give(world, ordered(world, far, seals[CONTROLLER])) == 0
     world.run(3_000)
-    cell = next(role for role in world.roles.values() if isinstance(role, ControlledCell))
+    cell = world.cell
     assert cell._number > 1 << 61
     assert world.stamper._newest > 1 << 61
     assert world.stamper._fraction == cell.controller.shadow_fraction
@@ -266,7 +259,7 @@ def done_now(world: World, cycle: int, node: str = "R2", sink: str = "control") 
 
 
 def carried(world: World, *messages: tuple[str, bytes]) -> Arrival:
-    return Arrival(Keys(world.problem.name).carried(), encode(Carried(messages)))
+    return Arrival(world.keys.carried(), encode(Carried(messages)))
 
 
 @pytest.fixture
@@ -280,7 +273,7 @@ def forge(world: World, seals: dict[str, Seals]) -> Callable[..., bytes]:
 
 
 def test_a_relay_cannot_make_completions_up(world: World, forge: Callable[..., bytes]) -> None:
-    keys = Keys(world.problem.name)
+    keys = world.keys
     # What has been released last never arrives.
     world.kill("sink.control@R2")
     world.run(2 * world.problem.pipeline.period_ms)
@@ -306,7 +299,7 @@ def test_no_other_task_speaks_for_a_sink(world: World, seals: dict[str, Seals]) 
     """What E may sign, of its own task, keeps no cycle from counting as complete."""
     world.kill("sink.control@R2")
     world.run(2 * world.problem.pipeline.period_ms)
-    keys, cycle = Keys(world.problem.name), world.stamper.cycle - 1
+    keys, cycle = world.keys, world.stamper.cycle - 1
     others = encode(done_now(world, cycle, node="E", sink="planning"))
     give(world, Arrival(keys.ended(), seals["E"].seal("ended", others)))
     assert world.stamper.guard.newest < cycle
@@ -321,7 +314,7 @@ def test_a_relay_that_repeats_itself_does_not_hide_a_fault(world: World) -> None
     receive = world.stamper.receive
 
     def listen(sample: Arrival, now_ns: int) -> None:
-        if sample.key == Keys(world.problem.name).carried():
+        if sample.key == world.keys.carried():
             heard.append(sample)
         receive(sample, now_ns)
 
@@ -343,7 +336,7 @@ def test_a_relay_that_repeats_itself_does_not_hide_a_fault(world: World) -> None
 
 def test_orders_take_no_detour(world: World, seals: dict[str, Seals]) -> None:
     """Not even good ones: whoever sends one that way holds it back as long as he likes."""
-    keys = Keys(world.problem.name)
+    keys = world.keys
     sealed = ordered(world, order_of(world, "LOC"), seals[CONTROLLER]).payload
     root = keys.root
     for key in (
@@ -364,7 +357,7 @@ def beat_of(world: World, who: str, node: str, **more: object) -> Beat:
 
 
 def test_a_relay_cannot_make_beats_up(world: World, seals: dict[str, Seals]) -> None:
-    keys, who = Keys(world.problem.name), "control@R2"
+    keys, who = world.keys, "control@R2"
     beat = beat_of(world, who, "R2", ready=False)
     key = keys.beat("R2", who)
     before = world.stamper.pulse.detector.last(who)
@@ -377,7 +370,7 @@ def test_a_relay_cannot_make_beats_up(world: World, seals: dict[str, Seals]) -> 
 
 def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]) -> None:
     """The key is what a certificate is let through for."""
-    keys, who = Keys(world.problem.name), "control@R2"
+    keys, who = world.keys, "control@R2"
     beat = beat_of(world, who, "R2", ready=False)
     before = world.stamper.pulse.detector.last(who)
     data = seals["E"].seal("beat", encode(beat))
@@ -391,48 +384,33 @@ def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]
 # ----------------------------------------------------------------------- the controller's
 
 
-def cell_of(world: World) -> ControlledCell:
-    return next(role for role in world.roles.values() if isinstance(role, ControlledCell))
-
-
-def told(world: World, key: str, data: bytes) -> int:
-    cell = cell_of(world)
-    before = cell.place.complained
-    cell.receive(Arrival(key, data), world.network.now_ns)
-    return cell.place.complained - before
-
-
 def test_the_controller_believes_the_stamper_alone(world: World, seals: dict[str, Seals]) -> None:
-    keys, cell, stamper = Keys(world.problem.name), cell_of(world), world.stamper
+    keys, cell, stamper = world.keys, world.cell, world.stamper
     answer = Accepted(0, cell.name, "", stamper.run, stamper.term + 5, "LOC", stamper.cycle)
     for name in ("E", "R2", CONTROLLER):
-        assert told(world, keys.accepted(), seals[name].seal("accepted", encode(answer))) == 1
-    assert told(world, keys.accepted(), encode(answer)) == 1
+        assert world.tell(keys.accepted(), seals[name].seal("accepted", encode(answer))) == 1
+    assert world.tell(keys.accepted(), encode(answer)) == 1
     gathered = encode(Carried(((keys.accepted(), seals["E"].seal("accepted", encode(answer))),)))
-    assert told(world, keys.gathered(), gathered) == 1
+    assert world.tell(keys.gathered(), gathered) == 1
     assert cell.held is not None
     assert cell.held.placement == "SO"
     stamped = encode(Carried(((keys.stamped(), b"anything"),)))
-    assert told(world, keys.gathered(), stamped) == 1
+    assert world.tell(keys.gathered(), stamped) == 1
 
 
 def test_loads_and_states_are_told_by_their_node(world: World, seals: dict[str, Seals]) -> None:
-    keys = Keys(world.problem.name)
+    keys = world.keys
     load = Load("R1", 1, world.network.now_ns, 1, 1, 1)
-    assert told(world, keys.load("R1"), seals["E"].seal("load", encode(load))) == 1
-    assert told(world, keys.load("E"), seals["R1"].seal("load", encode(load))) == 1
-    assert told(world, keys.load("R1"), seals["R1"].seal("load", encode(load))) == 0
+    assert world.tell(keys.load("R1"), seals["E"].seal("load", encode(load))) == 1
+    assert world.tell(keys.load("E"), seals["R1"].seal("load", encode(load))) == 1
+    assert world.tell(keys.load("R1"), seals["R1"].seal("load", encode(load))) == 0
     restored = Restored(1, "planning", "R2", 1, 1)
-    assert told(world, keys.restored(), seals["E"].seal("restored", encode(restored))) == 1
+    assert world.tell(keys.restored(), seals["E"].seal("restored", encode(restored))) == 1
 
 
 def test_states_are_asked_for_by_the_controller(problem: Problem, seals: dict[str, Seals]) -> None:
-    tasks = dict(problem.pipeline.tasks)
-    tasks["planning"] = replace(tasks["planning"], state_bytes=100)
-    stateful = replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
-    world = World(
-        stateful, exec_ms=EXEC_MS, policy="LOC", seals=seals, stages={"planning": Counting}
-    )
+    moving = stateful(problem, "planning", 100)
+    world = World(moving, policy="LOC", seals=seals, stages={"planning": Counting})
     world.run(1_500)
     worker, key = world.worker("planning@R2"), Keys(problem.name).snapshot("planning", "R2")
     asked = encode(Snapshot(9, "planning", "R2", "E", 1, 1))
@@ -486,7 +464,7 @@ def command_of(world: World, cycle: int, seal: bytes, *, term: int = 1) -> Arriv
     stamper = world.stamper
     stamp = Stamp(stamper.run, cycle, term, stamper.placement, world.network.now_ns)
     header = Header(stamp, "planning", "E", "bytes", seal=seal)
-    return Arrival(Keys(world.problem.name).inputs("control", "R2"), b"-", encode(header))
+    return Arrival(world.keys.inputs("control", "R2"), b"-", encode(header))
 
 
 def test_a_cycle_that_nobody_has_stamped_stops_no_arm(

@@ -9,7 +9,7 @@ import yaml
 
 import dwell
 from dwell.model import Problem
-from dwell.testbed.chaos.faults import Fault, Means, bound_of, faults_of
+from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
 from dwell.testbed.chaos.light_cell import document
 
 
@@ -21,12 +21,12 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
 
 
 def of(problem: Problem, name: str) -> Fault:
-    (found,) = [fault for fault in faults_of(problem, Means()) if fault.name == name]
+    (found,) = [fault for fault in faults_of(problem) if fault.name == name]
     return found
 
 
 def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
-    left = list(faults_of(problem, Means(clocks=False, disks=False)))
+    left = list(faults_of(problem, disks=False))
     assert not [fault for fault in left if fault.how in ("jump", "drift")]
     assert [fault.whom for fault in left if fault.how == "fill"] == [("runs",)]
 

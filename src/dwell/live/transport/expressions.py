@@ -7,7 +7,6 @@ A key is chunks with ``/`` between them; in an expression a chunk ``*`` stands f
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from itertools import pairwise
 
 from dwell.errors import LiveError
@@ -38,22 +37,3 @@ def require_expression(expression: str) -> None:
     for one, other in pairwise(chunks):
         if one == "**" and other in ("*", "**"):
             raise LiveError(f"key expression {expression!r}: write */** and not {one}/{other}")
-
-
-def matcher(expression: str) -> Callable[[str], bool]:
-    """Return what tells whether a key is under an expression.
-
-    Raises
-    ------
-    LiveError
-        If it is none.
-    """
-    require_expression(expression)
-    pattern = ""
-    for chunk in expression.split("/"):
-        if chunk == "**":
-            pattern += "(?:/[^/]+)*"
-        else:
-            pattern += "/" + ("[^/]+" if chunk == "*" else re.escape(chunk))
-    compiled = re.compile(pattern)
-    return lambda key: compiled.fullmatch(f"/{key}") is not None

@@ -35,6 +35,26 @@ from dwell.model import FrozenDict
 if TYPE_CHECKING:
     import zenoh
 
+# What was measured to work.
+#: Silence, ms, after which a peer counts as gone and its connection is given up. Nothing waits for
+#: it: who is there is known by beats, and a process that has died closes its connections.
+LEASE_MS = 1_500
+#: Signs of life sent in that time. At one each 100 ms they were a third of what an idle worker took
+#: of a core.
+KEEP_ALIVES = 3
+#: Shortest and longest pause between attempts to connect, ms.
+RETRY_MS = 50, 200
+#: Messages, or fragments of 48 kB, that wait for one peer at most, 1 to 16.
+QUEUE_BATCHES = 16
+#: How long a put waits for room in a full queue before it drops the message, µs. Each batch that a
+#: larger message has found room for doubles that, until here for fragments.
+DROP_AFTER_US, DROP_FRAGMENTS_AFTER_US = 100, 50_000
+#: Payloads above that are put by a thread, which may wait as long as the former says.
+PATIENT_BYTES = 150_000
+#: Payloads from here on go through shared memory where they stay on the node.
+SHARED_BYTES = 100_000
+#: Shared memory for payloads under way from one process.
+POOL_BYTES = 16 << 20
 #: Longest message that is put together from its fragments; Zenoh's own limit is 1 GiB.
 LONGEST_BYTES = 64 << 20
 #: Begins an attachment that says which key it was put under. No header does: MessagePack never
@@ -77,33 +97,12 @@ def _mark(key: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class ZenohSettings:
-    """How sessions behave; the defaults are what was measured to work.
+    """Bounds of a process's sessions, and what protects them.
 
     Parameters
     ----------
-    lease_ms : int
-        Silence after which a peer counts as gone and its connection is given up. Nothing waits for
-        it: who is there is known by beats, and a process that has died closes its connections.
-    keep_alives : int
-        Signs of life sent in that time. At one each 100 ms they were a third of what an idle
-        worker took of a core.
-    retry_ms : (int, int)
-        Shortest and longest pause between attempts to connect.
-    queue_batches : int
-        Messages, or fragments of 48 kB, that wait for one peer at most, 1 to 16.
-    drop_after_us : int
-        How long a put waits for room in a full queue before it drops the message. Each batch that
-        a larger message has found room for doubles that.
-    drop_fragments_after_us : int
-        Where the doubling ends.
-    patient_bytes : int
-        Payloads above that are put by a thread, which may wait as long as the former says.
-    shared_bytes : int
-        Payloads from here on go through shared memory where they stay on the node.
-    pool_bytes : int
-        Shared memory for payloads under way from one process.
     longest_bytes, longest_control_bytes : int
-        Of a message that arrives in fragments, in a session for payloads and in `control`; of a
+        Longest message that arrives in fragments, in a session for payloads and in `control`; of a
         longer one what has come is dropped, with the connection. A peer can have a process keep
         that much for each of its connections, of 8 priorities and 2 reliabilities.
     most_peers : int
@@ -112,15 +111,6 @@ class ZenohSettings:
         Further settings of Zenoh by path, as ``transport/link/tls/root_ca_certificate``.
     """
 
-    lease_ms: int = 1_500
-    keep_alives: int = 3
-    retry_ms: tuple[int, int] = (50, 200)
-    queue_batches: int = 16
-    drop_after_us: int = 100
-    drop_fragments_after_us: int = 50_000
-    patient_bytes: int = 150_000
-    shared_bytes: int = 100_000
-    pool_bytes: int = 16 << 20
     longest_bytes: int = LONGEST_BYTES
     longest_control_bytes: int = LONGEST_BYTES
     most_peers: int = 1_000
@@ -176,7 +166,7 @@ class ZenohTransport:
             raise
         self._connections.start()
         if "local" in self._sessions:
-            self._pool = _Pool.of(self.settings)
+            self._pool = _Pool.of()
 
     def put(
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
@@ -189,7 +179,7 @@ class ZenohTransport:
         data = payload if isinstance(payload, bytes) else bytes(payload)
         if route.sender is None:
             content = route.content(data)
-            if content is not data or len(data) <= self.settings.patient_bytes:
+            if content is not data or len(data) <= PATIENT_BYTES:
                 self._send(route, content, header)
                 return
         self._sender(route).send(data, header)
@@ -272,7 +262,7 @@ class ZenohTransport:
                 return None
             raise
         pool = self._pool if name == "local" else None
-        route = _Route(publisher.put, pool, self.settings.shared_bytes, mark=_mark(key))
+        route = _Route(publisher.put, pool, mark=_mark(key))
         while len(self._routes) >= _PUBLISHERS:
             dropped = self._routes.pop(next(iter(self._routes)), None)
             if dropped is not None and dropped.sender is not None:
@@ -358,14 +348,13 @@ class _Route:
 
     put: _Put
     pool: _Pool | None
-    shared_bytes: int
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
     mark: bytes = b""
 
     def content(self, data: bytes) -> Any:
         """Return a payload as Zenoh is handed it: in shared memory, or as it is."""
-        if self.pool is None or len(data) < self.shared_bytes:
+        if self.pool is None or len(data) < SHARED_BYTES:
             return data
         return self.pool.filled(data)
 
@@ -419,21 +408,21 @@ class _Pool:
         self._policy = shm.Defragment(shm.GarbageCollect())
 
     @classmethod
-    def of(cls, settings: ZenohSettings) -> _Pool | None:
+    def of(cls, pool_bytes: int = POOL_BYTES) -> _Pool | None:
         """Return a pool, or None where there is no shared memory for it."""
         try:
             room = os.statvfs(_SHARED_MEMORY)
         except OSError:
             return None
         # The file is sparse: writing to one that does not fit would kill the process.
-        if room.f_bavail * room.f_frsize < 2 * settings.pool_bytes:
+        if room.f_bavail * room.f_frsize < 2 * pool_bytes:
             _LOG.warning(
                 "%s has less than %d bytes free: images are copied through sockets",
                 _SHARED_MEMORY,
-                2 * settings.pool_bytes,
+                2 * pool_bytes,
             )
             return None
-        return cls(settings.pool_bytes)
+        return cls(pool_bytes)
 
     def filled(self, payload: bytes) -> Any:
         """Return the payload in shared memory, or as it is where there is no room."""
@@ -448,7 +437,7 @@ class _Pool:
 def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -> dict[str, object]:
     """Zenoh's settings for one session, by path."""
     listen = entry.listen.get(name)
-    first_ms, last_ms = settings.retry_ms
+    first_ms, last_ms = RETRY_MS
     retry = {"period_init_ms": first_ms, "period_max_ms": last_ms, "period_increase_factor": 2}
     queue = "transport/link/tx/queue"
     return {
@@ -466,15 +455,13 @@ def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": retry,
-        "transport/link/tx/lease": settings.lease_ms,
-        "transport/link/tx/keep_alive": settings.keep_alives,
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/keep_alive": KEEP_ALIVES,
         # One message is one batch: nothing waits for company, and 100 kB cost 25 us, not 130.
         f"{queue}/batching/enabled": False,
-        f"{queue}/size": dict.fromkeys(_PRIORITIES, settings.queue_batches),
-        f"{queue}/congestion_control/drop/wait_before_drop": settings.drop_after_us,
-        f"{queue}/congestion_control/drop/max_wait_before_drop_fragments": (
-            settings.drop_fragments_after_us
-        ),
+        f"{queue}/size": dict.fromkeys(_PRIORITIES, QUEUE_BATCHES),
+        f"{queue}/congestion_control/drop/wait_before_drop": DROP_AFTER_US,
+        f"{queue}/congestion_control/drop/max_wait_before_drop_fragments": DROP_FRAGMENTS_AFTER_US,
         "transport/link/rx/max_message_size": (
             settings.longest_control_bytes if name == "control" else settings.longest_bytes
         ),

@@ -19,7 +19,7 @@ from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
 from dwell.testbed.chaos.disk import may_mount
 from dwell.testbed.chaos.fault_timeline import PlannedFault, planned
-from dwell.testbed.chaos.faults import Fault, Means, bound_of, faults_of
+from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
 from dwell.testbed.chaos.harness import CLOCK_FILE, STARVING_THREADS, Harness, environment_of
 from dwell.testbed.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.testbed.chaos.stages import APPLY
@@ -116,7 +116,6 @@ class Result:
 
     Parameters
     ----------
-    outcomes : list of (PlannedFault, Outcome)
     stalled : int
         Faults in which a bound was missed, or a silence was too long, while the machine stalled.
     wrong : list of str
@@ -168,7 +167,6 @@ class FaultCampaign:
 
     Parameters
     ----------
-    staging : callable
     out : Path
         For the cells' folders and ``faults.jsonl``.
     again : str
@@ -229,7 +227,7 @@ class FaultCampaign:
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
         testbed, _ = self._staging(1)
-        there = list(faults_of(testbed.problem, Means(disks=self._disks)))
+        there = list(faults_of(testbed.problem, disks=self._disks))
         found = planned(self._seed, there)
         if only is not None:
             return islice(found, only - 1, only)

@@ -40,10 +40,6 @@ def planned(seed: int, faults: Sequence[Fault]) -> Iterator[PlannedFault]:
 
     Each kind comes once a round, in a random order, and its faults in a random order, too: none
     comes again before all of its kind have been there.
-
-    Parameters
-    ----------
-    faults : sequence of Fault
     """
     kinds: dict[str, list[Fault]] = {}
     for fault in faults:

@@ -46,24 +46,14 @@ class Fault:
     home: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Means:
-    """What can be done to a cell here.
+def faults_of(problem: Problem, *, disks: bool = True) -> Iterator[Fault]:
+    """Yield every fault of a cell; `bound_of` says what is promised for it.
 
     Parameters
     ----------
-    clocks : bool
-        Whether its clocks can be made wrong.
     disks : bool
         Whether nodes have disks of their own that can be made full.
     """
-
-    clocks: bool = True
-    disks: bool = True
-
-
-def faults_of(problem: Problem, means: Means) -> Iterator[Fault]:
-    """Yield every fault of a cell; `bound_of` says what is promised for it."""
     everybody = roles(problem)
     relay = problem.live.relay or problem.controller_node
     nodes = list(problem.fabric.nodes)
@@ -84,12 +74,11 @@ def faults_of(problem: Problem, means: Means) -> Iterator[Fault]:
         yield Fault(f"cut {one}-{other}", "cut", (f"{one}->{other}", f"{other}->{one}"))
         for a, b in ((one, other), (other, one)):
             yield Fault(f"cut {a}->{b}", "cut", (f"{a}->{b}",), kind="cut one way")
-    if means.clocks:
-        yield from _clocks(nodes)
+    yield from _clocks(nodes)
     for node in nodes:
         yield Fault(f"starve {node}", "starve", (node,))
     yield Fault("fill the disk of the runs", "fill", ("runs",))
-    if means.disks:
+    if disks:
         for node in nodes:
             yield Fault(f"fill the disk of {node}", "fill", (node,))
     yield Fault("write to the same disk", "hog", ("runs",))
