@@ -22,10 +22,9 @@ import dwell
 from dwell.errors import LiveError, TrustError
 from dwell.live import messages
 from dwell.live.controlled_cell import ControlledCell
-from dwell.live.keys import Keys
+from dwell.live.keys import TWICE, Keys
 from dwell.live.messages import MAX_HEADER_BYTES, Beat, Carried, Completion, Header, Order, encode
 from dwell.live.payloads import read_payload
-from dwell.live.role import TWICE
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.trust.authority import Authority

@@ -106,7 +106,7 @@ def test_a_flood_of_junk_costs_the_loop_no_cycle_and_takes_no_memory() -> None:
 
 def relay_of(world: World) -> Agent:
     problem = world.problem
-    found = world.roles[f"agent@{problem.live.relay or problem.controller_node}"]
+    found = world.roles[f"agent@{problem.relay_node}"]
     assert isinstance(found, Agent)
     return found
 

@@ -45,7 +45,7 @@ def chaos(
     after the other, by a seed, for two minutes if nothing else is said.
     """
     from dwell.testbed.chaos.disk import unmount_leftovers
-    from dwell.testbed.chaos.fault_campaign import FaultCampaign, on_hosts, on_loopback, summary
+    from dwell.testbed.chaos.fault_campaign import FaultCampaign, Staging, summary
     from dwell.testbed.playing import interruptible, make_folder
 
     if minutes is None and faults is None:
@@ -55,11 +55,8 @@ def chaos(
         unmount_leftovers(out)
         make_folder(out, MARK, "a chaos campaign's")
     what = ("" if cell is None else f" {cell}") + (" --hosts" if hosts else "")
-    staging = on_hosts if hosts else on_loopback
     campaign = FaultCampaign(
-        staging(cell, folder, seed),
-        folder,
-        seed,
+        Staging(cell, folder, seed, hosts=hosts),
         f"dwell testbed chaos{what} --seed {seed}",
         lambda line: typer.echo(line, err=True),
     )

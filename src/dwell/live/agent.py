@@ -13,9 +13,10 @@ import psutil
 
 from dwell.live.control_group import ControlGroup
 from dwell.live.failures import start_thread
+from dwell.live.keys import TWICE
 from dwell.live.messages import Carried, Load, encode
 from dwell.live.relay_batch import MOST_MESSAGES, RelayBatch
-from dwell.live.role import TWICE, Pulse, RolePlace
+from dwell.live.role import Pulse, RolePlace
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.transport import Arrival
 from dwell.model.instants import NEVER_NS
@@ -32,21 +33,16 @@ AGENT_BEAT = 5
 
 
 class CpuCount:
-    """Core-nanoseconds that some CPUs have been busy.
+    """Core-nanoseconds that the CPUs that this process may use have been busy.
 
     Parameters
     ----------
-    cpus : iterable of int, optional
-        Those that the node has; all that this process may use where None.
     group : ControlGroup, optional
         Counts only what the processes of a control group have used of any CPU.
     """
 
-    def __init__(
-        self, cpus: Iterable[int] | None = None, group: ControlGroup | None = None
-    ) -> None:
-        own = psutil.Process().cpu_affinity() or list(range(psutil.cpu_count() or 1))
-        self.cpus = tuple(own if cpus is None else cpus)
+    def __init__(self, group: ControlGroup | None = None) -> None:
+        self.cpus = psutil.Process().cpu_affinity() or range(psutil.cpu_count() or 1)
         self._group = group
 
     def busy_ns(self) -> int:
@@ -132,7 +128,7 @@ class Agent:
         self._cpu, self._accelerator = cpu, accelerator
         # No guard waits for it: it carries nothing that a cycle needs.
         self.pulse = Pulse(place, self._state, every=AGENT_BEAT)
-        self._relays = place.node == place.relay
+        self._relays = place.node == place.problem.relay_node
         self._look_ns = self._load_ns = self._housekeeping_ns = 0
         self._carried = RelayBatch()
         self._carry_ns = NEVER_NS

@@ -98,7 +98,8 @@ class ControlledCell:
         self.windows: LiveWindows | None = None
         # Of the others the relay's agent tells it now and then. What beats say of the clocks is
         # what they have heard themselves: it is as good when it comes late, by way of others.
-        agent = place.relay, f"agent@{place.relay}"
+        relay = place.problem.relay_node
+        agent = relay, f"agent@{relay}"
         self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
         self._keys = place.keys
         self.held: Accepted | None = None
@@ -501,7 +502,7 @@ class ControlledCell:
         if now_ns >= self._ask_ns:
             self._ask_ns = now_ns + ASK_NS
             # Also says that this controller is there, and what it would have proven.
-            self._send(self._order("", now_ns) if self.held is not None else self._hello())
+            self._send(self._order("", now_ns))
         wakes = [self.pulse.wake(now_ns), self._ask_ns]
         if due_ns is not None:
             wakes.append(due_ns)
@@ -511,9 +512,6 @@ class ControlledCell:
             # At once, but after all that has been due before: no order waits for a disk.
             wakes.append(now_ns)
         return min(wakes)
-
-    def _hello(self) -> Order:
-        return Order(self._next_number(), self.name, 0, 0)
 
     def _close(self, windows: LiveWindows, now_ns: int) -> None:
         """Close a window and act on what the policy makes of it."""

@@ -92,7 +92,7 @@ def _hears_nobody(
     if not members or any(_heard(status, role) for role in members):
         return None
     ages_ms = [heard[role.who]["age_ms"] for role in members if role.who in heard]
-    relay = problem.live.relay or problem.controller_node
+    relay = problem.relay_node
     why = f": the relay, agent {relay}, is silent"
     if not ages_ms:
         return f"the controller has heard nobody since it began {_time(status['up_ms'])} ago{why}"

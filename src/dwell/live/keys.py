@@ -5,6 +5,8 @@ from __future__ import annotations
 MAIN, SHADOW = "main", "shadow"
 #: Who orders, among those who have keys; all others of a cell go by their node's name.
 CONTROLLER = "controller"
+#: First words of the keys of what is sent twice: nothing else takes the detour.
+TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
 
 
 class Keys:

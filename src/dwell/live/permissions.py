@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 
-from dwell.live.keys import CONTROLLER, MAIN, SHADOW, Keys
+from dwell.live.keys import CONTROLLER, MAIN, SHADOW, TWICE, Keys
 from dwell.live.trust.roster import Roster
 from dwell.live.wiring import roles
 from dwell.model import Problem
@@ -20,7 +20,7 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
     Questions are missing: who may ask them is in nobody's cell file.
     """
     keys, pipeline = Keys(problem.name), problem.pipeline
-    stamper, relay = problem.stamper_node, problem.live.relay or problem.controller_node
+    stamper, relay = problem.stamper_node, problem.relay_node
     first = next(task for name, task in pipeline.tasks.items() if not pipeline.inputs(name))
     everywhere = frozenset(node for task in pipeline.tasks.values() for node in task.on)
     found: dict[str, frozenset[str]] = {
@@ -41,8 +41,7 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
     for node in problem.fabric.nodes:
         found[keys.load(node)] = frozenset([node])
     # What is sent twice may be handed to the relay by whoever may send it.
-    twice = {"done", "ended", "beat", "accepted", "load"}
-    found |= {keys.relay(key): who for key, who in found.items() if keys.word(key) in twice}
+    found |= {keys.relay(key): who for key, who in found.items() if keys.word(key) in TWICE}
     return found
 
 

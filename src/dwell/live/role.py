@@ -12,7 +12,7 @@ import msgspec
 from dwell import __version__
 from dwell.errors import LiveError, TrustError
 from dwell.live.failure_detector import FailureDetector
-from dwell.live.keys import CONTROLLER, Keys
+from dwell.live.keys import CONTROLLER, TWICE, Keys
 from dwell.live.log import printable
 from dwell.live.messages import (
     MAX_HEADER_BYTES,
@@ -32,8 +32,6 @@ from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import fingerprint
 
-#: First words of the keys of what is sent twice: nothing else takes the detour.
-TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
 #: What PTP and chrony on one network keep to.
 SYSTEM_BOUND_NS = 1_000_000
 #: Different complaints that are counted; a new one takes the place of the oldest.
@@ -109,11 +107,6 @@ class RolePlace:
     def period_ns(self) -> int:
         """P."""
         return round(self.problem.pipeline.period_ms * 1e6)
-
-    @property
-    def relay(self) -> str:
-        """Node whose agent carries small messages where a direct link fails."""
-        return self.problem.live.relay or self.problem.controller_node
 
     @property
     def patience_ns(self) -> int:

@@ -70,32 +70,23 @@ def _run(
     problem = place.problem
     # A stage that computes must not keep a beat waiting for long.
     sys.setswitchinterval(0.0005)
+    # What counts the CPU time of a node with a quota.
+    group = own_group() if problem.fabric.nodes[role.node].quota is not None else None
+    if role.kind not in ("stamper", "sink"):
+        _work(role, place, folder, stopped, clock, group)
+        return
+    hosted: Stamper | Sink
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
-        stamper = Stamper(place, book, time.time_ns(), clock())
-        _count(stamper, problem, role.node)
-        _host(stamper, place, stopped, clock)
-    elif role.kind == "sink":
+        hosted = Stamper(place, book, time.time_ns(), clock())
+    else:
         actuator = _actuator(problem, role.task)
         highest = HighestFile(folder / f"{role.who}.highest")
         expected = getattr(actuator, "inputs", {}).get(role.task)
-        sink = Sink(place, role.task, actuator, highest, expected)
-        _count(sink, problem, role.node)
-        _host(sink, place, stopped, clock)
-    else:
-        _work(role, place, folder, stopped, clock)
-
-
-def _group(problem: Problem, node: str) -> ControlGroup | None:
-    """What counts the CPU time of a node with a quota."""
-    return own_group() if problem.fabric.nodes[node].quota is not None else None
-
-
-def _count(role: Stamper | Sink, problem: Problem, node: str) -> None:
-    """Let a role know what its node has taken, where something counts it."""
-    group = _group(problem, node)
+        hosted = Sink(place, role.task, actuator, highest, expected)
     if group is not None:
-        role.group_clock = group.taken_ns
+        hosted.group_clock = group.taken_ns
+    _host(hosted, place, stopped, clock)
 
 
 def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Clock) -> None:
@@ -115,7 +106,12 @@ def _actuator(problem: Problem, task: str) -> Actuator:
 
 
 def _work(
-    role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
+    role: Named,
+    place: RolePlace,
+    folder: Path,
+    stopped: threading.Event,
+    clock: Clock,
+    group: ControlGroup | None,
 ) -> None:
     problem = place.problem
     name = problem.pipeline.tasks[role.task].run
@@ -135,7 +131,6 @@ def _work(
         shadow=role.kind == "shadow",
         stands_by=f"{role.task}@{role.node}" if role.kind == "standby" else "",
     )
-    group = _group(problem, role.node)
     if group is not None:
         worker.group_clock = group.counts
     inflight = InFlight(folder / f"{role.who}.inflight")

@@ -127,7 +127,7 @@ class Supervisor:
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
         child = SupervisedProcess(who, command, self.folder)
-        child.adopted = _survivor(child.mark)
+        child.adopted = survivor(child.mark)
         if child.adopted is not None:
             self._say(f"{who}: goes on (process {child.adopted.pid})")
             child.started_s = time.monotonic()
@@ -318,7 +318,7 @@ def _signal(process: psutil.Process, number: int) -> None:
         return
 
 
-def _survivor(mark: Path) -> psutil.Process | None:
+def survivor(mark: Path) -> psutil.Process | None:
     """Return the process that a mark tells of, if it is still that one."""
     try:
         told = json.loads(mark.read_text())

@@ -352,10 +352,9 @@ def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
 
 def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, frozenset[str]]]:
     """Every pair that has to hear each other, by session; each once, in a fixed order."""
-    relay = problem.live.relay or problem.controller_node
     found: dict[tuple[Session, frozenset[str]], None] = {}
     for one, other in combinations(everybody, 2):
-        if _meet(problem, one, other, relay):
+        if _meet(problem, one, other):
             found["control", frozenset((one.who, other.who))] = None
     for flow in problem.pipeline.flows:
         for one in _workers(everybody, flow.source):
@@ -380,19 +379,19 @@ def _session(flow: Flow, one: Role, other: Role) -> Session:
     return "local" if one.node == other.node else "images"
 
 
-def _meet(problem: Problem, one: Role, other: Role, relay: str) -> bool:
+def _meet(problem: Problem, one: Role, other: Role) -> bool:
     """Whether two processes have small things to say to each other, stages' messages aside."""
-    return any(_calls(problem, *pair, relay) for pair in ((one, other), (other, one)))
+    return any(_calls(problem, *pair) for pair in ((one, other), (other, one)))
 
 
-def _calls(problem: Problem, one: Role, other: Role, relay: str) -> bool:
+def _calls(problem: Problem, one: Role, other: Role) -> bool:
     """Whether the first is of a kind that has to reach the second."""
     same_node = one.node == other.node
     match one.kind:
         case "stamper":  # it stamps, and hears from everybody whether they are there
             return True
         case "agent":  # supervises its own node, and is the passage of all others
-            return other.kind == "agent" or same_node or one.node == relay
+            return other.kind == "agent" or same_node or one.node == problem.relay_node
         case "sink":  # takes the commands of its task's workers
             return other.kind == "controller" or (other.works and other.task == one.task)
         case "standby":  # works only while that one is silent

@@ -253,6 +253,11 @@ class Problem(Displayed):
         return next(iter((*self.fabric.tier("edge"), *self.fabric.nodes)))
 
     @property
+    def relay_node(self) -> str:
+        """Node whose agent carries small messages where a direct link fails."""
+        return self.live.relay or self.controller_node
+
+    @property
     def stamper_node(self) -> str:
         """Node where cycles are released: that of the first source task in the initial placement.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dwell.testbed.chaos.fault_campaign import FaultCampaign, on_hosts, on_loopback
+from dwell.testbed.chaos.fault_campaign import FaultCampaign, Staging
 from tests.testbed.machine import no_groups, no_hosts
 
 pytestmark = pytest.mark.skipif(
@@ -30,11 +30,9 @@ def test_the_cell_keeps_its_promises(
     if place == "hosts" and (why := no_hosts() or no_groups()):
         pytest.skip(why)
     faults, fewest = PLACES[place]
-    staging = on_hosts if place == "hosts" else on_loopback
+    staging = Staging(None, tmp_path, SEED, hosts=place == "hosts")
     command = "dwell testbed chaos" + (" --hosts" if place == "hosts" else "")
-    campaign = FaultCampaign(
-        staging(None, tmp_path, SEED), tmp_path, SEED, f"{command} --seed {SEED}", print
-    )
+    campaign = FaultCampaign(staging, f"{command} --seed {SEED}", print)
     result = campaign.run(until_s=time.monotonic() + SECONDS, faults=faults)
     assert not result.wrong, "\n".join([*result.wrong, capsys.readouterr().out])
     assert len(result.outcomes) >= fewest

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import yaml
 
@@ -30,74 +30,63 @@ from dwell.testbed.loopback import Loopback, on_this_machine
 from dwell.testbed.netns_testbed import NetnsTestbed
 from dwell.testbed.testbed import LocalTestbed
 
-#: Takes the number of a cell among those of a campaign; returns where it runs, and its home.
-Staging: TypeAlias = Callable[[int], tuple[LocalTestbed, str | None]]
-
 LIGHT_HOME = "SO"
 #: What is on its way to a tap.
 HEARD_S = 0.15
 
 
-def on_loopback(cell: Path | None, out: Path, seed: int) -> Staging:
-    """Return what has cells run on this computer's loopback, each in a folder of its own.
+@dataclass(frozen=True, slots=True)
+class Staging:
+    """Where the cells of a campaign run, each in a folder of its own.
 
     Parameters
     ----------
     cell : Path, optional
         Cell file; the light cell if left out.
     seed : int
-        Of delays and losses.
+        Seed of delays and losses.
+    hosts : bool
+        Whether every node gets a host of its own of a testbed, which only root can give; else all
+        are on this computer's loopback.
     """
 
-    def stage(number: int) -> tuple[LocalTestbed, str | None]:
-        problem, folder, environment, home = _cell(cell, out, number, quotas=False)
-        problem = on_this_machine(problem)
+    cell: Path | None
+    out: Path
+    seed: int
+    hosts: bool = False
+
+    def testbed(self, number: int) -> tuple[LocalTestbed, str | None]:
+        """Return where a cell runs, by its number in the campaign, and its home."""
+        folder = (self.out / f"cell-{number}").resolve()
+        folder.mkdir(parents=True, exist_ok=True)
+        home = LIGHT_HOME if self.cell is None else None
+        if self.cell is None:
+            written = folder / "written.yaml"
+            light = document(LIGHT_HOME, period_ms=PATIENT_MS, quotas=self.hosts)
+            written.write_text(yaml.safe_dump(light), encoding="utf-8")
+            problem, environment = dwell.load(written), environment_of(folder, exec_ms(LIGHT_HOME))
+        else:
+            problem, environment = _witnessed(dwell.load(self.cell), folder)
         clocks = folder / CLOCK_FILE
-        play = Loopback(problem, folder, {}, seed=seed, environment=environment, clocks=clocks)
-        return play, home
-
-    return stage
-
-
-def on_hosts(cell: Path | None, out: Path, seed: int) -> Staging:
-    """Return what gives every node a host of its own of a testbed; only root can.
-
-    Parameters
-    ----------
-    cell : Path, optional
-        Cell file; the light cell if left out.
-    seed : int
-        Of delays and losses.
-    """
-
-    def stage(number: int) -> tuple[LocalTestbed, str | None]:
-        problem, folder, environment, home = _cell(cell, out, number, quotas=True)
+        if not self.hosts:
+            problem = on_this_machine(problem)
+            return (
+                Loopback(
+                    *(problem, folder, {}),
+                    seed=self.seed,
+                    environment=environment,
+                    clocks=clocks,
+                ),
+                home,
+            )
         testbed = NetnsTestbed(
             *(problem, folder),
             name=f"chaos{os.getpid() % 10_000}",
-            seed=seed,
+            seed=self.seed,
             environment=environment,
-            clocks=folder / CLOCK_FILE,
+            clocks=clocks,
         )
         return testbed, home
-
-    return stage
-
-
-def _cell(
-    cell: Path | None, out: Path, number: int, *, quotas: bool
-) -> tuple[Problem, Path, dict[str, str], str | None]:
-    """Return a cell, its folder, the variables of its processes, and its home."""
-    folder = (out / f"cell-{number}").resolve()
-    folder.mkdir(parents=True, exist_ok=True)
-    if cell is None:
-        written = folder / "written.yaml"
-        light = document(LIGHT_HOME, period_ms=PATIENT_MS, quotas=quotas)
-        written.write_text(yaml.safe_dump(light), encoding="utf-8")
-        environment = environment_of(folder, exec_ms(LIGHT_HOME))
-        return dwell.load(written), folder, environment, LIGHT_HOME
-    problem, environment = _witnessed(dwell.load(cell), folder)
-    return problem, folder, environment, None
 
 
 def _witnessed(problem: Problem, folder: Path) -> tuple[Problem, dict[str, str]]:
@@ -167,8 +156,8 @@ class FaultCampaign:
 
     Parameters
     ----------
-    out : Path
-        For the cells' folders and ``faults.jsonl``.
+    staging : Staging
+        Its folder also gets ``faults.jsonl``.
     again : str
         Command that repeats it; the number of a fault is added.
     say : callable
@@ -178,15 +167,13 @@ class FaultCampaign:
     def __init__(
         self,
         staging: Staging,
-        out: Path,
-        seed: int,
         again: str,
         say: Callable[[str], None],
     ) -> None:
-        self._staging, self._out, self._seed = staging, out, seed
+        self._staging, self._out, self._seed = staging, staging.out, staging.seed
         self._again, self._say = again, say
         self._disks = may_mount()
-        self.result = Result(seed)
+        self.result = Result(self._seed)
         self.result.means = {
             "full disk": "a tmpfs in place of each folder, made as small as what is on it"
             if self._disks
@@ -226,7 +213,7 @@ class FaultCampaign:
         return self.result
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
-        testbed, _ = self._staging(1)
+        testbed, _ = self._staging.testbed(1)
         there = list(faults_of(testbed.problem, disks=self._disks))
         found = planned(self._seed, there)
         if only is not None:
@@ -242,7 +229,7 @@ class FaultCampaign:
         until_s: float | None,
     ) -> PlannedFault | None:
         """Have one cell go through faults; returns the next fault where the cell is past help."""
-        testbed, home = self._staging(number)
+        testbed, home = self._staging.testbed(number)
         with ExitStack() as stack:
             cell = stack.enter_context(Harness(testbed, home=home, disks=self._disks))
             observer = stack.enter_context(ActuatorObserver(testbed, testbed.folder / "cell.yaml"))
@@ -348,10 +335,9 @@ def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outco
     """Return commands that were applied too long after their stamp was heard."""
     if fault.how in ("jump", "drift"):
         return []
-    problem, stamped_ns = cell.problem, observer.judge.stamped_ns
-    max_age_ms = problem.live.max_age_ms or 2 * problem.pipeline.period_ms
+    stamped_ns = observer.judge.stamped_ns
     # The gate looks a little before the actuator is called, which may be scheduled out between.
-    limit_ms = max_age_ms + problem.pipeline.period_ms
+    limit_ms = cell.max_age_ms + cell.problem.pipeline.period_ms
     return [
         f"cycle {seen.cycle} was actuated {age_ms:.0f} ms after it was stamped"
         for seen in cell.actuations.since(outcome.begin_ns)

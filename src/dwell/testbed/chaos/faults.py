@@ -55,7 +55,7 @@ def faults_of(problem: Problem, *, disks: bool = True) -> Iterator[Fault]:
         Whether nodes have disks of their own that can be made full.
     """
     everybody = roles(problem)
-    relay = problem.live.relay or problem.controller_node
+    relay = problem.relay_node
     nodes = list(problem.fabric.nodes)
     for how in ("kill", "freeze"):
         for role in everybody:

@@ -11,10 +11,9 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from dwell.errors import LiveError
 from dwell.live.hosting import clock_of
+from dwell.live.supervision import survivor
 from dwell.model import Problem
 from dwell.testbed.burner import Burner
 from dwell.testbed.chaos.actuations import Actuations
@@ -43,13 +42,8 @@ def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) 
 
 def pid_of(mark: Path) -> int | None:
     """Return the process that an agent's mark tells of, if it lives."""
-    try:
-        told = json.loads(mark.read_text())
-        process = psutil.Process(told["pid"])
-        same = abs(process.create_time() - told["started"]) < 0.05
-        return process.pid if same and process.status() != psutil.STATUS_ZOMBIE else None
-    except (OSError, ValueError, psutil.Error):
-        return None
+    process = survivor(mark)
+    return None if process is None else process.pid
 
 
 class Harness(Started):
@@ -88,6 +82,11 @@ class Harness(Started):
     def period_ns(self) -> int:
         """P."""
         return round(self.problem.pipeline.period_ms * 1e6)
+
+    @property
+    def max_age_ms(self) -> float:
+        """Age beyond which the gate lets no command through."""
+        return self.problem.live.max_age_ms or 2 * self.problem.pipeline.period_ms
 
     def start(self) -> None:
         """Start everything, and wait until the cell is at home."""
@@ -181,12 +180,14 @@ class Harness(Started):
             if not who.startswith("*"):
                 found.append(who)
                 continue
-            node = who[1:]
             # The agent first: it must not bring back what dies next.
-            found += sorted(self.expected(node), key=lambda one: not one.startswith("agent"))
-            if node == self.problem.controller_node:
-                found.append(f"controller@{node}")
+            found += sorted(self._all_of(who[1:]), key=lambda one: not one.startswith("agent"))
         return found
+
+    def _all_of(self, node: str) -> list[str]:
+        """Return the processes of a node, its controller included."""
+        controller = [f"controller@{node}"] if node == self.problem.controller_node else []
+        return [*self.expected(node), *controller]
 
     # ------------------------------------------------------------------------- clocks
 
@@ -229,10 +230,7 @@ class Harness(Started):
         self.starved_cpus = frozenset()
 
     def _pin(self, node: str, cpus: Sequence[int]) -> None:
-        names = [*self.expected(node)]
-        if node == self.problem.controller_node:
-            names.append(f"controller@{node}")
-        for who in names:
+        for who in self._all_of(node):
             with suppress(LiveError, OSError):
                 for task in Path(f"/proc/{self.pid(who)}/task").iterdir():
                     with suppress(ProcessLookupError):

@@ -193,8 +193,7 @@ def _weigh(
     found.wrong += out_of_order(applied)
     if hit_by(problem, fault) is not None or not _strikes_sink(fault):
         during = [one for one in seen if one.at_ns >= begin_ns - period_ns]
-        max_age_ms = problem.live.max_age_ms or 2 * problem.pipeline.period_ms
-        found.late += unsafe(during, max_age_ms + problem.pipeline.period_ms + found.stall_ms)
+        found.late += unsafe(during, cell.max_age_ms + problem.pipeline.period_ms + found.stall_ms)
 
 
 def _strikes_sink(fault: Fault) -> bool:
