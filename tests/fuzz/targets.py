@@ -37,7 +37,7 @@ NODES = ("R1", "E", "R2")
 KINDS: tuple[type[msgspec.Struct], ...] = tuple(
     kind
     for kind in vars(messages).values()
-    if isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and kind.__struct_fields__
 )
 STAMP = messages.Stamp(1, 5, 1, "LOC", 0)
 HOP = messages.Hop("sensing", "R1", 1, 2, 3, (("stamper", 1),))
@@ -279,7 +279,8 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 # --------------------------------------------------------------------------------- seeds
 
 
-def _wholes() -> list[msgspec.Struct]:
+def wholes() -> list[msgspec.Struct]:
+    """Return a message of every kind, most of their fields filled in."""
     return [
         *(STAMP, messages.Stamped(**msgspec.structs.asdict(STAMP), intervals=((4, 9),)), HOP),
         Header(STAMP, "sensing", "R1", "bytes", (HOP,)),
@@ -305,19 +306,19 @@ def _whole_samples() -> list[bytes]:
     return [
         index.to_bytes(2, "big") + length + header + encode(whole)
         for index in range(len(_keys()))
-        for whole in _wholes()[index % 5 :: 5]
+        for whole in wholes()[index % 5 :: 5]
     ]
 
 
 def seeds(name: str) -> list[bytes]:
     """Return valid inputs of a target, to begin from."""
-    wholes = _wholes()
+    complete = wholes()
     if name == "message":
-        return [bytes([KINDS.index(type(one))]) + encode(one) for one in wholes]
+        return [bytes([KINDS.index(type(one))]) + encode(one) for one in complete]
     if name == "header":
-        return [encode(one) for one in wholes if isinstance(one, Header)]
+        return [encode(one) for one in complete if isinstance(one, Header)]
     if name == "bundle":
-        return [encode(one) for one in wholes if isinstance(one, Carried)]
+        return [encode(one) for one in complete if isinstance(one, Carried)]
     if name == "payload":
         kinds = {
             b"none": b"",

@@ -21,8 +21,7 @@ from typing import Protocol, TypeAlias
 import zenoh
 
 from dwell.errors import LiveError
-from dwell.live.transport.expressions import require_expression, require_key
-from dwell.live.transport.transport import Arrival, Lane, Receive
+from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 
 #: Says who may hear whom: names of sender and receiver, lane, key.
 Reach: TypeAlias = Callable[[str, str, Lane, str], bool]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -12,22 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import dwell
 from dwell.errors import LiveError
-from dwell.live import messages
 from dwell.live.messages import (
     MAX_CONTROL_BYTES,
     MAX_HEADER_BYTES,
     Beat,
-    Carried,
     Completion,
     Header,
     Heard,
-    Hop,
     Order,
-    Snapshot,
     Stamp,
-    State,
     decode,
     encode,
 )
@@ -38,14 +31,16 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.worker import MAX_JOINS
 from dwell.model import Problem
 from dwell.model.document import fingerprint
-from tests.live.small_world import EXEC_MS, Bench, Counting, Passing, World
-
-KINDS: tuple[type[msgspec.Struct], ...] = tuple(
-    kind
-    for kind in vars(messages).values()
-    if isinstance(kind, type) and issubclass(kind, msgspec.Struct)
+from tests.fuzz.targets import KINDS, wholes
+from tests.live.small_world import (
+    EXEC_MS,
+    Bench,
+    Counting,
+    Passing,
+    World,
+    canonical,
+    stateful,
 )
-STAMP = Stamp(1, 5, 1, "LOC", 0)
 
 calls: list[str] = []
 
@@ -69,14 +64,7 @@ class Stateful(Counting):
 
 
 def problem() -> Problem:
-    cell = dwell.load("examples/canonical.yaml")
-    tasks = dict(cell.pipeline.tasks)
-    tasks["planning"] = replace(tasks["planning"], state_bytes=100)
-    return replace(
-        cell,
-        pipeline=replace(cell.pipeline, tasks=tasks),
-        controller=replace(cell.controller, fallbacks=("LOC", "HYB")),
-    )
+    return stateful(canonical(fallbacks=("LOC", "HYB")), "planning", 100)
 
 
 @pytest.fixture(scope="module")
@@ -133,20 +121,6 @@ def test_any_bytes_are_decoded_or_refused(kind: type[msgspec.Struct], data: st.D
     with suppress(LiveError):
         found = decode(raw, kind)
         assert encode(decode(encode(found), kind)) == encode(found)
-
-
-def wholes() -> list[msgspec.Struct]:
-    hop = Hop("sensing", "R1", 1, 2, 3, (("stamper", 1),))
-    return [
-        STAMP,
-        Header(STAMP, "sensing", "R1", "bytes", (hop,)),
-        Completion(STAMP, "control", 9, "actuated", (hop,), "R2"),
-        Beat("agent@E", "E", 1, 5, True, (Heard("stamper@R1", "R1", 1, 2),), cell="x"),
-        Order(1, "me", 1, 1, "SO"),
-        State(1, 5, "planning", "R2"),
-        Snapshot(1, "planning", "E", "R2", 1, 5),
-        Carried((("a", b"b"),)),
-    ]
 
 
 @pytest.mark.parametrize("message", wholes(), ids=lambda message: type(message).__name__)
@@ -309,7 +283,7 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
         windows = getattr(role, "windows", None)
         if windows is not None:
             # They remember the cycles of the last windows, and a line of open ones.
-            assert len(windows._by_key) <= windows._kept + windows._longest
+            assert len(windows._by_key) <= windows.record._kept + windows._longest
         pulse = getattr(role, "pulse", None)
         if isinstance(pulse, Pulse):
             assert len(pulse.strangers) <= MAX_STRANGERS

@@ -180,9 +180,6 @@ def test_the_bound_of_a_silent_link_grows_with_what_is_known_of_the_drift() -> N
     for _ in cell.play(0, 130 * S):
         pass
     _, at_first_ns = cell.error_and_bound("E", 130 * S)
-    slow, fast = cell.offsets.drift_ppm("E")
-    assert slow <= 40 <= fast
-    assert fast - slow < 45
     error_ns, later_ns = cell.error_and_bound("E", 190 * S)
     assert error_ns <= later_ns
     assert 0 < later_ns - at_first_ns <= 60 * S * 23e-6
@@ -319,7 +316,6 @@ def test_synchronous_clocks_are_taken_at_their_word() -> None:
     assert offsets.to_reference("E", 7) == (7, 50 * US)
     assert offsets.from_reference("R2", 7) == (7, 50 * US)
     assert offsets.to_reference("R1", 7) == (7, 0)
-    assert offsets.drift_ppm("E") == (0.0, 0.0)
 
 
 def test_a_flood_of_names_takes_no_memory() -> None:

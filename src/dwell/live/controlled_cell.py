@@ -21,10 +21,10 @@ from dwell.live.messages import (
     Answer,
     Ask,
     Beat,
-    Completion,
     Order,
     Restored,
     Snapshot,
+    Stamp,
     Stamped,
     decode,
     encode,
@@ -134,17 +134,18 @@ class ControlledCell:
         yield keys.restored()
         yield from (keys.ask(), keys.look())
 
-    def receive(self, sample: Arrival, now_ns: int) -> int | None:
-        """Take a message in; returns when a window closes, or an order is sent again."""
+    def receive(self, sample: Arrival, now_ns: int) -> int:
+        """Take a message in; returns what is due next."""
         self._take(sample, now_ns)
-        windows, move = self.windows, self._move
-        due_ns = None if windows is None else windows.due_ns(now_ns)
-        if self._unconfirmed is not None:
-            due_ns = self._ask_ns if due_ns is None else min(due_ns, self._ask_ns)
-        if move is None:
-            return due_ns
-        again_ns = move.sent_ns + RESEND_NS
-        return again_ns if due_ns is None else min(due_ns, again_ns)
+        return self._due_ns(now_ns)
+
+    def _due_ns(self, now_ns: int) -> int:
+        """Return when a window closes, an order is sent again, or the stamper is asked."""
+        due_ns = self._ask_ns
+        if self._move is not None:
+            due_ns = min(due_ns, self._move.sent_ns + RESEND_NS)
+        close_ns = None if self.windows is None else self.windows.due_ns(now_ns)
+        return due_ns if close_ns is None else min(due_ns, close_ns)
 
     def _take(self, sample: Arrival, now_ns: int) -> None:
         keys = self._keys
@@ -165,7 +166,10 @@ class ControlledCell:
                     self._stamped(decode(sample.payload, Stamped), now_ns)
                 case "done" | "ended" if windows is not None:
                     done = self.place.completion(sample)
-                    if self._goes_on(done, now_ns):
+                    who = f"{done.sink}@{done.node}"
+                    # A source's guess counts where the stamper has released such a cycle.
+                    guess = not done.stamp.term
+                    if guess or self._goes_on(done.stamp, who, now_ns, alone=True):
                         windows.completed(done, now_ns)
                 case "load" if windows is not None:
                     windows.loaded(self.place.load(sample))
@@ -200,22 +204,24 @@ class ControlledCell:
                 f"({', '.join(known)}); the nodes' cell files differ"
             )
 
-    def _goes_on(self, told: Stamped | Completion, now_ns: int) -> bool:
-        """Whether a cycle goes on from those before it; complains of the first that does not."""
-        stamped = isinstance(told, Stamped)
-        stamp = told if isinstance(told, Stamped) else told.stamp
-        if not stamped and not stamp.term:
-            # A source's guess counts where the stamper has released such a cycle.
-            return True
-        continuity, cycle = self.continuity, (stamp.run, stamp.cycle)
+    def _goes_on(self, stamp: Stamp, who: str, now_ns: int, *, alone: bool = False) -> bool:
+        """Whether a cycle goes on from those before it; complains of the first that does not.
+
+        Parameters
+        ----------
+        who : str
+            Process that speaks of it.
+        alone : bool
+            As `Continuity.takes` has it.
+        """
+        continuity, cycle = self.continuity, stamp.key
         newest, ahead = continuity.newest, continuity.ahead(now_ns)
         held = self.held
         terms = 0 if held is None or held.run != stamp.run else stamp.term - held.term
-        if terms <= ahead and continuity.takes(cycle, now_ns, alone=not stamped):
+        if terms <= ahead and continuity.takes(cycle, now_ns, alone=alone):
             if continuity.newest == cycle != newest:
                 self._cycle_asked = self._number
             return True
-        who = self.place.stamper[1] if isinstance(told, Stamped) else f"{told.sink}@{told.node}"
         if terms > ahead:
             continuity.leaps += 1
         if self._doubted_until_ns is None or now_ns >= self._doubted_until_ns:
@@ -232,7 +238,7 @@ class ControlledCell:
     def _stamped(self, stamp: Stamped, now_ns: int) -> None:
         self._require_candidate(stamp.placement)
         held = self.held
-        if held is None or not self._goes_on(stamp, now_ns):
+        if held is None or not self._goes_on(stamp, self.place.stamper[1], now_ns):
             return
         if self.windows is not None:
             self.windows.stamped(stamp, now_ns)
@@ -483,9 +489,7 @@ class ControlledCell:
         """Close the windows that are due, push a migration on, beat; returns what is due next."""
         if self._began_ns is None:
             self._began_ns = now_ns
-        windows = self.windows
-        due_ns = None
-        unwritten = self._unwritten
+        windows, unwritten = self.windows, self._unwritten
         while windows is not None:
             due_ns = windows.due_ns(now_ns)
             if due_ns is None or due_ns > now_ns:
@@ -503,15 +507,9 @@ class ControlledCell:
             self._ask_ns = now_ns + ASK_NS
             # Also says that this controller is there, and what it would have proven.
             self._send(self._order("", now_ns))
-        wakes = [self.pulse.wake(now_ns), self._ask_ns]
-        if due_ns is not None:
-            wakes.append(due_ns)
-        if self._move is not None:
-            wakes.append(self._move.sent_ns + RESEND_NS)
-        if self._unwritten:
-            # At once, but after all that has been due before: no order waits for a disk.
-            wakes.append(now_ns)
-        return min(wakes)
+        due_ns = min(self.pulse.wake(now_ns), self._due_ns(now_ns))
+        # At once, but after all that has been due before: no order waits for a disk.
+        return min(due_ns, now_ns) if self._unwritten else due_ns
 
     def _close(self, windows: LiveWindows, now_ns: int) -> None:
         """Close a window and act on what the policy makes of it."""

@@ -131,7 +131,7 @@ class LiveWindows:
         """
         stamp = completion.stamp
         # Of term 0 is a source's own guess: it counts where the stamper has released such a cycle.
-        guessed = not stamp.term and (stamp.run, stamp.cycle) not in self._by_key
+        guessed = not stamp.term and stamp.key not in self._by_key
         if guessed or not self._ledger.tells(completion):
             self.ignored += 1
             return
@@ -199,7 +199,7 @@ class LiveWindows:
         self._beginning = None
 
     def _note(self, stamp: Stamp, at_ns: int | None) -> LiveCycle | None:
-        key = stamp.run, stamp.cycle
+        key = stamp.key
         known = self._by_key.get(key)
         if stamp.placement not in self.problem.candidates:
             self.ignored += 1

@@ -65,6 +65,11 @@ class Stamp(_Array, frozen=True):
     shadow: MaybeName = ""
     forks: Forks = ()
 
+    @property
+    def key(self) -> tuple[int, int]:
+        """Run and cycle: what later cycles have more of."""
+        return self.run, self.cycle
+
 
 class Stamped(Stamp, frozen=True):
     """A stamp as the controller is told it.
@@ -374,6 +379,11 @@ class State(_Array, frozen=True):
     task: Name
     node: Name
     number: Count = 0
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Run and cycle."""
+        return self.run, self.cycle
 
 
 class Restored(_Array, frozen=True):

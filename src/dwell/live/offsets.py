@@ -228,16 +228,6 @@ class Offsets:
         """How often clocks contradicted themselves: they were set, or their node restarted."""
         return sum(pair.breaks for pair in self._pairs.values())
 
-    def drift_ppm(self, node: str) -> tuple[float, float]:
-        """Bounds of the rate at which a node's clock gains on the reference's, per million."""
-        if node == self.reference or self._system_bound_ns is not None:
-            return 0.0, 0.0
-        pair = self._pairs.get((min(node, self.reference), max(node, self.reference)))
-        slow, fast = (
-            (-MAX_DRIFT_PPB, MAX_DRIFT_PPB) if pair is None else (pair.slowest, pair.fastest)
-        )
-        return (slow / 1e3, fast / 1e3) if self.reference < node else (-fast / 1e3, -slow / 1e3)
-
     def to_reference(self, node: str, instant_ns: int) -> Instant:
         """Convert an instant of a node's clock to the reference's.
 

@@ -97,7 +97,7 @@ class Sink:
         return here_ns + bound_ns - header.stamp.released_ns
 
     def _gate(self, header: Header, now_ns: int) -> str:
-        cycle = header.stamp.run, header.stamp.cycle
+        cycle = header.stamp.key
         if cycle <= self.newest:
             return "behind"
         if self.age_ns(header, now_ns) > self.max_age_ns:

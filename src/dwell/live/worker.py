@@ -26,7 +26,7 @@ from dwell.live.payloads import read_payload, write_payload
 from dwell.live.role import Pulse, RolePlace
 from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import Message, Stage, Stateful
-from dwell.live.transport.transport import Arrival, Lane
+from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import NEVER_NS
 
@@ -61,7 +61,7 @@ class Job:
     @property
     def order(self) -> tuple[int, int]:
         """Run and cycle: what later jobs have more of."""
-        return self.header.stamp.run, self.header.stamp.cycle
+        return self.header.stamp.key
 
     def hops(self) -> tuple[Hop, ...]:
         """All jobs behind it, each once."""
@@ -86,7 +86,7 @@ class _Joins:
         self, header: Header, payload: bytes, at_ns: int
     ) -> dict[str, tuple[Header, bytes, int]] | None:
         """Take an input; returns the complete set that it completes."""
-        cycle = header.stamp.run, header.stamp.cycle
+        cycle = header.stamp.key
         if cycle <= self.newest or header.source not in self.sources:
             return None
         inputs = self.waiting.setdefault(cycle, {})
@@ -117,8 +117,8 @@ class _Source:
 
     def stamped(self, header: Header, now_ns: int) -> None:
         """Take a stamp in; of one cycle the one with the highest term counts."""
-        cycle = header.stamp.run, header.stamp.cycle
-        if self._last is not None and cycle <= (self._last.stamp.run, self._last.stamp.cycle):
+        cycle = header.stamp.key
+        if self._last is not None and cycle <= self._last.stamp.key:
             return
         known = self._waiting.get(cycle)
         if known is None or known[0].stamp.term < header.stamp.term:
@@ -188,25 +188,20 @@ class Worker:
         problem = place.problem
         self.routes = Routes(problem)
         self.offsets = place.offsets()
-        flows = problem.pipeline.inputs(task)
-        sources = frozenset(flow.source for flow in flows) or frozenset([STAMPER])
+        #: Declared bytes of what it takes from each task before it, sends to each behind it, and
+        #: of its state: they say the lanes, and how long a payload may be.
+        self._input_bytes = {f.source: f.payload_bytes for f in problem.pipeline.inputs(task)}
+        self._output_bytes = {f.target: f.payload_bytes for f in problem.pipeline.outputs(task)}
+        self._state_bytes = problem.pipeline.tasks[task].state_bytes
+        sources = frozenset(self._input_bytes) or frozenset([STAMPER])
         #: Whether its stage's frames begin the cycles: those of the first source do.
         first = next(name for name in problem.pipeline.tasks if not problem.pipeline.inputs(name))
         frames = problem.live.release == "frames" and task == first
         self.triggers = frames and not shadow and not stands_by
         self._framed_ns: int | None = None
-        self.is_sink = not problem.pipeline.outputs(task)
+        self.is_sink = not self._output_bytes
         self._depth = problem.pipeline.tasks[task].depth
         self._joins = {MAIN: _Joins(sources), SHADOW: _Joins(sources)}
-        self._lanes: dict[str, Lane] = {
-            flow.target: lane_of(flow.payload_bytes) for flow in problem.pipeline.outputs(task)
-        }
-        #: Of what it sends, and of what it takes from the tasks before it.
-        outputs = problem.pipeline.outputs(task)
-        self._longest_output = {f.target: longest_bytes(f.payload_bytes) for f in outputs}
-        self._longest_state = longest_bytes(problem.pipeline.tasks[task].state_bytes)
-        self._longest_input = {flow.source: longest_bytes(flow.payload_bytes) for flow in flows}
-        self._state_lane = lane_of(problem.pipeline.tasks[task].state_bytes)
         self._expected: Mapping[str, type] = getattr(stage, "inputs", {})
         #: What is read at a job's start and after the stage was called; a stage that is said to use
         #: several threads is charged with all that its process does meanwhile.
@@ -286,7 +281,8 @@ class Worker:
         if header.source == STAMPER and self._source is not None:
             self._source.stamped(header, now_ns)
             return
-        longest = self._longest_input.get(header.source, 0)
+        declared = self._input_bytes.get(header.source)
+        longest = 0 if declared is None else longest_bytes(declared)
         if len(sample.payload) > longest:
             what = f"{len(sample.payload)} bytes from {header.source}; at most {longest} are taken"
             self.place.complain(LiveError(f"{self.task} on {self.place.node}: {what}"))
@@ -337,17 +333,12 @@ class Worker:
         state = decode(sample.header, State)
         if state.task != self.task:
             raise LiveError(f"a state of {state.task} came to {self.task}")
-        if len(sample.payload) > self._longest_state:
-            told = (
-                f"a state of {len(sample.payload)} bytes; at most {self._longest_state} are taken"
-            )
-            raise LiveError(f"{self.task}: {told}")
+        length, longest = len(sample.payload), longest_bytes(self._state_bytes)
+        if length > longest:
+            raise LiveError(f"{self.task}: a state of {length} bytes; at most {longest} are taken")
         if state.number:
             self._restoring = state, sample.payload
-        elif self._checkpoint is None or (state.run, state.cycle) > (
-            self._checkpoint[0].run,
-            self._checkpoint[0].cycle,
-        ):
+        elif self._checkpoint is None or state.key > self._checkpoint[0].key:
             self._checkpoint = state, sample.payload
 
     def next_chore(self) -> Snapshot | tuple[State, bytes] | None:
@@ -367,7 +358,7 @@ class Worker:
             self._send_state(chore.to, chore.number)
             return
         state, data = chore
-        order, failed = (state.run, state.cycle), ""
+        order, failed = state.key, ""
         if order < self._worked_at:
             cycle = self._worked_at[1]
             failed = f"{self.task}: a state of cycle {state.cycle} came after one of {cycle}"
@@ -378,7 +369,7 @@ class Worker:
                 self._replay.clear()
                 self._replay.extend(job for job in self._forked if job.order > self.state_at)
         who = state.number, self.task, self.place.node
-        self._restored = Restored(*who, state.run, state.cycle, failed)
+        self._restored = Restored(*who, *state.key, failed)
         if failed:
             self._say_restored()
 
@@ -397,12 +388,12 @@ class Worker:
         except Exception as error:  # the user's code
             self._failed(f"snapshot() failed ({type(error).__name__}: {error})")
             return
-        if len(data) > self._longest_state:
-            told = _too_long(f"its state of {len(data)}", self._longest_state, "state_bytes")
-            self._failed(told)
+        if len(data) > (longest := longest_bytes(self._state_bytes)):
+            self._failed(_too_long(f"its state of {len(data)}", longest, "state_bytes"))
             return
         header = encode(State(run, cycle, self.task, place.node, number))
-        place.transport.put(place.keys.state(self.task, to), data, header, lane=self._state_lane)
+        lane = lane_of(self._state_bytes)
+        place.transport.put(place.keys.state(self.task, to), data, header, lane=lane)
 
     def _take_over(self, state: State, data: bytes) -> str:
         """Restore a state; returns what went wrong, or nothing."""
@@ -413,7 +404,7 @@ class Worker:
         except Exception as error:  # the user's code
             self._failed(f"restore() failed ({type(error).__name__}: {error})")
             return self.trouble
-        self.state_at = self._restored_at = state.run, state.cycle
+        self.state_at = self._restored_at = state.key
         return ""
 
     def _recover(self, job: Job) -> int:
@@ -421,7 +412,7 @@ class Worker:
         if self._checkpoint is None:
             return UNKNOWN
         (state, data), self._checkpoint = self._checkpoint, None
-        if (state.run, state.cycle) <= self.state_at or (state.run, state.cycle) >= job.order:
+        if state.key <= self.state_at or state.key >= job.order:
             return UNKNOWN
         if self._take_over(state, data):
             return UNKNOWN
@@ -583,13 +574,14 @@ class Worker:
                 place.transport.put(place.keys.command(self.task), data, head)
         elif job.shadow or mine:
             for target, node, to in destinations:
-                longest = self._longest_output[target]
+                declared = self._output_bytes[target]
+                longest = longest_bytes(declared)
                 if len(data) > longest:
                     told = _too_long(f"its output of {len(data)}", longest, "the flow's bytes")
                     self._failed(f"cycle {stamp.cycle}: {told}")
                     continue
                 key = place.keys.inputs(target, node, to)
-                place.transport.put(key, data, head, lane=self._lanes[target])
+                place.transport.put(key, data, head, lane=lane_of(declared))
             self._checkpoint_due(job)
 
     def framed(self, now_ns: int) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from dwell.errors import LiveError
-from dwell.live.transport.transport import Arrival, Lane
+from dwell.live.transport.transport import Arrival, Lane, require_expression, require_key
 from tests.live.transport.meshes import MemoryMesh, Mesh, ZenohMesh, introduce
 
 A, B, FAR = "a@R1", "b@R1", "c@E"
@@ -210,3 +210,23 @@ def test_what_is_no_key_is_refused(mesh: Mesh, key: str) -> None:
 def test_what_is_no_key_expression_is_refused(mesh: Mesh, expression: str) -> None:
     with pytest.raises(LiveError, match="key expression"):
         mesh.open(A).subscribe(expression, mesh.inbox())
+
+
+@pytest.mark.parametrize("key", ["", "a//b", "/a", "a/", "a/@b", "a/b c", "a/*", "a/$b", "a?", "#"])
+def test_a_key_that_nothing_can_be_sent_under(key: str) -> None:
+    with pytest.raises(LiveError, match="is empty, starts with @, or has white space"):
+        require_key(key)
+
+
+@pytest.mark.parametrize(
+    ("expression", "words"),
+    [
+        ("a/**/*", r"write \*/\*\* and not \*\*/\*"),
+        ("a/**/**", r"write \*/\*\* and not \*\*/\*\*"),
+        ("a/b*", "neither a plain name nor"),
+        ("a//b", "neither a plain name nor"),
+    ],
+)
+def test_an_expression_that_cannot_be_subscribed_to(expression: str, words: str) -> None:
+    with pytest.raises(LiveError, match=words):
+        require_expression(expression)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import yaml
 
 import dwell
 from dwell.model import Problem
-from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
+from dwell.testbed.chaos.faults import Fault, bound_of, faults_of, planned
 from dwell.testbed.chaos.light_cell import document
 
 
@@ -26,8 +27,7 @@ def of(problem: Problem, name: str) -> Fault:
 
 
 def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
-    left = list(faults_of(problem, disks=False))
-    assert not [fault for fault in left if fault.how in ("jump", "drift")]
+    left = faults_of(problem, disks=False)
     assert [fault.whom for fault in left if fault.how == "fill"] == [("runs",)]
 
 
@@ -59,3 +59,29 @@ def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
 def test_bounds(problem: Problem, name: str, at_so: int | None, at_loc: int | None) -> None:
     assert bound_of(problem, of(problem, name), "SO") == at_so
     assert bound_of(problem, of(problem, name), "LOC") == at_loc
+
+
+def test_a_seed_makes_the_same_timeline_again(problem: Problem) -> None:
+    faults = list(faults_of(problem))
+    first = list(islice(planned(3, faults), 60))
+    assert first == list(islice(planned(3, faults), 60))
+    assert first != list(islice(planned(4, faults), 60))
+
+
+def test_every_kind_has_its_turn_in_every_round(problem: Problem) -> None:
+    faults = list(faults_of(problem))
+    kinds = {fault.kind or fault.how for fault in faults}
+    first = list(islice(planned(1, faults), len(kinds)))
+    assert {one.fault.kind or one.fault.how for one in first} == kinds
+    assert kinds == {
+        *("kill", "kill node", "freeze", "freeze node", "cut", "cut one way", "relay"),
+        *("jump", "drift", "starve", "fill", "hog"),
+    }
+
+
+def test_every_fault_has_its_turn(problem: Problem) -> None:
+    faults = list(faults_of(problem))
+    kinds = {fault.kind or fault.how for fault in faults}
+    rounds = max(sum((f.kind or f.how) == kind for f in faults) for kind in kinds)
+    everything = {one.fault.name for one in islice(planned(1, faults), rounds * len(kinds))}
+    assert everything == {fault.name for fault in faults}

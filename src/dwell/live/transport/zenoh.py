@@ -26,9 +26,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
-from dwell.live.transport.expressions import require_expression, require_key
 from dwell.live.transport.no_linger import Connections
-from dwell.live.transport.transport import Arrival, Lane, Receive
+from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 from dwell.live.wiring import Session, WiringEntry, session_of
 from dwell.model import FrozenDict
 

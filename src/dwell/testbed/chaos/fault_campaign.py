@@ -18,8 +18,7 @@ import dwell
 from dwell.errors import DwellError, LiveError
 from dwell.model import FrozenDict, Problem
 from dwell.testbed.chaos.disk import may_mount
-from dwell.testbed.chaos.fault_timeline import PlannedFault, planned
-from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
+from dwell.testbed.chaos.faults import Fault, PlannedFault, bound_of, faults_of, planned
 from dwell.testbed.chaos.harness import CLOCK_FILE, STARVING_THREADS, Harness, environment_of
 from dwell.testbed.chaos.light_cell import PATIENT_MS, document, exec_ms
 from dwell.testbed.chaos.stages import APPLY
