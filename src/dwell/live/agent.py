@@ -1,6 +1,6 @@
-"""Agent: what a node has one of. It keeps the cell's processes there, and carries none of its data.
+"""Agent: one a node. It keeps the cell's processes there running, and carries none of its data.
 
-It also tells what the node's CPU does, and on one node it is the detour for small messages.
+It also reports the load of the node's CPU, and on one node it is the detour for small messages.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ class Agent:
         return min(wakes)
 
     def _tell(self, now_ns: int) -> None:
-        """Tell the controller what came over the detour: of beats the last, and now and then."""
+        """Tell the controller what came over the detour; of beats the last, and less often."""
         told = self._gathered.taken()
         if now_ns >= self._beats_ns:
             told += self._beats.taken()

@@ -1,4 +1,4 @@
-"""Continuity: what one message alone does not move.
+"""Continuity: numbers that one message alone does not move.
 
 Cycles, terms, lives and instants only grow: a single number that is far too high, damaged or made
 up, would make all that come later old ones.
@@ -135,7 +135,7 @@ class OvershootDetector:
         Parameters
         ----------
         *order : int
-            What grows: an instant, or a life and an instant.
+            Instant that grows, or life and instant.
         """
         if self._behind is None or order > self._behind:
             self._behind = order

@@ -24,11 +24,12 @@ class Counts(NamedTuple):
     Parameters
     ----------
     others_ns : int
-        The other processes of its group.
+        CPU time of the other processes of its group.
     outside_ns : int
-        Those of no such group, on the CPUs that it may run on; version 2 does not count it.
+        CPU time of processes outside any group, on the CPUs that it may run on; version 2 does
+        not count it.
     group_ns : int
-        Its group, itself included.
+        CPU time of its group, itself included.
     """
 
     others_ns: int = UNKNOWN
@@ -112,7 +113,7 @@ class ControlGroup:
             return UNKNOWN
 
     def counts(self) -> Counts:
-        """What has been taken by now."""
+        """Return the CPU time that others have taken by now."""
         own_ns = time.process_time_ns()
         group_ns = self.taken_ns()
         if group_ns == UNKNOWN:

@@ -48,7 +48,7 @@ class Recorder(Protocol):
 
     @property
     def trouble(self) -> str:
-        """What keeps the rows from being written; empty for nothing."""
+        """Why the rows cannot be written; empty where they can."""
         ...
 
     def open(self, run: int) -> Resume:
@@ -56,7 +56,7 @@ class Recorder(Protocol):
         ...
 
     def append(self, rows: Rows, **meta: object) -> None:
-        """Keep rows that belong together, and what is to be said of the run from now on."""
+        """Keep rows that belong together, and the run's metadata from now on."""
         ...
 
 
@@ -368,7 +368,7 @@ class ControlledCell:
         return True
 
     def _take_back(self, answer: Accepted) -> None:
-        """What was believed of the term was wrong: the cell is where it was."""
+        """Go back to the placement that the stamper says: the term that was believed was false."""
         self.place.complain(
             LiveError(
                 f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
@@ -415,7 +415,7 @@ class ControlledCell:
         return wanted if wanted is not None and self._clear(wanted) else ""
 
     def _begin(self, name: str, now_ns: int, *, decided: bool = False) -> None:
-        """Begin a migration, that the policy has decided or somebody asked for."""
+        """Begin a migration that the policy has decided or a person has asked for."""
         held = self.held
         if held is None:
             return
@@ -447,7 +447,7 @@ class ControlledCell:
         self._send(move.order)
 
     def _ask_for_states(self, move: _Move, held: Accepted) -> None:
-        """The inputs are forked: have the states follow."""
+        """Have the states follow the inputs, which are forked."""
         move.phase = "state"
         keys = self.place.keys
         old = self.place.problem.candidates[held.placement]
@@ -471,7 +471,7 @@ class ControlledCell:
             self._push(move, now_ns)
 
     def _give_up(self, now_ns: int) -> None:
-        """A migration has not come about: the cell is where it was."""
+        """End a migration that has not come about: the cell is where it was."""
         move, held = self._move, self.held
         self._move = None
         if held is None:

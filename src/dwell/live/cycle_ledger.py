@@ -1,4 +1,4 @@
-"""LiveCycle: what is known of one cycle; Ledger: what follows from what its messages say.
+"""LiveCycle: the messages about one cycle; Ledger: its latency, jobs and evidence by them.
 
 A job's instants travel with its output, so that of a cycle that never arrives nothing is told of
 where it went: unless a worker has said that it replaced it by a newer one, the first message to
@@ -32,7 +32,7 @@ SHADOW, REPLACED = "shadow", "replaced"
 
 
 class Shift(msgspec.Struct, frozen=True, gc=False):
-    """What takes a node's instants to the stamper's clock, and how far off that may be."""
+    """Shift from a node's clock to the stamper's, and the bound of its error."""
 
     by_ns: int
     bound_ns: int
@@ -132,7 +132,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
     @property
     def segment(self) -> tuple[int, int, str]:
-        """What changes with every migration."""
+        """Run, term and placement, which a migration changes."""
         return self.run, self.term, self.placement
 
     def identify(self, stamp: Stamp) -> None:
@@ -485,6 +485,6 @@ class Ledger:
 
 
 def _between(before_ns: int, after_ns: int) -> int:
-    """What a counter has gone on by; `UNKNOWN` where one of the two is, or it has begun anew."""
+    """Difference of two counts; `UNKNOWN` where one of them is, or the counter began anew."""
     known = UNKNOWN not in (before_ns, after_ns) and after_ns >= before_ns
     return after_ns - before_ns if known else UNKNOWN

@@ -36,7 +36,7 @@ def end_process(what: str, error: BaseException) -> NoReturn:
     Parameters
     ----------
     what : str
-        What has failed.
+        Part of the process that has failed.
     """
     # There may be no memory left to say it, and no room where it is said.
     with suppress(BaseException):

@@ -57,7 +57,7 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     Parameters
     ----------
     status : mapping
-        Of `dwell.live.controlled_cell.ControlledCell.status`.
+        As `dwell.live.controlled_cell.ControlledCell.status` returns it.
 
     Returns
     -------

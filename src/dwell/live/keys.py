@@ -22,11 +22,11 @@ class Keys:
         self.root = f"dwell/{cell}"
 
     def inputs(self, task: str, node: str, kind: str = MAIN) -> str:
-        """What a task's worker takes in; of its shadow worker where `kind` is `SHADOW`."""
+        """Inputs of a task's worker; of its shadow worker where `kind` is `SHADOW`."""
         return f"{self.root}/in/{task}/{node}/{kind}"
 
     def command(self, task: str) -> str:
-        """What a sink task sends to its actuator."""
+        """Commands of a sink task to its actuator."""
         return f"{self.root}/sink/{task}"
 
     def done(self, sink: str) -> str:
@@ -46,7 +46,7 @@ class Keys:
         return f"{self.root}/stamped"
 
     def frame(self) -> str:
-        """Asks the stamper for a cycle, because the source has a frame."""
+        """Requests to the stamper for a cycle, because the source has a frame."""
         return f"{self.root}/frame"
 
     def order(self) -> str:
@@ -58,11 +58,11 @@ class Keys:
         return f"{self.root}/accepted"
 
     def load(self, node: str) -> str:
-        """What each node's CPU does."""
+        """Reports of a node's CPU."""
         return f"{self.root}/load/{node}"
 
     def snapshot(self, task: str, node: str) -> str:
-        """Asks a worker for its state."""
+        """Requests to a worker for its state."""
         return f"{self.root}/snapshot/{task}/{node}"
 
     def state(self, task: str, node: str) -> str:
@@ -70,15 +70,15 @@ class Keys:
         return f"{self.root}/state/{task}/{node}"
 
     def restored(self) -> str:
-        """Says that a state has arrived."""
+        """Reports that a state has arrived."""
         return f"{self.root}/restored"
 
     def ask(self) -> str:
-        """What a person asks of the controller."""
+        """Questions and wishes of a person to the controller."""
         return f"{self.root}/ask"
 
     def look(self) -> str:
-        """Asks the controller how the cell is, and for nothing else."""
+        """Questions for the controller's status, and nothing else."""
         return f"{self.root}/look"
 
     def answer(self, number: str) -> str:
@@ -86,7 +86,7 @@ class Keys:
         return f"{self.root}/answer/{number}"
 
     def relay(self, key: str) -> str:
-        """The copy of a message for whoever carries it on; ``**`` below the root for all."""
+        """The copy of a message for the relay; ``**`` below the root for all."""
         return f"{self.root}/relay/{key.removeprefix(self.root + '/')}"
 
     def detour(self, key: str) -> str:
@@ -98,7 +98,7 @@ class Keys:
         return not key.startswith(f"{self.root}/detour/")
 
     def word(self, key: str) -> str:
-        """First word of a key, whichever way its message came: what it is."""
+        """Return the first word of a key, whichever way its message came: its kind."""
         return key.removeprefix(f"{self.root}/").removeprefix("detour/").partition("/")[0]
 
     def carried(self) -> str:
@@ -106,5 +106,5 @@ class Keys:
         return f"{self.root}/carried"
 
     def gathered(self) -> str:
-        """The same for the controller, which is in less of a hurry."""
+        """The same for the controller, less often."""
         return f"{self.root}/gathered"

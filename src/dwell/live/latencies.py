@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from dwell.live.messages import Beat, Completion
 
-#: Round trips are forgotten after one to two of these.
+#: Time after one to two of which a round trip is forgotten.
 SPAN_NS = 60_000_000_000
 #: Cycles that are waited for at a time, and intervals that wait to be told.
 MOST_WAITING = 256
@@ -74,7 +74,7 @@ class Intervals:
                 best.take(max(now_ns - heard.beat_ns - held_ns, 0), now_ns)
 
     def return_ns(self, node: str) -> int | None:
-        """What a message from a node takes at best; None if that is not known."""
+        """Return the best time, ns, of a message from a node to here; None if it is not known."""
         best = self._best.get(node)
         round_trip_ns = None if best is None else best.value_ns
         return None if round_trip_ns is None else round_trip_ns // 2
@@ -82,8 +82,8 @@ class Intervals:
     def completed(self, done: Completion, now_ns: int, *, newest: int, direct: bool) -> None:
         """Take in a sink's completion, or its second copy.
 
-        Of a cycle that was first heard of over the detour the way back is not known: it has no
-        interval. Nor has one beyond the last `MOST_WAITING` up to `newest`, the last that may
+        A cycle that was first heard of over the detour has no interval, as its way back is not
+        known; nor has a cycle beyond the last `MOST_WAITING` up to `newest`, the last that may
         have been sent: such a number is old or false.
         """
         cycle = done.stamp.cycle

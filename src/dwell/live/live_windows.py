@@ -304,7 +304,7 @@ class LiveWindows:
         Parameters
         ----------
         now_ns : int
-            What the clock shows: a cycle that has been heard of has been released.
+            The clock's time: a cycle that has been heard of has been released.
         """
         start, ordered = self._begin()
         if ordered or len(self._line) <= start + self._size:

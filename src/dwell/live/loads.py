@@ -1,4 +1,4 @@
-"""Loads: what CPU counters showed at any instant between two reports, of nodes and of processes."""
+"""Loads: CPU counters of nodes and of processes at any instant between two reports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOST_PROCESSES = 256
 
 
 class NodeLoad:
-    """What one node has done over its own time.
+    """Work of a node over its own time.
 
     Core-nanoseconds of all work, of the cell's jobs and of its shadows; and the nanoseconds that
     its accelerator was busy.
@@ -87,7 +87,7 @@ class ProcessLoads:
         self._count: Counter[str] = Counter()
 
     def report(self, node: str, at_ns: int, processes: Iterable[tuple[str, int]]) -> None:
-        """Take in what processes of a node have taken since each was started."""
+        """Take in the CPU time of a node's processes since each was started."""
         for who, cpu_ns in processes:
             key = node, who
             if key not in self._of:

@@ -1,4 +1,4 @@
-"""What the processes of a live cell say to one another, and how it is written.
+"""Messages of the processes of a live cell, and how they are written.
 
 Everything but a stage's payload is a MessagePack array of one of the types below. Decoding checks
 length, types and bounds, allocates no more than the message is long, and names what is wrong; it
@@ -39,7 +39,7 @@ class _Array(msgspec.Struct, array_like=True, frozen=True, gc=False):
 
 
 class Stamp(_Array, frozen=True):
-    """What the stamper writes on a cycle, and everyone downstream routes by.
+    """Placement of a cycle, by the stamper; every process downstream routes by it.
 
     Parameters
     ----------
@@ -72,13 +72,13 @@ class Stamp(_Array, frozen=True):
 
 
 class Stamped(Stamp, frozen=True):
-    """A stamp as the controller is told it.
+    """A stamp as the controller gets it.
 
     Parameters
     ----------
     intervals : tuple of (int, int)
         Earlier cycles of the run, and how long they took by the stamper's clock alone, ns (see
-        `dwell.live.latencies`). Each is told once.
+        `dwell.live.latencies`), each once.
     group_ns : int
         CPU time that the control group of the stamper's node had taken at the release; -1 where
         that is not known.
@@ -139,7 +139,7 @@ class Header(_Array, frozen=True):
     shadow : bool
         Whether this is the shadow of the cycle and not the cycle itself.
     seal : bytes
-        Signature of the stamp, by whoever has made it; empty without keys.
+        Signature of the stamp by its maker; empty without keys.
     """
 
     stamp: Stamp
@@ -152,7 +152,7 @@ class Header(_Array, frozen=True):
 
 
 class Completion(_Array, frozen=True):
-    """What a sink says once of every cycle that reached it, and a task of one that ended there.
+    """End of a cycle: at a sink, or at a task where it ended before.
 
     Parameters
     ----------
@@ -181,14 +181,14 @@ class Completion(_Array, frozen=True):
 
 
 class Heard(_Array, frozen=True):
-    """The last beat that the sender of a beat has heard of somebody.
+    """Last beat of another process that the sender of a beat has heard.
 
     Parameters
     ----------
     beat_ns : int
-        When that beat was sent, on the clock of who sent it.
+        When that beat was sent, on its sender's clock.
     at_ns : int
-        When it was heard, on the clock of who heard it.
+        When it was heard, on the listener's clock.
     """
 
     who: Name
@@ -198,7 +198,7 @@ class Heard(_Array, frozen=True):
 
 
 class Beat(_Array, frozen=True):
-    """Heartbeat: I am there; and what I last heard of others, so that clocks can be compared.
+    """Heartbeat: its process is there, and last heard these others; so clocks can be compared.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class Beat(_Array, frozen=True):
     cell : str
         Digest of the cell file, so that different files are noticed.
     note : str
-        What keeps it from being ready, or the last thing that went wrong.
+        Why it is not ready, or the last failure.
     version : str
         Version of Dwell.
     """
@@ -234,14 +234,14 @@ class Beat(_Array, frozen=True):
 
 
 class Order(_Array, frozen=True):
-    """What the controller asks of the stamper; answered by one `Accepted`.
+    """Order of the controller to the stamper, answered by one `Accepted`.
 
     Parameters
     ----------
     number : int
         Grows with every order of this controller; a repeated one is the same order.
     controller : str
-        Name of the controller that asks.
+        Name of the controller that orders.
     run, term : int
         Run and term it was computed on; 0 and 0 only to ask how things are (`placement` empty).
     placement : str
@@ -280,12 +280,12 @@ class Carried(_Array, frozen=True):
 
 
 class Ask(_Array, frozen=True):
-    """What a person asks of a cell's controller.
+    """Question or wish of a person to a cell's controller.
 
     Parameters
     ----------
     number : str
-        Chosen by who asks; the answer goes to the key of that name.
+        Chosen by the asker; the answer goes to the key of that name.
     what : str
         ``status``, ``pin``, ``unpin``, ``drain`` or ``undrain``.
     about : str
@@ -303,9 +303,9 @@ class Answer(_Array, frozen=True):
     Parameters
     ----------
     refused : str
-        Why not; empty if it was done.
+        Why it was not done; empty if it was.
     status : dict
-        How the cell is; see `dwell.live.controlled_cell.ControlledCell.status`.
+        State of the cell; see `dwell.live.controlled_cell.ControlledCell.status`.
     """
 
     number: Name
@@ -314,7 +314,7 @@ class Answer(_Array, frozen=True):
 
 
 class Load(_Array, frozen=True):
-    """What a node's CPU has done since it started counting.
+    """Work of a node's CPU since its agent began to count.
 
     Parameters
     ----------
@@ -325,7 +325,7 @@ class Load(_Array, frozen=True):
     busy_ns, own_ns, shadow_ns : int
         Core-nanoseconds of everything, of the cell's own processes, and of its shadow workers.
     accelerator : float
-        Utilisation of the node's accelerator, where a hook tells; -1 otherwise.
+        Utilisation of the node's accelerator where a hook measures it; -1 otherwise.
     processes : tuple of (str, int)
         CPU time of each of the cell's processes there, the agent's included, since it was started.
     """
@@ -341,7 +341,7 @@ class Load(_Array, frozen=True):
 
 
 class Snapshot(_Array, frozen=True):
-    """Asks the worker of a task for its state, to be sent to another node's.
+    """Request to a task's worker to send its state to another node's.
 
     Parameters
     ----------
@@ -371,7 +371,7 @@ class State(_Array, frozen=True):
     task, node : str
         Task, and where the state comes from.
     number : int
-        That of the `Snapshot` it answers; 0 for a checkpoint, which waits until it is needed.
+        Number of the `Snapshot` it answers; 0 for a checkpoint, which waits until it is needed.
     """
 
     run: Count
@@ -387,14 +387,14 @@ class State(_Array, frozen=True):
 
 
 class Restored(_Array, frozen=True):
-    """Says that a state has arrived and the inputs since then are replayed.
+    """Report that a state has arrived and the inputs since then are replayed.
 
     Parameters
     ----------
     run, cycle : int
         The last cycle that is in the state now.
     failed : str
-        What went wrong; empty if nothing.
+        Failure; empty for none.
     """
 
     number: Count
@@ -411,13 +411,13 @@ class Accepted(_Array, frozen=True):
     Parameters
     ----------
     controller : str
-        Whose order it answers.
+        Sender of the order that it answers.
     refused : str
         Empty where it was accepted; else ``stale term``, ``stale run``, ``stale order``,
         ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``,
         with details.
     placement : str
-        What holds now.
+        Candidate that holds.
     cycle : int
         The next one that will be stamped, with what was ordered.
     fallback : bool
@@ -472,14 +472,14 @@ def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
     Parameters
     ----------
     kind : type
-        What it has to be.
+        Type that it has to be.
     limit : int
         Longest length accepted.
 
     Raises
     ------
     LiveError
-        If it is longer, or anything else.
+        If it is longer, or no such message.
     """
     if len(data) > limit:
         raise LiveError(f"a {kind.__name__} of {len(data)} bytes; at most {limit} are read")

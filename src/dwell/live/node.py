@@ -1,4 +1,4 @@
-"""What runs on a node: its agent, and on one of them the controller of some cells."""
+"""Runs a node's agent, and the controller of some cells."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ def run_agent(
     Parameters
     ----------
     folder : Path
-        Where they keep their files.
+        Folder of their files.
     program : sequence of str
         Command of the process that the others are forked from (`ForkServer`).
     words : callable
-        Returns what it is told to start a process, by the process's name.
+        Returns the words that start a process, by the process's name.
     cpus : iterable of int, optional
-        Those that the node may use.
+        CPUs that the node may use.
     accelerator : callable, optional
         Returns the utilisation of the node's accelerator, a share from 0 to 1.
     environment : mapping of str to str, optional
-        Of the node's processes, with the variables of `dwell.live.security`; this process's own if
-        left out.
+        Environment of the node's processes, with the variables of `dwell.live.security`; this
+        process's own if left out.
     platform : Platform, optional
         Clock and transport of the agent; without faults if left out.
     say : callable

@@ -1,4 +1,4 @@
-"""Offsets: what every node's clock is ahead of a reference node's, and how sure that is.
+"""Offsets of the nodes' clocks from a reference node's, with the bounds of their errors.
 
 No message arrives before it was sent. A message from a to b that was sent at s on a's clock and
 arrived at r on b's says that b's clock is at most r - s ahead of a's; one from b to a bounds it
@@ -62,7 +62,7 @@ _Interval: TypeAlias = tuple[int | None, int | None]
 
 
 class _Pair:
-    """What clock b is ahead of clock a, as an interval that moves with a's time."""
+    """Offset of clock b from clock a, as an interval that moves with a's time."""
 
     __slots__ = (
         *("_overshoot", "anchors", "breaks", "fastest"),

@@ -35,7 +35,7 @@ SWEEP_S = 60.0
 def end_with_owner(stopped: threading.Event, owner: int | None) -> None:
     """Set an event when the owner has ended; nothing happens where there is none.
 
-    Whoever hangs, and does not look at the event, ends some seconds later.
+    A process that hangs, and does not look at the event, ends some seconds later.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
 
 
 def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
-    """Return who may put what stages send to one another, and what is about their states."""
+    """Return who may put stages' messages to one another, and messages about their states."""
     pipeline = problem.pipeline
     found: dict[str, frozenset[str]] = {}
     restored: set[str] = set()
@@ -81,7 +81,7 @@ def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
     known = {subject.name: subject.role for subject in roster.subjects.values()}
 
     def allowed(names: Iterable[str]) -> frozenset[str]:
-        """Those who are still there, and are what the cell file takes them for."""
+        """Return the names that the roster has, in the role that the cell file takes them for."""
         return frozenset(
             name
             for name in names

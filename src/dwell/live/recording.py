@@ -46,7 +46,7 @@ class RunRecorder:
     folder : Path or None
         Folder of the run that is kept; None until it could be made.
     trouble : str
-        What keeps it from being written; empty for nothing.
+        Why it cannot be written; empty where it can.
     waiting, dropped : int
         Rows that wait, and that found no room any more.
     """

@@ -1,7 +1,7 @@
 """Relay batch: small messages that the detour carries together.
 
-Whoever gets a bundle reads a bounded length of it (`MAX_CONTROL_BYTES`), or nothing. So one that
-sends too much, or too often, must leave room for what the others have sent.
+The receiver of a bundle reads a bounded length of it (`MAX_CONTROL_BYTES`), or nothing. So a sender
+that sends too much, or too often, must leave room for the messages of others.
 """
 
 from __future__ import annotations

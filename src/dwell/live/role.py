@@ -1,4 +1,4 @@
-"""What every process of a cell has in common: it hears, it wakes, it beats."""
+"""RolePlace, RoleLogic and Pulse: every process of a cell hears, wakes and beats."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 class RoleLogic(Protocol):
     """A process of a cell, without its threads, sockets and clock.
 
-    Whoever runs it calls one method at a time: `receive` for every message under its
+    Its host calls one method at a time: `receive` for every message under its
     `subscriptions`, `wake` when the instant has come that the last call returned.
     """
 
@@ -142,7 +142,7 @@ class RolePlace:
         Parameters
         ----------
         kind : type
-            What it has to be.
+            Type that it has to be.
         by : callable
             Returns the subject who has to have signed it: a node, or the controller.
 
@@ -216,7 +216,7 @@ class RolePlace:
     def beat(self, sample: Arrival) -> Beat:
         """Read a beat.
 
-        One that came directly was let through for its sender's certificate; one that somebody has
+        A beat that came directly was let through for its sender's certificate; a beat that was
         carried here is believed for its signature.
 
         Raises
@@ -236,8 +236,8 @@ class RolePlace:
     def put_twice(self, key: str, message: msgspec.Struct) -> None:
         """Send a small message directly, and over the detour; signed where there are keys.
 
-        Those on the relay's own node do so, too: the detour reaches whoever has no connection of
-        its own to the sender.
+        Processes on the relay's own node do so, too: the detour reaches processes that have no
+        connection of their own to the sender.
         """
         payload = self._sealed(key, message)
         self.transport.put(key, payload)
@@ -271,8 +271,8 @@ class RolePlace:
     def header(self, sample: Arrival) -> Header | None:
         """Read the header of a data message; None, and a complaint, where it is none.
 
-        Or where nobody has stamped the cycle who may: one with too high a number would keep all
-        others from the actuator.
+        So it is where nobody has stamped the cycle who may: a cycle with too high a number would
+        keep all others from the actuator.
         """
         try:
             header = decode(sample.header, Header, limit=MAX_HEADER_BYTES)

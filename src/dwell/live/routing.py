@@ -1,4 +1,4 @@
-"""Who gets what a task sends, by the stamp of the cycle."""
+"""Destinations of a task's output, by the stamp of the cycle."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Routes:
         Parameters
         ----------
         task : str
-            Who sends; `STAMPER` for the stamp itself.
+            Sender; `STAMPER` for the stamp itself.
         stamp : Stamp
             The cycle's stamp; its placements are candidates. Term 0 is a source's own guess.
         shadow : bool

@@ -39,7 +39,7 @@ VISITORS = ("operator", "observer", "controller")
 
 @dataclass(frozen=True, slots=True)
 class Security:
-    """What a process of a cell is protected by.
+    """Protection of a process of a cell.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Security:
     def of(
         cls, problem: Problem, role: Role, environment: Mapping[str, str] | None = None
     ) -> Security:
-        """Return what the environment gives a process.
+        """Return the protection that the environment gives a process.
 
         Parameters
         ----------
@@ -138,7 +138,7 @@ class Security:
         return RolePlace(self.problem, who, node, transport, time.time_ns(), say=say, seals=seals)
 
     def warnings(self) -> Iterator[str]:
-        """Yield what its log should say, again and again."""
+        """Yield warnings that belong into its log every day."""
         if self.keyring is None:
             addresses = sorted(set(_beyond(self.problem).values()))
             if addresses:

@@ -1,4 +1,4 @@
-"""Stages: the user's code, and what it is handed."""
+"""Stages: the user's code, and its messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """What a stage gets from each task before it, and what it returns.
+    """Input of a stage from a task before it, and its output.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Stateful(Protocol):
 
 
 class Actuator(Protocol):
-    """What applies commands; it is called behind the gate."""
+    """Applies commands; it is called behind the gate."""
 
     def apply(self, command: Message) -> None:
         """Apply a command."""

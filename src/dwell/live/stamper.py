@@ -39,7 +39,7 @@ MAX_PARTIAL = 1_024
 
 @dataclass(frozen=True, slots=True)
 class StamperState:
-    """What outlives the stamper's process.
+    """State of the stamper that outlives its process.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a process of a live cell keeps across its own death, in files of its node."""
+"""Files in which a process of a live cell keeps its state across its own death."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def _checksum(run: int, cycle: int) -> int:
 
 
 class InFlight:
-    """What a worker is working on, in mapped memory: what it died of, if it dies."""
+    """Inputs of a worker's present job, in mapped memory: it died of them, if it dies."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

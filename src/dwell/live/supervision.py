@@ -1,4 +1,4 @@
-"""Supervision: keeps the processes of a node running, and finds out what they die of."""
+"""Supervision: keeps the processes of a node running, and finds out why they die."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class SupervisedProcess:
     Parameters
     ----------
     folder : Path
-        Where it keeps its files.
+        Folder of its files.
     """
 
     who: str
@@ -71,19 +71,19 @@ class SupervisedProcess:
 
     @property
     def pid(self) -> int | None:
-        """Of the process that runs."""
+        """Id of the running process; None where none runs."""
         if self.process is not None:
             return self.process.pid
         return self.adopted.pid if self.adopted is not None else None
 
     @property
     def inflight(self) -> Path:
-        """Where a worker notes what it is working on."""
+        """File in which a worker notes the inputs of its present job."""
         return self.folder / f"{self.who}.inflight"
 
     @property
     def log(self) -> Path:
-        """What the process prints."""
+        """File of the process's output."""
         return self.folder / f"{self.who}.log"
 
     @property
@@ -284,7 +284,7 @@ class Supervisor:
         return found
 
     def notes(self) -> str:
-        """What went wrong last, of processes that keep dying or growing, or died for memory."""
+        """Return the last troubles of processes that keep dying or growing, or died for memory."""
         since_s = time.monotonic() - STARVED_S
         found = [child.starved for child in self.children if child.starved_s > since_s]
         found += [child.note for child in self.children if child.failures > 1]

@@ -84,7 +84,7 @@ class Wire:
     Parameters
     ----------
     source, target : str
-        Who connects, and who listens.
+        Process that connects, and process that listens.
     """
 
     session: Session
@@ -101,7 +101,7 @@ class Passage:
     Parameters
     ----------
     source, target : str
-        Nodes: of who connects, and of who listens.
+        Node of the process that connects, and of the process that listens.
     """
 
     source: str
@@ -113,14 +113,14 @@ class Passage:
 
 @dataclass(frozen=True, slots=True)
 class WiringEntry:
-    """What one process opens.
+    """Endpoints that a process opens.
 
     Parameters
     ----------
     listen : mapping of str to Locator
-        By session; those that nobody connects to are missing.
+        Endpoint by session; sessions that no process connects to are missing.
     connect : mapping of str to tuple of Locator
-        By session.
+        Endpoints of others, by session.
     """
 
     role: Role
@@ -133,20 +133,20 @@ class WiringEntry:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        """Those it has to open."""
+        """Sessions that the process has to open."""
         return tuple(name for name in SESSIONS if name in self.listen or name in self.connect)
 
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Everybody's ports and connections.
+    """Ports and connections of all processes.
 
     Parameters
     ----------
     entries : mapping of str to WiringEntry
-        By who.
+        By name of the process.
     passages : tuple of Passage
-        What has to be there that is no part of the cell.
+        Ways that something outside the cell has to provide.
     """
 
     cell: str
@@ -158,7 +158,7 @@ class Wiring:
         object.__setattr__(self, "entries", FrozenDict(self.entries))
 
     def entry(self, who: str) -> WiringEntry:
-        """Return what a process opens.
+        """Return the endpoints of a process.
 
         Raises
         ------
@@ -180,7 +180,7 @@ class Wiring:
         return frozenset(wire.session for wire in self.wires if (wire.source, wire.target) in pairs)
 
     def peers(self, who: str) -> int:
-        """How many processes one is connected to, in the session with most of them."""
+        """Return how many processes a process is connected to, in the session with most of them."""
         counts = Counter(w.session for w in self.wires if who in (w.source, w.target))
         return max(counts.values(), default=0)
 
@@ -190,7 +190,7 @@ class Wiring:
         return session_of(entry, lane, key) in self.connected(source, target)
 
     def visitor(self, who: str, to: str) -> WiringEntry:
-        """Return what a process that is no part of the cell opens to talk to one that is."""
+        """Return the endpoints of a process outside the cell that talks to a process of it."""
         host = self.entry(to)
         if "control" not in host.listen:
             raise LiveError(f"{to} of cell {self.cell!r} does not listen to anybody")

@@ -452,7 +452,7 @@ class Worker:
 
     @property
     def has_work(self) -> bool:
-        """Whether there may be something for `next_chore` or `next_job`."""
+        """Whether `next_chore` or `next_job` may return something."""
         waits = (
             self._jobs
             or self._replay

@@ -34,7 +34,7 @@ class Connections:
         self._stopped = threading.Event()
 
     def start(self) -> None:
-        """Look after them from now on."""
+        """Look for connections from now on."""
         start_thread("dwell-lingering", self._run)
 
     def stop(self) -> None:
@@ -48,7 +48,7 @@ class Connections:
                 self.wait_for_nobody()
 
     def wait_for_nobody(self) -> None:
-        """Have none of those that there are now wait."""
+        """Disable the lingering of all present connections."""
         known = set()
         for number in map(int, os.listdir(_OPEN)):
             try:
@@ -63,10 +63,10 @@ class Connections:
 
 
 def _released(number: int) -> bool:
-    """Have a connection not wait, and return whether it need not be looked at again.
+    """Disable a connection's lingering; return whether it need not be looked at again.
 
-    One that is still being made has not been asked to wait yet: it will be, once it is there, which
-    takes as long as its peer is out of reach.
+    A connection that is still being made lingers only once it is there, which takes as long as its
+    peer is out of reach.
     """
     try:
         # A number of our own: the other may be closed at any time, and mean something else then.

@@ -24,7 +24,7 @@ _CHUNK = re.compile(r"[^/*$?#@\s][^/*$?#\s]*")
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """One message as it arrives.
+    """A message as it arrives.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ _Put: TypeAlias = Callable[..., None]
 
 @lru_cache(maxsize=1_024)
 def _mark(key: str) -> bytes:
-    """What a message has with it that was put under a key.
+    """Return the mark of a key, which every message that is put under it carries.
 
     Zenoh sends a number for a key that was declared in a session. Where sessions end and begin
     anew, a message may be read with the numbers of another one, and be delivered under another key.
@@ -117,7 +117,7 @@ class ZenohSettings:
 
 
 class ZenohTransport:
-    """One process's sessions; see `Transport`.
+    """Sessions of a process; see `Transport`.
 
     It returns at once, whoever else is there yet, and connects in the background for as long as it
     is open. Callbacks run in Zenoh's own threads.

@@ -26,7 +26,7 @@ def access_control(
     Parameters
     ----------
     root : str
-        What all keys of the cell begin with.
+        Beginning of all keys of the cell.
     may_put : mapping of str to iterable of str
         By key expression: names of the subjects who may put there. Those that the roster does not
         have are left out.

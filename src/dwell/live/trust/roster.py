@@ -30,7 +30,7 @@ DOMAIN = b"dwell roster 1\0"
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Somebody with a certificate.
+    """A holder of a certificate.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class Subject:
 
     @property
     def key(self) -> Ed25519PublicKey:
-        """What verifies its signatures.
+        """Key that verifies its signatures.
 
         Raises
         ------
@@ -99,9 +99,9 @@ class Roster:
     number : int
         Grows with every change.
     subjects : mapping of str to Subject
-        Those that are in force, by name.
+        Subjects whose certificates are in force, by name.
     revoked : tuple of int
-        Serial numbers of certificates that are not.
+        Serial numbers of certificates that are not in force.
     """
 
     cell: str

@@ -1,4 +1,4 @@
-"""Seals: who has written a message, whichever way it came.
+"""Seals: signatures that say who has written a message, whichever way it came.
 
 A sealed message is a signature of 64 bytes (Ed25519, RFC 8032) and the message as it was encoded.
 What is signed begins with the cell and what kind of message it is: none passes for one of another
@@ -19,7 +19,7 @@ REMEMBERED = 512
 
 
 class Seals:
-    """Seals what a process says, and checks what others have said.
+    """Signs a process's messages, and checks those of others.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Seals:
         Parameters
         ----------
         word : str
-            What kind of message it is.
+            Kind of the message, by the first word of its key.
         """
         return self._keyring.sign(self._of(word), data) + data
 

@@ -1,4 +1,4 @@
-"""Actuations: what the actuator has written down itself (see `stages.Witness`)."""
+"""Actuations: the calls of the actuator, by its own log (see `stages.Witness`)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Seen:
     placement : str
         Candidate of the light cell that the command came through, by its own account.
     cycle : int
-        As the runtime says.
+        Cycle by the runtime.
     said : int
-        As the command itself says.
+        Cycle by the command itself.
     released_ns : int
         Release as the source saw it.
     at_ns : int
@@ -43,19 +43,19 @@ class Seen:
 
     @property
     def age_ms(self) -> float:
-        """Since the release."""
+        """Time since the release."""
         return (self.at_ns - self.released_ns) / 1e6
 
 
 class Actuations:
-    """What the actuator has written, as far as it has been read."""
+    """Calls that the actuator has written down, as far as they have been read."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.all = path, list[Seen]()
         self._read = 0
 
     def look(self) -> None:
-        """Read what is new."""
+        """Read the new calls."""
         if not self.path.exists():
             return
         with self.path.open("rb") as file:
@@ -103,7 +103,7 @@ class Actuations:
 
 
 def out_of_order(applied: Sequence[Seen]) -> list[str]:
-    """Return what must never be: something twice, out of order, or another cycle's."""
+    """Return commands that came twice, out of order, or with another cycle's number."""
     found = [
         f"cycle {later.cycle} actuated after {before.cycle}"
         for before, later in pairwise(applied)

@@ -100,7 +100,7 @@ def _witnessed(problem: Problem, folder: Path) -> tuple[Problem, dict[str, str]]
 
 @dataclass(slots=True)
 class Result:
-    """What became of a campaign.
+    """Result of a campaign.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class Result:
     heard : dict of str to int
         Messages, by their kind, that were held against the cell file.
     means : dict of str to str
-        How what needs a right that not everybody has was brought about.
+        How faults that need special rights were brought about.
     """
 
     seed: int

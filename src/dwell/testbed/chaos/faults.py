@@ -25,7 +25,7 @@ RESTS_S = 0.0, 1.5
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that befalls a cell.
+    """A fault of a cell.
 
     Parameters
     ----------
@@ -33,13 +33,13 @@ class Fault:
         Processes, ``*E`` for all of a node; directions of a cut, as ``R1->E``; nodes; ``runs`` for
         the disk that the runs are kept on.
     amount : float
-        Of a jump ms, of a drift parts per million.
+        Jump in ms, drift in parts per million.
     bound : int, optional
         Consecutive cycles that may be lost; None where no fallback can be whole.
     kind : str
-        What it is one of; `how` if left out.
+        Kind that shares its turns; `how` if left out.
     home : str
-        Where the cell has to be that it befalls; empty for anywhere.
+        Placement that the cell has to be at before; empty for any.
     """
 
     name: str
@@ -165,7 +165,7 @@ class PlannedFault:
     number : int
         From 1.
     phase : float
-        Of the period at which it begins.
+        Fraction of the period at which it begins.
     lasts_s, rests_s : float
         How long it lasts, and how long nothing happens before it.
     """

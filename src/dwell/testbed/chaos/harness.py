@@ -284,7 +284,7 @@ class Harness(Started):
         return begin_ns
 
     def end(self, fault: Fault) -> str:
-        """End a fault; returns what is to be said of it."""
+        """End a fault; returns a note about it."""
         match fault.how:
             case "cut":
                 for way in fault.whom:
@@ -326,7 +326,7 @@ class Harness(Started):
             time.sleep(0.002)
 
     def status(self) -> Mapping[str, Any]:
-        """Return what the controller says; nothing where it does not answer."""
+        """Return the controller's status; nothing where it does not answer."""
         try:
             return self.testbed.sample(0.4)
         except LiveError:

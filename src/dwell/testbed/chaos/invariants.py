@@ -1,4 +1,4 @@
-"""Invariants: what must never be, by what is heard on the wire.
+"""Invariants: violations of a cell's promises, by its messages on the wire.
 
 Nothing of a cell's own code decides anything here: its messages are decoded, and held against the
 cell file.
@@ -56,7 +56,7 @@ class Term:
 
 @dataclass(slots=True)
 class Judge:
-    """Hears everything that is said, in the order in which it arrived, and finds what is wrong.
+    """Hears all messages in the order of their arrival, and finds violations.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Judge:
     _looked: int = -1
 
     def hear(self, at_ns: int, key: str, payload: bytes, header: bytes) -> Iterable[str]:
-        """Take a message in; returns what is wrong with it."""
+        """Take a message in; returns its violations."""
         word = Keys(self.problem.name).word(key)
         self.counts[word] = self.counts.get(word, 0) + 1
         try:

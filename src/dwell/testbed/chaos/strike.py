@@ -1,4 +1,4 @@
-"""Strike: a fault befalls a cell, ends, and the cell recovers; what that has cost."""
+"""Strike: a fault befalls a cell, ends, and the cell recovers; its cost."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ SOON_NS = 5_000_000
 
 @dataclass(slots=True)
 class Outcome:
-    """What a fault has cost.
+    """Cost of a fault.
 
     Parameters
     ----------
     phase : float
-        Of the period, after a release, at which it began.
+        Fraction of the period, after a release, at which it began.
     lost, lost_after : int
         Most consecutive cycles without an actuation, by their numbers: from the fault to its end,
         and from there to the recovery. A stamper that starts anew leaves numbers out: -1.
@@ -46,9 +46,9 @@ class Outcome:
     begin_ns, end_ns, back_ns : int
         When it began, ended, and the cell had recovered, on the true clock.
     wrong : list of str
-        What should not be.
+        Violations.
     late : list of str
-        What should not be, and is the machine's doing where it stalled.
+        Violations that the machine has caused where it stalled.
     """
 
     fault: str
@@ -89,9 +89,9 @@ def strike(
     cell : Harness
         At home, and healthy where the fault makes it move.
     phase : float
-        Of the period, after a release.
+        Fraction of the period, after a release.
     seed : int
-        That `phase` and `lasts` were drawn with.
+        Seed that `phase` and `lasts` were drawn with.
     lasts : int
         Periods until what is frozen or cut is so no more.
     bound : int, optional

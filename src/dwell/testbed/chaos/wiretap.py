@@ -29,13 +29,13 @@ HEARD_S = 20.0
 
 
 def heard(keys: Keys) -> tuple[str, ...]:
-    """Return what is listened to."""
+    """Return the key expressions that are listened to."""
     said = keys.stamped(), keys.order(), keys.accepted(), keys.done("*")
     return (*said, keys.inputs("*", "*", "*"))
 
 
 def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
-    """Return what has to be opened to hear all processes of some nodes, beside them."""
+    """Return the endpoints of a listener to all processes of some nodes."""
     connect: dict[Session, list[Any]] = {}
     for entry in wiring.entries.values():
         if entry.role.node in nodes:
@@ -80,7 +80,7 @@ class Records:
         self._path, self._read = path, 0
 
     def news(self) -> Iterator[tuple[int, str, bytes, bytes]]:
-        """Yield what is new: instant, key, message and header."""
+        """Yield the new records: instant, key, message and header."""
         if not self._path.exists():
             return
         with self._path.open("rb") as file:
@@ -106,7 +106,7 @@ class ActuatorObserver:
     Parameters
     ----------
     testbed : LocalTestbed
-        That runs.
+        Testbed of the cell, which runs.
     cell : Path
         Its cell file.
     """
@@ -148,7 +148,7 @@ class ActuatorObserver:
         self._stack.close()
 
     def look(self) -> list[str]:
-        """Return what is wrong with what has been heard since the last time."""
+        """Return the faults of the messages heard since the last call."""
         news = [one for records in self._records for one in records.news()]
         news.sort(key=lambda one: one[0])
         found = [wrong for one in news for wrong in self.judge.hear(*one)]
