@@ -22,7 +22,7 @@ from dwell.live.transport.transport import Arrival
 from dwell.live.trust.signing import Seals
 from dwell.live.wiring import roles, wire
 from dwell.live.worker import Worker
-from dwell.model import Host, Problem
+from dwell.model import Host, Problem, QoS
 from dwell.policies import MinimalPolicy
 from tests.live.memory_transport import Clock, MemoryTransport, Network, NetworkConditions
 
@@ -49,6 +49,30 @@ def stateful(problem: Problem, task: str, state_bytes: int) -> Problem:
     tasks = dict(problem.pipeline.tasks)
     tasks[task] = replace(tasks[task], state_bytes=state_bytes)
     return replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
+
+
+class Staying:
+    """A policy that is content with where the cell is."""
+
+    def start(self, problem: Problem) -> None:
+        self.name = problem.initial
+
+    def adopt(self, name: str) -> None:
+        self.name = name
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        return self.name
+
+
+class Alternating:
+    """A policy that moves at every window, from a candidate to the next."""
+
+    def __init__(self, *names: str) -> None:
+        self.names, self.place = names, 0
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        self.place += 1
+        return self.names[self.place % len(self.names)]
 
 
 class MemoryBook:

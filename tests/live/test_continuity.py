@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
@@ -25,8 +25,7 @@ from dwell.live.messages import (
 from dwell.live.offsets import Offsets
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from dwell.model.qos import QoS
-from tests.live.small_world import World, canonical
+from tests.live.small_world import Staying, World, canonical
 
 MS, S = 1_000_000, 1_000_000_000
 PERIOD_NS = 33 * MS
@@ -36,19 +35,6 @@ HUGE = 1 << 40
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     return canonical(10, min_dwell=1, estimator="profile")
-
-
-class Staying:
-    """Is content with where the cell is."""
-
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
-        return self.here
-
-    def start(self, problem: Problem) -> None:
-        self.here = problem.initial
-
-    def adopt(self, name: str) -> None:
-        self.here = name
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import itertools
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,8 +14,7 @@ from dwell.live.messages import Answer, Ask, Order, decode, encode
 from dwell.live.run_rows import Rows
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from dwell.model.qos import QoS
-from tests.live.small_world import World, canonical
+from tests.live.small_world import Alternating, World, canonical
 
 CONTROLLER = "controller@E"
 
@@ -24,17 +22,6 @@ CONTROLLER = "controller@E"
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     return canonical(20, min_dwell=1, estimator="profile")
-
-
-class Alternating:
-    """Moves at every window, from a candidate to the next."""
-
-    def __init__(self, *names: str) -> None:
-        self.names, self.place = names, 0
-
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
-        self.place += 1
-        return self.names[self.place % len(self.names)]
 
 
 def alternating(problem: Problem) -> World:

@@ -11,22 +11,9 @@ import pytest
 import dwell
 from dwell.model import Problem
 from dwell.model.qos import QoS
-from tests.live.small_world import World
+from tests.live.small_world import Staying, World
 
 PERIOD_MS = 100.0
-
-
-class Staying:
-    """Wants to be wherever the cell is."""
-
-    def start(self, problem: Problem) -> None:
-        self.name = problem.initial
-
-    def adopt(self, name: str) -> None:
-        self.name = name
-
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
-        return self.name
 
 
 class Wanting(Staying):

@@ -195,7 +195,7 @@ def test_a_mark_of_another_process_is_not_believed(tmp_path: Path, said: list[st
     (tmp_path / "stamper@R1.pid").write_text(f'{{"pid": {os.getpid()}, "started": 12.5}}')
     supervisor = Supervisor(tmp_path, said.append)
     child = keep(supervisor, "stamper@R1", "import time; time.sleep(1000)")
-    assert child.adopted is None
+    assert child.process is None
     until(supervisor, lambda: child.starts == 1)
     supervisor.stop()
 

@@ -374,12 +374,17 @@ class ControlledCell:
                 f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
             )
         )
-        self.held, self._move = answer, None
+        self.held = answer
         self._term_asked = self._number
-        self.controller.resume(answer.placement, fallback=answer.fallback)
+        self._stay(answer, f"the stamper says that {answer.placement} holds")
+
+    def _stay(self, held: Accepted, why: str) -> None:
+        """Go on with the placement that holds: no migration has come about."""
+        self._move = None
+        self.controller.resume(held.placement, fallback=held.fallback)
         self._unwritten = True
         if self.windows is not None:
-            self.windows.refused(f"the stamper says that {answer.placement} holds")
+            self.windows.refused(why)
 
     def _send(self, order: Order) -> None:
         if self.place.stamper[1] in self.pulse.strangers:
@@ -473,14 +478,10 @@ class ControlledCell:
     def _give_up(self, now_ns: int) -> None:
         """End a migration that has not come about: the cell is where it was."""
         move, held = self._move, self.held
-        self._move = None
-        if held is None:
+        if held is None or move is None:
             return
-        self.controller.resume(held.placement, fallback=held.fallback)
-        self._unwritten = True
-        if self.windows is not None:
-            self.windows.refused((move.refused if move is not None else "") or "no answer")
-        if move is not None and move.forks:
+        self._stay(held, move.refused or "no answer")
+        if move.forks:
             self._send(self._order("", now_ns))
 
     # ------------------------------------------------------------------------- windows

@@ -197,37 +197,48 @@ class ForkServer(Launcher):
         self._next_s = float("inf")
 
 
-class _Forked:
-    """A process that a fork server has forked."""
+class Survivor:
+    """A process whose agent, or fork server, has died before it: its exit code is not known."""
 
-    def __init__(self, server: ForkServer, pid: int) -> None:
-        self.pid, self._server = pid, server
-        self._code: int | None = None
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
         self._process: psutil.Process | None = None
         with suppress(psutil.NoSuchProcess):
             self._process = psutil.Process(pid)
 
     def poll(self) -> int | None:
-        """Return its exit code, negative for a signal; None while it runs."""
-        if self._code is None:
-            self._code = self._server.code(self.pid)
-        if self._code is None and not self._server.watches(self.pid) and not self._alive():
-            self._code = UNKNOWN_CODE
-        return self._code
-
-    def _alive(self) -> bool:
-        if self._process is None:
-            return False
+        """Return `UNKNOWN_CODE` when it has ended; None while it runs."""
         try:
-            return self._process.is_running() and self._process.status() != psutil.STATUS_ZOMBIE
+            process = self._process
+            runs = process is not None and process.is_running()
+            if process is not None and runs and process.status() != psutil.STATUS_ZOMBIE:
+                return None
         except psutil.NoSuchProcess:
-            return False
+            pass
+        return UNKNOWN_CODE
 
     def wait(self) -> int:
         """Return its exit code when it has ended."""
         while (code := self.poll()) is None:
             time.sleep(0.005)
         return code
+
+
+class _Forked(Survivor):
+    """A process that a fork server has forked, and tells the end of while it lives."""
+
+    def __init__(self, server: ForkServer, pid: int) -> None:
+        super().__init__(pid)
+        self._server = server
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        """Return its exit code, negative for a signal; None while it runs."""
+        if self._code is None:
+            self._code = self._server.code(self.pid)
+        if self._code is None and not self._server.watches(self.pid):
+            self._code = super().poll()
+        return self._code
 
 
 def serve(stdin: int = 0) -> list[str] | None:

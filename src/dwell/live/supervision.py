@@ -17,7 +17,7 @@ from pathlib import Path
 import psutil
 
 from dwell.files import write_whole
-from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running
+from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running, Survivor
 from dwell.live.log import printable
 from dwell.live.state_files import InFlight
 
@@ -54,7 +54,6 @@ class SupervisedProcess:
     command: Sequence[str]
     folder: Path
     process: Running | None = None
-    adopted: psutil.Process | None = None
     starts: int = 0
     failures: int = 0
     started_s: float = 0.0
@@ -72,9 +71,7 @@ class SupervisedProcess:
     @property
     def pid(self) -> int | None:
         """Id of the running process; None where none runs."""
-        if self.process is not None:
-            return self.process.pid
-        return self.adopted.pid if self.adopted is not None else None
+        return self.process.pid if self.process is not None else None
 
     @property
     def inflight(self) -> Path:
@@ -127,9 +124,9 @@ class Supervisor:
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
         child = SupervisedProcess(who, command, self.folder)
-        child.adopted = survivor(child.mark)
-        if child.adopted is not None:
-            self._say(f"{who}: goes on (process {child.adopted.pid})")
+        if (process := survivor(child.mark)) is not None:
+            child.process = Survivor(process.pid)
+            self._say(f"{who}: goes on (process {process.pid})")
             child.started_s = time.monotonic()
         self.children.append(child)
         return child
@@ -142,18 +139,13 @@ class Supervisor:
                 self._start(child)
 
     def _alive(self, child: SupervisedProcess) -> bool:
-        if child.process is not None:
-            code = child.process.poll()
-            if code is None:
-                return True
+        if child.process is None:
+            return False
+        code = child.process.poll()
+        if code is not None:
             child.process = None
             self._died(child, _reason(code))
-        elif child.adopted is not None:
-            if child.adopted.is_running() and child.adopted.status() != psutil.STATUS_ZOMBIE:
-                return True
-            child.adopted = None
-            self._died(child, ENDED)
-        return False
+        return code is None
 
     def _died(self, child: SupervisedProcess, reason: str) -> None:
         now_s = time.monotonic()
@@ -307,7 +299,7 @@ class Supervisor:
             child.mark.unlink(missing_ok=True)
             if child.process is not None:
                 child.process.wait()
-            child.process = child.adopted = None
+            child.process = None
         self._launcher.stop()
 
 

@@ -18,10 +18,9 @@ from dwell.live.trust.acl import access_control
 from dwell.live.trust.roster import Roster, Subject
 from dwell.live.wiring import roles
 from dwell.model import Problem
-from dwell.model.qos import QoS
 from tests.cells.generated import random_problem
 from tests.live.memory_transport import MemoryTransport, matcher
-from tests.live.small_world import Counting, World
+from tests.live.small_world import Alternating, Counting, World, stateful
 from tests.live.trust.rosters import roster_of
 
 NOBODY = "nobody.1"
@@ -69,17 +68,6 @@ def problem() -> Problem:
     return dwell.load("examples/canonical.yaml")
 
 
-class Restless:
-    """Moves at every window."""
-
-    def __init__(self, names: list[str]) -> None:
-        self.names, self.place = names, 0
-
-    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
-        self.place += 1
-        return self.names[self.place % len(self.names)]
-
-
 def said_in(
     problem: Problem, periods: int, monkeypatch: pytest.MonkeyPatch
 ) -> set[tuple[str, str]]:
@@ -93,7 +81,7 @@ def said_in(
 
     monkeypatch.setattr(MemoryTransport, "put", note)
     exec_ms = dict.fromkeys(problem.pipeline.tasks, problem.pipeline.period_ms / 20)
-    policy = Restless(list(problem.candidates))
+    policy = Alternating(*problem.candidates)
     stages = {name: Counting for name, task in problem.pipeline.tasks.items() if task.state_bytes}
     world = World(problem, exec_ms=exec_ms, policy=policy, stages=stages)
     world.run(periods * problem.pipeline.period_ms)
@@ -112,14 +100,9 @@ def test_whatever_a_cell_says_may_be_said(
     problem: Problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With states that move, and with shadows."""
-    tasks = dict(problem.pipeline.tasks)
-    tasks["planning"] = replace(tasks["planning"], state_bytes=100)
-    problem = replace(
-        problem,
-        window_cycles=20,
-        pipeline=replace(problem.pipeline, tasks=tasks),
-        controller=replace(problem.controller, estimator="shadow", min_dwell=1),
-    )
+    settings = replace(problem.controller, estimator="shadow", min_dwell=1)
+    moving = stateful(problem, "planning", 100)
+    problem = replace(moving, window_cycles=20, controller=settings)
     wall = wall_of(problem, roster_of(problem))
     said = said_in(problem, 200, monkeypatch)
     assert {who for who, _ in said} == {role.who for role in roles(problem)}
