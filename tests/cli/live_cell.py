@@ -22,8 +22,8 @@ from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
+from tests.cli.small_cell import ROOT, call
 
-ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "live"
 PATIENCE_S = 60.0
 
@@ -65,6 +65,12 @@ def free_ports(count: int) -> int:
                 stack.enter_context(socket.create_server(("127.0.0.1", port)))
             return first
     raise AssertionError("no ports")
+
+
+def invoke(*arguments: str | Path) -> tuple[int, str, str]:
+    """Run a command in this process."""
+    result = call(*arguments)
+    return result.exit_code, result.stdout, result.stderr
 
 
 class RealCell:
@@ -122,9 +128,17 @@ class RealCell:
         words = ("--node", node, "--cell", cell or self.file, "--state", self.state(node))
         self.start(f"agent-{node}", "agent", *words, *more)
 
-    def controller(self) -> None:
+    def controller(self, *more: str) -> None:
         """Start the controller."""
-        self.start("controller", "controller", "--cell", self.file, "--out", self.folder / "runs")
+        words = ("--cell", self.file, "--out", self.folder / "runs")
+        self.start("controller", "controller", *words, *more)
+
+    def begin(self) -> None:
+        """Start the controller and all agents, and wait until a window has closed."""
+        self.controller()
+        for node in ("R2", "E", "R1"):
+            self.agent(node)
+        self.until(lambda status: status["window"] and not status["silent"])
 
     def end(self, name: str) -> int:
         """End a command as systemd would."""

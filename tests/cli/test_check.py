@@ -10,7 +10,7 @@ import yaml
 
 import dwell
 from dwell.model.document import to_document
-from tests.cli.small_cell import CANONICAL, SMALL, call, read_json
+from tests.cli.small_cell import CANONICAL, SMALL, assert_refused, call, read_json
 
 
 def test_check_sums_up_a_cell(cell: Path) -> None:
@@ -140,9 +140,7 @@ def test_examples_are_without_faults_and_warnings() -> None:
 def test_traces_may_be_elsewhere(cell: Path, tmp_path: Path) -> None:
     text = SMALL.replace("delay_ms: 1}", "delay_ms: {trace: {file: t.csv, column: up}}}")
     cell.write_text(text, encoding="utf-8")
-    missing = call("check", cell)
-    assert missing.exit_code == 2
-    assert "--traces" in missing.stderr
+    assert_refused(call("check", cell), "--traces")
     folder = tmp_path / "measured"
     folder.mkdir()
     (folder / "t.csv").write_text("up\n" + "1.5\n" * 400, encoding="utf-8")

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from dwell.cli.commands import app
 from dwell.cli.completion import FILES, Shell, completions, script
+from tests.cli.small_cell import ROOT, call
 
-ROOT = Path(__file__).parents[2]
 COMMAND = Path(sys.executable).with_name("dwell")
 PATIENCE_S = 60.0
 
@@ -107,12 +106,12 @@ def test_every_option_of_every_command_is_offered_but_hidden_ones() -> None:
 
 @pytest.mark.parametrize("shell", Shell)
 def test_the_command_prints_the_script(shell: Shell) -> None:
-    done = CliRunner().invoke(app, ["completion", shell])
+    done = call("completion", shell)
     assert done.stdout == script(shell)
 
 
 def test_another_shell_is_wrong_input() -> None:
-    assert CliRunner().invoke(app, ["completion", "ksh"]).exit_code == 2
+    assert call("completion", "ksh").exit_code == 2
 
 
 def test_an_answer_imports_neither_tables_nor_compilers() -> None:

@@ -16,20 +16,18 @@ from typing import Any
 
 import pytest
 from numba.core import config
-from typer.testing import CliRunner
 
-from dwell.cli.commands import app
 from dwell.cli.first_answer import find_kernels
 from dwell.live.trust.authority import Authority
+from tests.cli.small_cell import ROOT, call
 
-ROOT = Path(__file__).parents[2]
 LIVE = ROOT / "examples" / "live" / "cell.yaml"
 PARTS = ["extras", "cache", "CPU", "clocks", "ports", "certificates", "testbed", "runs here"]
 OLD = "advance.advance-1.py311.0123456789abcdef.01234567.nbi"
 
 
 def doctor(*words: object, code: int = 0) -> list[dict[str, Any]]:
-    done = CliRunner().invoke(app, ["doctor", *map(str, words), "--json"])
+    done = call("doctor", *map(str, words), "--json")
     assert done.exit_code == code, done.output
     told = json.loads(done.stdout)
     assert told["ok"] == (code == 0)
@@ -148,6 +146,6 @@ def test_a_certificate_is_told_with_its_end_and_a_damaged_one_is_broken(tmp_path
 
 
 def test_a_cell_that_is_not_there_is_wrong_input(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["doctor", str(tmp_path / "absent.yaml")])
+    done = call("doctor", tmp_path / "absent.yaml")
     assert done.exit_code == 2
     assert len(done.output.splitlines()) == 1

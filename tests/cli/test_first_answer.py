@@ -5,9 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import pty
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,20 +16,18 @@ import psutil
 import pytest
 
 import dwell
-from tests.cli.small_cell import ROOT, SMALL
+from tests.cli.small_cell import ROOT, SMALL, interrupt_at_first_sign
 
 FIND = "from dwell.cli.first_answer import find_kernels as f; k = f(); print(k.folder, k.suffix)"
 
 
 @pytest.fixture
-def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cell(cell: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a cell in the current folder, in which the kernels' cache is empty."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cell.with_name("cache")))
     monkeypatch.delenv("NUMBA_DISABLE_JIT", raising=False)
-    path = tmp_path / "small.yaml"
-    path.write_text(f"{SMALL}controller: {{estimator: corrected}}\n", encoding="utf-8")
-    return path
+    cell.write_text(f"{SMALL}controller: {{estimator: corrected}}\n", encoding="utf-8")
+    return cell
 
 
 def start(cell: Path, out: str) -> subprocess.Popen[str]:
@@ -81,36 +77,6 @@ def compilers(lock: Path) -> list[psutil.Process]:
     return found
 
 
-def interrupted_after(words: bytes, *command: str) -> tuple[bytes, int]:
-    """Run a command on a terminal until it says something.
-
-    Returns
-    -------
-    (bytes, int)
-        What it has said, and the exit code after Ctrl-C.
-    """
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(
-        (sys.executable, "-m", "dwell", *command),
-        stdout=subprocess.DEVNULL,
-        stderr=theirs,
-        env={**os.environ, "COLUMNS": "80", "TERM": "xterm"},
-    )
-    os.close(theirs)
-    said = b""
-    try:
-        while words not in said:
-            said += os.read(ours, 1000)  # raises where the process has ended
-    finally:
-        process.send_signal(signal.SIGINT)
-        # A terminal that nobody reads would hold the process.
-        with suppress(OSError):
-            while os.read(ours, 1000):
-                pass
-        os.close(ours)
-    return said, process.wait(timeout=120)
-
-
 def test_who_plays_a_run_does_not_matter(cell: Path) -> None:
     lock = lock_file()
     with locked(lock):
@@ -158,10 +124,11 @@ def test_long_work_says_that_it_compiles(cell: Path, command: str) -> None:
         "policies: [LOC]\nscenarios: [baseline]\n",
         encoding="utf-8",
     )
-    words = {"run": (str(cell), "--windows", "4000"), "study": ("study.yaml",)}.get(command, ())
-    said, code = interrupted_after(b"compiling the simulator, once", command, *words)
-    assert b"simulating" not in said
-    assert code == 130
+    words = {"run": [str(cell), "--windows", "4000"], "study": ["study.yaml"]}.get(command, [])
+    sign = "compiling the simulator, once"
+    code, stdout, shown = interrupt_at_first_sign([command, *words], cell.parent, sign=sign)
+    assert (code, stdout) == (130, "")
+    assert "simulating" not in shown
 
 
 def test_a_cache_that_cannot_be_written(cell: Path) -> None:
@@ -178,8 +145,9 @@ def test_no_cache_can_be_written_at_all(cell: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setenv(name, str(value))
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null/cache")
     run(cell, "first")
-    said, code = interrupted_after(b"each process compiles", "demo", "--out", "demo")
-    assert (said.splitlines()[0][:5], code) == (b"note:", 130)
+    arguments = ["demo", "--out", "demo"]
+    code, _, shown = interrupt_at_first_sign(arguments, cell.parent, sign="each process compiles")
+    assert (shown.splitlines()[0][:5], code) == ("note:", 130)
 
 
 # ----------------------------------------------------------------- versions side by side

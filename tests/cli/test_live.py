@@ -13,24 +13,16 @@ from pathlib import Path
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 import dwell
-from dwell.cli.commands import app
 from dwell.errors import LiveError
 from dwell.live.operator_client import OperatorClient
 from dwell.live.wiring import roles
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
-from tests.cli.live_cell import EXAMPLE, MOODY, PATIENCE_S, RealCell
+from tests.cli.live_cell import EXAMPLE, MOODY, PATIENCE_S, RealCell, invoke
+from tests.cli.small_cell import ROOT
 
-ROOT = Path(__file__).parents[2]
 CPU = min(os.sched_getaffinity(0))
-
-
-def invoke(*arguments: str | Path) -> tuple[int, str, str]:
-    """Run a command in this process."""
-    result = CliRunner().invoke(app, [str(word) for word in arguments])
-    return result.exit_code, result.stdout, result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -241,10 +233,7 @@ def test_a_run_folder_that_is_full_from_the_start_keeps_nobody_from_deciding(
     with SmallDisk(tmp_path / "runs") as disk:
         disk.fill()
         try:
-            made.controller()
-            for node in ("R2", "E", "R1"):
-                made.agent(node)
-            made.until(lambda status: status["window"] and not status["silent"])
+            made.begin()
             assert invoke("live", "pin", "SO", "--cell", made.file)[0] == 0
             status = made.until(lambda status: status["placement"] == "SO" and status["window"])
             assert "No space left on device" in status["record"]

@@ -17,22 +17,19 @@ import polars as pl
 import psutil
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 import dwell
-from dwell.cli.commands import app
-from dwell.cli.live_run import MARK, _Told
+from dwell.cli.live_run import MARK, _ObservedRun
 from dwell.errors import LiveError
 from dwell.live.trust import KEYS
 from dwell.model import Problem
 from dwell.model.document import to_document
-from dwell.report.phases import Disturbed, disturbed
 from dwell.testbed.playing import crowded, make_folder
 from dwell.testbed.timeline import timeline_of
+from tests.cli.small_cell import ROOT, assert_refused, call
 from tests.report.live_runs import PERIOD_NS, live_run
 
-CELL = Path(__file__).parents[2] / "examples" / "visual_servoing" / "cell.yaml"
-SECONDS = 116.0
+CELL = ROOT / "examples" / "visual_servoing" / "cell.yaml"
 #: Far more than any of it takes, on a machine that has a lot else to do.
 PATIENCE_S = 60.0
 LIVE_RUN = (sys.executable, "-m", "dwell", "live", "run")
@@ -46,15 +43,10 @@ def problem() -> Problem:
     return dwell.load(CELL)
 
 
-@pytest.fixture
-def plan(problem: Problem) -> list[Disturbed]:
-    return disturbed(problem.scenario("demo"), problem.fabric)
-
-
 def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path) -> None:
     folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
     timeline = timeline_of(problem, "demo", seed=5, seconds=100)
-    told = _Told(problem, "demo", 5, timeline)
+    told = _ObservedRun(problem, "demo", 5, timeline)
     told.changed(timeline.changes[0], 20 * PERIOD_NS)
     run = told.note(folder, **told.observed(folder))
     assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
@@ -86,7 +78,7 @@ def test_a_machine_that_was_full_while_nothing_disturbed_it_is_warned_of(
 
 def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:
     timeline = timeline_of(problem, "demo", seed=1, seconds=1_000)
-    told = _Told(problem, "demo", 1, timeline)
+    told = _ObservedRun(problem, "demo", 1, timeline)
     seen = []
     for change in timeline.changes:
         told.changed(change)
@@ -246,15 +238,13 @@ def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path:
     document["live"] = {**document.get("live", {}), **change.get("live", {})}
     cell = tmp_path / "cell.yaml"
     cell.write_text(yaml.safe_dump(document))
-    words = ["live", "run", str(cell), "--out", str(tmp_path / "out")]
     scenario = ["--scenario", change["scenario"]] if "scenario" in change else []
-    done = CliRunner().invoke(app, [*words, *scenario])
+    done = call("live", "run", cell, "--out", tmp_path / "out", *scenario)
     assert done.exit_code in (1, 2)
     assert said in done.stderr
     assert not (tmp_path / "out").exists()
 
 
 def test_the_demo_of_before_says_what_has_taken_its_place() -> None:
-    done = CliRunner().invoke(app, ["live", "demo", "--seconds", "20"])
-    assert done.exit_code == 2
-    assert "dwell live run examples/visual_servoing/cell.yaml" in done.stderr
+    former = call("live", "demo", "--seconds", "20")
+    assert_refused(former, "dwell live run examples/visual_servoing/cell.yaml")

@@ -17,8 +17,7 @@ from dwell.live.keys import Keys
 from dwell.live.messages import Order, Stamped, encode
 from dwell.live.security import INSECURE, Security
 from dwell.live.wiring import Role, wire
-from tests.cli.live_cell import EXAMPLE, PATIENCE_S, RealCell
-from tests.cli.test_live import invoke
+from tests.cli.live_cell import EXAMPLE, PATIENCE_S, RealCell, invoke
 from tests.live.test_security import Intruder, tls
 
 PIN = ("live", "pin", "SO")
@@ -45,11 +44,8 @@ class SecureCell(RealCell):
     def agent(self, node: str, *more: str, cell: Path | None = None) -> None:
         super().agent(node, "--keys", str(self.host / node), *more, cell=cell)
 
-    def controller(self) -> None:
-        self.start(
-            "controller", "controller", "--cell", self.file, "--out", self.folder / "runs",
-            "--keys", self.host / "controller",
-        )  # fmt: skip
+    def controller(self, *more: str) -> None:
+        super().controller("--keys", str(self.host / "controller"), *more)
 
     def as_(self, name: str, *words: str) -> tuple[int, str]:
         code, stdout, stderr = invoke(*words, "--cell", self.file, "--keys", self.host / name)
@@ -131,10 +127,7 @@ def test_an_agent_without_keys_says_so_loudly(abroad: Path) -> None:
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureCell]:
     made = SecureCell(tmp_path_factory.mktemp("secure"))
     try:
-        made.controller()
-        for node in ("R2", "E", "R1"):
-            made.agent(node)
-        made.until(lambda status: not status["silent"] and status["window"])
+        made.begin()
         yield made
     finally:
         made.close()

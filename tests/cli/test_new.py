@@ -1,9 +1,8 @@
-"""`dwell new` and `dwell schema`: what they make, and what they refuse."""
+"""`dwell new`: what it makes, and what it refuses."""
 
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -15,11 +14,6 @@ import dwell
 from tests.cli.small_cell import ROOT, call
 
 FILES = {"cell.yaml", "policy.py", "stages.py", "test_cell.py", "cell.schema.json"}
-CELLS = [
-    path
-    for path in sorted((ROOT / "examples").rglob("*.yaml"))
-    if re.search("^dwell: ", path.read_text(encoding="utf-8"), re.MULTILINE)
-]
 
 
 @pytest.fixture
@@ -97,34 +91,6 @@ def test_a_folder_around_it_that_is_missing(here: Path) -> None:
     found = call("new", "absent/hall")
     assert (found.exit_code, found.stderr.count("\n")) == (2, 1)
     assert "there is no folder absent" in found.stderr
-
-
-@pytest.mark.parametrize("cell", CELLS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_examples_name_their_schema(cell: Path) -> None:
-    first = cell.read_text(encoding="utf-8").partition("\n")[0]
-    place = first.removeprefix("# yaml-language-server: $schema=")
-    known = (cell.parent / place).read_text(encoding="utf-8")
-    # Made by `dwell schema --write examples/cell.schema.json`.
-    assert known == call("schema").stdout
-
-
-def test_a_schema_is_written_and_replaced(here: Path) -> None:
-    for arguments in ((), ("cell.schema.json",), ("other.json",)):
-        assert call("schema", "--write", *arguments).exit_code == 0
-    assert {path.name for path in here.iterdir()} == {"cell.schema.json", "other.json"}
-    text = Path("cell.schema.json").read_text(encoding="utf-8")
-    assert text == Path("other.json").read_text(encoding="utf-8") == call("schema").stdout
-
-
-def test_a_schema_that_cannot_be_written(here: Path) -> None:
-    Path("cell.yaml").write_text("dwell: 1\n", encoding="utf-8")
-    Path("folder").mkdir()
-    for name in ("cell.yaml", "folder", "absent/cell.schema.json"):
-        found = call("schema", "--write", name)
-        assert (found.exit_code, found.stderr.count("\n")) == (2, 1)
-    assert Path("cell.yaml").read_text(encoding="utf-8") == "dwell: 1\n"
-    assert call("schema", "other.json").exit_code == 2
-    assert not Path("other.json").exists()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -12,14 +12,11 @@ import polars as pl
 import pytest
 import typer
 import yaml
-from typer.testing import CliRunner
 
 import dwell
 from dwell.cli.commands import app
 from dwell.cli.options import windows_of
-
-ROOT = Path(__file__).parents[2]
-CANONICAL = ROOT / "examples" / "canonical.yaml"
+from tests.cli.small_cell import CANONICAL, call
 
 #: Options that mean the same wherever they are.
 SHARED = (
@@ -66,7 +63,7 @@ def test_no_command_takes_a_length_in_windows_or_seconds_alone_where_it_has_one_
 def test_an_old_spelling_works_with_a_warning(
     arguments: tuple[str, ...], old: str, today: str
 ) -> None:
-    found = CliRunner().invoke(app, list(arguments), prog_name="dwell")
+    found = call(*arguments)
     assert f"warning: {old} is now {today or '--real-links'}; " in found.stderr
     assert "No such option" not in found.stderr
     # What the option was given is judged under its name of today.
@@ -86,12 +83,12 @@ def test_a_run_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
     problem = dwell.load(CANONICAL)
     seconds = str(4 * problem.window_cycles * problem.pipeline.period_ms / 1e3)
     words = ["run", str(CANONICAL), "--policy", "cusum+corrected", "--out", str(tmp_path / "run")]
-    done = CliRunner().invoke(app, [*words, "--seconds", seconds])
+    done = call(*words, "--seconds", seconds)
     assert done.exit_code == 0, done.output
     made = dwell.open_run(tmp_path / "run")
     assert made.meta["windows"] == 4
     assert (made.meta["estimator"], made.meta["policy"][:5]) == ("Corrected", "Cusum")
-    both = CliRunner().invoke(app, [*words, "--seconds", seconds, "--windows", "4"])
+    both = call(*words, "--seconds", seconds, "--windows", "4")
     assert (both.exit_code, "give one of them" in both.stderr) == (2, True)
 
 
@@ -106,11 +103,11 @@ def test_a_study_may_be_given_its_length_in_seconds(tmp_path: Path) -> None:
     )
     words = ["study", str(study), "--seeds", "1", "--processes", "1"]
     words += ["--out", str(tmp_path / "out")]
-    done = CliRunner().invoke(app, [*words, "--seconds", str(6.5 * window_s)])
+    done = call(*words, "--seconds", str(6.5 * window_s))
     assert done.exit_code == 0, done.output
     runs = pl.read_parquet(tmp_path / "out" / "runs.parquet")
     assert set(runs["windows"]) == {7 - problem.warmup_windows}
-    both = CliRunner().invoke(app, [*words, "--seconds", "20", "--windows", "4"])
+    both = call(*words, "--seconds", "20", "--windows", "4")
     assert (both.exit_code, "give one of them" in both.stderr) == (2, True)
 
 
@@ -118,13 +115,13 @@ def test_seconds_of_windows_that_differ_in_length_are_refused(tmp_path: Path) ->
     told = {"dwell-study": 1, "name": "s", "cell": str(CANONICAL), "policies": ["LOC"]}
     study = tmp_path / "study.yaml"
     study.write_text(yaml.safe_dump({**told, "parameters": {"window_cycles": [50, 100]}}))
-    refused = CliRunner().invoke(app, ["study", str(study), "--seconds", "20"])
+    refused = call("study", study, "--seconds", "20")
     assert refused.exit_code == 2
     assert "--seconds 20: windows last 1.66667, 3.33333 s here; give --windows" in refused.stderr
 
 
 def test_an_estimator_that_is_named_twice_is_refused(tmp_path: Path) -> None:
     words = ["run", str(CANONICAL), "--policy", "cusum+corrected", "--estimator", "shadow"]
-    refused = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "run")])
+    refused = call(*words, "--out", str(tmp_path / "run"))
     assert refused.exit_code == 2
     assert "'cusum+corrected' names its estimator" in refused.stderr

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import pty
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,15 +9,10 @@ from pathlib import Path
 import pytest
 
 import dwell
+from tests.cli.small_cell import CANONICAL, environment, interrupt_at_first_sign
 
-ROOT = Path(__file__).parents[2]
-CANONICAL = ROOT / "examples" / "canonical.yaml"
 # Not pydantic: Typer itself may read arguments with it.
 HEAVY = ("polars", "numba", "numpy", "matplotlib", "rich", "yaml", "zenoh")
-
-
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 
 
 def call(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -85,45 +77,6 @@ def test_a_mistake_is_told_without_a_traceback(
     assert words in result.stderr
     assert "Traceback" not in result.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def interrupt_at_first_sign(
-    arguments: list[str], folder: Path, *, sign: str = "simulating"
-) -> tuple[int, str, str]:
-    """Start a command with stderr on a terminal, and press Ctrl-C once it shows a sign.
-
-    Returns
-    -------
-    tuple
-        Exit code, what stdout had, and what the terminal had.
-    """
-    main_end, its_end = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dwell", *arguments],
-        cwd=folder,
-        env={**environment(), "TERM": "xterm"},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=its_end,
-        start_new_session=True,
-    )
-    os.close(its_end)
-    shown = b""
-    while sign.encode() not in shown:
-        shown += os.read(main_end, 1024)
-    # A terminal sends it to the whole group: worker processes as well.
-    os.killpg(process.pid, signal.SIGINT)
-    while True:
-        try:
-            data = os.read(main_end, 65536)
-        except OSError:  # its end is closed
-            break
-        if not data:
-            break
-        shown += data
-    stdout, _ = process.communicate(timeout=300)
-    os.close(main_end)
-    return process.returncode, stdout.decode(), shown.decode()
 
 
 def test_an_interrupted_run_leaves_nothing(tmp_path: Path) -> None:

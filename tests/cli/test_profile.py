@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import queue
 import signal
@@ -12,19 +11,17 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import dwell
 from dwell.calibration.profile_file import read_profile
 from dwell.calibration.round_trips import listen
-from dwell.cli.commands import app
 from dwell.estimators import Profile
-
-ROOT = Path(__file__).parents[2]
+from tests.cli.small_cell import ROOT, assert_refused, read_json
+from tests.cli.small_cell import call as call_dwell
 
 STAGES = """\
 import os
@@ -79,7 +76,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def call(*arguments: str | Path) -> Result:
     """Run `dwell profile`."""
-    return CliRunner().invoke(app, ["profile", *map(str, arguments)])
+    return call_dwell("profile", *arguments)
 
 
 def measure(node: str, *more: str | Path, runs: int = 40) -> Result:
@@ -107,19 +104,12 @@ def port() -> Iterator[int]:
     thread.join(timeout=10)
 
 
-def read_json(result: Result) -> Any:
-    assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
-
-
 def refused(result: Result, code: int, *words: str) -> None:
     """Assert that a command failed with an error of one line, and has written nothing."""
-    assert (result.exit_code, result.stdout) == (code, "")
+    assert_refused(result, *words, code=code)
     lines = [line for line in result.stderr.splitlines() if line != "printed by the stage"]
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: ")
-    for word in words:
-        assert word in lines[0]
     assert [path.name for path in Path().rglob("*.parquet")] == []
 
 
@@ -296,14 +286,10 @@ def test_files_that_cannot_be_merged(folder: Path) -> None:
     measure("R1")
     measure("E", runs=41)
     files = ("profiles/R1.parquet", "profiles/E.parquet")
-    result = call("merge", *files, "--out", "all.parquet")
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "profiles/R1.parquet 40, profiles/E.parquet 41" in result.stderr
-    result = call("merge", files[0], files[0], "--out", "all.parquet")
-    assert result.exit_code == 2
-    assert (
-        "perception@R1 is both in profiles/R1.parquet and in profiles/R1.parquet" in result.stderr
-    )
+    differing = call("merge", *files, "--out", "all.parquet")
+    assert_refused(differing, "profiles/R1.parquet 40, profiles/E.parquet 41")
+    twice = call("merge", files[0], files[0], "--out", "all.parquet")
+    assert_refused(twice, "perception@R1 is both in profiles/R1.parquet and in profiles/R1.parquet")
     assert not Path("all.parquet").exists()
 
 

@@ -6,20 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from typer.testing import CliRunner
-
 import dwell
-from dwell.cli.commands import app
 from tests.cells.small import make_problem
-from tests.cli.small_cell import call, read_json
+from tests.cli.small_cell import assert_refused, call, read_json
 
 RECOVERED = {"sealed": False, "opened": 2, "torn_bytes": 17, "damaged_bytes": 0}
-
-
-def report(*words: object) -> tuple[int, str, str]:
-    """Run the command; returns its exit code and what it printed."""
-    done = CliRunner().invoke(app, ["report", *map(str, words)])
-    return done.exit_code, done.stdout, done.stderr
 
 
 def kept(folder: Path, **meta: Any) -> Path:
@@ -32,31 +23,25 @@ def kept(folder: Path, **meta: Any) -> Path:
 
 
 def test_it_says_what_was_lost_of_a_run(tmp_path: Path) -> None:
-    folder = kept(tmp_path / "run", recovered=RECOVERED)
-    code, said, _ = report(folder, "--out", tmp_path / "page.html")
-    assert code == 0
-    assert "note: The controller was started 2 times while the run went on." in said
-    assert "note: 17 bytes at the journal's end were torn by a kill" in said
-    assert "note: The run was not closed" in said
-    code, said, _ = report(folder, "--out", tmp_path / "page.html", "--json")
-    told = json.loads(said)
-    assert told["recovered"] == RECOVERED
-    assert len(told["lost"]) == 3
+    folder, page = kept(tmp_path / "run", recovered=RECOVERED), tmp_path / "page.html"
+    result = call("report", folder, "--out", page)
+    assert result.exit_code == 0
+    for note in (
+        "note: The controller was started 2 times while the run went on.",
+        "note: 17 bytes at the journal's end were torn by a kill",
+        "note: The run was not closed",
+    ):
+        assert note in result.stdout
+    found = read_json(call("report", folder, "--out", page, "--json"))
+    assert found["recovered"] == RECOVERED
+    assert len(found["lost"]) == 3
 
 
 def test_of_a_run_that_is_whole_it_says_where_the_page_is(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    code, said, _ = report(kept(tmp_path / "run"), "--out", page, "--static")
-    assert (code, said) == (0, f"report: {page}\n")
+    result = call("report", kept(tmp_path / "run"), "--out", page, "--static")
+    assert (result.exit_code, result.stdout) == (0, f"report: {page}\n")
     assert page.read_text().startswith("<!DOCTYPE html>")
-
-
-def test_a_trace_wants_jobs(tmp_path: Path) -> None:
-    folder, trace = kept(tmp_path / "run"), tmp_path / "trace.json"
-    code, _, errors = report(folder, "--out", tmp_path / "page.html", "--trace", trace)
-    assert code == 2
-    assert "--jobs" in errors
-    assert not trace.exists()
 
 
 def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
@@ -72,9 +57,7 @@ def test_report_writes_the_page_and_the_trace(cell: Path) -> None:
 
 def test_report_of_what_is_not_there(cell: Path) -> None:
     call("run", cell, "--windows", "12", "--out", "kept")
-    without_jobs = call("report", "kept", "--trace", "t.json")
-    assert (without_jobs.exit_code, without_jobs.stdout) == (2, "")
-    assert "dwell run --jobs" in without_jobs.stderr
+    assert_refused(call("report", "kept", "--trace", "t.json"), "dwell run --jobs")
     assert {path.name for path in cell.parent.iterdir()} == {"small.yaml", "kept"}
     assert not Path("kept/report.html").exists()
     assert call("report", "nowhere").exit_code == 2

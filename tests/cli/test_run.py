@@ -9,12 +9,7 @@ import pytest
 import dwell
 from dwell.errors import RunError
 from dwell.record import Run
-from tests.cli.small_cell import SMALL, call, read_json
-
-# --------------------------------------------------------------------------------- general
-
-
-# ----------------------------------------------------------------------------------- check
+from tests.cli.small_cell import SMALL, assert_refused, call, read_json
 
 
 def test_cycles_on_their_way_when_a_run_ends_are_told_apart_from_lost_ones(cell: Path) -> None:
@@ -29,9 +24,6 @@ def test_cycles_on_their_way_when_a_run_ends_are_told_apart_from_lost_ones(cell:
     assert "unfinished at the end" in text
     assert "inf" not in text
     assert "unfinished" not in call("run", cell, "--policy", "OFF", "--out", "three").stdout
-
-
-# ------------------------------------------------------------------------------------- run
 
 
 def test_run_saves_and_sums_up(cell: Path) -> None:
@@ -87,9 +79,7 @@ def test_a_wrong_argument_changes_nothing(
     cell: Path, arguments: tuple[str, ...], words: tuple[str, ...]
 ) -> None:
     result = call("run", cell, *arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    for word in words:
-        assert word in result.stderr
+    assert_refused(result, *words)
     assert [path.name for path in cell.parent.iterdir()] == ["small.yaml"]
 
 
@@ -98,13 +88,11 @@ def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
     assert call(*words).exit_code == 0
     assert call(*words).exit_code == 0, "the same run again"
     other = call(*words, "--seed", "2")
-    assert (other.exit_code, other.stdout) == (2, "")
-    assert "kept holds another run" in other.stderr
+    assert_refused(other, "kept holds another run")
     assert dwell.open_run("kept").meta["seed"] == 1
     # So many windows can not be drawn: the folder is looked at before.
     more = call("run", cell, "--windows", str(1 << 32), "--out", "kept")
-    assert (more.exit_code, more.stdout) == (2, "")
-    assert "kept holds another run" in more.stderr
+    assert_refused(more, "kept holds another run")
     assert call(*words, "--seed", "2", "--force").exit_code == 0
     assert dwell.open_run("kept").meta["seed"] == 2
 
@@ -131,8 +119,7 @@ def test_a_folder_that_cannot_be_written_is_a_failure(
 
     monkeypatch.setattr(Run, "save", full)
     result = call("run", cell, "--windows", "2")
-    assert (result.exit_code, result.stdout) == (1, "")
-    assert "No space left" in result.stderr
+    assert_refused(result, "No space left", code=1)
 
 
 def test_names_that_are_no_file_names(cell: Path) -> None:
@@ -140,12 +127,3 @@ def test_names_that_are_no_file_names(cell: Path) -> None:
     assert read_json(call("run", cell, "--windows", "2", "--json"))["run"] == (
         "runs/.._a_b_c-baseline-dtp-1"
     )
-
-
-# ---------------------------------------------------------------------------------- report
-
-
-# ---------------------------------------------------------------------------------- schema
-
-
-# ------------------------------------------------------------------------------------ demo

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 from pathlib import Path
@@ -11,8 +10,7 @@ import polars as pl
 import pytest
 
 from dwell.report.formatting import shown_policy
-from tests.cli.small_cell import SMALL, call
-from tests.cli.test_process import interrupt_at_first_sign
+from tests.cli.small_cell import assert_refused, call, interrupt_at_first_sign, read_json
 
 STUDY = """\
 dwell-study: 1
@@ -28,11 +26,9 @@ parameters:
 
 
 @pytest.fixture
-def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a small study in a folder of its own, which is the current one."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.yaml").write_text(SMALL, encoding="utf-8")
-    path = tmp_path / "study.yaml"
+def study(cell: Path) -> Path:
+    """Return a small study beside the small cell."""
+    path = cell.with_name("study.yaml")
     path.write_text(STUDY, encoding="utf-8")
     return path
 
@@ -56,9 +52,7 @@ def test_a_study_prints_tables_and_keeps_them(study: Path) -> None:
 
 def test_a_study_as_json(study: Path) -> None:
     arguments = ("--seeds", "1", "--windows", "10", "--out", "out", "--processes", "1")
-    result = call("study", study, *arguments, "--json")
-    assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
+    found = read_json(call("study", study, *arguments, "--json"))
     assert (found["study"], found["folder"], found["runs"]) == ("a small one", "out", 16)
     assert len(found["table"]) == 16
     row = found["table"][0]
@@ -84,9 +78,7 @@ def test_a_folder_of_another_study_is_refused(study: Path) -> None:
     arguments = ("--windows", "5", "--processes", "1", "--out", "out")
     assert call("study", study, "--seeds", "1", *arguments).exit_code == 0
     result = call("study", study, "--seeds", "2", *arguments)
-    assert result.exit_code == 2
-    assert result.stderr.startswith("error: out holds another study")
-    assert "seeds: 1 there, 1, 2 now" in result.stderr
+    assert_refused(result, "error: out holds another study", "seeds: 1 there, 1, 2 now")
 
 
 def test_a_folder_that_cannot_be_written_fails(study: Path) -> None:
@@ -98,8 +90,7 @@ def test_a_folder_that_cannot_be_written_fails(study: Path) -> None:
 def test_a_cluster_that_is_not_there_fails(study: Path) -> None:
     pytest.importorskip("distributed")
     result = call("study", study, "--dask", "nowhere")
-    assert result.exit_code == 1
-    assert result.stderr.startswith("error: no Dask scheduler answers at 'nowhere'")
+    assert_refused(result, "error: no Dask scheduler answers at 'nowhere'", code=1)
 
 
 def test_without_the_package_a_cluster_is_out_of_reach(
@@ -107,8 +98,7 @@ def test_without_the_package_a_cluster_is_out_of_reach(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     result = call("study", study, "--dask", "tcp://127.0.0.1:8786")
-    assert result.exit_code == 1
-    assert "pip install 'dwell-placement[dask]'" in result.stderr
+    assert_refused(result, "pip install 'dwell-placement[dask]'", code=1)
 
 
 def test_many_points_do_not_fill_the_screen(study: Path) -> None:
@@ -133,3 +123,16 @@ def test_an_interrupted_study_says_how_to_go_on(study: Path) -> None:
     finished = 4 * len(list(Path("out/parts").iterdir()))
     assert finished - int(said) in (0, 4)
     assert not list(Path("out").rglob(".*"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["paper"],
+        ["paper", "--quick"],
+        ["paper", "--chapter", "table", "--examples", "examples"],
+        ["my-study.yaml", "--quick"],
+    ],
+)
+def test_the_old_command_for_the_paper_names_the_new_one(words: list[str]) -> None:
+    assert_refused(call("study", *words), "make paper")

@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -55,6 +56,25 @@ def wait_for(event: Callable[[], object], what: str) -> None:
     while not event():
         assert time.monotonic() < until, f"waited in vain for {what}"
         time.sleep(0.1)
+
+
+@contextmanager
+def running(cell: Path, out: Path, name: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a long run, and wait until its stamper is there."""
+    errors = out.with_suffix(".errors")
+    with errors.open("wb") as file:
+        process = subprocess.Popen(
+            command("run", cell, "--seconds", 600, "--out", out, "--name", name), stderr=file
+        )
+    try:
+        stamper = out / "R1" / "stamper@R1.pid"
+        wait_for(lambda: stamper.exists() or process.poll() is not None, "the stamper")
+        assert process.poll() is None, errors.read_text()
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+    assert "Traceback" not in errors.read_text()
 
 
 # ------------------------------------------------------------------------------- refusals
@@ -166,25 +186,12 @@ def test_a_run_plays_its_scenario_opens_and_leaves_nothing(tmp_path: Path) -> No
 @MACHINE
 def test_killed_it_is_cleared_away_by_the_next_of_its_name(tmp_path: Path) -> None:
     name, cell = own_name(), write_cell(tmp_path)
-    with (tmp_path / "said").open("wb") as said:
-        first = subprocess.Popen(
-            command("run", cell, "--seconds", 600, "--out", tmp_path / "first", "--name", name),
-            stderr=said,
-        )
-    try:
-        stamper = tmp_path / "first" / "R1" / "stamper@R1.pid"
-        wait_for(lambda: stamper.exists() or first.poll() is not None, "the first one's stamper")
-        assert first.poll() is None, (tmp_path / "said").read_text()
+    with running(cell, tmp_path / "first", name) as first:
         # While it lives the name is its own.
         refused = dwell_testbed("run", cell, "--out", tmp_path / "other", "--name", name)
         assert refused.returncode == 1
         assert "runs already" in refused.stderr
         of_it = psutil.Process(first.pid).children(recursive=True)
-        first.kill()
-        first.wait()
-    finally:
-        first.kill()
-        first.wait()
     options = ("--seconds", "5", "--name", name, "--json")
     done = dwell_testbed("run", cell, "--out", tmp_path / "second", *options)
     assert done.returncode in (0, 1), done.stderr
@@ -198,20 +205,9 @@ def test_killed_it_is_cleared_away_by_the_next_of_its_name(tmp_path: Path) -> No
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_it_takes_everything_down(number: signal.Signals, tmp_path: Path) -> None:
     name, cell = own_name(), write_cell(tmp_path)
-    with (tmp_path / "said").open("wb") as said:
-        one = subprocess.Popen(
-            command("run", cell, "--seconds", 600, "--out", tmp_path / "out", "--name", name),
-            stderr=said,
-        )
-    try:
-        mark = tmp_path / "out" / "R1" / "stamper@R1.pid"
-        wait_for(lambda: mark.exists() or one.poll() is not None, "the stamper")
-        of_it = psutil.Process(one.pid).children(recursive=True)
-        one.send_signal(number)
-        assert one.wait(PATIENCE_S) == 130
-    finally:
-        one.kill()
-        one.wait()
+    with running(cell, tmp_path / "out", name) as process:
+        of_it = psutil.Process(process.pid).children(recursive=True)
+        process.send_signal(number)
+        assert process.wait(PATIENCE_S) == 130
     assert left(name) == []
     assert not [process for process in of_it if process.is_running()]
-    assert "Traceback" not in (tmp_path / "said").read_text()

@@ -9,21 +9,18 @@ from pathlib import Path
 import pytest
 
 import dwell
-from tests.cli.small_cell import SMALL, call, read_json
+from tests.cli.small_cell import call, read_json
 
 CALIBRATED = "small.yaml"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder with a cell and two of its runs, which is the current one."""
-    monkeypatch.chdir(tmp_path)
-    cell = tmp_path / CALIBRATED
-    cell.write_text(SMALL, encoding="utf-8")
+def folder(cell: Path) -> Path:
+    """Return the current folder, which has a cell and two of its runs."""
     problem = dwell.load(cell)
     for policy in ("LOC", "OFF"):
-        dwell.simulate(problem, policy=policy, seed=9, windows=40).save(tmp_path / policy)
-    return tmp_path
+        dwell.simulate(problem, policy=policy, seed=9, windows=40).save(policy)
+    return cell.parent
 
 
 def test_page_table_and_text(folder: Path) -> None:

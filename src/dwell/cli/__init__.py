@@ -22,9 +22,9 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     Parameters
     ----------
     arguments : sequence of str, optional
-        Those of the process where None.
+        Words after ``dwell``; those of this process if not given.
     platform : Platform, optional
-        Clock and transport of an agent or a controller; without faults if left out.
+        Clock and transport of an agent or a controller; without faults if not given.
     """
     # Pydantic would look for plugins in all that is installed; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")

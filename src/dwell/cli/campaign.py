@@ -20,7 +20,7 @@ from dwell.cli.options import (
     Windows,
     seconds_of_runs,
 )
-from dwell.cli.output import file_name, print_json, working, write_report
+from dwell.cli.output import file_name, print_json, say, working, write_report
 
 if TYPE_CHECKING:
     from dwell.model import Problem
@@ -135,7 +135,7 @@ def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float
                 play,
                 name=name,
                 minutes=minutes,
-                tell=partial(typer.echo, err=True),
+                tell=say,
             )
     except KeyboardInterrupt:
         done = len(list(folder.glob("runs/*/run.json")))
@@ -155,14 +155,7 @@ def report_campaign(
     static: bool = False,
     as_json: bool,
 ) -> None:
-    """Write the report of a campaign, finished or not, and print what it comes to.
-
-    Parameters
-    ----------
-    figures : Path, optional
-        Folder for its figures and tables as files.
-    static : bool
-        Whether the page is without scripts.
+    """Write the report of a campaign, finished or not (see `write_report`), and print its results.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import typer
 
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import Json, Seed
-from dwell.cli.output import json_text, print_json, write_file
+from dwell.cli.output import json_text, print_json, say, write_file
 
 #: A folder with this file is a campaign's, and may be replaced by the next.
 MARK = ".dwell-chaos"
@@ -58,7 +58,7 @@ def chaos(
     campaign = FaultCampaign(
         Staging(cell, folder, seed, hosts=hosts),
         f"dwell testbed chaos{what} --seed {seed}",
-        lambda line: typer.echo(line, err=True),
+        say,
     )
     until_s = None if minutes is None else time.monotonic() + 60 * minutes
     result = campaign.result

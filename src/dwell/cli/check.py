@@ -57,8 +57,8 @@ def check(
     profile = Profile(problem)
     warnings = tuple(_warnings(problem, profile))
     if as_json:
-        found = [_fault(warning) for warning in warnings]
-        print_json({"valid": True, **_contents(problem, profile), "warnings": found})
+        rows = [_fault(warning) for warning in warnings]
+        print_json({"valid": True, **_contents(problem, profile), "warnings": rows})
     else:
         typer.echo(_summary(problem, profile))
         for warning in warnings:

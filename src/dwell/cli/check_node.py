@@ -49,10 +49,10 @@ def check_node(
     if security is not None:
         warnings += [line.removeprefix("warning: ") for line in security.warnings()]
     if as_json:
-        found = [{"path": fault.path, "message": fault.message} for fault in faults]
+        rows = [{"path": fault.path, "message": fault.message} for fault in faults]
         processes = [] if wiring is None else [role.who for role in wiring.on(node)]
-        told = {"node": node, "ready": not faults, "faults": found, "processes": processes}
-        print_json({**told, "warnings": warnings})
+        head = {"node": node, "ready": not faults, "faults": rows, "processes": processes}
+        print_json({**head, "warnings": warnings})
         return not faults
     for fault in faults:
         typer.echo(f"{cell}: node {node}: {fault}", err=True)
@@ -88,7 +88,7 @@ def _wiring(problem: Problem) -> tuple[Wiring | None, list[Fault]]:
     except LiveError as error:
         parts = (line.partition(": ") for line in str(error).splitlines())
         return None, [
-            Fault(path, told) if told else Fault("live.hosts", path) for path, _, told in parts
+            Fault(path, text) if text else Fault("live.hosts", path) for path, _, text in parts
         ]
 
 
@@ -172,9 +172,9 @@ def _summary(problem: Problem, wiring: Wiring, node: str) -> str:
 
 def _others(wiring: Wiring, role: Role, node_of: dict[str, str], *, incoming: bool) -> str:
     """Return the other nodes that a process is reached from, or connects to."""
-    found = {
-        node_of[one.source if incoming else one.target]
-        for one in wiring.wires
-        if role.who == (one.target if incoming else one.source)
+    nodes = {
+        node_of[link.source if incoming else link.target]
+        for link in wiring.wires
+        if role.who == (link.target if incoming else link.source)
     }
-    return ", ".join(sorted(found - {role.node})) or "-"
+    return ", ".join(sorted(nodes - {role.node})) or "-"

@@ -7,7 +7,7 @@ line, each with a tab and its help, or `FILES` alone where the shell completes p
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -123,14 +123,14 @@ def answer(line: str) -> None:
 
 @dataclass(slots=True)
 class _Line:
-    """What a line has said when its last word begins.
+    """The words of a line before its last.
 
     Parameters
     ----------
     command : click.Command
         The innermost that is named.
     given : dict of str to list of str
-        Values by the parameter that they are of.
+        Values by the name of their parameter.
     waiting : click.Option, optional
         The option whose value comes next.
     """
@@ -152,16 +152,14 @@ class _Line:
             option = self.option(name)
             if option is None:
                 return False
-            if equals:
+            if equals or option.is_flag:
                 self.give(option, value)
-            elif option.is_flag:
-                self.give(option, "")
             else:
                 self.waiting = option
-        elif (inner := self.commands()) is not None:
-            if word not in inner:
+        elif (commands := self.commands()) is not None:
+            if word not in commands:
                 return False
-            self.command = inner[word]
+            self.command = commands[word]
         elif (argument := self.argument()) is not None:
             self.give(argument, word)
         return True
@@ -169,20 +167,36 @@ class _Line:
     def give(self, parameter: Any, value: str) -> None:
         self.given.setdefault(parameter.name, []).append(value)
 
+    def parameters(self, kind: str) -> list[Any]:
+        return [known for known in self.command.params if known.param_type_name == kind]
+
     def option(self, name: str) -> Any:
-        return next((one for one in self.options() if name in one.opts), None)
-
-    def options(self) -> list[Any]:
-        return [one for one in self.command.params if one.param_type_name == "option"]
-
-    def commands(self) -> Mapping[str, Any] | None:
-        found: Mapping[str, Any] | None = getattr(self.command, "commands", None)
-        return found
+        return next((known for known in self.parameters("option") if name in known.opts), None)
 
     def argument(self) -> Any:
         """Return the argument whose turn it is."""
-        arguments = [one for one in self.command.params if one.param_type_name == "argument"]
+        arguments = self.parameters("argument")
         return next((a for a in arguments if a.nargs == -1 or a.name not in self.given), None)
+
+    def commands(self) -> Mapping[str, Any] | None:
+        commands: Mapping[str, Any] | None = getattr(self.command, "commands", None)
+        return commands
+
+    def cell(self) -> Mapping[str, Any]:
+        """Return the content of the cell file that the line names, if it can be read."""
+        from dwell.cellfile.document_faults import Faults
+        from dwell.cellfile.yaml_text import read_yaml
+
+        for path in self.given.get("cell", ()):
+            content = read_yaml(str(Path(path).expanduser()), Faults())
+            if isinstance(content, dict):
+                return content
+        return {}
+
+    def keys(self, section: str) -> list[str]:
+        """Return the keys of a section of the cell file."""
+        keys = self.cell().get(section)
+        return [key for key in keys if isinstance(key, str)] if isinstance(keys, dict) else []
 
 
 def completions(root: Any, text: str) -> list[tuple[str, str]]:
@@ -205,12 +219,12 @@ def completions(root: Any, text: str) -> list[tuple[str, str]]:
         name, equals, begun = last.partition("=")
         option = line.option(name)
         if equals and option is not None and not option.is_flag:
-            told = _values(line, option, begun)
-            return [(f"{name}={value}", about) for value, about in told if value != FILES]
+            values = _values(line, option, begun)
+            return [(f"{name}={value}", about) for value, about in values if value != FILES]
         return _beginning(last, _option_names(line))
-    if (inner := line.commands()) is not None:
-        visible = [(name, one) for name, one in inner.items() if not one.hidden]
-        return _beginning(last, [(name, one.get_short_help_str(70)) for name, one in visible])
+    if (commands := line.commands()) is not None:
+        visible = [(name, known) for name, known in commands.items() if not known.hidden]
+        return _beginning(last, [(name, known.get_short_help_str(70)) for name, known in visible])
     argument = line.argument()
     return [] if argument is None else _values(line, argument, last)
 
@@ -227,14 +241,15 @@ def _words(text: str) -> list[str]:
     return [*words, ""] if not quote and text[-1:].isspace() else words
 
 
-def _beginning(begun: str, offers: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+def _beginning(begun: str, offers: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     return [(value, " ".join(about.split())) for value, about in offers if value.startswith(begun)]
 
 
 def _option_names(line: _Line) -> list[tuple[str, str]]:
-    free = [one for one in line.options() if one.multiple or one.name not in line.given]
-    told = [(one.opts[0], one.help or "") for one in free if not one.hidden]
-    return [*told, ("--help", "Show this message and exit.")]
+    visible = [known for known in line.parameters("option") if not known.hidden]
+    free = [known for known in visible if known.multiple or known.name not in line.given]
+    names = [(known.opts[0], known.help or "") for known in free]
+    return [*names, ("--help", "Show this message and exit.")]
 
 
 # ------------------------------------------------------------------------- values
@@ -249,38 +264,16 @@ def _values(line: _Line, parameter: Any, begun: str) -> list[tuple[str, str]]:
         return [(FILES, "")]
     for name in (f"{line.command.name} {parameter.name}", parameter.name):
         if name in OFFERS:
-            return _beginning(begun, [(one, "") for one in OFFERS[name](line, begun)])
+            return _beginning(begun, [(value, "") for value in OFFERS[name](line, begun)])
     return [(FILES, "")] if is_path else []
 
 
-def _cell(line: _Line) -> Mapping[str, Any]:
-    """Return what the cell file that a line names says, as far as it can be read."""
-    from dwell.cellfile.document_faults import Faults
-    from dwell.cellfile.yaml_text import read_yaml
-
-    for path in line.given.get("cell", ()):
-        read = read_yaml(str(Path(path).expanduser()), Faults())
-        if isinstance(read, dict):
-            return read
-    return {}
-
-
-def _keys(line: _Line, section: str) -> list[str]:
-    found = _cell(line).get(section)
-    return [key for key in found if isinstance(key, str)] if isinstance(found, dict) else []
+#: Makes the values that are offered for a word, by the line before it and how it begins.
+Offer = Callable[[_Line, str], Iterable[str]]
 
 
 def _scenarios(line: _Line, begun: str) -> list[str]:
-    cell = _cell(line)
-    return list(dict.fromkeys(["baseline", *_keys(line, "scenarios")])) if cell else []
-
-
-def _candidates(line: _Line, begun: str) -> list[str]:
-    return _keys(line, "candidates")
-
-
-def _nodes(line: _Line, begun: str) -> list[str]:
-    return _keys(line, "nodes")
+    return list(dict.fromkeys(["baseline", *line.keys("scenarios")])) if line.cell() else []
 
 
 def _estimators(line: _Line, begun: str) -> Sequence[str]:
@@ -295,54 +288,57 @@ def _policies(line: _Line, begun: str) -> list[str]:
 
     policy, plus, _ = begun.partition("+")
     if plus:
-        return [f"{policy}+{one}" for one in _estimators(line, "")]
-    return [*names(), *_candidates(line, begun)]
+        return [f"{policy}+{estimator}" for estimator in _estimators(line, "")]
+    return [*names(), *line.keys("candidates")]
 
 
-def _several(offer: Callable[[_Line, str], Sequence[str]]) -> Callable[[_Line, str], list[str]]:
+def _several(offer: Offer) -> Offer:
     """Offer the last of several names with commas."""
 
     def offered(line: _Line, begun: str) -> list[str]:
         head, comma, last = begun.rpartition(",")
-        return [f"{head}{comma}{one}" for one in offer(line, last)]
+        return [f"{head}{comma}{value}" for value in offer(line, last)]
 
     return offered
 
 
-def _paths(begun: str, wanted: Callable[[Path], bool]) -> Iterator[str]:
-    """Yield the wanted paths that begin so, and the folders on the way to others."""
-    folder, slash, name = begun.rpartition("/")
-    with suppress(OSError):
-        for entry in sorted(Path(f"{folder}{slash}" or ".").expanduser().iterdir()):
-            if not entry.name.startswith(name) or entry.name.startswith(".") > name.startswith("."):
-                continue
-            if wanted(entry):
-                yield f"{folder}{slash}{entry.name}"
-            elif entry.is_dir():
-                yield f"{folder}{slash}{entry.name}/"
+def _paths(wanted: Callable[[Path], bool]) -> Offer:
+    """Offer the wanted paths, and the folders on the way to others."""
+
+    def offered(_: _Line, begun: str) -> Iterator[str]:
+        folder, slash, name = begun.rpartition("/")
+        with suppress(OSError):
+            for entry in sorted(Path(f"{folder}{slash}" or ".").expanduser().iterdir()):
+                shown = name.startswith(".") or not entry.name.startswith(".")
+                if not entry.name.startswith(name) or not shown:
+                    continue
+                if wanted(entry):
+                    yield f"{folder}{slash}{entry.name}"
+                elif entry.is_dir():
+                    yield f"{folder}{slash}{entry.name}/"
+
+    return offered
 
 
-def _files_with(key: str) -> Callable[[_Line, str], list[str]]:
+def _files_with(key: str) -> Offer:
     """Offer YAML files that begin with a key."""
 
-    def is_one(path: Path) -> bool:
+    def wanted(path: Path) -> bool:
         if path.suffix not in (".yaml", ".yml") or not path.is_file():
             return False
         with suppress(OSError), path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-            return any(one.startswith(key.encode()) for one in head.splitlines())
+            lines = file.read(HEAD_BYTES).splitlines()
+            return any(line.startswith(key.encode()) for line in lines)
         return False
 
-    return lambda _, begun: list(_paths(begun, is_one))
+    return _paths(wanted)
 
 
-def _results(line: _Line, begun: str) -> list[str]:
-    """Offer folders of runs, studies and campaigns."""
-    return list(_paths(begun, lambda path: any((path / name).is_file() for name in RESULTS)))
+#: Folders of runs, studies and campaigns.
+_results = _paths(lambda path: any((path / name).is_file() for name in RESULTS))
 
-
-#: What makes the offers for a parameter, by its name, or by its command's and its own.
-OFFERS: Mapping[str, Callable[[_Line, str], Sequence[str]]] = {
+#: The offers for a parameter, by its name, or by its command's and its own.
+OFFERS: Mapping[str, Offer] = {
     "cell": _files_with("dwell:"),
     "cells": _files_with("dwell:"),
     "study file": _files_with("dwell-study:"),
@@ -354,8 +350,8 @@ OFFERS: Mapping[str, Callable[[_Line, str], Sequence[str]]] = {
     "policy": _policies,
     "policies": _several(_policies),
     "estimator": _estimators,
-    "candidate": _candidates,
-    "node": _nodes,
+    "candidate": lambda line, _: line.keys("candidates"),
+    "node": lambda line, _: line.keys("nodes"),
     "new origin": lambda *_: ("canonical", "live"),
     "shell": lambda *_: tuple(Shell),
 }

@@ -66,8 +66,7 @@ def consult(
     """
     counters = MachineCounters(os.sched_getaffinity(0))
     extras = [_extra(name) for name in EXTRAS]
-    problems = [] if problem is None else [problem]
-    testbed = testbed_doctor.examine(problems)
+    testbed = testbed_doctor.examine([] if problem is None else [problem])
     parts = {
         "extras": extras,
         "cache": list(_cache(clear=clear_cache)),
@@ -75,25 +74,25 @@ def consult(
         "clocks": [_synchronised(), _clock_source()],
         "ports": [_ports(problem)],
         "certificates": list(_certificates(keys, problem)),
-        "testbed": [replace(one, needed=False) for one in testbed],
+        "testbed": [_optional(row.name, row.ok, row.found, row.remedy) for row in testbed],
         "runs here": list(_runs(extras, testbed)),
     }
-    parts = {part: [_well_needs_nothing(one) for one in rows] for part, rows in parts.items()}
-    broken = [one for rows in parts.values() for one in rows if one.needed and not one.ok]
+    well = all(row.ok or not row.needed for rows in parts.values() for row in rows)
     if as_json:
-        rows = [{"part": part, **asdict(one)} for part, found in parts.items() for one in found]
-        print_json({"ok": not broken, "version": dwell.__version__, "findings": rows})
-        return not broken
+        findings = [{"part": part, **asdict(row)} for part, rows in parts.items() for row in rows]
+        print_json({"ok": well, "version": dwell.__version__, "findings": findings})
+        return well
     system = f"{platform.system()} {platform.release()} ({platform.machine()})"
     typer.echo(f"dwell {dwell.__version__}, Python {platform.python_version()}, {system}")
-    for part, found in parts.items():
+    for part, rows in parts.items():
         typer.echo(f"\n{part}")
-        print_findings(found, broken="BROKEN", lacking="note")
-    return not broken
+        print_findings(rows, broken="BROKEN", lacking="note")
+    return well
 
 
-def _well_needs_nothing(one: Finding) -> Finding:
-    return replace(one, remedy="") if one.ok else one
+def _optional(name: str, ok: bool, found: str, remedy: str = "") -> Finding:
+    """Return a finding on what Dwell can do without; its remedy is there where it is not well."""
+    return Finding(name, ok, found, "" if ok else remedy, needed=False)
 
 
 def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) -> None:
@@ -105,10 +104,10 @@ def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) ->
         Marks of what is needed and not well, and of what is not well and not needed.
     """
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
-    for one in findings:
-        mark = "ok" if one.ok else broken if one.needed else lacking
-        lines = [f"{mark:8} {one.name}: {one.found}"]
-        lines += [f"{'':8} {one.remedy}"] * bool(not one.ok and one.remedy)
+    for finding in findings:
+        mark = "ok" if finding.ok else broken if finding.needed else lacking
+        lines = [f"{mark:8} {finding.name}: {finding.found}"]
+        lines += [f"{'':8} {finding.remedy}"] * bool(not finding.ok and finding.remedy)
         for line in lines:
             indent = " " * 9
             typer.echo(
@@ -123,7 +122,7 @@ def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) ->
 def _modules() -> dict[str, str]:
     """Return the module of every optional package, by the package; looks at all installed ones."""
     packages = packages_distributions()
-    return {package: one for one in OPTIONAL for package in packages.get(one, ())}
+    return {package: module for module in OPTIONAL for package in packages.get(module, ())}
 
 
 def _extra(name: str) -> Finding:
@@ -132,7 +131,7 @@ def _extra(name: str) -> Finding:
         lines = requires(DISTRIBUTION) or []
     except PackageNotFoundError:
         found = f"{DISTRIBUTION} itself is not installed, only its sources are there"
-        return Finding(name, False, found, installing(name), needed=False)
+        return _optional(name, False, found, installing(name))
     modules = _modules()
     wanted = [
         re.split(r"[^\w.-]", line)[0]
@@ -148,14 +147,14 @@ def _extra(name: str) -> Finding:
         except PackageNotFoundError:
             missing.append(package)
         except Exception as error:
-            told = (str(error).strip() or type(error).__name__).splitlines()[0]
-            failed.append(f"{package} cannot be imported: {told}")
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            failed.append(f"{package} cannot be imported: {reason}")
     if failed:
         again = installing(name).replace("install", "install --force-reinstall")
         return Finding(name, False, "; ".join(failed), again)
     if missing:
         found = f"not installed: {', '.join(missing)}"
-        return Finding(name, False, found, installing(name), needed=False)
+        return _optional(name, False, found, installing(name))
     return Finding(name, True, ", ".join(there))
 
 
@@ -172,7 +171,7 @@ def _cache(*, clear: bool) -> Iterator[Finding]:
     if kernels.folder is None:
         remedy = "export NUMBA_CACHE_DIR=FOLDER, one that you may write to"
         found = "no folder can keep it: every command compiles for itself"
-        yield Finding(name, False, found, remedy, needed=False)
+        yield _optional(name, False, found, remedy)
         return
     stamp = kernels.suffix.partition(".")[0]
     files = [file for pattern in CACHED for file in kernels.folder.glob(pattern)]
@@ -188,7 +187,7 @@ def _cache(*, clear: bool) -> Iterator[Finding]:
         except OSError as error:
             found = f"{error.filename}: {error.strerror}"
             remedy = f"rm {kernels.folder}/*.nb[ci]"
-            yield Finding("compiled before", False, found, remedy, needed=False)
+            yield _optional("compiled before", False, found, remedy)
     if kernels.cached:
         kept = _bytes(file for file in files if file.exists())
         yield Finding(name, True, f"of this version, {kept / 1e6:.1f} MB in {kernels.folder}")
@@ -215,35 +214,35 @@ def _cpu(counters: MachineCounters) -> Iterator[Finding]:
     quota = _quota()
     found = "none on this process" if quota is None else f"this process gets {quota:g} CPU at most"
     remedy = "start it in a control group without (docker --cpus, systemd CPUQuota=)"
-    yield Finding("quota", quota is None, found, remedy, needed=False)
+    yield _optional("quota", quota is None, found, remedy)
     governor = seen.governor or "not told, as in virtual machines"
     well = seen.governor in (None, "performance")
     remedy = "cpupower frequency-set --governor performance"
-    yield Finding("governor", well, governor, remedy, needed=False)
+    yield _optional("governor", well, governor, remedy)
     if seen.steal is not None:
         found = f"{seen.steal:.1%} of the time of these CPUs goes to other virtual machines"
         well = seen.steal <= Rule().stolen_most
-        yield Finding("steal", well, found, "a machine that is not shared", needed=False)
+        yield _optional("steal", well, found, "a machine that is not shared")
     well = seen.load < seen.cpus
     found = f"{seen.load:.1f} threads wanted a CPU in the last minute; there are {seen.cpus}"
-    yield Finding("load", well, found, "measure when nothing else runs", needed=False)
+    yield _optional("load", well, found, "measure when nothing else runs")
 
 
 def _quota() -> float | None:
     """Return the CPUs that the quotas of this process's group and those around it leave it."""
     try:
         groups = find_cgroups()
-        told = Path("/proc/self/cgroup").read_text(encoding="utf-8")
+        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except (LiveError, OSError):
         return None
     top = groups.folders["cpu"]
     quotas = []
-    for line in told.splitlines():
+    for line in lines:
         _, controllers, path = line.split(":", 2)
         if controllers.split(",").count("cpu" if groups.version == 1 else ""):
             folder = top / path.lstrip("/")
-            around = (one for one in (folder, *folder.parents) if one.is_relative_to(top))
-            quotas += [_limit(one) for one in around]
+            around = (group for group in (folder, *folder.parents) if group.is_relative_to(top))
+            quotas += [_limit(group) for group in around]
     return min((quota for quota in quotas if quota is not None), default=None)
 
 
@@ -275,17 +274,17 @@ class _Timex(ctypes.Structure):
 def _synchronised() -> Finding:
     """Ask the kernel whether something keeps its clock right; nothing is set."""
     name, unsynchronised = "synchronised", 0x40
-    told = _Timex()
+    state = _Timex()
     try:
-        failed = ctypes.CDLL(None).adjtimex(ctypes.byref(told)) < 0
+        failed = ctypes.CDLL(None).adjtimex(ctypes.byref(state)) < 0
     except (AttributeError, OSError):
         failed = True
     if failed:
         return Finding(name, True, "not told by this system")
-    if not told.status & unsynchronised:
-        return Finding(name, True, f"to within {told.maxerror / 1e3:.1f} ms, says the kernel")
+    if not state.status & unsynchronised:
+        return Finding(name, True, f"to within {state.maxerror / 1e3:.1f} ms, says the kernel")
     found = "no; a cell with `clock: system` on several computers needs it, others do not"
-    return Finding(name, False, found, "apt-get install chrony", needed=False)
+    return _optional(name, False, found, "apt-get install chrony")
 
 
 def _clock_source() -> Finding:
@@ -295,7 +294,7 @@ def _clock_source() -> Finding:
         source = file.read_text(encoding="utf-8").strip()
     found = f"{source}, {time.get_clock_info('monotonic').resolution * 1e9:.0f} ns"
     well = source not in SLOW_CLOCKS
-    return Finding("resolution", well, found, "boot with clocksource=tsc", needed=False)
+    return _optional("resolution", well, found, "boot with clocksource=tsc")
 
 
 # ------------------------------------------------------------------------- ports and keys
@@ -319,7 +318,7 @@ def _ports(problem: Problem | None) -> Finding:
         ports.setdefault(owners.get(inode, "another user's process"), []).append(str(port))
     whom = "; ".join(f"{', '.join(some)} by {owner}" for owner, some in ports.items())
     remedy = "end it, or give the nodes in live.hosts other ports"
-    return Finding("TCP", False, f"of {span} are taken: {whom}", remedy, needed=False)
+    return _optional("TCP", False, f"of {span} are taken: {whom}", remedy)
 
 
 def _ports_here(problem: Problem | None) -> set[int]:
@@ -330,39 +329,39 @@ def _ports_here(problem: Problem | None) -> set[int]:
         from dwell.live.wiring import PORTS_PER_ROLE, wire
     except ImportError:
         return {host.port for host in problem.live.hosts.values() if _is_here(host.address)}
-    found: set[int] = set()
+    ports: set[int] = set()
     wiring = wire(problem)
     for node, host in problem.live.hosts.items():
         if _is_here(host.address):
             count = PORTS_PER_ROLE * len(list(wiring.on(node)))
-            found.update(range(host.port, host.port + count))
-    return found
+            ports.update(range(host.port, host.port + count))
+    return ports
 
 
 def _is_here(address: str) -> bool:
     with suppress(OSError):
         kind, *_, place = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(kind) as one:
-            one.bind(place)
+        with socket.socket(kind) as probe:
+            probe.bind(place)
             return True
     return False
 
 
 def _listening() -> dict[int, str]:
     """Return the ports that somebody listens on, with the inode of the socket (proc_net(5))."""
-    found = {}
+    inodes = {}
     for file in ("/proc/net/tcp", "/proc/net/tcp6"):
         with suppress(OSError):
             for line in Path(file).read_text(encoding="utf-8").splitlines()[1:]:
                 words = line.split()
                 if words[3] == LISTENS:
-                    found[int(words[1].rpartition(":")[2], 16)] = words[9]
-    return found
+                    inodes[int(words[1].rpartition(":")[2], 16)] = words[9]
+    return inodes
 
 
 def _owners(inodes: set[str]) -> dict[str, str]:
     """Return the process that has each socket, as far as this user may see it."""
-    found = {}
+    owners = {}
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
@@ -371,8 +370,8 @@ def _owners(inodes: set[str]) -> dict[str, str]:
                     inode = os.readlink(file).removeprefix("socket:[").removesuffix("]")
                     if inode in inodes:
                         line = " ".join([Path(words[0]).name, *words[1:]]).strip()
-                        found[inode] = f"{textwrap.shorten(line, 60)} (process {process.name})"
-    return found
+                        owners[inode] = f"{textwrap.shorten(line, 60)} (process {process.name})"
+    return owners
 
 
 def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Finding]:
@@ -387,7 +386,7 @@ def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Findin
         found = f"{keys} cannot be read without cryptography"
         yield Finding(name, False, found, installing("live"))
         return
-    folders = [one.parent for one in sorted(keys.glob("*/cert.pem"))] or [keys]
+    folders = [file.parent for file in sorted(keys.glob("*/cert.pem"))] or [keys]
     cell = None if problem is None else problem.name
     for folder in folders:
         try:
@@ -397,7 +396,7 @@ def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Findin
             continue
         found = f"{keyring.own.common_name} in {folder} holds until {keyring.expires:%Y-%m-%d}"
         warning = keyring.warning()
-        yield Finding(name, not warning, warning or found, "dwell keys issue", needed=False)
+        yield _optional(name, not warning, warning or found, "dwell keys issue")
 
 
 # ------------------------------------------------------------------------- what runs here
@@ -405,14 +404,14 @@ def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Findin
 
 def _runs(extras: Sequence[Finding], testbed: Sequence[Finding]) -> Iterator[Finding]:
     """Yield what works on this computer, by what was found before."""
-    named = {one.name: replace(one, name=f"the extra {one.name}") for one in extras}
+    named = {extra.name: replace(extra, name=f"the extra {extra.name}") for extra in extras}
     needs = {
-        **{EXTRAS[name]: [one] for name, one in named.items()},
-        "dwell testbed": [named["live"], *(one for one in testbed if one.needed)],
+        **{EXTRAS[name]: [extra] for name, extra in named.items()},
+        "dwell testbed": [named["live"], *(part for part in testbed if part.needed)],
     }
-    for commands, found in needs.items():
-        lacking = [one for one in found if not one.ok]
-        remedies = dict.fromkeys(one.remedy for one in lacking if one.remedy)
-        names = ", ".join(one.name for one in lacking)
-        said = f"not without {names}" if lacking else "yes"
-        yield Finding(commands, not lacking, said, "; ".join(remedies), needed=False)
+    for commands, needed in needs.items():
+        lacking = [need for need in needed if not need.ok]
+        remedies = dict.fromkeys(need.remedy for need in lacking if need.remedy)
+        names = ", ".join(need.name for need in lacking)
+        found = f"not without {names}" if lacking else "yes"
+        yield _optional(commands, not lacking, found, "; ".join(remedies))

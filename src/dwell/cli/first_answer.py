@@ -38,9 +38,9 @@ class Kernels:
     Parameters
     ----------
     folder : Path, optional
-        Of their cache; None where no folder can hold one.
+        Folder of Numba's cache; None where no folder can hold one.
     suffix : str
-        Of the names of their files.
+        Part of the names of their files that tells versions and processors apart.
     """
 
     folder: Path | None
@@ -61,28 +61,23 @@ def find_kernels() -> Kernels:
 
     # Numba chooses the folder by a function's file.
     source = str(Path(dwell.__file__).parent / "kernels" / "advance.py")
-    found: dict[str, Any] = {}
-    exec(compile("def advance(): pass", source, "exec"), found)  # noqa: S102
+    namespace: dict[str, Any] = {}
+    exec(compile("def advance(): pass", source, "exec"), namespace)  # noqa: S102
     try:
-        kept: Any = caching.CompileResultCacheImpl
-        place = kept(found["advance"]).locator.get_cache_path()
+        cache: Any = caching.CompileResultCacheImpl
+        place = cache(namespace["advance"]).locator.get_cache_path()
     except RuntimeError:
         return Kernels(None, cache_suffix())
     return Kernels(Path(place), cache_suffix())
 
 
 def prepare(cycles: int) -> str | None:
-    """Choose how this process plays its work, before the simulator is imported.
-
-    Parameters
-    ----------
-    cycles : int
-        How long the work is.
+    """Choose, before the simulator is imported, how this process plays so many cycles.
 
     Returns
     -------
     str or None
-        What to tell the user of it; None where compiled kernels are there.
+        A remark for the user; None where compiled kernels are there.
     """
     kernels = None if "dwell.kernels.compiled" in sys.modules else _uncompiled()
     if kernels is None:

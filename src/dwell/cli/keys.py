@@ -82,8 +82,7 @@ def issue(
 
     authority = Authority.open(folder)
     authority.issue(name, role, address, days=days)
-    _show(authority.roster, as_json=as_json)
-    _remind(authority.roster, as_json=as_json)
+    _show_changed(authority.roster, as_json=as_json)
 
 
 @keys.command()
@@ -93,8 +92,7 @@ def revoke(folder: Folder, name: Name, as_json: Json = False) -> None:
 
     authority = Authority.open(folder)
     authority.revoke(name)
-    _show(authority.roster, as_json=as_json)
-    _remind(authority.roster, as_json=as_json)
+    _show_changed(authority.roster, as_json=as_json)
 
 
 @keys.command()
@@ -115,7 +113,8 @@ def show(
     _show(keyring.roster, own=keyring.own.name, as_json=as_json)
 
 
-def _remind(roster: Roster, *, as_json: bool) -> None:
+def _show_changed(roster: Roster, *, as_json: bool) -> None:
+    _show(roster, as_json=as_json)
     if not as_json:
         typer.echo(
             f"\nTake roster.json (number {roster.number}) to every host, and start its processes "

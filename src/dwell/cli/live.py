@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
@@ -27,7 +26,7 @@ from dwell.cli.options import (
     Policy,
     Seed,
 )
-from dwell.cli.output import json_text, print_json
+from dwell.cli.output import json_text, print_json, say
 
 if TYPE_CHECKING:
     from dwell.live.operator_client import OperatorClient
@@ -100,7 +99,7 @@ def agent(
 
     problem = load_without_traces(cell)
     for caution in lint(problem):
-        _say(f"warning: {caution}")
+        say(f"warning: {caution}")
     folder = state or _state_folder() / problem.name / node
     sys.path.insert(0, str(cell.resolve().parent))
     read = None if accelerator is None else load_function(accelerator, "--accelerator")
@@ -120,7 +119,7 @@ def agent(
         accelerator=read,
         environment=environment(keys, insecure=insecure),
         platform=platform,
-        say=_say,
+        say=say,
     )
 
 
@@ -164,10 +163,10 @@ def controller(
         jobs=jobs,
         environment=environment(keys, insecure=insecure),
         platform=ctx.find_object(Platform),
-        say=_say,
+        say=say,
     )
     for folder in folders:
-        _say(f"run: {folder}")
+        say(f"run: {folder}")
 
 
 @live.command()
@@ -193,15 +192,15 @@ def status(
     with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
         if watch:
             _watch(visitor, as_json=as_json)
-        found = visitor.look()
-    absent = found["health"] == "absent"
+        answer = visitor.look()
+    absent = answer["health"] == "absent"
     if as_json:
-        print_json(found)
+        print_json(answer)
     elif absent:
-        typer.echo(f"error: {found['headline']}", err=True)
+        typer.echo(f"error: {answer['headline']}", err=True)
     else:
-        typer.echo("\n".join(told(found)))
-    if absent or (check and found["headline"]):
+        typer.echo("\n".join(status_lines(answer)))
+    if absent or (check and answer["headline"]):
         raise typer.Exit(ExitCode.FAILED)
 
 
@@ -210,13 +209,13 @@ def _watch(visitor: OperatorClient, *, as_json: bool) -> NoReturn:
     screen = sys.stdout.isatty() and not as_json
     while True:
         until_s = time.monotonic() + WATCH_S
-        found = visitor.look(patience_s=WATCH_S)
+        answer = visitor.look(patience_s=WATCH_S)
         if as_json:
-            typer.echo(json_text(found, None))
+            typer.echo(json_text(answer, None))
         elif screen:
-            typer.echo(_drawn(told(found)), nl=False)
+            typer.echo(_drawn(status_lines(answer)), nl=False)
         else:
-            typer.echo("\n".join((*told(found), "")))
+            typer.echo("\n".join((*status_lines(answer), "")))
         time.sleep(max(until_s - time.monotonic(), 0.0))
 
 
@@ -341,11 +340,11 @@ def _ask(
     from dwell.live.operator_client import OperatorClient
 
     with OperatorClient(load_without_traces(cell), environment(keys, insecure=insecure)) as visitor:
-        found = visitor.ask(what, about)
+        answer = visitor.ask(what, about)
     if as_json:
-        print_json(found)
+        print_json(answer)
         return
-    for line in told(found):
+    for line in status_lines(answer):
         typer.echo(line)
 
 
@@ -354,11 +353,11 @@ def environment(keys: Path | None, *, insecure: bool) -> dict[str, str]:
     from dwell.live.security import INSECURE
     from dwell.live.trust import KEYS
 
-    said = {KEYS: str(keys.resolve())} if keys is not None else {}
-    return {**os.environ, **said, **({INSECURE: "1"} if insecure else {})}
+    named = {KEYS: str(keys.resolve())} if keys is not None else {}
+    return {**os.environ, **named, **({INSECURE: "1"} if insecure else {})}
 
 
-def told(status: dict[str, Any]) -> list[str]:
+def status_lines(status: dict[str, Any]) -> list[str]:
     """Return a status as lines of text: first what is wrong, and who is not well."""
     headline = status["headline"]
     lines = [f"{status['cell']} is {status['health']}: {headline}"] if headline else []
@@ -408,16 +407,16 @@ def proof(proving: Mapping[str, Any]) -> str:
 def _by_process(
     option: str, given: Sequence[str] | None, there: Sequence[str], read: Callable[[str], T]
 ) -> dict[str, T]:
-    """Read options of the form PROCESS=VALUE, the process with ``*`` for any; the last counts."""
-    found: dict[str, T] = {}
-    for one in given or ():
-        pattern, equals, text = one.partition("=")
+    """Read options of the form PROCESS=VALUE, where PROCESS may have a ``*``; the last counts."""
+    values: dict[str, T] = {}
+    for text in given or ():
+        pattern, equals, value = text.partition("=")
         names = fnmatch.filter(there, pattern)
         if not equals or not names:
             known = ", ".join(there)
-            raise typer.BadParameter(f"{option}: {one!r} is for no process of the node: {known}")
-        found.update(dict.fromkeys(names, read(text)))
-    return found
+            raise typer.BadParameter(f"{option}: {text!r} is for no process of the node: {known}")
+        values.update(dict.fromkeys(names, read(value)))
+    return values
 
 
 def _priority(text: str) -> int:
@@ -426,21 +425,23 @@ def _priority(text: str) -> int:
     return int(text)
 
 
-def _cpus(text: str | None, option: str = "--cpus", of: set[int] | None = None) -> set[int] | None:
-    """Read a list of CPUs; they have to be among others."""
+def _cpus(
+    text: str | None, option: str = "--cpus", among: set[int] | None = None
+) -> set[int] | None:
+    """Read a list of CPUs, each of which has to be available."""
     if text is None:
         return None
-    found: set[int] = set()
+    cpus: set[int] = set()
     try:
         for part in text.split(","):
             first, _, last = part.partition("-")
-            found.update(range(int(first), int(last or first) + 1))
+            cpus.update(range(int(first), int(last or first) + 1))
     except ValueError:
         raise typer.BadParameter(f"{option}: {text!r} is no list of CPUs, as 0,2-3") from None
-    there = of or os.sched_getaffinity(0)
-    if not found or not found <= there:
-        raise typer.BadParameter(f"{option}: {text} cannot be had; there are {sorted(there)}")
-    return found
+    available = among or os.sched_getaffinity(0)
+    if not cpus or not cpus <= available:
+        raise typer.BadParameter(f"{option}: {text} cannot be had; there are {sorted(available)}")
+    return cpus
 
 
 def _state_folder() -> Path:
@@ -457,9 +458,3 @@ def _until_told(owner: int | None) -> threading.Event:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     return stopped
-
-
-def _say(line: str) -> None:
-    # A log on a disk that is full must not end who writes it.
-    with suppress(OSError):
-        typer.echo(line, err=True)

@@ -57,22 +57,9 @@ def run_live(
     out: Path | None,
     as_json: bool,
 ) -> None:
-    """Run the cell, save the run, write its report, print what happened.
+    """Run the cell, save the run, write its report, print what happened (see `dwell live run`).
 
     Interrupted, it ends everything and reports on what there is.
-
-    Parameters
-    ----------
-    scenario : str or None
-        Played on it; the cell's first that disturbs something if not given.
-    seconds : float or None
-        Length; until some time after the scenario's last change if not given.
-    policy, estimator : str or None
-        What the cell says if not given.
-    seed : int
-        Of delays and losses.
-    out : Path or None
-        For logs, the run and its report.
 
     Raises
     ------
@@ -90,12 +77,12 @@ def run_live(
     out = out or Path("live-out", problem.name)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
-    told = _Told(problem, scenario, seed, timeline)
+    played = _ObservedRun(problem, scenario, seed, timeline)
     interrupted = False
     cell = Loopback(problem, out.resolve(), _cpus(problem), seed=seed)
     with interruptible():
         try:
-            _watch_from_start(cell, seconds, told)
+            _watch_from_start(cell, seconds, played)
         except KeyboardInterrupt:
             interrupted = True
             typer.echo("interrupted; ending the cell", err=True)
@@ -107,7 +94,7 @@ def run_live(
         raise typer.Exit(ExitCode.INTERRUPTED)
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    run = told.note(folder, **told.observed(folder))
+    run = played.note(folder, **played.observed(folder))
     run = seal_run(folder, warnings=crowded(run, problem))
     _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
     if interrupted:
@@ -150,8 +137,8 @@ def _length_s(scenario: Scenario) -> float:
 
 
 @dataclass(slots=True)
-class _Told(Played):
-    """What is known of a run here, and not to its controller."""
+class _ObservedRun(Played):
+    """A played run, and its observer: neither is known to its controller."""
 
     observer: CellObserver | None = None
 
@@ -186,7 +173,7 @@ def _cpus(problem: Problem) -> dict[str, int]:
     }
 
 
-def _watch_from_start(cell: Loopback, seconds: float, told: _Told) -> None:
+def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
     """Start the cell, and play the scenario."""
     with working("starting the cell"):
         cell.start()
@@ -194,17 +181,17 @@ def _watch_from_start(cell: Loopback, seconds: float, told: _Told) -> None:
     cell.begun_ns = max(cell.begun_ns, earliest_ns)
     name = cell.problem.live.observer
     if name is not None:
-        told.observer = load_observer(name, cell.problem, cell.folder, cell.begun_ns)
+        played.observer = load_observer(name, cell.problem, cell.folder, cell.begun_ns)
     try:
-        with live_view(cell.problem, seconds, told.planned()) as view:
-            _watch(cell, seconds, told, view)
+        with live_view(cell.problem, seconds, played.planned()) as view:
+            _watch(cell, seconds, played, view)
     finally:
-        if told.observer is not None:
-            told.look()
-            told.observer.close()
+        if played.observer is not None:
+            played.look()
+            played.observer.close()
 
 
-def _watch(cell: Loopback, seconds: float, told: _Told, view: View) -> None:
+def _watch(cell: Loopback, seconds: float, played: _ObservedRun, view: View) -> None:
     """Play the changes at their times, and show how the cell is."""
     status: Mapping[str, Any] = {}
     answered_s = 0.0
@@ -216,9 +203,9 @@ def _watch(cell: Loopback, seconds: float, told: _Told, view: View) -> None:
             answered_s = (time.monotonic_ns() - cell.begun_ns) / 1e9
         except LiveError:
             pass  # the view shows for how long nobody has answered
-        view.show(Look(at_s, status, answered_s, told.look(), told.on()))
+        view.show(Look(at_s, status, answered_s, played.look(), played.on()))
 
-    play_on(cell, told, seconds, look)
+    play_on(cell, played, seconds, look)
 
 
 def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:

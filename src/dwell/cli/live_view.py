@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import groupby, islice
 from typing import Any, Protocol
 
 import typer
@@ -39,14 +40,13 @@ class Look:
     Parameters
     ----------
     at_s : float
-        Since the beginning.
+        Time since the cell began.
     status : mapping
         The controller's last answer; empty before the first.
     answered_s : float
-        When that was.
+        Time of that answer.
     observed : mapping of str to float
         What the cell's observer sees, by names with units; ``error_mm`` is drawn.
-    active : sequence of Disturbed
     """
 
     at_s: float
@@ -65,6 +65,11 @@ class Look:
         """The last closed window."""
         window: Mapping[str, Any] = self.status.get("window") or {}
         return window
+
+    @property
+    def disturbances(self) -> str:
+        """The disturbances that are on, in words."""
+        return "; ".join(f"{item.kind} ({item.what})" for item in self.active)
 
     @property
     def silent_s(self) -> float:
@@ -88,9 +93,9 @@ def live_view(problem: Problem, seconds: float, plan: Sequence[Disturbed]) -> It
     Parameters
     ----------
     seconds : float
-        How long it will be shown.
+        Length of the run.
     plan : sequence of Disturbed
-        What will be done to it.
+        All that will disturb it.
     """
     if not sys.stderr.isatty():
         yield Lines()
@@ -112,10 +117,9 @@ class Lines:
         """Print a line if there is news."""
         status, window = look.status, look.window
         silent = look.silent_s > 0
-        active = tuple(f"{one.kind} ({one.what})" for one in look.active)
         headline = "" if silent else status.get("headline") or ""
         moved = status.get("placement"), status.get("guard_moves")
-        key = (*moved, silent, status.get("health"), active)
+        key = (*moved, silent, status.get("health"), look.disturbances)
         if key == self.last:
             return
         self.last = key
@@ -126,41 +130,44 @@ class Lines:
             f"  V_D {_number(_hundred(window.get('violation_rate')), '%')}"
             f"{_error(look)}"
             f"{'  the controller is silent' if silent else ''}"
-            f"  {'; '.join(active) or 'nothing disturbs it'}"
+            f"  {look.disturbances or 'nothing disturbs it'}"
             f"{f'  {headline}' if headline else ''}",
             err=True,
         )
 
 
-@dataclass(slots=True)
-class _Course:
-    """What was seen so far, in columns of equal time."""
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """Columns of equal time, which looks are laid out in anew: a terminal may change its width."""
 
-    columns: int
+    count: int
     seconds: float
-    placed: list[tuple[str, bool]] = field(default_factory=list)
-    values: dict[str, list[float]] = field(default_factory=dict)
 
     def column(self, at_s: float) -> int:
         """Return the column of an instant."""
-        return min(max(int(at_s / self.seconds * self.columns), 0), self.columns - 1)
+        return min(max(int(at_s / self.seconds * self.count), 0), self.count - 1)
 
-    def place(self, at_s: float, name: str, *, fallback: bool) -> None:
-        """Note where the cell is."""
-        column = self.column(at_s)
-        while len(self.placed) <= column:
-            self.placed.append((name, fallback))
-        self.placed[column] = name, fallback
+    def placements(self, looks: Iterable[Look]) -> list[tuple[str, bool]]:
+        """Return the last placement of each column so far, and whether it is a fallback."""
+        placed: list[tuple[str, bool]] = []
+        for look in looks:
+            if name := look.status.get("placement"):
+                column = self.column(look.at_s)
+                newest = name, bool(look.status.get("fallback"))
+                placed += [newest] * (column + 1 - len(placed))
+                placed[column] = newest
+        return placed
 
-    def value(self, name: str, at_s: float, value: float) -> None:
-        """Note a value; of several in a column, the worst is shown."""
-        if not math.isfinite(value):
-            return
-        values, column = self.values.setdefault(name, []), self.column(at_s)
-        fresh = len(values) <= column
-        while len(values) <= column:
-            values.append(values[-1] if values else math.nan)
-        values[column] = value if fresh else max(values[column], value)
+    def worst(self, values: Iterable[tuple[float, float]]) -> list[float]:
+        """Return the largest value of each column so far; without any it is that before it."""
+        worst: list[float] = []
+        for at_s, value in values:
+            if math.isfinite(value):
+                column = self.column(at_s)
+                fresh = len(worst) <= column
+                worst += [worst[-1] if worst else math.nan] * (column + 1 - len(worst))
+                worst[column] = value if fresh else max(worst[column], value)
+        return worst
 
 
 class Screen:
@@ -168,9 +175,8 @@ class Screen:
 
     Parameters
     ----------
-    plan : sequence of Disturbed
     update : callable
-        Takes what is to be seen now.
+        Shows a drawing in place of the one before.
     """
 
     def __init__(
@@ -205,11 +211,11 @@ class Screen:
         look = self._looks[-1]
         width = min(self._console.width, MOST_COLUMNS)
         inner = width - 4
-        course = self._course(inner - LABEL - VALUE)
+        columns = _Columns(inner - LABEL - VALUE, self.seconds)
         parts: tuple[RenderableType, ...] = (
             self._head(look, inner),
             Text(),
-            *self._strips(look, course),
+            *self._strips(look, columns),
             Text(),
             self._tables(look),
             Text(),
@@ -218,45 +224,31 @@ class Screen:
         title = f"{self.problem.name}, live"
         return Panel(Group(*parts), title=title, width=width, border_style=GREY, padding=(0, 1))
 
-    def _course(self, columns: int) -> _Course:
-        """Lay what was seen out in columns: a terminal may change its width."""
-        course = _Course(columns, self.seconds)
-        seen = -1
-        for look in self._looks:
-            placement = look.status.get("placement")
-            if placement:
-                course.place(look.at_s, placement, fallback=bool(look.status.get("fallback")))
-            course.value("error", look.at_s, look.error_mm)
-            number = look.window.get("number", -1)
-            if number != seen:
-                seen = number
-                course.value("L95", look.at_s, _float(look.window.get("l95_ms")))
-                course.value("V_D", look.at_s, _float(look.window.get("violation_rate")))
-        return course
-
     def _head(self, look: Look, width: int) -> Text:
         clock = f"{min(look.at_s, self.seconds):.0f} of {self.seconds:.0f} s"
-        what = "; ".join(f"{one.kind} ({one.what})" for one in look.active)
-        head = Text(what or "nothing disturbs it", style="bold", no_wrap=True)
+        head = Text(look.disturbances or "nothing disturbs it", style="bold", no_wrap=True)
         head.truncate(width - len(clock) - 2, overflow="ellipsis", pad=True)
         return head.append(f"  {clock}")
 
-    def _strips(self, look: Look, course: _Course) -> Iterator[Text]:
+    def _strips(self, look: Look, columns: _Columns) -> Iterator[Text]:
         deadline_ms = self.problem.pipeline.deadline_ms
-        window = look.window
         placement = look.status.get("placement") or "-"
-        yield self._line("played", self._planned(look, course), "")
-        yield self._line("placed", self._placed(course), placement, self._colours.get(placement))
-        for name, value, most, limit in (
-            ("L95", _number(window.get("l95_ms"), "ms"), DEADLINES * deadline_ms, deadline_ms),
-            ("V_D", _number(_hundred(window.get("violation_rate")), "%"), MOST_RATE, 0.05),
-            ("error", _number(look.error_mm, "mm"), MOST_MM, math.inf),
+        yield self._line("played", self._planned(look, columns), "")
+        yield self._line("placed", self._placed(columns), placement, self._colours.get(placement))
+        numbered = groupby(self._looks, lambda seen: seen.window.get("number"))
+        # Of each window, the look that saw it first.
+        windows = [(seen.at_s, seen.window) for _, looks in numbered for seen in islice(looks, 1)]
+        for name, key, scale, unit, most, limit in (
+            ("L95", "l95_ms", 1, "ms", DEADLINES * deadline_ms, deadline_ms),
+            ("V_D", "violation_rate", 100, "%", MOST_RATE, 0.05),
         ):
-            if name == "error" and self.problem.live.observer is None:
-                continue
-            strip = _sparkline(course.values.get(name, []), most, limit)
-            strip.append(" " * (course.columns - len(strip)))
-            yield self._line(name, strip, value)
+            worst = columns.worst((at_s, _float(window.get(key))) for at_s, window in windows)
+            value = _number(scale * _float(look.window.get(key)), unit)
+            yield self._line(name, _sparkline(worst, columns.count, most, limit), value)
+        if self.problem.live.observer is not None:
+            worst = columns.worst((seen.at_s, seen.error_mm) for seen in self._looks)
+            strip = _sparkline(worst, columns.count, MOST_MM, math.inf)
+            yield self._line("error", strip, _number(look.error_mm, "mm"))
 
     @staticmethod
     def _line(label: str, strip: Text, value: str, style: str | None = None) -> Text:
@@ -265,23 +257,23 @@ class Screen:
         room = " " * max(0, 1 - len(value) + VALUE - 1)
         return line.append(room).append(value, style=f"bold {style}" if style else "bold")
 
-    def _planned(self, look: Look, course: _Course) -> Text:
-        """Write when what is done to it, dim as long as it is to come."""
-        letters = ["·"] * course.columns
-        for one in self.plan:
-            first, last = course.column(one.begin_s), course.column(min(one.end_s, self.seconds))
-            length = max(last - first, 1)
-            name = f" {one.kind} " if len(one.kind) + 2 <= length else f" {one.kind.split()[0]} "
+    def _planned(self, look: Look, columns: _Columns) -> Text:
+        """Write the names of the disturbances at their times, dim as long as they are to come."""
+        letters = ["·"] * columns.count
+        for item in self.plan:
+            first = columns.column(item.begin_s)
+            length = max(columns.column(min(item.end_s, self.seconds)) - first, 1)
+            name = f" {item.kind} " if len(item.kind) + 2 <= length else f" {item.kind.split()[0]} "
             letters[first : first + length] = name[:length].center(length, "━")
-        text, now = Text(), course.column(look.at_s) + 1
+        text, now = Text(), columns.column(look.at_s) + 1
         text.append("".join(letters[:now]), style="default")
         return text.append("".join(letters[now:]), style=GREY)
 
-    def _placed(self, course: _Course) -> Text:
+    def _placed(self, columns: _Columns) -> Text:
         text = Text()
-        for name, fallback in course.placed:
+        for name, fallback in columns.placements(self._looks):
             text.append("▒" if fallback else "█", style=self._colours.get(name, "default"))
-        text.append("·" * (course.columns - len(text)), style=GREY)
+        text.append("·" * (columns.count - len(text)), style=GREY)
         return text
 
     def _tables(self, look: Look) -> Table:
@@ -349,8 +341,7 @@ class Screen:
         yield remark
 
 
-def _sparkline(values: Sequence[float], most: float, limit: float) -> Text:
-
+def _sparkline(values: Sequence[float], columns: int, most: float, limit: float) -> Text:
     text = Text()
     for value in values:
         if math.isnan(value):
@@ -358,6 +349,7 @@ def _sparkline(values: Sequence[float], most: float, limit: float) -> Text:
             continue
         step = min(max(int(value / most * len(BLOCKS)), 0), len(BLOCKS) - 1)
         text.append(BLOCKS[step], style=MISSED if value > limit else "default")
+    text.append(" " * (columns - len(text)))
     return text
 
 

@@ -93,14 +93,14 @@ OLD_SPELLINGS = {
 def respelt(arguments: Sequence[str]) -> list[str]:
     """Return a command line with today's spellings; a warning on stderr names each old one."""
     known = OLD_SPELLINGS.get(arguments[0], {}) if arguments else {}
-    found = []
+    words = []
     for argument in arguments:
         option, equals, value = argument.partition("=")
         today = known.get(option, option)
         if today != option:
             typer.echo(f"warning: {option} is now {today}; the old spelling will go", err=True)
-        found.append(f"{today}{equals}{value}")
-    return found
+        words.append(f"{today}{equals}{value}")
+    return words
 
 
 def require_one_length(windows: int | None, seconds: float | None) -> None:

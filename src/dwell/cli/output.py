@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,6 +92,12 @@ def write_report(page: Page, path: Path, *, figures: Path | None, static: bool) 
             write_whole(figures / name, data, durable=False)
 
 
+def say(line: str) -> None:
+    """Print a line on stderr; a log on a disk that is full does not end its writer."""
+    with suppress(OSError):
+        typer.echo(line, err=True)
+
+
 @contextmanager
 def working(what: str) -> Iterator[None]:
     """Show on stderr, where that is a terminal, that work goes on."""
@@ -111,9 +117,9 @@ def progress(what: str, *, cycles: float | None = None) -> Iterator[Progress | N
     Parameters
     ----------
     what : str
-        Stands before the bar.
+        Text before the bar.
     cycles : float, optional
-        Cycles of one of what is counted; the rate is shown where it is given.
+        Cycles of each item that is counted; the rate is shown where it is given.
     """
     if not sys.stderr.isatty():
         yield None

@@ -27,11 +27,11 @@ def server(cell: Path, program: Sequence[str], owner: int | None = None) -> list
     Parameters
     ----------
     cell : Path
-        File that it reads once, so that all that reading takes is imported.
+        File that it reads once, so that the modules for reading are imported.
     program : sequence of str
-        Module, and its first arguments, that runs this or what stands for it (`Platform`).
+        Module that runs this one or stands for it, with its first arguments (see `Platform`).
     owner : int, optional
-        Process that all of them end with.
+        Id of the process that all of them end with.
     """
     ends_with = [] if owner is None else ["--owner", str(owner)]
     return [sys.executable, "-m", *program, "--cell", str(cell), "--serve", *ends_with]
@@ -51,16 +51,16 @@ def words(
     state : Path
         Folder of its node's files.
     cpus : iterable of int, optional
-        Those that it may use; those of its agent where None.
+        CPUs that it may use; its agent's if not given.
     priority : int, optional
-        Its real-time priority, 1 to 99.
+        Real-time priority, 1 to 99.
     """
-    found = ["--who", who, "--cell", str(cell), "--state", str(state)]
+    arguments = ["--who", who, "--cell", str(cell), "--state", str(state)]
     if cpus is not None:
-        found += ["--cpus", ",".join(map(str, sorted(cpus)))]
+        arguments += ["--cpus", ",".join(map(str, sorted(cpus)))]
     if priority is not None:
-        found += ["--realtime", str(priority)]
-    return found
+        arguments += ["--realtime", str(priority)]
+    return arguments
 
 
 def main(arguments: Sequence[str] | None = None, platform: Platform | None = None) -> int:
@@ -69,9 +69,9 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     Parameters
     ----------
     arguments : sequence of str, optional
-        Those of the process where None.
+        Words after the module; those of this process if not given.
     platform : Platform, optional
-        Its clock and transport; without faults if left out.
+        Clock and transport; without faults if not given.
     """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cell", type=Path, required=True)
@@ -81,11 +81,11 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     parser.add_argument("--cpus", default="")
     parser.add_argument("--realtime", type=int, default=0)
     parser.add_argument("--owner", type=int)
-    asked = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
-        if asked.serve:
-            return _serve(asked.cell, asked.owner, platform)
-        _run(asked, platform)
+        if options.serve:
+            return _serve(options.cell, options.owner, platform)
+        _run(options, platform)
     except DwellError as error:
         print(error, file=sys.stderr)
         return 2
@@ -114,14 +114,14 @@ def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
     return main(words if owner is None else [*words, "--owner", str(owner)], platform)
 
 
-def _run(asked: argparse.Namespace, platform: Platform | None) -> None:
-    _name(asked.who)
-    _schedule(asked.who, asked.cpus, asked.realtime)
+def _run(options: argparse.Namespace, platform: Platform | None) -> None:
+    _name(options.who)
+    _schedule(options.who, options.cpus, options.realtime)
     stopped = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.set())
     # The user's stages lie beside their cell file.
-    sys.path.insert(0, str(asked.cell.resolve().parent))
+    sys.path.insert(0, str(options.cell.resolve().parent))
 
     from dwell.calibration.memory import keep_memory
     from dwell.cellfile import load_without_traces
@@ -132,8 +132,8 @@ def _run(asked: argparse.Namespace, platform: Platform | None) -> None:
     # What a user's code prints, and its exceptions, are shown on terminals.
     escape_output()
     keep_memory()
-    end_with_owner(stopped, asked.owner)
-    run_process(load_without_traces(asked.cell), asked.who, asked.state, stopped, platform)
+    end_with_owner(stopped, options.owner)
+    run_process(load_without_traces(options.cell), options.who, options.state, stopped, platform)
 
 
 def _name(who: str) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dwell.cli.options import Json, Samples, Warmup
-from dwell.cli.output import aligned, file_name, print_json
+from dwell.cli.output import aligned, file_name, print_json, say
 from dwell.errors import ProfileError
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def listen(
         typer.echo(f"listening on {address}:{taken}")
         sys.stdout.flush()
 
-    answer(host, port, announce=announce, log=lambda line: typer.echo(line, err=True), once=once)
+    answer(host, port, announce=announce, log=say, once=once)
 
 
 @profile.command()
@@ -188,7 +188,7 @@ def _measured(
         }
         for task, call in calls.items():
             _say(f"measuring {task}")
-            one = measure_task(
+            measurement = measure_task(
                 task,
                 node,
                 call,
@@ -197,7 +197,7 @@ def _measured(
                 source=sources[task],
                 inputs_source=factories.get(task),
             )
-            measured.append(one)
+            measured.append(measurement)
     return measured
 
 
@@ -244,7 +244,7 @@ def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: boo
     yaml = cell_yaml(path, measured)
     doubts = {one.name: list(find_doubts(one)) for one in measured}
     if as_json:
-        found: dict[str, Any] = {
+        rows: dict[str, Any] = {
             one.name: {
                 "columns": {name: asdict(describe(one.columns[name])) for name in one.columns},
                 "about": one.about,
@@ -252,7 +252,7 @@ def _print_measured(path: Path, measured: Sequence[Measurement], *, as_json: boo
             }
             for one in measured
         }
-        print_json({"profile": path, "measurements": found, "yaml": yaml})
+        print_json({"profile": path, "measurements": rows, "yaml": yaml})
         return
     typer.echo(_table(measured))
     typer.echo("")
@@ -271,16 +271,16 @@ def _table(measured: Sequence[Measurement]) -> str:
     head = ("ms", "n", "mean", "median", "p95", "p99", "max", "cv", "lag 1", "cores used")
     rows = []
     for one in measured:
-        found = describe(one.samples)
-        times = (found.mean, found.median, found.p95, found.p99, found.max)
+        column = describe(one.samples)
+        times = (column.mean, column.median, column.p95, column.p99, column.max)
         cores = one.about.get("cores_used")
         rows.append(
             (
                 one.name,
-                str(found.n),
+                str(column.n),
                 *(f"{value:.3f}" for value in times),
-                f"{found.cv:.3f}",
-                "-" if found.lag1 is None else f"{found.lag1:.2f}",
+                f"{column.cv:.3f}",
+                "-" if column.lag1 is None else f"{column.lag1:.2f}",
                 "-" if cores is None else f"{cores:.2f}",
             )
         )

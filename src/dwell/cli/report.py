@@ -92,23 +92,17 @@ def report(
 
 
 def _recovered(run: Run) -> dict[str, Any]:
-    """Return what is to be said of a run that was killed or damaged; nothing of others."""
+    """Return what a run that was killed or damaged has lost; nothing of others."""
     recovered = run.meta.get("recovered", {})
-    lost = list(_what_was_lost(recovered))
+    lost = list(_losses(recovered))
     return {"recovered": recovered, "lost": lost} if lost else {}
 
 
-def _what_was_lost(told: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on what is not in a run because something was killed or damaged.
-
-    Parameters
-    ----------
-    told : mapping
-        What its meta say under ``recovered``.
-    """
+def _losses(recovered: Mapping[str, Any]) -> Iterator[str]:
+    """Yield sentences on what is not in a run because something was killed or damaged."""
     from dwell.report.formatting import listed
 
-    opened = int(told.get("opened", 1))
+    opened = int(recovered.get("opened", 1))
     if opened > 1:
         yield f"The controller was started {opened} times while the run went on."
     lost = [
@@ -117,14 +111,14 @@ def _what_was_lost(told: Mapping[str, Any]) -> Iterator[str]:
             ("torn_bytes", "{} bytes at the journal's end were torn by a kill"),
             ("damaged_bytes", "{} bytes within the journal were damaged"),
         )
-        if told.get(name)
-        for text in [text.format(told[name])]
+        if recovered.get(name)
+        for text in [text.format(recovered[name])]
     ]
     if lost:
         yield f"{listed(lost)}; what they said is not here."
-    if told.get("missing_windows"):
-        yield f"Windows missing from the run: {told['missing_windows']}."
-    if told and not told.get("sealed", True):
+    if recovered.get("missing_windows"):
+        yield f"Windows missing from the run: {recovered['missing_windows']}."
+    if recovered and not recovered.get("sealed", True):
         yield (
             "The run was not closed: it goes on, or its controller was killed. This is what its "
             "journal holds; what came after its last window is not here."

@@ -109,13 +109,13 @@ def run(
         typer.echo(f"\nsaved to {folder}")
 
 
-def _require_same(folder: Path, asked: Mapping[str, Any]) -> None:
+def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
     """Raise a RunError where a folder holds another run: other than this one made again."""
     if not (folder / "run.json").is_file():
         return
     kept = dwell.open_run(folder).meta
     # Versions of software make no other run.
-    if {**kept, "versions": None} != {**json.loads(json.dumps(asked)), "versions": None}:
+    if {**kept, "versions": None} != {**json.loads(json.dumps(settings)), "versions": None}:
         raise RunError(
             f"{folder} holds another run; choose another folder, or say --force to replace it"
         )

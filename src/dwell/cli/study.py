@@ -149,12 +149,12 @@ def _text(result: StudyResult) -> str:
     # Intervals take time: only of what is shown.
     some = result.runs.head(SHOWN * len(study.policies) * len(study.seeds))
     lines = []
-    for labels, mine in some.group_by(keys, maintain_order=True):
+    for labels, runs in some.group_by(keys, maintain_order=True):
         *values, scenario = labels
         at = ", ".join(
             f"{name} = {value}" for name, value in zip(study.parameters, values, strict=True)
         )
-        table = over_seeds(mine, ("policy",), [measure.column for measure in measures])
+        table = over_seeds(runs, ("policy",), [measure.column for measure in measures])
         rows = [
             [shown_policy(row["policy"]), *(_written(row, measure) for measure in measures)]
             for row in table.to_dicts()

@@ -23,7 +23,7 @@ from dwell.cli.options import (
     require_one_length,
     seconds_of_runs,
 )
-from dwell.cli.output import aligned, file_name, print_json
+from dwell.cli.output import aligned, file_name, print_json, say
 
 testbed = typer.Typer(
     no_args_is_help=True,
@@ -61,7 +61,7 @@ def run(
     problem = dwell.load(cell)
     parts = (problem.name, scenario, policy or problem.controller.policy, str(seed))
     folder = out or Path("testbed-out", file_name("-".join(parts)))
-    found = run_once(
+    saved = run_once(
         problem,
         scenario=scenario,
         policy=policy,
@@ -70,9 +70,9 @@ def run(
         out=folder,
         name=name,
         jobs=jobs,
-        tell=_say,
+        tell=say,
     )
-    _sum_up(found, as_json=as_json)
+    _sum_up(saved, as_json=as_json)
 
 
 def _sum_up(folder: Path, *, as_json: bool) -> None:
@@ -80,38 +80,38 @@ def _sum_up(folder: Path, *, as_json: bool) -> None:
     import dwell
     from dwell.testbed.run import summary
 
-    found = dwell.open_run(folder)
-    pressure = found.meta.get("pressure") or {}
-    told = summary(found)
+    result = dwell.open_run(folder)
+    pressure = result.meta.get("pressure") or {}
+    totals = summary(result)
     failed = bool(pressure.get("failed"))
     if as_json:
-        head = {key: found.meta.get(key) for key in ("cell", "scenario", "seed", "policy")}
-        print_json({**head, **told, "failed": failed, "why": pressure.get("why"), "run": folder})
+        head = {key: result.meta.get(key) for key in ("cell", "scenario", "seed", "policy")}
+        print_json({**head, **totals, "failed": failed, "why": pressure.get("why"), "run": folder})
     else:
-        typer.echo(_lines(told))
+        typer.echo(_lines(totals))
         typer.echo(f"\nrun: {folder}")
     if failed:
-        _say(
-            f"error: the machine was the bottleneck in {told['excluded']} of {told['windows']} "
+        say(
+            f"error: the machine was the bottleneck in {totals['excluded']} of {totals['windows']} "
             f"windows ({pressure['why']}); run it on a machine that does nothing else"
         )
         raise typer.Exit(ExitCode.FAILED)
 
 
-def _lines(told: dict[str, Any]) -> str:
+def _lines(totals: dict[str, Any]) -> str:
     def number(value: float | None, scale: float, unit: str) -> str:
         return "-" if value is None else f"{scale * value:.1f} {unit}"
 
     rows = [
-        ("windows after the warm-up", str(told["windows"])),
-        ("excluded: the machine was the bottleneck", str(told["excluded"])),
-        ("L95, mean of windows", number(told["l95_ms"], 1.0, "ms")),
-        ("missed deadlines (V_D)", number(told["violation_rate"], 100.0, "%")),
-        ("migrations", str(told["migrations"])),
+        ("windows after the warm-up", str(totals["windows"])),
+        ("excluded: the machine was the bottleneck", str(totals["excluded"])),
+        ("L95, mean of windows", number(totals["l95_ms"], 1.0, "ms")),
+        ("missed deadlines (V_D)", number(totals["violation_rate"], 100.0, "%")),
+        ("migrations", str(totals["migrations"])),
     ]
     rows += [
         (f"utilisation of {node}", number(used, 100.0, "%"))
-        for node, used in told["utilisation"].items()
+        for node, used in totals["utilisation"].items()
     ]
     return aligned(("", ""), rows).lstrip("\n")
 
@@ -179,13 +179,9 @@ def calibrate(
     if not runs:
         folder = out.with_name(f"{out.stem}.runs")
         length_s = seconds_of_runs(cell, windows, seconds)
-        runs = make_runs(cell, folder, seconds=length_s, seed=seed, name=name, tell=_say)
+        runs = make_runs(cell, folder, seconds=length_s, seed=seed, name=name, tell=say)
     write_calibrated(cell, runs, out, emulated=not real, say=typer.echo)
     typer.echo(f"written to {out}")
-
-
-def _say(line: str) -> None:
-    typer.echo(line, err=True)
 
 
 testbed.command()(chaos)

@@ -84,12 +84,12 @@ def _sidecar(cell: Path) -> tuple[list[str], Usual]:
     if not file.is_file():
         return [], Usual()
     try:
-        told = json.loads(file.read_text(encoding="utf-8"))
-        usual = Usual.of(told)
+        document = json.loads(file.read_text(encoding="utf-8"))
+        usual = Usual.of(document)
         # Runs of two campaigns may have the same name; what their stamps carry differs.
-        if told.get("ids"):
-            return [str(one) for one in told["ids"]], usual
-        return [Path(str(name)).name for name in told.get("runs", [])], usual
+        if document.get("ids"):
+            return [str(run_id) for run_id in document["ids"]], usual
+        return [Path(str(name)).name for name in document.get("runs", [])], usual
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise RunError(
             f"{file}: cannot be read ({error}); it says in `runs` from which runs the cell was "
@@ -99,7 +99,7 @@ def _sidecar(cell: Path) -> tuple[list[str], Usual]:
 
 def _open(folders: Sequence[Path]) -> dict[str, Run]:
     """Open the runs by the names of their folders; of two of one name, by their whole paths."""
-    found: dict[str, Run] = {}
+    runs: dict[str, Run] = {}
     faults: list[str] = []
     known: set[Path] = set()
     for folder in folders:
@@ -113,10 +113,10 @@ def _open(folders: Sequence[Path]) -> dict[str, Run]:
         except RunError as error:
             faults.append(str(error))
             continue
-        found[whole.name if whole.name not in found else str(whole)] = run
+        runs[whole.name if whole.name not in runs else str(whole)] = run
     if faults:
         raise RunError("\n".join(faults))
-    return found
+    return runs
 
 
 def _document(validation: Validation) -> dict[str, Any]:
