@@ -42,11 +42,11 @@ def by_length(
     names: Iterable[str], windows: int, timetable_windows: int
 ) -> Iterator[tuple[str, tuple[str, ...], int]]:
     """Part scenarios by the length of their runs; yield a suffix of names, scenarios, windows."""
-    mine = tuple(names)
-    usual = tuple(name for name in mine if name not in TIMETABLE)
-    timed = tuple(name for name in mine if name in TIMETABLE)
-    yield from (("", usual, windows),) if usual else ()
-    yield from (("-timetable", timed, timetable_windows),) if timed else ()
+    scenarios = tuple(names)
+    for suffix, timed, length in (("", False, windows), ("-timetable", True, timetable_windows)):
+        mine = tuple(name for name in scenarios if (name in TIMETABLE) is timed)
+        if mine:
+            yield suffix, mine, length
 
 
 def of_cell(
@@ -69,11 +69,9 @@ def of_cell(
 # ------------------------------------------------------------------------------ contenders
 
 
-def believing(
-    policy: str, estimator: str, settings: Mapping[str, object] | None = None, *, name: str = ""
-) -> Contender:
-    """Return a policy with an estimator, called ``dtp+corrected`` unless it is given a name."""
-    return Contender(name or f"{policy}+{estimator}", policy, estimator, settings or {})
+def believing(policy: str, estimator: str) -> Contender:
+    """Return a policy with an estimator, called ``dtp+corrected``."""
+    return Contender(f"{policy}+{estimator}", policy, estimator)
 
 
 def dtp(name: str, settings: Mapping[str, object]) -> Contender:
@@ -94,9 +92,8 @@ def rules() -> tuple[Contender, ...]:
 def scores(runs: pl.DataFrame, column: str) -> dict[str, float]:
     """Return the mean over scenarios of the mean over seeds, by policy; less is better."""
     # Every scenario counts alike, however many of its runs there are.
-    means = runs.group_by("policy", "scenario", maintain_order=True).agg(pl.col(column).mean())
-    found = means.group_by("policy", maintain_order=True).agg(pl.col(column).mean())
-    return dict(found.rows())
+    means = runs.group_by("policy", "scenario", maintain_order=True).agg(pl.mean(column))
+    return dict(means.group_by("policy", maintain_order=True).agg(pl.mean(column)).rows())
 
 
 def best(contenders: Iterable[Contender], score: Mapping[str, float]) -> Contender:

@@ -67,8 +67,8 @@ class Scale:
 
     @property
     def held_out(self) -> tuple[int, ...]:
-        """Seeds that parameters are tuned on, and nothing else is done on; five at most."""
-        return tuple(range(HELD_OUT + 1, HELD_OUT + 1 + min(self.tuning_seeds, 5)))
+        """Seeds that parameters are tuned on, and nothing else is done on."""
+        return tuple(HELD_OUT + seed for seed in range(1, self.tuning_seeds + 1))
 
 
 def scale_of(name: str) -> Scale:

@@ -8,20 +8,17 @@ and metric, and `p_least` is the smallest p value that so many seeds and compari
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 
 from dwell.study import AIM, Family, Interval, Study, over_seeds, under
 
-#: Groups of runs that are compared, by (scenario, first, second): what is in their columns.
-Pairs: TypeAlias = Mapping[tuple[str, str, str], tuple[Mapping[str, object], Mapping[str, object]]]
-
-TEXTS = ("claim", "design", "scenario", "first", "second", "metric", "word")
 NUMBERS = ("effect", "low", "high", "p", "p_least")
-COLUMNS = (*TEXTS[:-1], *NUMBERS, "word")
-SCHEMA = {name: pl.String if name in TEXTS else pl.Float64 for name in COLUMNS}
+COLUMNS = ("claim", "design", "scenario", "first", "second", "metric", *NUMBERS, "word")
+SCHEMA = {name: pl.Float64 if name in NUMBERS else pl.String for name in COLUMNS}
 
 
 class Answer(NamedTuple):
@@ -38,16 +35,6 @@ def design_of(*studies: Study) -> str:
     )
 
 
-def policies(scenarios: Iterable[str], pairs: Iterable[tuple[str, str]]) -> Pairs:
-    """Return the pairs of policies in every scenario."""
-    wanted = tuple(pairs)
-    return {
-        (scenario, first, second): between(scenario, first, second)
-        for scenario in scenarios
-        for first, second in wanted
-    }
-
-
 def values(runs: pl.DataFrame, column: str, **labels: object) -> np.ndarray:
     """Return a column of the runs with these labels: one number a seed, in the order of seeds."""
     mine = runs.filter(*(pl.col(name) == label for name, label in labels.items())).sort("seed")
@@ -59,49 +46,6 @@ def by_policy(runs: pl.DataFrame, columns: Sequence[str]) -> pl.DataFrame:
     return over_seeds(runs, ("scenario", "policy"), columns)
 
 
-def between(
-    scenario: str, first: str, second: str, **more: object
-) -> tuple[dict[str, object], dict[str, object]]:
-    """Return the labels of two policies in a scenario; `more` holds in both groups."""
-    common: dict[str, object] = {"scenario": scenario, **more}
-    return {**common, "policy": first}, {**common, "policy": second}
-
-
-def compare(
-    runs: pl.DataFrame, claim: str, metrics: Iterable[str], pairs: Pairs, *studies: Study
-) -> pl.DataFrame:
-    """Compare pairs in every metric; each metric is a family of its own.
-
-    Returns
-    -------
-    DataFrame
-        One row a pair and metric: ``claim``, ``design``, ``scenario``, ``first``, ``second``,
-        ``metric``; ``effect`` (the first less the second: mean, or median where a metric may be
-        infinite) with ``low`` and ``high``, ``p`` (Holm's), ``p_least`` and ``word``.
-    """
-    found = [pl.DataFrame(schema=SCHEMA)]
-    named = {" | ".join(names): pair for names, pair in pairs.items()}
-    for metric in metrics:
-        rows = Family.of_runs(runs, claim, metric, named).table()
-        columns = {
-            name: pl.Series([names[index] for names in pairs], dtype=pl.String)
-            for index, name in enumerate(("scenario", "first", "second"))
-        }
-        found.append(
-            rows.select(
-                "metric",
-                pl.col("difference").alias("effect"),
-                *("low", "high", pl.col("p_holm").alias("p"), "p_least"),
-                pl.col("verdict").alias("word"),
-                claim=pl.lit(claim),
-                design=pl.lit(design_of(*studies)),
-            )
-            .with_columns(**columns)
-            .select(COLUMNS)
-        )
-    return pl.concat(found)
-
-
 def claims(
     runs: pl.DataFrame,
     metrics: Iterable[str],
@@ -109,11 +53,32 @@ def claims(
     pairs: Mapping[str, Iterable[tuple[str, str]]],
     *studies: Study,
 ) -> list[pl.DataFrame]:
-    """Compare pairs of policies in every scenario, by claim."""
-    return [
-        compare(runs, claim, metrics, policies(scenarios, mine), *studies)
-        for claim, mine in pairs.items()
-    ]
+    """Compare pairs of policies in every scenario, by claim; each metric is a family of its own.
+
+    Returns
+    -------
+    list of DataFrame
+        One row a pair and metric: ``claim``, ``design``, ``scenario``, ``first``, ``second``,
+        ``metric``; ``effect`` (the first less the second: mean, or median where a metric may be
+        infinite) with ``low`` and ``high``, ``p`` (Holm's), ``p_least`` and ``word``.
+    """
+    schema = dict.fromkeys(("scenario", "first", "second"), pl.String)
+    renamed = {"difference": "effect", "p_holm": "p", "verdict": "word"}
+    frames = [pl.DataFrame(schema=SCHEMA)]
+    for claim, metric in product(pairs, metrics):
+        rows = [(scenario, *pair) for scenario, pair in product(scenarios, pairs[claim])]
+        contrasts = {
+            " | ".join((scenario, first, second)): (
+                {"scenario": scenario, "policy": first},
+                {"scenario": scenario, "policy": second},
+            )
+            for scenario, first, second in rows
+        }
+        family = Family.of_runs(runs, claim, metric, contrasts).table().drop("p").rename(renamed)
+        labels = pl.DataFrame(rows, schema=schema, orient="row")
+        labels = labels.with_columns(claim=pl.lit(claim), design=pl.lit(design_of(*studies)))
+        frames.append(labels.hstack(family).select(COLUMNS))
+    return frames
 
 
 def judge(

@@ -13,11 +13,11 @@ from itertools import combinations, product
 import polars as pl
 
 from dwell.model import Placement, Problem
-from dwell.study import Study, StudyResult
-from reproduction.cell import RANDOM, believing, of_cell, with_candidates
+from dwell.study import Contender, Study, StudyResult
+from reproduction.cell import RANDOM, of_cell, with_candidates
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, by_policy, compare, policies
+from reproduction.verdicts import Answer, by_policy, claims
 
 TITLE = "RQ3: Does the Hamming-distance penalty suppress chatter more finely than a threshold?"
 
@@ -27,7 +27,7 @@ STRENGTHS, FEW_STRENGTHS = (0.2, 0.4, 0.8), (0.2, 0.8)
 #: What runs are judged by. J without switching and the tasks moved follow from two prices of a
 #: move, this one and the contender's own, which must differ.
 JUDGED_BY = 1.0
-PENALTY, THRESHOLD = "penalty", "threshold"
+RULES = PENALTY, THRESHOLD = "penalty", "threshold"
 METRICS = ("migrations", "returns", "moved", "violation_rate", "j_still")
 PRICE = "objective.weights.switching"
 
@@ -42,13 +42,10 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         "chatter-two", judging(with_candidates(cell, far)), (0.2,), scale.some_seeds, scale
     )
     runs, check = (with_moves(run(study)) for study in (three, two))
-    verdicts = [
-        compare(table, claim, METRICS, policies(SCENARIOS, pairs_of(of)), study)
-        for claim, table, of, study in (
-            ("The penalty is calmer than a threshold of the same mean", runs, strengths, three),
-            ("With two candidates, the penalty differs from the threshold", check, (0.2,), two),
-        )
-    ]
+    calmer = {"The penalty is calmer than a threshold of the same mean": pairs_of(strengths)}
+    same = {"With two candidates, the penalty differs from the threshold": pairs_of((0.2,))}
+    verdicts = claims(runs, METRICS, SCENARIOS, calmer, three)
+    verdicts += claims(check, METRICS, SCENARIOS, same, two)
     return Answer(
         pl.concat(verdicts),
         {
@@ -92,7 +89,7 @@ def study_of(
                 PRICE: switching,
             }
             called = named(estimator, dwell, rule, strength)
-            who.append(believing("dtp", estimator, settings, name=called))
+            who.append(Contender(called, "dtp", estimator, settings))
     return of_cell(name, cell, SCENARIOS, who, seeds, scale.windows)
 
 
@@ -137,18 +134,12 @@ def with_moves(result: StudyResult) -> pl.DataFrame:
 def identical(runs: pl.DataFrame) -> pl.DataFrame:
     """Count pairs of runs with two candidates that are the same in every number, by N_min."""
     rows = []
-    plain = runs.drop("cost", "j_still")
+    plain = runs.drop("cost", "j_still").sort("scenario", "policy", "seed")
     for dwell in DWELLS:
-        same = total = 0
-        for scenario, estimator in product(SCENARIOS, ESTIMATORS):
-            first, second = (
-                plain.filter(scenario=scenario, policy=named(estimator, dwell, rule, 0.2))
-                .sort("seed")
-                .drop("policy")
-                .rows()
-                for rule in (PENALTY, THRESHOLD)
-            )
-            total += len(first)
-            same += sum(one == other for one, other in zip(first, second, strict=True))
-        rows.append({"min_dwell": dwell, "same": same, "of": total})
+        policies = [[named(one, dwell, rule, 0.2) for one in ESTIMATORS] for rule in RULES]
+        first, second = (
+            plain.filter(pl.col("policy").is_in(names)).drop("policy").rows() for names in policies
+        )
+        same = sum(one == other for one, other in zip(first, second, strict=True))
+        rows.append({"min_dwell": dwell, "same": same, "of": len(first)})
     return pl.DataFrame(rows)

@@ -16,7 +16,6 @@ from dwell.model import NodeDisturbance, Problem, Scenario
 from dwell.policies import ATP
 from dwell.study import Contender, Point, Study
 from reproduction.cell import (
-    PAPERS_DTP,
     RULES,
     believing,
     best,
@@ -70,7 +69,7 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
             Contender("atp", "atp"),
             Contender(TUNED, overall.policy),
             *favourites.values(),
-            believing("dtp", "profile", name=PAPERS_DTP),
+            believing("dtp", "profile"),
             *rules(),
         ),
         seeds=scale.all_seeds,

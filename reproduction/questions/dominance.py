@@ -23,16 +23,8 @@ from dwell.model import (
     Task,
     Uniform,
 )
-from dwell.study import Point, Study, paired_difference
-from reproduction.cell import (
-    RULES,
-    STEADY,
-    of_cell,
-    rules,
-    statics,
-    with_candidate,
-    with_scenarios,
-)
+from dwell.study import Interval, Point, Study, paired_difference
+from reproduction.cell import RULES, STEADY, of_cell, rules, statics, with_candidate, with_scenarios
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
 from reproduction.verdicts import Answer, by_policy, claims, values
@@ -85,17 +77,13 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         ("steady", steady_cases(cell), scale.windows),
         ("dynamic", {one: cell.scenarios[one] for one in CHANGING}, scale.dynamic_windows),
     ):
-        three, more = (
-            of_cell(
-                f"dominance-{count}-{name}",
-                with_scenarios(base, scenarios),
-                scenarios,
-                (*placed, *rules()),
-                scale.all_seeds,
-                length,
-            )
-            for count, base, placed in (("three", cell, ()), ("four", four, statics(four)))
+        four_there, three_there = (with_scenarios(base, scenarios) for base in (four, cell))
+        who = (*statics(four), *rules())
+        more = of_cell(
+            f"dominance-four-{name}", four_there, scenarios, who, scale.all_seeds, length
         )
+        points = (Point({}, three_there),)
+        three = replace(more, name=f"dominance-three-{name}", points=points, contenders=rules())
         frames.append(run(more).runs)
         frames.append(run(three).runs.with_columns(pl.col("policy").replace_strict(without)))
         studies.append(more)
@@ -141,12 +129,10 @@ def map_points(cell: Problem, size: int) -> tuple[Point, ...]:
 
 def map_scenarios(cell: Problem, width_ms: float) -> dict[str, Scenario]:
     """Return the paper's scenarios and R2's stress, with a uniform delay on every link."""
-    jitter: Scenario = ()
-    if width_ms > 0:
-        jitter = tuple(
-            LinkDisturbance(link.source, link.target, add_delay_ms=Uniform(0.0, width_ms))
-            for link in cell.fabric.links.values()
-        )
+    jitter: Scenario = tuple(
+        LinkDisturbance(link.source, link.target, add_delay_ms=Uniform(0.0, width_ms))
+        for link in (cell.fabric.links.values() if width_ms > 0 else ())
+    )
     threads = 2 * cell.fabric.nodes[ARM].cores
     base: dict[str, Scenario] = {
         name: () if name == "undisturbed" else cell.scenarios[name] for name in PREDICTED
@@ -207,9 +193,7 @@ def winners(runs: pl.DataFrame, metric: str, candidates: Sequence[str]) -> pl.Da
                 **dict(zip((*PARAMETERS, "scenario"), labels, strict=True)),
                 "winner": first,
                 "second": second,
-                "margin": margin.mean,
-                "margin_low": margin.low,
-                "margin_high": margin.high,
+                **Interval(margin.mean, margin.low, margin.high).columns("margin"),
                 "clear": margin.low > 0,
             }
         )
@@ -222,12 +206,8 @@ def predicted(papers: pl.DataFrame, led: pl.DataFrame, candidates: Sequence[str]
     means = led.group_by(keys, maintain_order=True).agg(
         pl.col(f"share_{name}").mean().alias(name) for name in candidates
     )
-    leaders = means.select(
-        "scenario",
-        winner=pl.concat_list(candidates)
-        .list.arg_max()
-        .replace_strict(list(range(len(candidates))), list(candidates), return_dtype=pl.String),
-    )
+    most = means.select(candidates).to_numpy().argmax(axis=1)
+    leaders = means.select("scenario", winner=pl.Series([candidates[place] for place in most]))
     rows = []
     for scenario, dominant in PREDICTED.items():
         row: dict[str, object] = {"scenario": scenario, "predicted": " or ".join(dominant)}

@@ -6,7 +6,7 @@ what every candidate alone showed: their regret is what rule and lag cost, the r
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -64,9 +64,9 @@ METRICS = ("regret", "cost", "violation_rate", "share_kept", "migrations", "aoi_
 def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     """Measure regret, part it, and hold it against the aim."""
     tuning = run(tuning_study(cell, scale))
-    chosen = tuned(tuning)
-    who = contenders(cell, chosen)
-    dynamic = study_of("dynamic", cell, who, scale.all_seeds, scale.dynamic_windows)
+    who = contenders(cell, tuning)
+    length = (scale.all_seeds, scale.dynamic_windows)
+    dynamic = of_cell("dynamic", cell, DYNAMIC, who, *length, references=True)
     steady = replace(dynamic, name="dynamic-steady", scenarios=STEADY, windows=scale.windows)
     runs = pl.concat([run(study).runs for study in (dynamic, steady)])
     fractions = run(fractions_study(cell, scale))
@@ -109,13 +109,6 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 # --------------------------------------------------------------------------------- studies
 
 
-def study_of(
-    name: str, cell: Problem, who: Iterable[Contender], seeds: tuple[int, ...], windows: int
-) -> Study:
-    """Return a study of the dynamic scenarios, with references."""
-    return of_cell(name, cell, DYNAMIC, who, seeds, windows, references=True)
-
-
 def tuning_study(cell: Problem, scale: Scale) -> Study:
     """Return the grid of both rules on held-out seeds."""
     size = max(2, scale.grid // 3)
@@ -139,30 +132,22 @@ def tuning_study(cell: Problem, scale: Scale) -> Study:
         dtp(f"dtp {n} {least:g}", {"controller.min_dwell": n, "controller.min_improvement": least})
         for n, least in product(thinned((0, 1, 3), size), thinned((0.05, 0.2, 0.4), size))
     ]
-    return study_of("dynamic-tuning", cell, who, scale.held_out, scale.dynamic_windows)
+    length = (scale.held_out, scale.dynamic_windows)
+    return of_cell("dynamic-tuning", cell, DYNAMIC, who, *length, references=True)
 
 
-def tuned(tuning: StudyResult) -> dict[str, Contender]:
-    """Return the best of each rule under the name that it is compared by."""
-    score = scores(tuning.runs, "regret")
-    who = tuning.study.contenders
-    return {
-        TUNED_DTP: best([one for one in who if one.name.startswith("dtp ")], score),
-        TUNED_CUSUM: best([one for one in who if one.name.startswith("cusum ")], score),
+def contenders(cell: Problem, tuning: StudyResult) -> tuple[Contender, ...]:
+    """Return who plays: real estimators, the tuned rules too, and those that are told."""
+    score, grid = scores(tuning.runs, "regret"), tuning.study.contenders
+    tuned = {
+        name: best([one for one in grid if one.name.startswith(rule)], score)
+        for name, rule in ((TUNED_DTP, "dtp "), (TUNED_CUSUM, "cusum "))
     }
-
-
-def contenders(cell: Problem, chosen: Mapping[str, Contender]) -> tuple[Contender, ...]:
-    """Return who plays: real estimators, and those that are told."""
     real = (
-        believing("dtp", "profile", name=PAPERS_DTP),
-        believing("dtp", "shadow"),
-        believing("dtp", "scaling"),
-        believing("dtp", "corrected", name=DTP),
-        believing("dtp", "corrected", {"controller.escape": True}, name=ESCAPE),
-        believing("cusum", "corrected", name=CUSUM),
-        believing("work-function", "corrected", name=WORK),
-        *(replace(one, name=name) for name, one in chosen.items()),
+        *(believing("dtp", name) for name in ("profile", "shadow", "scaling", "corrected")),
+        dtp(ESCAPE, {"controller.escape": True}),
+        *(believing(name, "corrected") for name in ("cusum", "work-function")),
+        *(replace(one, name=name) for name, one in tuned.items()),
     )
     told = [
         replace(one, name=TOLD[one.name], estimator=Hindsight()) for one in real if one.name in TOLD
@@ -177,7 +162,8 @@ def fractions_study(cell: Problem, scale: Scale) -> Study:
         for policy, share in product(("dtp", "cusum"), (0.0, *FRACTIONS))
         for name in (f"{policy}+corrected {share:g}",)
     ]
-    return study_of("dynamic-fractions", cell, who, scale.some_seeds, scale.dynamic_windows)
+    length = (scale.some_seeds, scale.dynamic_windows)
+    return of_cell("dynamic-fractions", cell, DYNAMIC, who, *length, references=True)
 
 
 # ----------------------------------------------------------------------------------- aims
@@ -185,13 +171,9 @@ def fractions_study(cell: Problem, scale: Scale) -> Study:
 
 def reference_rates(runs: pl.DataFrame, scenario: str, candidates: Sequence[str]) -> np.ndarray:
     """V_D of the reference, one a seed: of the cheapest candidate or clairvoyant sequence."""
-    known = (*candidates, *REFERENCES)
-    costs, rates = (
-        np.stack([values(runs, column, scenario=scenario, policy=name) for name in known])
-        for column in ("cost", "violation_rate")
-    )
-    found: np.ndarray = rates[costs.argmin(axis=0), np.arange(rates.shape[1])]
-    return found
+    known = runs.filter(pl.col("policy").is_in((*candidates, *REFERENCES)), scenario=scenario)
+    cheapest = known.sort("seed", "cost", maintain_order=True).group_by("seed", maintain_order=True)
+    return cheapest.first()["violation_rate"].to_numpy()
 
 
 def aims(
@@ -226,16 +208,14 @@ def within(known: Interval, bound: float) -> str:
 
 def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:
     """Part regret into what rule and lag make of it, and what the estimate adds, seed by seed."""
-    rows = []
-    for scenario, (name, told) in product((*DYNAMIC, *STEADY), TOLD.items()):
-        mine, rule = (values(runs, "regret", scenario=scenario, policy=who) for who in (name, told))
-        static = np.min(
-            [values(runs, "regret", scenario=scenario, policy=one) for one in candidates], axis=0
-        )
-        row: dict[str, object] = {"scenario": scenario, "policy": name}
-        shown = {"regret": mine, "rule_and_lag": rule, "estimate": mine - rule}
-        for column, sample in (shown | {"best_static": static}).items():
-            known = mean_interval(sample)
-            row |= {column: known.value, f"{column}_low": known.low, f"{column}_high": known.high}
-        rows.append(row)
-    return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
+    keys, policy = ("scenario", "seed"), pl.col("policy")
+    static = runs.filter(policy.is_in(candidates)).group_by(keys).agg(best_static=pl.min("regret"))
+    rule = runs.filter(policy.is_in(TOLD.values())).select(
+        *keys,
+        policy=policy.replace_strict({told: name for name, told in TOLD.items()}),
+        rule_and_lag="regret",
+    )
+    parted = runs.drop("best_static").join(rule, on=(*keys, "policy"), maintain_order="left")
+    parted = parted.join(static, on=keys, maintain_order="left")
+    parted = parted.with_columns(estimate=pl.col("regret") - pl.col("rule_and_lag"))
+    return by_policy(parted, ("regret", "rule_and_lag", "estimate", "best_static")).drop("seeds")

@@ -6,7 +6,6 @@ migrations (a moved task waits for its state and its start), which make every mo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -14,7 +13,7 @@ import polars as pl
 
 from dwell.model import FrozenDict, Problem
 from dwell.study import Contender
-from reproduction.cell import PAPERS_DTP, believing, by_length, dtp, of_cell
+from reproduction.cell import believing, by_length, dtp, of_cell
 from reproduction.questions import Run
 from reproduction.scale import Scale
 from reproduction.verdicts import Answer, by_policy, claims
@@ -33,16 +32,14 @@ COLD = ("flapping", "mixture", "step")
 START_MS, STATE_BYTES = 500.0, 20_000_000
 
 METRICS = ("migrations", "cost", "violation_rate")
+MIGRATION = "controller.migration"
 COSTS = "A cold migration costs more than a warm one"
-#: Policies whose migrations are tried cold: the policy, its estimator and settings.
-MOVERS: Mapping[str, tuple[str, str, Mapping[str, object]]] = {
-    PAPERS_DTP: ("dtp", "profile", {}),
-    "cusum+corrected": ("cusum", "corrected", {}),
-    **{
-        f"dtp+corrected, N_min = {dwell}": ("dtp", "corrected", {"controller.min_dwell": dwell})
-        for dwell in (0, 3, 12)
-    },
-}
+#: Policies whose migrations are tried cold.
+MOVERS = (
+    believing("dtp", "profile"),
+    believing("cusum", "corrected"),
+    *(dtp(f"dtp+corrected, N_min = {n}", {"controller.min_dwell": n}) for n in (0, 3, 12)),
+)
 
 
 def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
@@ -54,16 +51,16 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         for n, least in product(dwells, thresholds)
     ]
     escaping = [
-        believing("dtp", belief, {"controller.escape": on}, name=escape_name(belief, on))
+        Contender(escape_name(belief, on), "dtp", belief, {"controller.escape": on})
         for belief, on in product(("profile", "corrected"), (False, True))
     ]
     moving = [
-        Contender(f"{name}, {kind}", policy, belief, {**more, "controller.migration": kind})
-        for (name, (policy, belief, more)), kind in product(MOVERS.items(), ("warm", "cold"))
+        replace(one, name=f"{one.name}, {kind}", settings={**one.settings, MIGRATION: kind})
+        for one, kind in product(MOVERS, ("warm", "cold"))
     ]
     calmer = [(grid_name(*one), grid_name(*NONE)) for one in SETTINGS]
     freer = [(escape_name(one, True), escape_name(one, False)) for one in ("profile", "corrected")]
-    dearer = [(f"{one}, cold", f"{one}, warm") for one in MOVERS]
+    dearer = [(f"{one.name}, cold", f"{one.name}, warm") for one in MOVERS]
     verdicts, tables = [], {}
     for name, claim, problem, scenarios, who, seeds, pairs in (
         ("", "Hysteresis calms DTP, against none", cell, SCENARIOS, grid, scale.some_seeds, calmer),

@@ -18,7 +18,7 @@ from dwell.study import Contender, Point, Study, median_interval
 from reproduction.cell import believing, rules, statics
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, Pairs, between, compare, judge, values
+from reproduction.verdicts import Answer, claims, judge, values
 
 TITLE = "Does the jitter of the links decide where the stages should run?"
 
@@ -53,23 +53,26 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     def study(name: str, points: Sequence[Point], who: Sequence[Contender]) -> Study:
         return Study(name, tuple(points), SCENARIOS, tuple(who), scale.some_seeds, scale.windows)
 
-    spread = study("jitter", enveloped(cell, widths), (*fixed, *adaptive))
-    mean = study("jitter-mean", enveloped(cell, widths, spread=False), fixed)
-    classes = study("jitter-classes", classed(cell), (*fixed, *adaptive))
+    delays = {width: Uniform(BASE_MS, BASE_MS + width) for width in widths}
+    means = {width: Constant(BASE_MS + width / 2) for width in widths}
+    spread = study("jitter", delayed(cell, WIDTH, delays), (*fixed, *adaptive))
+    mean = study("jitter-mean", delayed(cell, WIDTH, means), fixed)
+    classes = study("jitter-classes", delayed(cell, NETWORK, CLASSES), (*fixed, *adaptive))
     periods = study("jitter-periods", timed(cell), (*fixed, believing("dtp", "profile"), *adaptive))
     results = {one.name: run(one) for one in (spread, mean, classes, periods)}
-    runs = results["jitter"].runs
-    both = pl.concat(
-        results[name]
-        .runs.select(AT, "scenario", "policy", "seed", "violation_rate")
-        .with_columns(spread=pl.lit(name))
-        for name in ("jitter", "jitter-mean")
-    )
-    rate, beyond = ("violation_rate",), "Variation raises V_D beyond its mean"
+    runs = by_envelope(results["jitter"].runs)
+    narrow, even = f", w = {widths[0]:g} ms", ", delays at their mean"
+    wider = pl.concat([runs, narrowest(results["jitter"].runs, widths, narrow)])
+    varying = pl.concat([runs, by_envelope(results["jitter-mean"].runs, even)], how="diagonal")
+    places = [at(*place) for place in product(SCENARIOS, widths)]
+    beyond_first = [at(*place) for place in product(SCENARIOS, widths[1:])]
+    pays = {"Offloading pays": [(OFFLOADED, LOCAL)]}
+    raises = {"A wider envelope raises V_D": [(one, one + narrow) for one in spread.policies]}
+    varies = {"Variation raises V_D beyond its mean": [(one, one + even) for one in mean.policies]}
     verdicts = [
-        compare(runs, "Offloading pays", ("cost", *rate), offloading(widths), spread),
-        compare(runs, "A wider envelope raises V_D", rate, wider(spread, widths), spread),
-        compare(both, beyond, rate, varying(mean, widths), mean),
+        *claims(runs, ("cost", "violation_rate"), places, pays, spread),
+        *claims(wider, ("violation_rate",), beyond_first, raises, spread),
+        *claims(varying, ("violation_rate",), places, varies, mean),
         *(turning(runs, scenario, widths, spread) for scenario in SCENARIOS),
     ]
     return Answer(
@@ -83,28 +86,6 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
 
 
 # ---------------------------------------------------------------------------------- points
-
-
-def enveloped(cell: Problem, widths: Sequence[float], *, spread: bool = True) -> list[Point]:
-    """Return a point for every envelope, or one with the mean of its delays alone."""
-    return [
-        Point(
-            {WIDTH: width},
-            with_delay(
-                cell,
-                Uniform(BASE_MS, BASE_MS + width) if spread else Constant(BASE_MS + width / 2),
-            ),
-        )
-        for width in widths
-    ]
-
-
-def classed(cell: Problem) -> list[Point]:
-    """Return a point for every class of networks."""
-    return [
-        Point({NETWORK: name}, cell if delay_ms is None else with_delay(cell, delay_ms))
-        for name, delay_ms in CLASSES.items()
-    ]
 
 
 def timed(cell: Problem) -> list[Point]:
@@ -121,46 +102,22 @@ def timed(cell: Problem) -> list[Point]:
     return points
 
 
-def with_delay(cell: Problem, delay_ms: Process) -> Problem:
-    """Return the cell with the same delay on every link, and nobody else's traffic."""
-    links = {
-        name: replace(link, delay_ms=delay_ms, bursts=None)
-        for name, link in cell.fabric.links.items()
-    }
-    return replace(cell, fabric=replace(cell.fabric, links=FrozenDict(links)))
+def delayed(
+    cell: Problem, parameter: str, delays_ms: Mapping[float, Process] | Mapping[str, Process | None]
+) -> list[Point]:
+    """Return a point a delay, which every link has, with nobody else's traffic; None: the cell."""
+    points = []
+    for value, delay_ms in delays_ms.items():
+        links = {
+            name: replace(link, delay_ms=delay_ms, bursts=None) if delay_ms else link
+            for name, link in cell.fabric.links.items()
+        }
+        fabric = replace(cell.fabric, links=FrozenDict(links))
+        points.append(Point({parameter: value}, replace(cell, fabric=fabric)))
+    return points
 
 
 # --------------------------------------------------------------------------------- reading
-
-
-def offloading(widths: Sequence[float]) -> Pairs:
-    """Return offloading both stages beside none, at every envelope."""
-    return {
-        (at(scenario, width), OFFLOADED, LOCAL): between(scenario, OFFLOADED, LOCAL, **{AT: width})
-        for scenario, width in product(SCENARIOS, widths)
-    }
-
-
-def wider(study: Study, widths: Sequence[float]) -> Pairs:
-    """Return every envelope beside the narrowest."""
-    first = widths[0]
-    return {
-        (at(scenario, width), policy, f"{policy}, w = {first:g} ms"): (
-            {"scenario": scenario, "policy": policy, AT: width},
-            {"scenario": scenario, "policy": policy, AT: first},
-        )
-        for scenario, policy, width in product(SCENARIOS, study.policies, widths[1:])
-    }
-
-
-def varying(study: Study, widths: Sequence[float]) -> Pairs:
-    """Return delays as they are beside all of them at their mean."""
-    found: dict[tuple[str, str, str], tuple[dict[str, object], dict[str, object]]] = {}
-    for scenario, policy, width in product(SCENARIOS, study.policies, widths):
-        labels: dict[str, object] = {"scenario": scenario, "policy": policy, AT: width}
-        names = (at(scenario, width), policy, f"{policy}, delays at their mean")
-        found[names] = ({**labels, "spread": "jitter"}, {**labels, "spread": "jitter-mean"})
-    return found
 
 
 def at(scenario: str, width: float) -> str:
@@ -168,20 +125,31 @@ def at(scenario: str, width: float) -> str:
     return f"{scenario}, w = {width:g} ms"
 
 
+def by_envelope(runs: pl.DataFrame, suffix: str = "") -> pl.DataFrame:
+    """Return runs with the envelope in the scenario's name, and a suffix behind the policy's."""
+    suffixes = {width: at("", width) for width in ENVELOPES_MS}
+    return runs.with_columns(
+        scenario=pl.col("scenario") + pl.col(AT).replace_strict(suffixes),
+        policy=pl.col("policy") + suffix,
+    )
+
+
+def narrowest(runs: pl.DataFrame, widths: Sequence[float], suffix: str) -> pl.DataFrame:
+    """Return the runs at the narrowest envelope as if they were those of every wider one."""
+    first = runs.filter(pl.col(AT) == widths[0])
+    moved = (first.with_columns(pl.lit(width).alias(AT)) for width in widths[1:])
+    return pl.concat(by_envelope(one, suffix) for one in moved)
+
+
 def turning(
     runs: pl.DataFrame, scenario: str, widths: Sequence[float], study: Study
 ) -> pl.DataFrame:
     """Judge up to which envelope offloading costs less by J: the median over seeds."""
-    here = runs.filter(scenario=scenario)
-    excess = np.stack(
-        [
-            np.subtract(
-                *(values(here, "cost", policy=who, **{AT: w}) for who in (OFFLOADED, LOCAL))
-            )
-            for w in widths
-        ]
+    offloaded, local = (
+        np.stack([values(runs, "cost", scenario=at(scenario, w), policy=who) for w in widths])
+        for who in (OFFLOADED, LOCAL)
     )
-    known = median_interval([turning_point(widths, one) for one in excess.T])
+    known = median_interval([turning_point(widths, one) for one in (offloaded - local).T])
     word = "cannot tell"
     if known.known:
         within = known.low > 0 and np.isfinite(known.high)

@@ -16,12 +16,13 @@ from dwell.study import Contender, longest_run
 from reproduction.cell import EXAMPLES, PAPERS_DTP, believing, of_cell, rules, statics
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, by_policy, compare, policies, under_aim
+from reproduction.verdicts import Answer, by_policy, claims, under_aim
 
 TITLE = "Do the findings hold where recorded measurements are replayed?"
 
 CELLS = ("real.yaml", "real-5g.yaml")
 METRICS = ("violation_rate", "cost", "migrations")
+FINDINGS = "The findings hold on recorded traces"
 
 
 def answer(traces: Path, scale: Scale, run: Run) -> Answer:
@@ -44,9 +45,9 @@ def answer(traces: Path, scale: Scale, run: Run) -> Answer:
     pairs += [(cusum, PAPERS_DTP), (cusum, dtp)]
     columns = ("violation_rate", "l95_ms", "u_robot", "cost", "migrations", "aoi_mean_ms")
     main = by_policy(runs, columns)
-    named = policies(dict.fromkeys(runs["scenario"]), pairs)
+    scenarios, asked = main["scenario"].unique(maintain_order=True), {FINDINGS: pairs}
     verdicts = [
         under_aim(main, runs, *studies),
-        compare(runs, "The findings hold on recorded traces", METRICS, named, *studies),
+        *claims(runs, METRICS, scenarios, asked, *studies),
     ]
     return Answer(pl.concat(verdicts), {"Every policy on the recorded traces": main})

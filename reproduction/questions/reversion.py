@@ -24,7 +24,7 @@ from reproduction.cell import (
 )
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
-from reproduction.verdicts import Answer, by_policy, claims, compare
+from reproduction.verdicts import Answer, by_policy, claims
 
 TITLE = "RQ2: Does routing T3 to R2 during network faults outperform binary R1/E reversion?"
 
@@ -76,8 +76,9 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     two = with_candidates(faulty, BINARY)
     binary = of_cell("reversion-binary", two, scenarios, rules(), *long)
     without = {rule: f"{rule} {' or '.join(BINARY)}" for rule in RULES}
-    reverting = run(binary).runs.with_columns(pl.col("policy").replace_strict(without))
-    runs = pl.concat([run(whole).runs, reverting], how="diagonal")
+    having, lacking = run(whole).runs, run(binary).runs
+    reverting = lacking.with_columns(pl.col("policy").replace_strict(without))
+    runs = pl.concat([having, reverting], how="diagonal")
     sweep = run(sweep_study(cell, scale))
     faults = [name for name in scenarios if control(name) != name]
     pairs = [(rule, other) for rule, less in without.items() for other in (less, "atp")]
@@ -86,19 +87,20 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
         "HYB that never moves beats LOC and SO": [(HYBRID, other) for other in BINARY],
     }
     verdicts = claims(runs, METRICS, scenarios, asked, whole)
-    changes = pl.concat(
-        change(runs, scenario, rule, less)
-        for scenario, (rule, less) in product(scenarios, without.items())
+    keys = ("scenario", "policy", "seed")
+    changes = having.join(lacking, on=keys).select(
+        *keys, *(pl.col(name) - pl.col(f"{name}_right") for name in METRICS)
     )
-    beyond = {
-        (scenario, rule, control(scenario)): (
-            {"scenario": scenario, "policy": rule},
-            {"scenario": control(scenario), "policy": rule},
+    changes = changes.rename(dict(zip(METRICS, CHANGES, strict=True)))
+    calm = pl.concat(
+        changes.filter(scenario=control(fault)).with_columns(
+            scenario=pl.lit(fault), policy=pl.col("policy") + f", {NONE}"
         )
-        for scenario, rule in product(faults, RULES)
-    }
-    claim = "Having HYB helps more with the fault than under the same stress without it"
-    verdicts.append(compare(changes, claim, CHANGES, beyond, whole))
+        for fault in faults
+    )
+    beyond = "Having HYB helps more with the fault than under the same stress without it"
+    asked = {beyond: [(rule, f"{rule}, {NONE}") for rule in RULES]}
+    verdicts += claims(pl.concat([changes, calm]), CHANGES, faults, asked, whole)
     columns = ("violation_rate", "l95_ms", "cost", "migrations")
     return Answer(
         pl.concat(verdicts),
@@ -147,18 +149,6 @@ def control(scenario: str) -> str:
     """Return the scenario with the same stress and no fault."""
     _, plus, condition = scenario.partition(" + ")
     return f"{NONE}{plus}{condition}"
-
-
-def change(runs: pl.DataFrame, scenario: str, rule: str, less: str) -> pl.DataFrame:
-    """Return what having HYB changes for a rule, one row a seed."""
-    having, lacking = (
-        runs.filter(scenario=scenario, policy=name).sort("seed") for name in (rule, less)
-    )
-    differences = {
-        name: having[metric] - lacking[metric]
-        for name, metric in zip(CHANGES, METRICS, strict=True)
-    }
-    return having.select("scenario", "policy", "seed").with_columns(**differences)
 
 
 def crossed(cell: Problem) -> pl.DataFrame:

@@ -15,7 +15,7 @@ from dwell.study import paper_predictions
 from reproduction.cell import PAPERS_DTP
 from reproduction.questions import Run, study_file
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, by_policy, compare, policies, under_aim
+from reproduction.verdicts import Answer, by_policy, claims, under_aim
 
 TITLE = "Do the paper's predictions for the steady scenarios hold?"
 
@@ -42,16 +42,11 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     candidates = tuple(cell.candidates)
     pairs = [(PAPERS_DTP, other) for other in candidates]
     pairs += [(CORRECTED, other) for other in (*candidates, PAPERS_DTP)]
+    asked = {"DTP against the static placements": pairs}
     main = by_policy(result.runs, [*MAIN, *(f"share_{name}" for name in candidates)])
     verdicts = [
         under_aim(main, result.runs, study),
-        compare(
-            result.runs,
-            "DTP against the static placements",
-            ("violation_rate", "cost"),
-            policies(study.scenarios, pairs),
-            study,
-        ),
+        *claims(result.runs, ("violation_rate", "cost"), study.scenarios, asked, study),
     ]
     predictions = paper_predictions(result, ADAPTIVE)
     of_policies = pl.col("policy").is_in(ADAPTIVE)

@@ -13,11 +13,11 @@ from SALib.analyze import sobol as analysis
 from SALib.sample import sobol as sampling
 
 from dwell.model import Problem
-from dwell.study import Contender, StudyResult
+from dwell.study import Contender, Interval, StudyResult
 from reproduction.cell import DYNAMIC, STEADY, by_length, dtp, of_cell
 from reproduction.questions import Run
 from reproduction.scale import Scale
-from reproduction.verdicts import Answer, compare, policies
+from reproduction.verdicts import Answer, claims
 
 TITLE = "RQ4: Does it matter how the five weights are chosen?"
 
@@ -54,9 +54,9 @@ def answer(cell: Problem, scale: Scale, run: Run) -> Answer:
     swept = pl.concat([indices(run(study), scale.sobol_n) for study in together])
     runs = pl.concat([run(study).runs for study in alone])
     pairs = [(one.name, AS_IT_IS) for one in alone[0].contenders if one.name != AS_IT_IS]
-    claim = "One weight changed changes a metric"
+    asked = {"One weight changed changes a metric": pairs}
     return Answer(
-        compare(runs, claim, OUTPUTS, policies(ONE_AT_A_TIME, pairs), *alone),
+        pl.concat(claims(runs, OUTPUTS, ONE_AT_A_TIME, asked, *alone)),
         {"Outputs over the weights, the part of it that is luck, and Sobol indices": swept},
     )
 
@@ -110,7 +110,7 @@ def indices(result: StudyResult, n: int) -> pl.DataFrame:
                 value = half = np.nan
                 if found is not None:
                     value, half = float(found[name][index]), float(found[f"{name}_conf"][index])
-                row |= {name: value, f"{name}_low": value - half, f"{name}_high": value + half}
+                row |= Interval(value, value - half, value + half).columns(name)
             rows.append(row)
     return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
 
