@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -37,21 +36,19 @@ def test_of_a_policy_that_moves_what_was_decided_on_them_is_left_out_too() -> No
         told = {"excluded": [5, {"window": 7, "reason": "steal"}, 50, last]}
         one = read_measured(name, with_meta(run, pressure=told), problem)
         assert set(one.excluded) == left_out
-        assert one.excluded[7] == "steal"
-    assert one.excluded[52] == "what was decided on window 50 holds for so long"
 
 
 @pytest.mark.parametrize(
     ("meta", "expected"),
     [
-        ({}, {}),
-        ({"excluded_windows": [3, 4]}, {3: "excluded", 4: "excluded"}),
-        ({"excluded_windows": {"3": "steal"}}, {3: "steal"}),
-        ({"excluded_windows": [[3, "steal"]]}, {3: "steal"}),
-        ({"pressure": {"excluded": [9]}}, {9: "excluded"}),
+        ({}, set()),
+        ({"excluded_windows": [3, 4]}, {3, 4}),
+        ({"excluded_windows": {"3": "steal"}}, {3}),
+        ({"excluded_windows": [[3, "steal"]]}, {3}),
+        ({"pressure": {"excluded": [9]}}, {9}),
     ],
 )
-def test_ways_to_name_windows(meta: dict[str, Any], expected: Mapping[int, str]) -> None:
+def test_ways_to_name_windows(meta: dict[str, Any], expected: set[int]) -> None:
     assert excluded_windows(meta) == expected
 
 

@@ -9,14 +9,13 @@ family: the 5 % hold for each, and a report says how many there are.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.study.intervals import CONFIDENCE, median_interval, share_interval
+from dwell.study.intervals import CONFIDENCE, Floats, median_interval, share_interval
 from dwell.study.over_seeds import interval_of, metric_values
 from dwell.study.pairs import (
     PairedDifference,
@@ -29,7 +28,6 @@ from dwell.study.pairs import (
 if TYPE_CHECKING:
     import polars as pl
 
-Floats: TypeAlias = NDArray[np.float64]
 #: Columns of runs and what they have to be, for one run a seed to be left.
 Labels: TypeAlias = Mapping[str, object]
 #: Two groups of runs, one run a seed each.
@@ -88,8 +86,8 @@ class Family:
     @property
     def adjusted(self) -> dict[str, float]:
         """Holm's p value of each comparison."""
-        found = holm([item.p for item in self.comparisons.values()])
-        return dict(zip(self.comparisons, found, strict=True))
+        adjusted = holm([item.p for item in self.comparisons.values()])
+        return dict(zip(self.comparisons, adjusted, strict=True))
 
     @property
     def verdicts(self) -> dict[str, Comparative]:
@@ -128,16 +126,32 @@ class Family:
         """
         import polars as pl
 
+        columns = {
+            **dict.fromkeys(("question", "metric", "comparison", "centre"), pl.String),
+            **dict.fromkeys(("difference", "low", "high", "d_z", "superiority"), pl.Float64),
+            "n": pl.Int64,
+            **dict.fromkeys(("p", "p_holm", "p_least"), pl.Float64),
+            "verdict": pl.String,
+        }
         adjusted, verdicts = self.adjusted, self.verdicts
-        rows = [
-            (
-                *(self.question, self.metric, name),
-                *_numbers(item),
-                *(adjusted[name], _least_adjusted(item.n, len(self.comparisons)), verdicts[name]),
+        rows = []
+        for name, item in self.comparisons.items():
+            centre = "mean" if isinstance(item, PairedDifference) else "median"
+            known = asdict(item)
+            rows.append(
+                {
+                    "question": self.question,
+                    "metric": self.metric,
+                    "comparison": name,
+                    "centre": centre,
+                    "difference": known.pop(centre),
+                    **known,
+                    "p_holm": adjusted[name],
+                    "p_least": _least_adjusted(item.n, len(self.comparisons)),
+                    "verdict": verdicts[name],
+                }
             )
-            for name, item in self.comparisons.items()
-        ]
-        return pl.DataFrame(rows, schema=_schema(), orient="row").fill_nan(None)
+        return pl.DataFrame(rows, schema=columns).fill_nan(None)
 
 
 def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
@@ -159,13 +173,13 @@ def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
     """
     import polars as pl
 
-    mine = runs.filter(*(pl.col(name) == value for name, value in labels.items()))
-    if mine.is_empty() or mine["seed"].n_unique() != mine.height:
+    group = runs.filter(*(pl.col(name) == value for name, value in labels.items()))
+    if group.is_empty() or group["seed"].n_unique() != group.height:
         raise SimulationError(
-            f"{dict(labels)} leaves {mine.height} runs of {mine['seed'].n_unique()} seeds; it must "
-            "leave one a seed"
+            f"{dict(labels)} leaves {group.height} runs of {group['seed'].n_unique()} seeds; it "
+            "must leave one a seed"
         )
-    return metric_values(mine.sort("seed"), column)
+    return metric_values(group.sort("seed"), column)
 
 
 def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
@@ -227,28 +241,3 @@ def holm(p_values: Sequence[float]) -> list[float]:
     adjusted = np.empty(len(values))
     adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1.0)
     return [float(value) for value in adjusted]
-
-
-def _numbers(item: Difference) -> tuple[str | float | int | None, ...]:
-    """Return what a row of `Family.table` shows of a comparison alone."""
-    if isinstance(item, PairedDifference):
-        centre: tuple[str, float] = ("mean", item.mean)
-        d_z: float | None = item.d_z
-    else:
-        centre, d_z = ("median", item.median), None
-    return (*centre, item.low, item.high, d_z, item.superiority, item.n, item.p)
-
-
-def _schema() -> dict[str, pl.DataType]:
-    """Columns of `Family.table`, for a family without comparisons too."""
-    import polars as pl
-
-    text = ("question", "metric", "comparison", "centre", "verdict")
-    order = (
-        *("question", "metric", "comparison", "centre", "difference", "low", "high", "d_z"),
-        *("superiority", "n", "p", "p_holm", "p_least", "verdict"),
-    )
-    return {
-        name: pl.String() if name in text else pl.Int64() if name == "n" else pl.Float64()
-        for name in order
-    }

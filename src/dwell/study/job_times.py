@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.model import Problem
-from dwell.study.intervals import Interval, mean_interval
+from dwell.study.intervals import Floats, Interval, mean_interval
 from dwell.study.summary import count_in, order_statistic
 
 if TYPE_CHECKING:
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
-Floats: TypeAlias = NDArray[np.float64]
 
 BASELINE = "baseline"
 ENDS = ("", "_low", "_high", "_p5", "_p50", "_p95")

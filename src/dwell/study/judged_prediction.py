@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import Problem
-from dwell.study.intervals import CONFIDENCE, Interval, rule_of_three
+from dwell.study.intervals import CONFIDENCE, Floats, Interval, rule_of_three
 from dwell.study.qos_sample import QosSample
 from dwell.study.resampling import ends, resample_units, resample_windows
 
-Floats: TypeAlias = NDArray[np.float64]
 Outcome: TypeAlias = Literal["met", "explained", "open", "missed", ""]
 
 L95_ALLOWED = 0.10

@@ -20,6 +20,7 @@ from dwell.record import Run, open_run
 from dwell.record.campaign_folder import CampaignFolder, read_campaign
 from dwell.study.comparison import Comparison
 from dwell.study.job_times import jobs_of, links_of, profiles_of
+from dwell.study.measured_run import excluded_windows
 from dwell.study.player import Example
 from dwell.study.summary import Row, busiest_nodes, latency_grid_ms, summarise
 
@@ -165,14 +166,10 @@ def without_excluded(run: Run, problem: Problem) -> Run:
     Ages at the actuator and tracking errors are of no use in what is left: they go on through the
     gaps.
 
-    Parameters
-    ----------
-    run : Run
-        Its ``meta`` say under ``pressure`` which windows are excluded.
     """
     import polars as pl
 
-    excluded = list((run.meta.get("pressure") or {}).get("excluded", ()))
+    excluded = sorted(excluded_windows(run.meta))
     if not excluded:
         return run
     kept = ~pl.col("window").is_in(excluded)

@@ -54,9 +54,10 @@ class MeasuredRun:
         Whether the cell's guard could act.
     jobs : bool
         Whether the run kept its jobs.
-    excluded : mapping of int to str
-        Windows that are left out, and why: those of its record and, of a policy that moves, those
-        after them in which what was decided on them holds.
+    excluded : frozenset of int
+        Windows that are left out: those of its record and, of a policy that moves, those after them
+        in which what was decided on them holds. Whether it moved there makes no difference: who
+        looks for that would choose by the result.
     """
 
     name: str
@@ -67,7 +68,7 @@ class MeasuredRun:
     windows: int
     guard: bool
     jobs: bool
-    excluded: Mapping[int, str]
+    excluded: frozenset[int]
 
     @property
     def contender(self) -> str:
@@ -123,9 +124,12 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
         )
         problem = at_speed_of(run, problem, usual or Usual())
         if policy not in problem.candidates:
-            excluded = _with_consequences(
-                excluded, problem.controller.min_dwell, run.windows.height
-            )
+            excluded |= {
+                window + step
+                for window in excluded
+                for step in range(1, problem.controller.min_dwell + 1)
+                if window + step < run.windows.height
+            }
     except DwellError as error:
         raise RunError(f"{name}: {error}") from None
     live = meta.get("kind", "simulated") != "simulated"
@@ -143,55 +147,41 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
     )
 
 
-def excluded_windows(meta: Mapping[str, Any]) -> dict[int, str]:
-    """Return the windows that a run's record says to leave out, and why.
+def excluded_windows(meta: Mapping[str, Any]) -> frozenset[int]:
+    """Return the windows that a run's record says to leave out.
 
     Parameters
     ----------
     meta : mapping
         ``excluded_windows``, or ``excluded`` of ``pressure``: numbers, mappings with ``window``
-        and ``reason``, or a mapping of number to reason. None where both are missing.
+        and ``reason``, pairs of these, or a mapping of number to reason. None where both are
+        missing.
 
     Raises
     ------
     RunError
         If it is something else.
     """
-    found: dict[int, str] = {}
     pressure = meta.get("pressure")
     named = {
         "excluded_windows": meta.get("excluded_windows"),
         "pressure.excluded": pressure.get("excluded") if isinstance(pressure, Mapping) else None,
     }
-    for field, told in named.items():
-        pairs = told.items() if isinstance(told, Mapping) else map(_numbered, told or ())
+    numbers: set[int] = set()
+    for field, windows in named.items():
         try:
-            found.update({int(number): str(reason) for number, reason in pairs})
+            numbers.update(map(_number_of, windows or ()))
         except (TypeError, ValueError):
-            raise RunError(f"{field} is {told!r}; numbers of windows are wanted") from None
-    return found
+            raise RunError(f"{field} is {windows!r}; numbers of windows are wanted") from None
+    return frozenset(numbers)
 
 
-def _with_consequences(excluded: Mapping[int, str], min_dwell: int, windows: int) -> dict[int, str]:
-    """Add the windows after each in which a move that was decided on it cannot be taken back.
-
-    Whether there was such a move makes no difference: who looks for it would choose by the result.
-    """
-    after = {
-        window + step: f"what was decided on window {window} holds for so long"
-        for window in excluded
-        for step in range(1, min_dwell + 1)
-        if window + step < windows
-    }
-    return after | dict(excluded)
-
-
-def _numbered(item: object) -> tuple[Any, Any]:
-    if isinstance(item, Mapping):
-        return item.get("window"), item.get("reason", "excluded")
-    if isinstance(item, Sequence) and not isinstance(item, str) and len(item) == 2:
-        return item[0], item[1]
-    return item, "excluded"
+def _number_of(window: Any) -> int:
+    if isinstance(window, Mapping):
+        window = window.get("window")
+    elif isinstance(window, Sequence) and not isinstance(window, str) and len(window) == 2:
+        window = window[0]
+    return int(window)
 
 
 # ------------------------------------------------------------------------------------- the cell

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from dwell.errors import MetricError
 from dwell.model.semantics import nearest
 from dwell.study.intervals import (
+    Floats,
     Interval,
     mean_interval,
     median_interval,
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
 
     from dwell.study.summary import Row
 
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Means of what cannot be below 0, as utilisations cannot.
 NOT_NEGATIVE = frozenset({"cost", "j_still", "l95_ms", "migrations", "moved", "returns"})

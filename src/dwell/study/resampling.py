@@ -17,14 +17,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED
-
-Floats: TypeAlias = NDArray[np.float64]
+from dwell.study.intervals import CONFIDENCE, RESAMPLING_SEED, Floats
 
 #: So many that the quantiles of 2.5 % are order statistics of the resamples.
 DRAWS = 999

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from dwell.display import Displayed
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import Problem
 from dwell.model.semantics import nearest
-from dwell.study.intervals import Interval
+from dwell.study.intervals import Floats, Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
 
 if TYPE_CHECKING:
     import polars as pl
 
-Floats: TypeAlias = NDArray[np.float64]
 
 #: Begin of the columns that hold the values of parameters.
 PARAMETER = "parameter."

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from dwell.cellfile.work_folder import claimed
 from dwell.errors import SimulationError
 from dwell.study.player import Example, PlayedItem, Player
 from dwell.study.results import PARAMETER, StudyRuns
 from dwell.study.software import describe, versions
 from dwell.study.study import Item, Study
-from dwell.study.study_folder import TABLES, opened
+from dwell.study.study_folder import PARTS, STUDY, TABLES, finished, read_parts, write_table
 from dwell.study.summary import latency_grid_ms
 from dwell.study.workers import available_processes, spread
 
@@ -149,23 +150,23 @@ def _play_in_folder(
     items = study.items()
     names = [item.name for item in items]
     count = _counter(study, progress)
-    with opened(folder, describe(study), names) as there:
 
-        def take(item: Item, played: PlayedItem) -> None:
-            there.write_part(item.name, _frame(played))
-            count([item])
+    def take(item: Item, played: PlayedItem) -> None:
+        write_table(folder, f"{PARTS}/{item.name}", _frame(played))
+        count([item])
 
-        finished = there.finished()
-        count([item for item in items if item.name in finished])
-        missing = [item for item in items if item.name not in finished]
+    with claimed(folder, STUDY, describe(study)):
+        known = finished(folder)
+        count([item for item in items if item.name in known])
+        missing = [item for item in items if item.name not in known]
         try:
             _play(player, missing, processes, dask, take)
             # From the files in any case: a study that was stopped makes its tables of the same.
-            tables = _assembled(study, there.read_parts(names))
+            tables = _assembled(study, read_parts(folder, names))
             for name, table in tables.items():
-                there.write_table(name, table)
+                write_table(folder, name, table)
         except SimulationError as error:
-            done = len(there.finished())
+            done = len(finished(folder).intersection(names))
             if not done:
                 raise
             raise SimulationError(

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dwell.cellfile import from_record
-from dwell.cellfile.work_folder import Description, FolderMark, claimed, unwritable
+from dwell.cellfile.work_folder import FolderMark, unwritable
 from dwell.errors import DwellError, RunError
 from dwell.files import write_whole
 from dwell.study.results import StudyRuns
@@ -30,80 +28,41 @@ STUDY = FolderMark("study", "study.json", 1, (PARTS,))
 TABLES = ("runs", "costs", "latencies")
 
 
-@dataclass(slots=True)
-class StudyFolder:
-    """The folder of one study, open for this process alone.
-
-    Parameters
-    ----------
-    names : frozenset of str
-        Of all items of the study.
-    """
-
-    path: Path
-    names: frozenset[str]
-
-    def finished(self) -> frozenset[str]:
-        """Return the names of the items whose parts are there."""
-        found = (path.stem for path in (self.path / PARTS).glob("*.parquet"))
-        return self.names.intersection(found)
-
-    def write_part(self, name: str, frame: pl.DataFrame) -> None:
-        """Write the part of an item; the parts that are there stay (see `write_table`)."""
-        self.write_table(f"{PARTS}/{name}", frame)
-
-    def read_parts(self, names: Sequence[str]) -> pl.DataFrame:
-        """Return the parts of items, one below the other.
-
-        Raises
-        ------
-        RunError
-            If one cannot be read.
-        """
-        import polars as pl
-
-        remedy = "; remove it and run the study again"
-        paths = [self.path / PARTS / f"{name}.parquet" for name in names]
-        return pl.concat([_read(path, remedy) for path in paths])
-
-    def write_table(self, name: str, frame: pl.DataFrame) -> None:
-        """Write a table of the whole study.
-
-        Raises
-        ------
-        SimulationError
-            If that fails.
-        """
-        path = self.path / f"{name}.parquet"
-        # To memory first: how a disk is full is then the system's own answer.
-        data = io.BytesIO()
-        frame.rechunk().write_parquet(data)
-        try:
-            write_whole(path, data.getvalue())
-        except OSError as error:
-            raise unwritable(path, error) from None
+def finished(folder: Path) -> frozenset[str]:
+    """Return the names of the items whose parts are in the folder of a study."""
+    return frozenset(path.stem for path in (folder / PARTS).glob("*.parquet"))
 
 
-@contextmanager
-def opened(folder: Path, description: Description, names: Sequence[str]) -> Iterator[StudyFolder]:
-    """Open the folder of a study, which is made where there is none.
-
-    Parameters
-    ----------
-    description : mapping
-        JSON-able: all that the tables depend on.
-    names : sequence of str
-        Of all items.
+def read_parts(folder: Path, names: Sequence[str]) -> pl.DataFrame:
+    """Return the parts of items, one below the other.
 
     Raises
     ------
     RunError
-        If the folder holds something else, or another study, or is in use.
-    SimulationError
-        If it cannot be made or written.
+        If one cannot be read.
     """
-    with claimed(folder, STUDY, description):
-        yield StudyFolder(folder, frozenset(names))
+    import polars as pl
+
+    remedy = "; remove it and run the study again"
+    return pl.concat([_read(folder / PARTS / f"{name}.parquet", remedy) for name in names])
+
+
+def write_table(folder: Path, name: str, frame: pl.DataFrame) -> None:
+    """Write a table of the whole study, or the part ``parts/ITEM``.
+
+    Raises
+    ------
+    SimulationError
+        If that fails.
+    """
+    path = folder / f"{name}.parquet"
+    # To memory first: how a disk is full is then the system's own answer.
+    data = io.BytesIO()
+    frame.rechunk().write_parquet(data)
+    try:
+        write_whole(path, data.getvalue())
+    except OSError as error:
+        raise unwritable(path, error) from None
 
 
 def is_study(folder: Path) -> bool:
