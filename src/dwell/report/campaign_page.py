@@ -10,10 +10,9 @@ import numpy as np
 from dwell.report.charts import NO_LIMIT, cumulative
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, percent, shown_contender, write_number
-from dwell.report.method import method_blocks
-from dwell.report.page import Block, Definitions, Fact, Page, Section, page_html
+from dwell.report.page import Block, Fact, Page, Section, page_html
 from dwell.report.palette import ramp_styles
-from dwell.report.policy_blocks import RATE, PolicyBlocks, named
+from dwell.report.policy_blocks import MEASURES, PolicyBlocks, named
 from dwell.report.table import Columns, Table, Text, table_text
 from dwell.study.campaign_questions import CampaignQuestion, questions
 from dwell.study.measured_campaign import MeasuredCampaign
@@ -22,12 +21,7 @@ from dwell.study.measured_campaign import MeasuredCampaign
 POINTS = 80
 #: An axis of latencies ends after so many deadlines.
 DEADLINES = 4
-SHOWN = {
-    "violation_rate": RATE,
-    "l95_ms": Measure("l95_ms", "L95", "ms"),
-    "u_robot": Measure("u_robot", "U_r", "%", 100.0),
-    "u_edge": Measure("u_edge", "U_e", "%", 100.0),
-}
+SHOWN = {one.column: one for one in MEASURES if one.column not in ("cost", "migrations")}
 WHERE = {"testbed": "the testbed"}
 
 
@@ -47,7 +41,7 @@ def campaign_page(measured: MeasuredCampaign) -> Page:
         f"{WHERE.get(measured.where, 'real hosts')}; a repetition takes the place of a seed",
         facts=list(_facts(measured)),
         sections=list(_sections(measured, blocks)),
-        policies={name: style.colour for name, style in blocks.styles.items()},
+        policies=blocks.colours,
         seeds=comparison.seeds,
     )
 
@@ -65,8 +59,7 @@ def _facts(measured: MeasuredCampaign) -> Iterator[Fact]:
 
 
 def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Section]:
-    comparison = measured.comparison
-    yield Section("", [blocks.rate(), blocks.counts()])
+    yield Section("", blocks.answer())
     for place, asked in enumerate(questions(measured)):
         yield Section(asked.title, [_question_table(asked, blocks, place)])
     yield Section("Results", [blocks.results()])
@@ -89,32 +82,28 @@ def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Sect
     if not measured.links.is_empty():
         yield Section("What messages took", [_delays(measured), _links(measured)])
     yield Section("What was run when", [_log(measured), *_failed(measured)])
-    method = method_blocks(comparison.problem, comparison.scenarios, comparison.policies)
-    about = {
-        "estimators": ", ".join(
+    method = blocks.method(
+        estimators=", ".join(
             f"{shown_contender(name)}: {estimator}"
             for name, estimator in measured.estimators.items()
-            if name not in comparison.problem.candidates
+            if name not in blocks.problem.candidates
         ),
-        "order": "each repetition is a complete random order of all policies in all scenarios; "
+        order="each repetition is a complete random order of all policies in all scenarios; "
         "those of a scenario and repetition follow each other",
-        "intervals": "95 %, two-sided, over repetitions, by the studentised bootstrap from 4 on, "
+        intervals="95 %, two-sided, over repetitions, by the studentised bootstrap from 4 on, "
         "by Student’s t below",
-        "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
-    }
-    yield Section("How it was measured", [*method, Definitions(about)])
+    )
+    yield Section("How it was measured", method)
 
 
 def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -> Table:
-    metrics = {name: (measure.heading, measure.factor) for name, measure in SHOWN.items()}
-    metrics["cost"] = ("J", 1.0)
+    measures = {measure.column: measure for measure in MEASURES}
     rows = []
     for row in asked.table.iter_rows(named=True):
-        heading, factor = metrics[row["metric"]]
-        ends = {f"effect{end}": row[column] for end, column in (("_low", "low"), ("_high", "high"))}
-        numbers = {"effect": row["effect"], **ends}
-        scaled = {key: None if one is None else factor * one for key, one in numbers.items()}
-        rows.append({**row, **scaled, "metric": heading})
+        measure = measures[row["metric"]]
+        effect = {"effect": row["effect"], "effect_low": row["low"], "effect_high": row["high"]}
+        scaled = {key: one if one is None else measure.factor * one for key, one in effect.items()}
+        rows.append({**row, **scaled, "metric": measure.heading})
     return Table(
         f"question-{place}",
         f"Answer: {asked.answer}",

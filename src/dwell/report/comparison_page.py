@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from dwell.report.charts import curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, shown_policy, shown_scenario
-from dwell.report.method import method_blocks, ranges
-from dwell.report.page import Definitions, Page, Section, page_html
+from dwell.report.method import ranges
+from dwell.report.page import Page, Section, page_html
 from dwell.report.palette import Palette
 from dwell.report.phases import disturbed
 from dwell.report.policy_blocks import COST, RATE, THE_AIM, PolicyBlocks, named, scaled
@@ -58,7 +58,7 @@ def comparison_page(
     for comparison in comparisons:
         prefix = f"{comparison.problem.name}-" if several else ""
         blocks = PolicyBlocks(comparison, prefix)
-        policies |= {name: style.colour for name, style in blocks.styles.items()}
+        policies |= blocks.colours
         for part in islice(_sections(comparison, blocks, tenants), sections):
             title = f"{comparison.problem.name}: {part.title}" if several else part.title
             parts.append(Section(title.removesuffix(": "), part.blocks, part.note))
@@ -78,7 +78,7 @@ def comparison_page(
 def _sections(
     comparison: Comparison, blocks: PolicyBlocks, tenants: StudyResult | None
 ) -> Iterator[Section]:
-    yield Section("", [blocks.rate(), blocks.counts()])
+    yield Section("", blocks.answer())
     predictions = predictions_table(comparison, blocks)
     if predictions.rows:
         yield Section("What the paper predicts", [predictions])
@@ -100,17 +100,13 @@ def _sections(
         )
         yield Section("What was estimated, and what was measured", [_beliefs(comparison, blocks)])
     yield Section("More numbers", [blocks.more()])
-    about = {
-        "runs": f"{comparison.windows} windows, seeds {ranges(comparison.seeds)}; every policy "
+    method = blocks.method(
+        runs=f"{comparison.windows} windows, seeds {ranges(comparison.seeds)}; every policy "
         "plays the same realisation of a scenario and seed",
-        "intervals": "95 %, two-sided, over seeds, by the studentised bootstrap, each on its own; "
+        intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own; "
         "of medians, by order statistics",
-        "versions": ", ".join(f"{name} {text}" for name, text in comparison.versions.items()),
-    }
-    method = method_blocks(
-        comparison.problem, comparison.scenarios, comparison.policies, blocks.prefix
     )
-    yield Section("How it was made", [*method, Definitions(about)])
+    yield Section("How it was made", method)
 
 
 def predictions_table(comparison: Comparison, blocks: PolicyBlocks) -> Table:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING
 
 from dwell.report.figure import COLUMN_PT, Figure, pdf, printed_svg
 from dwell.report.formatting import SYMBOL
-from dwell.report.page import TEMPLATES, Page
+from dwell.report.page import Page, environment
 from dwell.report.table import Table, Text
 
 if TYPE_CHECKING:
@@ -98,38 +98,27 @@ def table_tex(table: Table) -> str:
 
 @cache
 def _environment() -> Environment:
-    import jinja2
-
-    found = jinja2.Environment(  # noqa: S701
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        undefined=jinja2.StrictUndefined,
+    latex = environment().overlay(
+        autoescape=False,
         variable_start_string="<<",
         variable_end_string=">>",
         block_start_string="<%",
         block_end_string="%>",
         comment_start_string="<#",
         comment_end_string="#>",
-        trim_blocks=True,
-        lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    found.filters["tex"] = _tex
-    return found
+    latex.filters["tex"] = _tex
+    return latex
 
 
 def _tex(text: str) -> str:
     """Return a text as LaTeX writes it; symbols with an index are set in mathematics."""
-    parts = SYMBOL.split(text)
-    found = []
-    # What stands between symbols, and each symbol's letter and index, in turn.
-    for plain, letter, index in _in_threes(parts):
-        found.append("".join(ESCAPES.get(sign, sign) for sign in plain))
-        if letter:
-            found.append(f"${ESCAPES.get(letter, letter).strip('$')}_{{\\mathrm{{{index}}}}}$")
-    return "".join(found)
 
+    def written(sign: re.Match[str]) -> str:
+        letter, index = sign.groups()
+        if index is None:
+            return ESCAPES.get(sign[0], sign[0])
+        return f"${ESCAPES.get(letter, letter).strip('$')}_{{\\mathrm{{{index}}}}}$"
 
-def _in_threes(parts: Sequence[str]) -> Iterator[tuple[str, str, str]]:
-    padded = [*parts, "", ""]
-    for place in range(0, len(parts), 3):
-        yield padded[place], padded[place + 1], padded[place + 2]
+    return re.sub(f"{SYMBOL.pattern}|.", written, text)

@@ -61,7 +61,6 @@ class Section:
 
     Parameters
     ----------
-    blocks : sequence of Figure, Table or Definitions
     note : str
         Fixed text under the heading.
     anchor : str
@@ -84,9 +83,7 @@ class Page:
     Parameters
     ----------
     subtitle : str
-        Of what it is a report.
-    facts : sequence of Fact
-    sections : sequence of Section
+        What it is a report of.
     policies : mapping of str to str
         Those that can be chosen, by how they are written: their colour.
     seeds : sequence of int

@@ -148,8 +148,6 @@ class PhaseRow(NamedTuple):
 
     Parameters
     ----------
-    cycles : int
-        Released in it.
     violation_rate, l95_ms : float
         Of their final latencies; infinite L95 where more than 5 % never finished.
     lost : int
@@ -203,9 +201,7 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
             rms_mm, rms_px = header.tracking.rms(phase.begin_s, phase.end_s)
         rows.append(
             PhaseRow(
-                phase.name,
-                phase.begin_s,
-                phase.end_s,
+                *phase,
                 mine.height,
                 float(mine["missed"].to_numpy().mean()),
                 float(order_statistic(latency_ms(mine), 95)),

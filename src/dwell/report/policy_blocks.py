@@ -19,6 +19,8 @@ from dwell.report.charts import (
 )
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, shown_contender, shown_scenario
+from dwell.report.method import method_blocks
+from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
 from dwell.study import AIM, over_seeds, under
@@ -73,6 +75,7 @@ class PolicyBlocks:
     """
 
     def __init__(self, found: StudyRuns, prefix: str = "") -> None:
+        self.found = found
         self.problem, self.runs, self.latencies = found.problem, found.runs, found.latencies
         self.prefix = prefix
         self.deadline = Limit(found.problem.pipeline.deadline_ms, "deadline")
@@ -86,6 +89,24 @@ class PolicyBlocks:
         )
         #: By what the policies are called in figures.
         self.styles = {shown_contender(name): self.palette.policies[name] for name in self.policies}
+
+    @property
+    def colours(self) -> dict[str, str]:
+        """Colours by what the policies are called in figures."""
+        return {name: style.colour for name, style in self.styles.items()}
+
+    def answer(self) -> list[Block]:
+        """Return what a page begins with: V_D of all, and who is under the aim."""
+        return [self.rate(), self.counts()]
+
+    def method(self, **about: str) -> list[Block]:
+        """Return what the cell, the scenarios and the policies are, and what else is to be said."""
+        found = self.found
+        versions = ", ".join(f"{name} {text}" for name, text in found.versions.items())
+        return [
+            *method_blocks(self.problem, found.scenarios, found.policies, self.prefix),
+            Definitions({**about, "versions": versions}),
+        ]
 
     # ------------------------------------------------------------------------------- figures
 

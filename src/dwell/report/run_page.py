@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -37,6 +38,7 @@ from dwell.report.formatting import (
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
 from dwell.report.palette import BAD, Palette
 from dwell.report.phases import phase_rows
+from dwell.report.policy_blocks import COST, L95, RATE
 from dwell.report.run_header import RunHeader
 from dwell.report.table import Columns, Table, Text
 from dwell.report.timeline import begins_by_number, run_timeline
@@ -198,8 +200,8 @@ class _RunPage:
             Text("name", "phase"),
             Measure("begin_s", "from", "s", decimals=0),
             Measure("end_s", "to", "s", decimals=0),
-            Measure("violation_rate", "V_D", "%", 100.0),
-            Measure("l95_ms", "L95", "ms"),
+            RATE,
+            L95,
             Measure("lost", "lost", decimals=0),
             *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
             Measure("migrations", "migrations", decimals=0),
@@ -236,9 +238,9 @@ class _RunPage:
             Text("window", "window", link="#window-{window}"),
             Measure("begin_s", "at", "s"),
             Text("placement", "placement", "placement"),
-            Measure("violation_rate", "V_D", "%", 100.0),
-            Measure("l95_ms", "L95", "ms"),
-            Measure("cost", "J", decimals=2),
+            RATE,
+            L95,
+            COST,
             *(Measure(f"u_{node}", node, "%", 100.0, 0) for node in self.header.nodes),
         ]
         caption = "The windows with the most misses; L95 is ∞ where more than 5 % never finished."
@@ -342,13 +344,17 @@ class _RunPage:
     # ------------------------------------------------------------------ outcomes and placements
 
     def _outcomes(self) -> Table:
-        counts = dict(self.counted.cycles["outcome"].cast(str).value_counts().rows())
-        total = self.counted.cycles.height
+        cycles = self.counted.cycles
+        counts = Counter(cycles["outcome"].cast(str))
         rows = [
-            {"outcome": name, "why": why, "cycles": counts.get(name, 0)}
+            {
+                "outcome": name,
+                "why": why,
+                "cycles": counts[name],
+                "share": counts[name] / cycles.height,
+            }
             for name, why in OUTCOME_SENTENCES.items()
         ]
-        rows = [{**row, "share": int(str(row["cycles"])) / total} for row in rows]
         columns: Columns = [
             Text("outcome", "outcome"),
             Text("why", "meaning"),
@@ -359,12 +365,16 @@ class _RunPage:
 
     def _shares(self) -> Table:
         windows = self.counted.windows
-        shares = dict(windows["placement"].cast(str).value_counts().rows())
+        counts = Counter(windows["placement"].cast(str))
         rows = [
-            {"placement": name, "windows": shares.get(name, 0), "where": _moving(self.header, name)}
+            {
+                "placement": name,
+                "where": _moving(self.header, name),
+                "windows": counts[name],
+                "share": counts[name] / windows.height,
+            }
             for name in self.palette.placements
         ]
-        rows = [{**row, "share": int(str(row["windows"])) / windows.height} for row in rows]
         columns: Columns = [
             Text("placement", "placement", "placement"),
             Text("where", "tasks that not all have on one node"),
@@ -377,11 +387,11 @@ class _RunPage:
 
     def _decisions(self) -> Iterator[Table]:
         decisions = self.counted.decisions
-        counts = dict(decisions["reason"].cast(str).value_counts().rows())
+        counts = Counter(decisions["reason"].cast(str))
         rows = [
             {"reason": name, "meaning": text, "times": counts[name]}
             for name, text in REASON_SENTENCES.items()
-            if counts.get(name)
+            if counts[name]
         ]
         columns: Columns = [
             Text("reason", "reason"),
@@ -420,23 +430,18 @@ class _RunPage:
         rows = []
         for move in moves.head(MOST_ROWS).iter_rows(named=True):
             window, target, reason = move["window"], move["placement"], str(move["reason"])
-            guard = reason == "guard"
             # A move of the guard is noted under the window that follows it.
-            before, after = (window - 1, window) if guard else (window, window + 1)
-            begin_s = self.begin_of.get(before, math.nan)
-            at_s = begin_s + length_s
-            if guard or before not in self.begin_of:
-                at_s = self.begin_of.get(window, math.nan)
+            before, later_s = (window - 1, 0.0) if reason == "guard" else (window, length_s)
             rows.append(
                 {
                     "window": before,
-                    "at_s": at_s,
+                    "at_s": self.begin_of.get(window, math.nan) + later_s,
                     "from": str(move["incumbent"]),
                     "to": str(target),
                     "reason": reason,
                     "before": cost.get(before),
                     "estimated": move[f"j_{target}"],
-                    "after": cost.get(after),
+                    "after": cost.get(before + 1),
                 }
             )
         columns: Columns = [

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from dwell.report.charts import NO_LIMIT, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
-from dwell.report.method import method_blocks, ranges
-from dwell.report.page import Block, Definitions, Page, Section, page_html
+from dwell.report.method import ranges
+from dwell.report.page import Block, Page, Section, page_html
 from dwell.report.policy_blocks import COST, L95, RATE, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
 from dwell.study import StudyRuns, over_seeds
@@ -43,7 +43,7 @@ def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
         f"{len(study.policies)} policies, {points} points, seeds {ranges(study.seeds)}, "
         f"{study.windows} windows",
         sections=list(islice(_sections(study, blocks), sections)),
-        policies={name: style.colour for name, style in blocks.styles.items()},
+        policies=blocks.colours,
         seeds=() if study.parameters else study.seeds,
     )
 
@@ -67,20 +67,18 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
             yield Section(f"More by {shown}", [*figures[1:], *tables[1:]], folded=True)
         yield Section("Every point", [_points(study, blocks)], folded=True)
     else:
-        yield Section("", [blocks.rate(), blocks.counts()])
+        yield Section("", blocks.answer())
         yield Section("Results", [blocks.results()])
         figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
         if REGRET in _measures(study):
             figures.append(blocks.measure(REGRET, title="Regret"))
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
         yield Section("More numbers", [blocks.more()])
-    about = {
-        "runs": f"{study.windows} windows, seeds {ranges(study.seeds)}",
-        "intervals": "95 %, two-sided, over seeds, by the studentised bootstrap, each on its own",
-        "versions": ", ".join(f"{name} {text}" for name, text in study.versions.items()),
-    }
-    method = method_blocks(study.problem, study.scenarios, study.policies)
-    yield Section("How it was made", [*method, Definitions(about)])
+    method = blocks.method(
+        runs=f"{study.windows} windows, seeds {ranges(study.seeds)}",
+        intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own",
+    )
+    yield Section("How it was made", method)
 
 
 def _measures(study: StudyRuns) -> list[Measure]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -130,17 +131,11 @@ class Table:
 
     def groups(self) -> Iterator[tuple[str, list[list[Cell]]]]:
         """Yield every group's heading, empty without groups, and the cells of its rows."""
-        found: list[list[Cell]] = []
-        shown: str | None = None
-        for row in self.rows:
-            heading = "" if self.group is None else self._text(self.group, row).text
-            if shown is not None and heading != shown:
-                yield shown, found
-                found = []
-            shown = heading
-            found.append([self._cell(column, row) for column in self.columns])
-        if shown is not None:
-            yield shown, found
+        group = self.group
+        for heading, rows in itertools.groupby(
+            self.rows, lambda row: "" if group is None else self._text(group, row).text
+        ):
+            yield heading, [[self._cell(column, row) for column in self.columns] for row in rows]
 
     def _cell(self, column: Text | Measure, row: Row) -> Cell:
         if isinstance(column, Text):
@@ -160,22 +155,23 @@ class Table:
     def _text(self, column: Text, row: Row) -> Cell:
         value = row.get(column.column)
         name = "–" if value is None or value == "" else str(value)
-        link = column.link.format(**row) if column.link else ""
-        if column.kind == "word":
-            return Cell(name, kind=f"word {WORDS.get(name, 'open')}", sort=name, link=link)
-        if column.kind == "scenario":
-            return Cell(shown_scenario(name), kind="text", sort=name, link=link)
-        if value is None or value == "":
-            return Cell(name, link=link)
-        if column.kind == "placement":
-            colour = self.palette.placements.get(name, MUTED)
-            return Cell(name, "", "name", name, colour, link=link)
-        if column.kind == "policy":
-            style = self.palette.policies.get(name)
-            colour = MUTED if style is None else style.colour
-            ring = name not in self.palette.placements
-            return Cell(shown_contender(name), "", "name", name, colour, ring, link)
-        return Cell(name, sort=name, link=link)
+        known = value is not None and value != ""
+        cell = Cell(name, sort=name, link=column.link.format(**row) if column.link else "")
+        placements, policies = self.palette.placements, self.palette.policies
+        match column.kind:
+            case "word":
+                return cell._replace(kind=f"word {WORDS.get(name, 'open')}")
+            case "scenario":
+                return cell._replace(text=shown_scenario(name))
+            case "placement" if known:
+                return cell._replace(kind="name", colour=placements.get(name, MUTED))
+            case "policy" if known:
+                colour = policies[name].colour if name in policies else MUTED
+                ring = name not in placements
+                shown = shown_contender(name)
+                return cell._replace(text=shown, kind="name", colour=colour, ring=ring)
+            case _:
+                return cell if known else cell._replace(sort="")
 
 
 def _sortable(value: float) -> float | str:

@@ -26,6 +26,7 @@ from dwell.report.formatting import Measure, percent, shown_contender, shown_sce
 from dwell.report.method import cell_definitions
 from dwell.report.page import Definitions, Page, Section, page_html
 from dwell.report.palette import DASHES, INK, MUTED, SHADE, Palette, Style
+from dwell.report.policy_blocks import named
 from dwell.report.table import Columns, Row, Table, Text, interval_row, table_text
 from dwell.study.judged_prediction import L95_ALLOWED, ORDER, POINTS_ALLOWED, USE_ALLOWED, Judged
 from dwell.study.resampling import DRAWS
@@ -128,23 +129,14 @@ def _sections(validation: Validation) -> Iterator[Section]:
 
 def _palette(validation: Validation) -> Palette:
     """Return the colours of placements and policies; runs may have had candidates of their own."""
-    names = dict.fromkeys([*validation.problem.candidates, *map(_share, _shares(validation))])
+    shares = (name.removeprefix("share_") for name in _shares(validation))
+    names = dict.fromkeys([*validation.problem.candidates, *shares])
     return Palette.of(names, [group.policy for group in validation.groups])
 
 
 def _shares(validation: Validation) -> list[str]:
-    return list(
-        dict.fromkeys(
-            name
-            for group in validation.groups
-            for name in group.figures
-            if name.startswith("share_")
-        )
-    )
-
-
-def _share(name: str) -> str:
-    return name.removeprefix("share_")
+    names = (name for group in validation.groups for name in group.figures)
+    return list(dict.fromkeys(name for name in names if name.startswith("share_")))
 
 
 def _table(
@@ -157,6 +149,14 @@ def _table(
 ) -> Table:
     palette = _palette(validation)
     return Table(slug, title, [POLICY, *columns], rows, SCENARIO, caption, palette)
+
+
+def _pair(
+    column: str, name: str, unit: str, factor: float = 1.0, decimals: int = 1
+) -> list[Measure]:
+    """Return the columns of a figure: measured, and predicted."""
+    measured = Measure(column, name, unit, factor, decimals)
+    return [measured, measured._replace(column=f"{column}_predicted", name="predicted")]
 
 
 def _named(group: Group) -> dict[str, object]:
@@ -212,12 +212,10 @@ def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
         Measure("minutes", "min"),
         Text("enough", "enough"),
         Measure("excluded", "windows excluded", decimals=0),
-        Measure("l95", "L95 measured", "ms"),
-        Measure("l95_predicted", "predicted", "ms"),
+        *_pair("l95", "L95 measured", "ms"),
         Measure("l95_off", "off", "%", 100.0, signed=True),
         Text("l95_word", "L95", "word"),
-        Measure("rate", "V_D measured", "%", 100.0),
-        Measure("rate_predicted", "predicted", "%", 100.0),
+        *_pair("rate", "V_D measured", "%", 100.0),
         Text("rate_word", "V_D", "word"),
         Text("node", "worst node"),
         Measure("use_off", "U off", "points", 100.0, signed=True),
@@ -256,25 +254,21 @@ def _over(validation: Validation) -> Figure:
     """Draw predicted over measured: L95, V_D and U, with what is allowed as a band."""
     import polars as pl
 
-    rows = []
-    for group in validation.groups:
-        name = shown_contender(group.policy)
-        figures = [("l95_ms", 1.0, group.figures["l95_ms"])]
-        figures.append(("violation_rate", 100.0, group.figures["violation_rate"]))
-        figures += [("use", 100.0, one) for one in group.uses.values()]
-        for goal, factor, one in figures:
-            numbers = (one.measured.value, one.measured.low, one.measured.high, one.predicted.value)
-            shown = [factor * number if math.isfinite(number) else None for number in numbers]
-            rows.append((goal, shown_scenario(group.scenario), name, one.metric, *shown))
-    texts = dict.fromkeys(("goal", "scenario", "policy", "metric"), pl.String)
-    numbers_of = dict.fromkeys(("measured", "low", "high", "predicted"), pl.Float64)
-    frame = pl.DataFrame(rows, schema={**texts, **numbers_of}, orient="row")
-    palette = _palette(validation)
-    policies = {
-        shown_contender(group.policy): palette.policies[group.policy].colour
-        for group in validation.groups
-    }
     titles = {"l95_ms": "L95 (ms)", "violation_rate": "V_D (%)", "use": "U of every node (%)"}
+    goal = pl.col("metric").str.replace("^u_.*", "use")
+    factor = pl.when(goal == "l95_ms").then(1.0).otherwise(100.0)
+    numbers = {"low": "measured_low", "high": "measured_high", "predicted": "predicted"}
+    frame = named(validation.table.filter(goal.is_in(list(titles)))).select(
+        goal.alias("goal"),
+        *("scenario", "policy", "metric"),
+        *(
+            pl.when(pl.col(column).is_finite()).then(factor * pl.col(column)).alias(name)
+            for name, column in {"measured": "measured", **numbers}.items()
+        ),
+    )
+    policies = {
+        shown_contender(name): style.colour for name, style in _palette(validation).policies.items()
+    }
     return Figure(
         "over",
         "Predicted over measured",
@@ -388,10 +382,8 @@ def _rates(validation: Validation) -> Table:
             }
         )
     columns: Columns = [
-        Measure("near", "within 10 % of D, measured", "%", 100.0),
-        Measure("near_predicted", "predicted", "%", 100.0),
-        Measure("rate", "V_D measured", "%", 100.0),
-        Measure("rate_predicted", "predicted", "%", 100.0),
+        *_pair("near", "within 10 % of D, measured", "%", 100.0),
+        *_pair("rate", "V_D measured", "%", 100.0),
         Measure("shorter", "if 10 % shorter", "%", 100.0),
         Measure("longer", "if 10 % longer", "%", 100.0),
         Measure("factor", "factor", decimals=2),
@@ -415,8 +407,7 @@ def _parts(validation: Validation) -> Table:
         column
         for part, shown in PARTS_SHOWN.items()
         for column in (
-            Measure(part, f"{shown}, measured", "ms", decimals=2),
-            Measure(f"{part}_predicted", "predicted", "ms", decimals=2),
+            *_pair(part, f"{shown}, measured", "ms", decimals=2),
             Measure(f"{part}_off", "off", "ms", decimals=2, signed=True),
         )
     ]
@@ -453,21 +444,17 @@ def _jobs(validation: Validation) -> Table:
 
 def _compared(validation: Validation, slug: str, names: Sequence[str], title: str) -> Table:
     """Return figures, measured and predicted."""
-    share = {name: not name.startswith(("window_", "migr")) for name in names}
     rows = []
     for group in validation.groups:
         row = _named(group)
         for name in names:
-            found = group.figures.get(name)
-            if found is not None:
-                row |= interval_row({name: found.measured})
-                row |= {f"{name}_predicted": found.predicted.value}
+            if name in group.figures:
+                row |= interval_row({name: group.figures[name].measured})
+                row[f"{name}_predicted"] = group.figures[name].predicted.value
         rows.append(row)
     called = {"window_l95_ms": ("L95 of windows", "ms"), "migrations": ("migrations", "")}
-    columns = []
+    columns: list[Measure] = []
     for name in names:
         shown, unit = called.get(name, (name.partition("_")[2], "%"))
-        factor = 100.0 if share[name] else 1.0
-        columns.append(Measure(name, shown, unit, factor))
-        columns.append(Measure(f"{name}_predicted", "predicted", unit, factor))
+        columns += _pair(name, shown, unit, 100.0 if unit == "%" else 1.0)
     return _table(validation, slug, title, columns, rows)
