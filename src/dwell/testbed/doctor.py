@@ -10,9 +10,9 @@ import math
 import os
 import shutil
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -266,19 +266,11 @@ def _module(name: str) -> bool:
 
 def _fifo() -> Finding:
     name = "real-time priority (SCHED_FIFO)"
-    failed: list[OSError] = []
-
-    def rise() -> None:  # of this thread alone, which ends at once
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-        except OSError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=rise)
-    thread.start()
-    thread.join()
-    if failed:
-        found = f"refused ({failed[0].strerror}); links may be late while CPUs are busy"
+    try:
+        with ThreadPoolExecutor(1) as thread:  # the priority is that thread's, which ends at once
+            thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
+    except OSError as error:
+        found = f"refused ({error.strerror}); links may be late while CPUs are busy"
         return Finding(name, False, found, PRIVILEGED, needed=False)
     return Finding(name, True, "granted", needed=False)
 

@@ -13,8 +13,8 @@ import os
 import shutil
 import struct
 import subprocess
-import threading
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -185,29 +185,21 @@ def within(namespace: str, act: Callable[[], T]) -> T:
     LiveError
         If the namespace cannot be entered.
     """
-    done: list[T] = []
-    failed: list[BaseException] = []
 
-    def enter() -> None:
+    def enter() -> T:
+        with namespace_path(namespace).open() as file:
+            libc = ctypes.CDLL(None, use_errno=True)
+            if libc.setns(file.fileno(), CLONE_NEWNET):
+                number = ctypes.get_errno()
+                raise OSError(number, os.strerror(number), file.name)
+        return act()
+
+    with ThreadPoolExecutor(1) as thread:
         try:
-            with namespace_path(namespace).open() as file:
-                libc = ctypes.CDLL(None, use_errno=True)
-                if libc.setns(file.fileno(), CLONE_NEWNET):
-                    number = ctypes.get_errno()
-                    raise OSError(number, os.strerror(number), file.name)
-            done.append(act())
-        except BaseException as error:  # raised again by whoever called
-            failed.append(error)
-
-    thread = threading.Thread(target=enter)
-    thread.start()
-    thread.join()
-    for error in failed:
-        if isinstance(error, OSError):
+            return thread.submit(enter).result()
+        except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
             raise LiveError(f"network namespace {namespace}: {where}{error.strerror}") from None
-        raise error
-    return done[0]
 
 
 def remove_namespace(namespace: str) -> None:
