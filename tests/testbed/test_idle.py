@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dwell.testbed.idle import Idle, Quiet, Sample, sample, wait_until_idle
+from dwell.testbed.idle import Counters, Idle, Quiet, sample, wait_until_idle
 
 QUIET = Quiet(busy=0.1, waiting=0.2, for_s=2.0, patience_s=9.0)
 
@@ -17,8 +17,8 @@ class Machine:
         self.at_s = self.busy = 0.0
         self.waited_s: float | None = 0.0
 
-    def read(self) -> Sample:
-        return Sample(self.at_s, self.busy, 200 * self.at_s, self.waited_s)
+    def read(self) -> Counters:
+        return Counters(self.at_s, self.busy, 200 * self.at_s, self.waited_s)
 
     def sleep(self, seconds: float) -> None:
         busy, waiting = self.loads.pop(0)

@@ -9,7 +9,7 @@ import pytest
 
 from dwell.model.document import to_document
 from dwell.record import Run
-from dwell.testbed.measured import Disturbed, Measured, Visit
+from dwell.testbed.measured import DisturbedPlaces, Measured, Visit
 from dwell.testbed.sensitivity import LEAST_POINTS, TOGETHER, sensitivities, usual_of
 from tests.cells.small import make_problem
 
@@ -60,7 +60,7 @@ def measured(
     return Measured(
         name=name,
         run=Run(meta, {}),
-        disturbed=Disturbed(frozenset(stressed), frozenset(), frozenset(stressed)),
+        disturbed=DisturbedPlaces(frozenset(stressed), frozenset(), frozenset(stressed)),
         placement="",
         windows=windows,
         jobs_s=1.0,

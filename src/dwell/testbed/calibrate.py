@@ -34,7 +34,7 @@ from dwell.testbed.node_loads import (
 )
 from dwell.testbed.paired import paired
 from dwell.testbed.sensitivity import usual_of
-from dwell.testbed.task_costs import Site, messaging, sites
+from dwell.testbed.task_costs import TaskCost, messaging, task_costs
 from dwell.testbed.trace_names import move_traces
 
 #: Seed of the delays that stand for a link's own process, and of the cell's own check.
@@ -120,19 +120,19 @@ def calibrate(
     messaging_ms = messaging(measured, problem)
     usual = usual_of(measured)
     known = hops(measured, messaging_ms, problem, _asked(problem) if emulated else {})
-    found = sites(measured, messaging_ms, known, problem, usual)
-    if not found:
+    costs = task_costs(measured, messaging_ms, known, problem, usual)
+    if not costs:
         raise RunError("no task has enough jobs in windows that can be used")
     cpus = _cpus(measured)
-    columns = paired({site: of.samples for site, of in found.items()}, cpus)
+    columns = paired({site: of.samples for site, of in costs.items()}, cpus)
     rows = len(next(iter(columns.values())))
     added_ms, delays_ms = _links(measured, known, problem, rows, emulated=emulated)
-    behind = backgrounds(measured, found, problem)
+    behind = backgrounds(measured, costs, problem)
     nodes = _short(
         {
             "background": behind,
             "background_beside": beside_jobs(measured, behind),
-            "interference": interferences(measured, found, usual),
+            "interference": interferences(measured, costs, usual),
             "contention": contentions(measured),
             "background_hz": wakes(measured, problem),
             "contention_stressed": contentions_stressed(measured, cpus),
@@ -140,18 +140,18 @@ def calibrate(
     )
     document = _document(cell, out)
     samples = out.with_name(f"{out.stem}.samples.parquet")
-    _write_samples(samples, found, columns, delays_ms, measured, added_ms)
-    _put_in(document, samples.name, found, delays_ms, nodes)
+    _write_samples(samples, costs, columns, delays_ms, measured, added_ms)
+    _put_in(document, samples.name, costs, delays_ms, nodes)
     _write_cell(out, document, cell, runs)
     written = dwell.load(out)
-    missing = _missing(problem, found, delays_ms)
+    missing = _missing(problem, costs, delays_ms)
     report = {
         "runs": [one.name for one in measured],
         "ids": [one.run.run_id for one in measured if one.run.run_id is not None],
         "cell": problem.name,
         **stamp(),
         "emulated_links": emulated,
-        "tasks": {task_name(*site): _about(of) for site, of in found.items()},
+        "tasks": {task_name(*site): _about(of) for site, of in costs.items()},
         "links": {
             link: _short({"added_ms": added_ms.get(link), "mean_ms": values.mean()})
             for link, values in delays_ms.items()
@@ -292,7 +292,7 @@ def _links(
 
 def _write_samples(
     path: Path,
-    found: Mapping[SiteName, Site],
+    costs: Mapping[SiteName, TaskCost],
     columns: Mapping[SiteName, Floats],
     delays_ms: Mapping[str, Floats],
     measured: Sequence[Measured],
@@ -306,7 +306,7 @@ def _write_samples(
             {task_name(*site): np.maximum(columns[site], LEAST_MS)},
             {"kind": "task", "task": site[0], "node": site[1], **about, **_about(of)},
         )
-        for site, of in found.items()
+        for site, of in costs.items()
     ]
     for link, values in delays_ms.items():
         source, _, target = link.partition("->")
@@ -332,7 +332,7 @@ def _document(cell: Path, out: Path) -> dict[str, Any]:
 def _put_in(
     document: dict[str, Any],
     file: str,
-    found: Mapping[SiteName, Site],
+    costs: Mapping[SiteName, TaskCost],
     delays_ms: Mapping[str, Floats],
     nodes: Mapping[str, Mapping[str, Any]],
 ) -> None:
@@ -341,7 +341,7 @@ def _put_in(
     def replay(column: str) -> dict[str, Any]:
         return {"trace": {"file": file, "column": column, "by": "row", "wrap": True}}
 
-    for (task, node), of in found.items():
+    for (task, node), of in costs.items():
         on = document["tasks"][task]["on"][node]
         on["exec_ms"] = replay(task_name(task, node))
         on |= {"before_ms": _short(of.before_ms), "after_ms": _short(of.after_ms)}
@@ -384,13 +384,13 @@ def _write_cell(out: Path, document: dict[str, Any], cell: Path, runs: Sequence[
 
 
 def _missing(
-    problem: Problem, found: Mapping[SiteName, Site], delays_ms: Mapping[str, Floats]
+    problem: Problem, costs: Mapping[SiteName, TaskCost], delays_ms: Mapping[str, Floats]
 ) -> tuple[str, ...]:
     tasks = (
         task_name(task.name, node)
         for task in problem.pipeline.tasks.values()
         for node in task.on
-        if (task.name, node) not in found
+        if (task.name, node) not in costs
     )
     return *tasks, *(link for link in problem.fabric.links if link not in delays_ms)
 
@@ -398,7 +398,7 @@ def _missing(
 # ------------------------------------------------------------------------------ the report
 
 
-def _about(of: Site) -> dict[str, Any]:
+def _about(of: TaskCost) -> dict[str, Any]:
     return {
         "mean_ms": _short(of.samples_ms.mean()),
         "std_ms": _short(of.samples_ms.std()),
@@ -467,8 +467,8 @@ def _lines(report: Mapping[str, Any]) -> list[str]:
         more = "" if beside is None else f", {beside:.3g} while jobs run"
         lines.append(f"{node}: background {value:.3g} cores{more}")
     for key, line in NODE_LINES.items():
-        for node, found in report[key].items():
-            values = found if isinstance(found, dict) else {"": found}
+        for node, value in report[key].items():
+            values = value if isinstance(value, dict) else {"": value}
             lines += [line.format(node=node, other=o, value=value) for o, value in values.items()]
     for name, value in report["sensitivity"].items():
         lines.append(f"{name}: takes x^{value:.3g} times as long where a CPU is x times as slow")

@@ -16,7 +16,7 @@ from typing import NamedTuple
 PSI = Path("/proc/pressure/cpu")
 
 
-class Sample(NamedTuple):
+class Counters(NamedTuple):
     """Counters of the machine since it was started.
 
     Parameters
@@ -74,14 +74,14 @@ class Idle(NamedTuple):
     waiting: float | None
 
 
-def sample() -> Sample:
+def sample() -> Counters:
     """Read the counters of this machine."""
     import psutil  # what a campaign has measured is read without it
 
     times = psutil.cpu_times()
     # Guests are in user and nice already.
     passed = sum(times) - times.guest - times.guest_nice
-    return Sample(time.monotonic(), passed - times.idle - times.iowait, passed, waited_s())
+    return Counters(time.monotonic(), passed - times.idle - times.iowait, passed, waited_s())
 
 
 def waited_s() -> float | None:
@@ -96,7 +96,7 @@ def waited_s() -> float | None:
 def wait_until_idle(
     quiet: Quiet,
     *,
-    read: Callable[[], Sample] = sample,
+    read: Callable[[], Counters] = sample,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Idle:
     """Wait until the machine has been idle for a while, or for as long as patience lasts."""
@@ -112,7 +112,7 @@ def wait_until_idle(
         before = now
 
 
-def _between(before: Sample, now: Sample) -> tuple[float, float | None]:
+def _between(before: Counters, now: Counters) -> tuple[float, float | None]:
     passed = now.all - before.all
     busy = (now.busy - before.busy) / passed if passed > 0 else 0.0
     elapsed_s = now.at_s - before.at_s

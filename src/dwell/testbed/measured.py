@@ -29,7 +29,7 @@ UNHINDERED = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Disturbed:
+class DisturbedPlaces:
     """Nodes and links that a run's scenario disturbed.
 
     Parameters
@@ -45,7 +45,7 @@ class Disturbed:
     stressed: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, run: Run) -> Disturbed:
+    def of(cls, run: Run) -> DisturbedPlaces:
         """Read a run's record.
 
         Raises
@@ -132,7 +132,7 @@ class Measured:
 
     name: str
     run: Run
-    disturbed: Disturbed
+    disturbed: DisturbedPlaces
     placement: str
     windows: int
     jobs_s: float
@@ -204,7 +204,7 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
     return Measured(
         name=name,
         run=run,
-        disturbed=Disturbed.of(run),
+        disturbed=DisturbedPlaces.of(run),
         placement=placements.pop() if len(placements) == 1 else "",
         windows=windows.height,
         jobs_s=jobs_s,

@@ -14,7 +14,7 @@ from dwell.calibration.speeds import Usual
 from dwell.model import Problem
 from dwell.model.bounds import BACKGROUND_HZ, CONTENTION
 from dwell.testbed.measured import LEAST_JOBS, Measured, SiteName
-from dwell.testbed.task_costs import Site
+from dwell.testbed.task_costs import TaskCost
 
 #: Wakes that come together: a message wakes a thread that waits for sockets, one that reads, and a
 #: worker's. In a trace of the scheduler under the example, the time from any instant until a thread
@@ -23,7 +23,7 @@ TOGETHER = 2.2
 
 
 def backgrounds(
-    measured: Sequence[Measured], found: Mapping[SiteName, Site], problem: Problem
+    measured: Sequence[Measured], costs: Mapping[SiteName, TaskCost], problem: Problem
 ) -> dict[str, float]:
     """Cores of every node that neither its jobs nor foreign threads took.
 
@@ -39,7 +39,7 @@ def backgrounds(
                 continue
             used = one.used[node] if of.quota is not None else sum(processes)
             sites_ = ((key, rate) for key, rate in one.starts.items() if key[1] == node)
-            jobs = sum(rate * _cores_ms(key, one, found, problem) / 1e3 for key, rate in sites_)
+            jobs = sum(rate * _cores_ms(key, one, costs, problem) / 1e3 for key, rate in sites_)
             left.append((used - jobs, one.windows))
         if left:
             values, weights = zip(*left, strict=True)
@@ -108,17 +108,17 @@ def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
 
 
 def interferences(
-    measured: Sequence[Measured], found: Mapping[SiteName, Site], usual: Usual
+    measured: Sequence[Measured], costs: Mapping[SiteName, TaskCost], usual: Usual
 ) -> dict[str, float]:
     """How many times as much core time stages took on nodes that were stressed all the time."""
     sums: dict[str, list[float]] = {}
     for one in measured:
         for site, visit in one.visits.items():
             node = site[1]
-            if node in one.disturbed.stressed and site in found:
+            if node in one.disturbed.stressed and site in costs:
                 total = sums.setdefault(node, [0.0, 0.0, 0.0])
                 total[0] += float(visit.stage_ms.sum()) / usual.factor(one.work_ms, *site)
-                total[1] += len(visit.stage_ms) * found[site].stage_ms
+                total[1] += len(visit.stage_ms) * costs[site].stage_ms
                 total[2] += len(visit.stage_ms)
     return {
         node: max(took / alone, 1.0)
@@ -130,14 +130,14 @@ def interferences(
 def _cores_ms(
     key: tuple[str, str, bool],
     one: Measured,
-    found: Mapping[SiteName, Site],
+    costs: Mapping[SiteName, TaskCost],
     problem: Problem,
 ) -> float:
     """Core time, ms, of a job as a simulator will charge it."""
     execution = problem.pipeline.tasks[key[0]].on[key[1]]
     if execution.accelerator is not None:
         return 0.0
-    site = found.get(key[:2])
+    site = costs.get(key[:2])
     if site is None:
         return one.spent_ms[key]
     return one.spent_ms[key] + execution.threads * (site.before_ms + site.after_ms)

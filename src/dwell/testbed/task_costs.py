@@ -34,8 +34,8 @@ SENDER, RECEIVER = range(2)
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
-    """A task on a node, over all runs.
+class TaskCost:
+    """Cost of a task on a node, over all runs.
 
     Parameters
     ----------
@@ -60,13 +60,13 @@ class Site:
         return np.concatenate([part.times_ms for part in self.samples.values()])
 
 
-def sites(
+def task_costs(
     measured: Sequence[Measured],
     messaging_ms: Mapping[SiteName, float],
     known: OnTheWay,
     problem: Problem,
     usual: Usual,
-) -> dict[SiteName, Site]:
+) -> dict[SiteName, TaskCost]:
     """Execution times of every task on every node that was visited undisturbed.
 
     Parameters
@@ -78,7 +78,7 @@ def sites(
     usual : Usual
         How fast the CPUs were in all runs together: samples are of CPUs as fast as that.
     """
-    found: dict[SiteName, Site] = {}
+    costs: dict[SiteName, TaskCost] = {}
     for site in sorted({site for one in measured for site in one.visits}):
         of = [one for one in measured if site in one.visits and site[1] not in one.disturbed.nodes]
         if sum(len(one.visits[site].stage_ms) for one in of) < LEAST_JOBS:
@@ -102,8 +102,8 @@ def sites(
             )
             for one in of
         }
-        found[site] = Site(samples, stage_ms, read_ms + write_ms, before_ms, after_ms)
-    return found
+        costs[site] = TaskCost(samples, stage_ms, read_ms + write_ms, before_ms, after_ms)
+    return costs
 
 
 def _with_messaging(stages_ms: Floats, mean_ms: float, around_ms: float) -> Floats:
