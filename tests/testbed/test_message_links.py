@@ -13,7 +13,8 @@ import pytest
 import dwell
 from dwell.errors import LiveError
 from dwell.model import Constant, Execution, Flow, Link, Node, Normal, Task
-from dwell.testbed.message_links import HELD, LinkEnds, LinkFile, transmission_ns
+from dwell.testbed.conditions import transmission_ns
+from dwell.testbed.message_links import HELD, LinkEnds, LinkFile
 from tests.cells.generated import make_problem
 
 NODES = "R1", "E", "R2"

@@ -76,6 +76,11 @@ class Conditions:
         bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 
 
+def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
+    """Return how long bytes take at a rate; no time at an infinite one."""
+    return round(size_bytes * 8e3 / rate_mbps)
+
+
 def fields_of(conditions: Conditions) -> dict[str, object]:
     """Return all fields by their names, as `to_json` and the links' `set` take them."""
     return {item.name: getattr(conditions, item.name) for item in fields(conditions)}

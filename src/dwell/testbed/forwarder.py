@@ -22,7 +22,7 @@ from typing import TypedDict, cast
 
 from dwell.errors import DwellError
 from dwell.testbed.child import Json, Parent
-from dwell.testbed.conditions import Draws, Scheduling, changed
+from dwell.testbed.conditions import Draws, Scheduling, changed, transmission_ns
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.packets import kind_of
 
@@ -185,8 +185,8 @@ class _Direction:
         if conditions.cut is not None or self._waiting_bytes > WAITING_BYTES:
             counts.vanished += 1
             return
-        self._free_ns = max(now_ns, self._free_ns)
-        self._free_ns += round(len(packet) * 8e3 / conditions.rate_mbps)
+        took_ns = transmission_ns(len(packet), conditions.rate_mbps)
+        self._free_ns = max(now_ns, self._free_ns) + took_ns
         flow = self._flows.get(kind.flow)
         begins = (
             flow is None or now_ns - flow.last_ns > GAP_NS or now_ns - flow.begun_ns > LONGEST_NS

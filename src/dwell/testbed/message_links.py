@@ -29,7 +29,7 @@ from typing import Self
 from dwell.errors import LiveError, ProblemError
 from dwell.files import write_whole
 from dwell.model import Link
-from dwell.testbed.conditions import Conditions, Draws, changed, fields_of, to_json
+from dwell.testbed.conditions import Conditions, Draws, changed, fields_of, to_json, transmission_ns
 from dwell.testbed.mapped_file import HEAD, make_file, open_file
 
 _KIND = "links"
@@ -43,11 +43,6 @@ LONGEST_WAIT_S = 10.0
 LOST, HELD = -1, -2
 #: Attempts at a message on a link that retransmits.
 MOST_ATTEMPTS = 20
-
-
-def transmission_ns(size_bytes: int, rate_mbps: float) -> int:
-    """Return how long bytes take at a rate; nothing at an infinite one."""
-    return round(size_bytes * 8e3 / rate_mbps) if math.isfinite(rate_mbps) else 0
 
 
 class LinkFile:
