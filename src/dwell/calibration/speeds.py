@@ -97,15 +97,15 @@ def window_work_ms(run: Run) -> dict[str, dict[int, float]]:
         for row in pressure.get("windows", ())
         if row.get("work_ms") and row["window"] >= warmup and row["window"] not in excluded
     }
-    found: dict[str, dict[int, float]] = {}
+    works: dict[str, dict[int, float]] = {}
     for node, about in testbed.get("nodes", {}).items():
         cpus = [str(cpu) for cpu in about["cpus"]]
-        found[node] = {
+        works[node] = {
             window: fmean(row[cpu] for cpu in cpus if cpu in row)
             for window, row in rows.items()
             if not row.keys().isdisjoint(cpus)
         }
-    return found
+    return works
 
 
 def at_speed_of(run: Run, problem: Problem, usual: Usual) -> Problem:

@@ -135,14 +135,14 @@ class Campaign:
     def plan(self) -> tuple[Planned, ...]:
         """Return all runs in their order: blocks of one repetition, each shuffled by itself."""
         pairs = [(scenario, one.name) for scenario in self.scenarios for one in self.entrants]
-        found: list[Planned] = []
+        runs: list[Planned] = []
         for repetition in range(1, self.repetitions + 1):
             drawn = np.random.default_rng((self.seed, repetition)).permutation(len(pairs))
             for index in drawn:
                 scenario, policy = pairs[index]
                 seed = self.seed + repetition - 1
-                found.append(Planned(len(found) + 1, repetition, scenario, policy, seed))
-        return tuple(found)
+                runs.append(Planned(len(runs) + 1, repetition, scenario, policy, seed))
+        return tuple(runs)
 
     @property
     def traces(self) -> dict[str, Path]:

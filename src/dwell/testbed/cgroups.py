@@ -46,14 +46,14 @@ def find_cgroups(mounts: Path = Path("/proc/self/mountinfo")) -> Cgroups:
         If neither has it.
     """
     try:
-        found = list(_mounted(mounts.read_text()))
+        mounted = list(_mounted(mounts.read_text()))
     except OSError as error:
         raise LiveError(f"{mounts} cannot be read ({error.strerror})") from None
-    for kind, top, _ in found:
+    for kind, top, _ in mounted:
         if kind == "cgroup2" and "cpu" in (has := _controllers(top)):
             return Cgroups(2, {name: top for name in ("cpu", "cpuset") if name in has})
     folders: dict[str, Path] = {}
-    for kind, top, options in found:
+    for kind, top, options in mounted:
         if kind == "cgroup":
             folders.update({name: top for name in USED if name in options})
     missing = [name for name in NEEDED if name not in folders]

@@ -306,12 +306,12 @@ def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
 
 def _lateness(watch_s: float) -> dict[float, float]:
     """Longest lateness of a probe on any CPU, ms, at every look, by the time of the look, s."""
-    found = {}
+    late_ms = {}
     with ExitStack() as stack:
         probes = [stack.enter_context(Probe(cpu)) for cpu in sorted(os.sched_getaffinity(0))]
         begun_s = time.monotonic()
         while time.monotonic() - begun_s < watch_s:
             time.sleep(EVERY_S)
             at_s = time.monotonic() - begun_s
-            found[at_s] = max(probe.read().max_ms for probe in probes)
-    return found
+            late_ms[at_s] = max(probe.read().max_ms for probe in probes)
+    return late_ms

@@ -260,10 +260,10 @@ class _Attempts:
 
 def _judged(run: Run) -> dict[str, Any]:
     """Say whether a run counts: it has windows, and not too many of them are excluded."""
-    told = run.meta.get("pressure") or {}
-    excluded, windows = len(told.get("excluded", ())), int((~run.windows["warmup"]).sum())
-    if told.get("failed"):
-        why = f" ({told['why']})" if told.get("why") else ""
+    pressure = run.meta.get("pressure") or {}
+    excluded, windows = len(pressure.get("excluded", ())), int((~run.windows["warmup"]).sum())
+    if pressure.get("failed"):
+        why = f" ({pressure['why']})" if pressure.get("why") else ""
         after = f"{windows} windows after the warm-up"
         reason = f"{excluded} of {after} were measured under pressure{why}"
         return {"outcome": "failed", "reason": reason}

@@ -237,13 +237,13 @@ class Groups(Started):
 
     def switches(self, node: str) -> dict[int, int]:
         """Return how often each thread of a node has gone to sleep by itself so far."""
-        found = {}
+        counts = {}
         for pid in self.pids(node):
             with suppress(OSError):  # it has ended meanwhile
                 for folder in Path(f"/proc/{pid}/task").iterdir():
                     with suppress(OSError):
-                        found[int(folder.name)] = _voluntary((folder / "status").read_text())
-        return found
+                        counts[int(folder.name)] = _voluntary((folder / "status").read_text())
+        return counts
 
     def pids(self, node: str) -> list[int]:
         """Return the processes in a node's group."""

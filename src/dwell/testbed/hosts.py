@@ -229,8 +229,8 @@ def _ip(*words: str, given: str = "") -> str:
         check=False,
     )
     if done.returncode:
-        said = done.stderr.strip() or f"status {done.returncode}"
-        raise LiveError(f"ip {' '.join(words)}: {said}")
+        reason = done.stderr.strip() or f"status {done.returncode}"
+        raise LiveError(f"ip {' '.join(words)}: {reason}")
     return done.stdout
 
 

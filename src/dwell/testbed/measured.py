@@ -329,13 +329,13 @@ def _taken_ms(own: pl.DataFrame, column: str) -> dict[SiteName, float]:
 
     if column not in own.columns:
         return {}
-    found = (
+    means = (
         own.filter(pl.col(column).is_not_null())
         .group_by("task", "node")
         .agg(pl.col(column).mean() / 1e6, jobs=pl.len())
         .filter(pl.col("jobs") >= LEAST_JOBS)
     )
-    return {(task, node): mean_ms for task, node, mean_ms, _ in found.iter_rows()}
+    return {(task, node): mean_ms for task, node, mean_ms, _ in means.iter_rows()}
 
 
 def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str, str], float]:
@@ -346,8 +346,8 @@ def _rates(run: Run, windows: pl.DataFrame, problem: Problem) -> dict[tuple[str,
         return {}
     size, grace_ns = problem.window_cycles, problem.controller.close_grace_ms * 1e6
     span_ns = windows.height * (size * problem.pipeline.period_ms * 1e6 + grace_ns)
-    found = run.processes.filter(pl.col("window").is_in(windows["window"].to_list()))
-    sums = found.group_by(pl.col("node").cast(str), "process").agg(pl.col("cpu_ns").sum())
+    counted = run.processes.filter(pl.col("window").is_in(windows["window"].to_list()))
+    sums = counted.group_by(pl.col("node").cast(str), "process").agg(pl.col("cpu_ns").sum())
     return {(node, process): cpu_ns / span_ns for node, process, cpu_ns in sums.iter_rows()}
 
 
@@ -355,7 +355,7 @@ def _delays(own: pl.DataFrame, problem: Problem) -> dict[tuple[str, str, str, st
     """Delays of messages, by flow and nodes; of joins it is not known which input came last."""
     import polars as pl
 
-    found: dict[tuple[str, str, str, str], Floats] = {}
+    delays: dict[tuple[str, str, str, str], Floats] = {}
     for flow in problem.pipeline.flows:
         if len(problem.pipeline.inputs(flow.target)) > 1:
             continue
@@ -364,8 +364,8 @@ def _delays(own: pl.DataFrame, problem: Problem) -> dict[tuple[str, str, str, st
         both = sent.join(came, on="cycle", maintain_order="left")
         for (node, to), of in both.group_by("node", "to", maintain_order=True):
             delay_ms = (of["ready_ns"] - of["end_ns"]).to_numpy() / 1e6
-            found[flow.source, flow.target, str(node), str(to)] = delay_ms
-    return found
+            delays[flow.source, flow.target, str(node), str(to)] = delay_ms
+    return delays
 
 
 def _begins(own: pl.DataFrame, run: Run, problem: Problem) -> dict[SiteName, float]:

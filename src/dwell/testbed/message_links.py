@@ -98,14 +98,14 @@ class LinkFile:
         except ProblemError as error:
             raise LiveError(f"link {source}->{target}: {error}") from None
         kind = self._kinds.get(way)
-        told = {
+        document = {
             "conditions": to_json(fields_of(self._conditions[way])),
             "retransmit_ms": None if kind is None else kind.retransmit_ms,
             "in_order": kind is not None and kind.in_order,
         }
         place = _place(self.nodes, source, target)
         # Whoever sees the number reads the file, or a newer one.
-        write_whole(_file_of(self.path, place), json.dumps(told), durable=False)
+        write_whole(_file_of(self.path, place), json.dumps(document), durable=False)
         (count,) = struct.unpack_from("<q", self._map, place)
         struct.pack_into("<q", self._map, place, count + 1)
 
@@ -187,14 +187,14 @@ class Way:
         (count,) = struct.unpack_from("<q", self._memory, self._place)
         if count == self._seen:
             return
-        told = json.loads(_file_of(self._path, self._place).read_text(encoding="utf-8"))
+        document = json.loads(_file_of(self._path, self._place).read_text(encoding="utf-8"))
         # A delay that stays goes on where it is.
         known = to_json(fields_of(self._draws.conditions))
         changes = {
-            name: value for name, value in told["conditions"].items() if known[name] != value
+            name: value for name, value in document["conditions"].items() if known[name] != value
         }
         self._draws.apply(changes)
-        self._retransmit_ms, self._in_order = told["retransmit_ms"], told["in_order"]
+        self._retransmit_ms, self._in_order = document["retransmit_ms"], document["in_order"]
         self._seen = count
 
     def _transmitted(self, size_bytes: int, now_ns: int) -> int:

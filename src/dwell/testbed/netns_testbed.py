@@ -76,11 +76,11 @@ def require_playable(problems: Sequence[Problem]) -> None:
 
 def _pairs_of(problems: Sequence[Problem]) -> list[tuple[str, str]]:
     """Return who is linked: the agents of a cell all talk to each other."""
-    found: dict[frozenset[str], tuple[str, str]] = {}
+    pairs: dict[frozenset[str], tuple[str, str]] = {}
     for problem in problems:
         for pair in combinations(problem.fabric.nodes, 2):
-            found.setdefault(frozenset(pair), pair)
-    return list(found.values())
+            pairs.setdefault(frozenset(pair), pair)
+    return list(pairs.values())
 
 
 class NetnsTestbed(LocalTestbed):

@@ -100,8 +100,8 @@ def wakes(measured: Sequence[Measured], problem: Problem) -> dict[str, float]:
     """How often in a second threads of a node wake, where the kernel looks at ticks otherwise."""
     result = {}
     for name, node in problem.fabric.nodes.items():
-        told = [one.run.meta.get("wakes_hz") or {} for one in measured]
-        known = [float(of[name]) for of in told if name in of]
+        counted = [one.run.meta.get("wakes_hz") or {} for one in measured]
+        known = [float(of[name]) for of in counted if name in of]
         if known and node.quota is not None and node.quota.tick_ms > 0:
             result[name] = min(sum(known) / len(known) / TOGETHER, BACKGROUND_HZ.high)
     return result

@@ -147,16 +147,16 @@ def crowded(run: Run, problem: Problem) -> list[str]:
     at_s = pl.col("release_ns")
     for item in run.played or ():
         windows = windows.filter((at_s + span_s < item.at_s) | (item.end_s < at_s))
-    found = []
+    warnings = []
     for node in problem.fabric.nodes:
         full = int((windows[f"u_{node}"] >= FULL).sum())
         if 2 * full > windows.height:
-            found.append(
+            warnings.append(
                 f"{node} was full ({FULL:.0%} busy or more) in {full} of {windows.height} windows "
                 "in which nothing was to disturb it: this machine has too little for the cell, and "
                 "what was missed says little about placements"
             )
-    return found
+    return warnings
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
@@ -318,8 +318,8 @@ def require_run(out: Path) -> Path:
 
 def longest_run(runs: Path) -> Path | None:
     """Return the longest of the runs in a folder; None where there is none."""
-    found: list[tuple[int, Path]] = []
+    lengths: list[tuple[int, Path]] = []
     for folder in sorted(runs.iterdir()) if runs.is_dir() else ():
         with suppress(DwellError):
-            found.append((int(open_run(folder).meta.get("windows", 0)), folder))
-    return max(found)[1] if found else None
+            lengths.append((int(open_run(folder).meta.get("windows", 0)), folder))
+    return max(lengths)[1] if lengths else None

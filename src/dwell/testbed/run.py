@@ -54,8 +54,8 @@ def require_machine(problems: Sequence[Problem]) -> None:
     """
     missing = [one for one in examine(problems) if one.needed and not one.ok]
     if missing:
-        told = "; ".join(f"{one.name}: {one.found}; {one.remedy}" for one in missing)
-        raise LiveError(f"this machine cannot run the testbed: {told}")
+        reasons = "; ".join(f"{one.name}: {one.found}; {one.remedy}" for one in missing)
+        raise LiveError(f"this machine cannot run the testbed: {reasons}")
 
 
 def run_once(
@@ -191,15 +191,15 @@ def spans_of(run: Run, played: Played) -> list[Span]:
     period_ns = round(problem.pipeline.period_ms * 1e6)
     release_ns = run.cycles["release_ns"].to_list()
     first = run.cycles["cycle"][0]
-    found = []
+    spans = []
     for window in run.windows.select("window", "first_cycle", "warmup").iter_rows(named=True):
         row = window["first_cycle"] - first
         last = min(row + problem.window_cycles, len(release_ns)) - 1
         begin_ns = origin_ns + release_ns[row]
         end_ns = origin_ns + release_ns[last] + period_ns
         stressed = _stressed(played, begin_ns, end_ns)
-        found.append(Span(window["window"], begin_ns, end_ns, window["warmup"], stressed))
-    return found
+        spans.append(Span(window["window"], begin_ns, end_ns, window["warmup"], stressed))
+    return spans
 
 
 def _stressed(played: Played, begin_ns: int, end_ns: int) -> dict[str, float]:

@@ -141,19 +141,19 @@ class Sampler(Started):
 
     def links(self) -> dict[str, Any]:
         """Return statistics of the delays drawn for each direction, ready for JSON."""
-        found = {}
+        statistics = {}
         for (source, target), total in self._totals.items():
             delay_ms = {
                 "mean": round(total.delay_mean_ms, 4),
                 "std": round(total.delay_std_ms, 4),
             }
-            found[f"{source}->{target}"] = {
+            statistics[f"{source}->{target}"] = {
                 "messages": total.bursts,
                 "delay_ms": delay_ms if total.bursts else None,
                 "held": total.held,
                 "vanished": total.vanished,
             }
-        return found
+        return statistics
 
 
 def rate_hz(before: Mapping[int, int], after: Mapping[int, int], lasted_s: float) -> float:
