@@ -7,7 +7,6 @@ another length go into a file of their own. How each was measured is JSON in the
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -151,10 +150,8 @@ def write_profile(path: Path, measurements: Sequence[Measurement]) -> None:
     )
     about = {one.name: {**one.about, "columns": list(one.columns)} for one in measurements}
     text = json.dumps({"format": FORMAT, "measurements": about}, allow_nan=False)
-    written = io.BytesIO()
-    frame.write_parquet(written, metadata={KEY: text})
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, written.getvalue())
+    write_whole(path, lambda draft: frame.write_parquet(draft, metadata={KEY: text}))
 
 
 def _require_one_length(rows: Mapping[str, int]) -> None:
