@@ -10,15 +10,12 @@ import pytest
 #: A worker of a cell in memory; what is appended makes something of it fail.
 WORKER = """
 import sys, threading, time
-from dataclasses import replace
-import dwell
 from dwell.live.hosting import Hosted, work
 from dwell.live.role import Pulse
 from dwell.live.transport.transport import Arrival
-from tests.live.small_world import Passing, World
+from tests.live.small_world import Passing, World, canonical
 
-problem = dwell.load("examples/canonical.yaml")
-world = World(problem, exec_ms={"sensing": 3.0, "perception": 1.0, "planning": 6.0, "control": 0.5})
+world = World(canonical())
 worker = world.worker("perception@E")
 """
 

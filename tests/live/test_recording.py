@@ -33,12 +33,9 @@ from tests.report.pages import table_of
 #: A cell in memory, at full speed; its controller records as that of real processes does.
 RECORDER = """
 import sys
-from dataclasses import replace
 from pathlib import Path
-import dwell
-from dwell.live.controlled_cell import ControlledCell
 from dwell.live.recording import RunRecorder
-from tests.live.small_world import World
+from tests.live.small_world import World, canonical
 
 class Telling(RunRecorder):
     def append(self, rows, **meta):
@@ -46,10 +43,7 @@ class Telling(RunRecorder):
         for row in rows.get("windows", ()):
             print(row[0], flush=True)
 
-problem = dwell.load("examples/canonical.yaml")
-problem = replace(problem, window_cycles=10, warmup_windows=0)
-exec_ms = {"sensing": 3.0, "perception": 10.0, "planning": 6.0, "control": 0.5}
-world = World(problem, exec_ms=exec_ms, policy="dtp")
+world = World(canonical(10), policy="dtp")
 cell = world.cell
 cell._recorder = Telling(Path(sys.argv[1]), world.problem, cell.controller, lambda line: None)
 for _ in range(400):

@@ -190,12 +190,12 @@ class Agent:
 
     def _tell(self, now_ns: int) -> None:
         """Tell the controller what came over the detour; of beats the last, and less often."""
-        told = self._gathered.taken()
+        messages = self._gathered.taken()
         if now_ns >= self._beats_ns:
-            told += self._beats.taken()
+            messages += self._beats.taken()
             self._beats_ns = now_ns + AGENT_BEAT * self.place.period_ns
-        if told:
-            self._put(self.place.keys.gathered(), told)
+        if messages:
+            self._put(self.place.keys.gathered(), messages)
 
     def _put(self, key: str, messages: list[tuple[str, bytes]]) -> None:
         self.place.transport.put(key, encode(Carried(tuple(messages))))

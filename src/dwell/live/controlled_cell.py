@@ -151,8 +151,8 @@ class ControlledCell:
         keys = self._keys
         word = keys.word(sample.key)
         if word == "gathered":
-            for one in self.place.around(sample):
-                self._take(one, now_ns)
+            for arrival in self.place.around(sample):
+                self._take(arrival, now_ns)
             return
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
@@ -320,7 +320,7 @@ class ControlledCell:
         if held is None:
             return
         held, move = self.held or held, self._move
-        mine = move is not None and move.order is not None and answer.number == move.order.number
+        of_move = move is not None and move.order is not None and answer.number == move.order.number
         if (answer.run, answer.term) > (held.run, held.term):
             # What was accepted may be an order before the one that waits for its answer.
             self._now_at(answer.run, answer.term, answer.placement, by_guard=answer.fallback)
@@ -330,7 +330,7 @@ class ControlledCell:
         self.held = answer
         if self._move is None and answer.proven and answer.proven != held.proven:
             self._follow_operators(now_ns)
-        if not mine or move is None or move is not self._move:
+        if not of_move or move is None or move is not self._move:
             return
         self.refused = answer.refused
         if answer.refused:
@@ -655,7 +655,7 @@ class ControlledCell:
         held, move = self.held, self._move
         began_ns = now_ns if self._began_ns is None else self._began_ns
         age_ms = round((now_ns - self._window_ns) / 1e6, 1)
-        found = {
+        status = {
             "cell": self.place.problem.name,
             "controller": self.name,
             "up_ms": round((now_ns - began_ns) / 1e6, 1),
@@ -681,8 +681,8 @@ class ControlledCell:
             "complaints": dict(list(self.place.complaints.items())[-10:]),
             "record": self._recorder.trouble or None,
         }
-        health, headline = diagnose(self.place.problem, found)
-        return {"health": health, "headline": headline, **found}
+        health, headline = diagnose(self.place.problem, status)
+        return {"health": health, "headline": headline, **status}
 
     def _proving(self, now_ns: int) -> dict[str, Any] | None:
         """Return how far the proof is that the guard's fallback is waiting for."""

@@ -296,21 +296,21 @@ class Ledger:
 
     def jobs(self, cycle: LiveCycle) -> list[Values]:
         """Return rows of ``jobs``: all known to have become ready for a cycle or its shadow."""
-        found: dict[tuple[bool, str, str], Hop] = {}
+        jobs: dict[tuple[bool, str, str], Hop] = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
-        told = [(hop, False) for hop in cycle.hops]
-        told += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
-        for hop, shadow in told:
+        hops = [(hop, False) for hop in cycle.hops]
+        hops += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
+        for hop, shadow in hops:
             if hop.task not in self._tasks or (shadow and hop.task in self.sinks):
                 continue
-            known = found.get((shadow, hop.task, hop.node))
+            known = jobs.get((shadow, hop.task, hop.node))
             if known is None or known.ended_ns == UNKNOWN:
-                found[shadow, hop.task, hop.node] = hop
-        order = sorted(found, key=lambda key: (key[0], self._tasks[key[1]]))
+                jobs[shadow, hop.task, hop.node] = hop
+        order = sorted(jobs, key=lambda key: (key[0], self._tasks[key[1]]))
         rows = []
         for key in order:
-            hop = found[key]
-            handover_ns = self._handover_ns(cycle, hop, found, shadow=key[0])
+            hop = jobs[key]
+            handover_ns = self._handover_ns(cycle, hop, jobs, shadow=key[0])
             ending_ns = UNKNOWN if key[0] else self._ending_ns(cycle, hop)
             rows.append(self._job_values(cycle, hop, (handover_ns, ending_ns), shadow=key[0]))
         return [row for row in rows if row is not None]
@@ -319,7 +319,7 @@ class Ledger:
         self,
         cycle: LiveCycle,
         hop: Hop,
-        found: Mapping[tuple[bool, str, str], Hop],
+        jobs: Mapping[tuple[bool, str, str], Hop],
         *,
         shadow: bool,
     ) -> int:
@@ -328,8 +328,8 @@ class Ledger:
         before_ns = UNKNOWN
         if not flows and hop.node == self._stamper_node:
             before_ns = cycle.group_ns
-        elif len(flows) == 1 and (shadow, flows[0].source, hop.node) in found:
-            before_ns = found[shadow, flows[0].source, hop.node].group_ns[1]
+        elif len(flows) == 1 and (shadow, flows[0].source, hop.node) in jobs:
+            before_ns = jobs[shadow, flows[0].source, hop.node].group_ns[1]
         return _between(before_ns, hop.group_ns[0])
 
     def _ending_ns(self, cycle: LiveCycle, hop: Hop) -> int:
@@ -399,8 +399,8 @@ class Ledger:
                 self._enter(known, row, cycle, report.hops, self._every)
             if cycle.heard and not (cycle.reports or cycle.replaced or cycle.told):
                 self._mark_lost(known, row, cycle)
-        for found in (known, of_shadows):
-            for instants in (found.ready_ns, found.end_ns, found.arrived_ns):
+        for group in (known, of_shadows):
+            for instants in (group.ready_ns, group.end_ns, group.arrived_ns):
                 instants[instants > close_ns] = UNKNOWN
         return Evidence(
             close_ns=close_ns,

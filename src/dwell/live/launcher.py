@@ -138,12 +138,12 @@ class ForkServer(Launcher):
             words = json.dumps(list(command)).encode()
             socket.send_fds(self._channel, [words], [log.fileno()])
         while self._channel is not None and (left_s := deadline - time.monotonic()) > 0:
-            told = self._receive(left_s)
-            if "forked" in told:
-                self._watched.add(told["forked"])
-                return _Forked(self, told["forked"])
-            if "refused" in told:
-                raise OSError(told["refused"], os.strerror(told["refused"]))
+            reply = self._receive(left_s)
+            if "forked" in reply:
+                self._watched.add(reply["forked"])
+                return _Forked(self, reply["forked"])
+            if "refused" in reply:
+                raise OSError(reply["refused"], os.strerror(reply["refused"]))
         self._end()
         raise OSError(errno.ECHILD, "the fork server does not answer")
 
@@ -166,11 +166,11 @@ class ForkServer(Launcher):
         if not data:
             self._end()
             return {}
-        told: dict[str, int] = json.loads(data)
+        message: dict[str, int] = json.loads(data)
         self._serves = True
-        if "code" in told:
-            self._codes[told["ended"]] = told["code"]
-        return told
+        if "code" in message:
+            self._codes[message["ended"]] = message["code"]
+        return message
 
     def code(self, pid: int) -> int | None:
         """Return the exit code of a process that was forked; None where it is not known (yet)."""

@@ -114,12 +114,12 @@ class ProcessLoads:
 
         In proportion between two reports; nothing before the first and after the last.
         """
-        found = {}
+        spent_ns = {}
         for (where, who), (at, total) in self._of.items():
             if where == node:
                 first, last = np.interp((begin_ns, end_ns), list(at), list(total))
-                found[who] = float(last - first)
+                spent_ns[who] = float(last - first)
                 while len(at) > 2 and at[1] < begin_ns:
                     at.popleft()
                     total.popleft()
-        return found
+        return spent_ns

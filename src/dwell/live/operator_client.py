@@ -106,10 +106,10 @@ class OperatorClient:
         answer = self._answer("status", "", patience_s)
         if answer is not None:
             return {**answer.status, "answer_age_ms": 0.0}
-        found = {"cell": self.problem.name, "health": "absent", "headline": self._absent()}
+        status = {"cell": self.problem.name, "health": "absent", "headline": self._absent()}
         if self._answered_s is None:
-            return {**found, "answer_age_ms": None}
-        return {**found, "answer_age_ms": round((time.monotonic() - self._answered_s) * 1e3, 1)}
+            return {**status, "answer_age_ms": None}
+        return {**status, "answer_age_ms": round((time.monotonic() - self._answered_s) * 1e3, 1)}
 
     def _answer(self, what: str, about: str, patience_s: float) -> Answer | None:
         """Ask until there is an answer, or patience ends."""

@@ -23,7 +23,7 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
     stamper, relay = problem.stamper_node, problem.relay_node
     first = next(task for name, task in pipeline.tasks.items() if not pipeline.inputs(name))
     everywhere = frozenset(node for task in pipeline.tasks.values() for node in task.on)
-    found: dict[str, frozenset[str]] = {
+    by_key: dict[str, frozenset[str]] = {
         **_of_stages(problem, keys),
         keys.ended(): everywhere,
         keys.stamped(): frozenset([stamper]),
@@ -34,41 +34,41 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
         keys.gathered(): frozenset([relay]),
     }
     if problem.live.release == "frames":
-        found[keys.frame()] = frozenset(first.on)
+        by_key[keys.frame()] = frozenset(first.on)
     for role in roles(problem):
         sender = CONTROLLER if role.kind == "controller" else role.node
-        found[keys.beat(role.node, role.who)] = frozenset([sender])
+        by_key[keys.beat(role.node, role.who)] = frozenset([sender])
     for node in problem.fabric.nodes:
-        found[keys.load(node)] = frozenset([node])
+        by_key[keys.load(node)] = frozenset([node])
     # What is sent twice may be handed to the relay by whoever may send it.
-    found |= {keys.relay(key): who for key, who in found.items() if keys.word(key) in TWICE}
-    return found
+    by_key |= {keys.relay(key): who for key, who in by_key.items() if keys.word(key) in TWICE}
+    return by_key
 
 
 def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
     """Return who may put stages' messages to one another, and messages about their states."""
     pipeline = problem.pipeline
-    found: dict[str, frozenset[str]] = {}
+    by_key: dict[str, frozenset[str]] = {}
     restored: set[str] = set()
     for name, task in pipeline.tasks.items():
         flows = pipeline.inputs(name)
         before = {node for flow in flows for node in pipeline.tasks[flow.source].on}
         sources = frozenset(before) if flows else frozenset([problem.stamper_node])
         for node in task.on:
-            found[keys.inputs(name, node, MAIN)] = sources
+            by_key[keys.inputs(name, node, MAIN)] = sources
             if flows:
-                found[keys.inputs(name, node, SHADOW)] = sources
+                by_key[keys.inputs(name, node, SHADOW)] = sources
         if not pipeline.outputs(name):
-            found[keys.command(name)] = frozenset(task.on)
-            found[keys.done(name)] = frozenset(task.on)
+            by_key[keys.command(name)] = frozenset(task.on)
+            by_key[keys.done(name)] = frozenset(task.on)
         if len(task.on) > 1:
             restored.update(task.on)
             for node in task.on:
-                found[keys.snapshot(name, node)] = frozenset([CONTROLLER])
-                found[keys.state(name, node)] = frozenset(task.on) - {node}
+                by_key[keys.snapshot(name, node)] = frozenset([CONTROLLER])
+                by_key[keys.state(name, node)] = frozenset(task.on) - {node}
     if restored:
-        found[keys.restored()] = frozenset(restored)
-    return found
+        by_key[keys.restored()] = frozenset(restored)
+    return by_key
 
 
 def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
@@ -88,10 +88,10 @@ def subjects(problem: Problem, roster: Roster) -> dict[str, Collection[str]]:
             if known.get(name) == ("controller" if name == CONTROLLER else "node")
         )
 
-    found: dict[str, Collection[str]] = {
+    by_key: dict[str, Collection[str]] = {
         key: allowed(names) for key, names in senders(problem).items()
     }
     people = [*of_role["controller"], *of_role["operator"]]
-    found[keys.ask()] = frozenset(people)
-    found[keys.look()] = frozenset([*people, *of_role["observer"]])
-    return found
+    by_key[keys.ask()] = frozenset(people)
+    by_key[keys.look()] = frozenset([*people, *of_role["observer"]])
+    return by_key

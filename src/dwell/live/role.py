@@ -251,9 +251,9 @@ class RolePlace:
             self.complain(error)
             return []
         keys = self.keys
-        told = [Arrival(keys.detour(key), payload) for key, payload in carried.messages]
-        fit = [one for one in told if keys.word(one.key) in TWICE]
-        if len(fit) < len(told):
+        arrivals = [Arrival(keys.detour(key), payload) for key, payload in carried.messages]
+        fit = [arrival for arrival in arrivals if keys.word(arrival.key) in TWICE]
+        if len(fit) < len(arrivals):
             self.complain(LiveError(f"{sample.key}: has what never takes the detour"))
         return fit
 
@@ -345,8 +345,8 @@ class Pulse:
             beat = self.place.beat(sample)
         except LiveError as error:
             who = sample.key.rpartition("/")[2]
-            told = f"{who}: {error}; does Dwell {__version__} run there, as here?"
-            self.place.complain(LiveError(told))
+            reason = f"{who}: {error}; does Dwell {__version__} run there, as here?"
+            self.place.complain(LiveError(reason))
             return None
         if differs := self._differs(beat):
             self._note_stranger(beat.who, differs, now_ns)
@@ -405,8 +405,8 @@ class Pulse:
         count = self._rivals.get(beat.who, 0) + 1
         if count >= RIVAL_BEATS:
             count = 0
-            told = f"two processes say that they are {beat.who}; end one: its agent runs twice?"
-            self.place.complain(LiveError(told))
+            reason = f"two processes say that they are {beat.who}; end one: its agent runs twice?"
+            self.place.complain(LiveError(reason))
         self._rivals[beat.who] = count
 
     def compare_clocks(self, sample: Arrival, now_ns: int, offsets: Offsets) -> None:

@@ -77,11 +77,11 @@ class Security:
             keyring = _keyring(Path(folder), problem, role)
             _require_own(keyring, role)
             return cls(problem, keyring)
-        found = cls(problem)
+        open_cell = cls(problem)
         faults = list(exposed(problem))
         if faults and given.get(INSECURE, "") != "1":
             raise LiveError("\n".join(map(str, faults)))
-        return found
+        return open_cell
 
     def remember(self, folder: Path) -> None:
         """Take note of the roster in a node's folder; it never goes back to an earlier one.
@@ -250,12 +250,12 @@ def exposed(problem: Problem) -> Iterator[Fault]:
 
 def _beyond(problem: Problem) -> dict[str, str]:
     """Return addresses that are not loopback, by where they stand in the cell file."""
-    found = {}
+    addresses = {}
     for node, host in problem.live.hosts.items():
-        found[f"live.hosts.{node}.address"] = host.address
+        addresses[f"live.hosts.{node}.address"] = host.address
         for other, end in host.seen_from.items():
-            found[f"live.hosts.{node}.seen_from.{other}.address"] = end.address
-    return {path: address for path, address in found.items() if not _loopback(address)}
+            addresses[f"live.hosts.{node}.seen_from.{other}.address"] = end.address
+    return {path: address for path, address in addresses.items() if not _loopback(address)}
 
 
 def _loopback(address: str) -> bool:

@@ -77,9 +77,10 @@ class Sink:
         header = self.place.header(sample)
         if header is None or header.source != self.task:
             return
-        if len(sample.payload) > longest_bytes(0):
-            told = f"a command of {len(sample.payload)} bytes; at most {longest_bytes(0)} are taken"
-            self.place.complain(LiveError(f"{sample.key}: {told}"))
+        length, longest = len(sample.payload), longest_bytes(0)
+        if length > longest:
+            reason = f"{sample.key}: a command of {length} bytes; at most {longest} are taken"
+            self.place.complain(LiveError(reason))
             return
         group_ns = self.group_clock()
         outcome = self._gate(header, now_ns)

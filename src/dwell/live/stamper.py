@@ -139,8 +139,8 @@ class Stamper:
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Take a message in."""
         if sample.key == self.place.keys.carried():
-            for one in self.place.around(sample):
-                self.receive(one, now_ns)
+            for arrival in self.place.around(sample):
+                self.receive(arrival, now_ns)
             return
         if self.pulse.hears(sample):
             beat = self.pulse.receive(sample, now_ns)
@@ -199,14 +199,14 @@ class Stamper:
                 self._probes.discard(stamp.cycle)
                 self.probation.completed(stamp.cycle, now_ns)
             return
-        told = done.outcome == "actuated" and done.sink in self._sinks
-        if not told or stamp.cycle < self.guard.newest:
+        actuated = done.outcome == "actuated" and done.sink in self._sinks
+        if not actuated or stamp.cycle < self.guard.newest:
             return
-        said = self._partial.setdefault(stamp.cycle, set())
-        if done.sink in said:
+        sinks = self._partial.setdefault(stamp.cycle, set())
+        if done.sink in sinks:
             return
-        said.add(done.sink)
-        if said == self._sinks:
+        sinks.add(done.sink)
+        if sinks == self._sinks:
             self.guard.completed(stamp.cycle, now_ns)
             self.probation.healthy()
         if len(self._partial) > MAX_PARTIAL:
@@ -387,8 +387,8 @@ class Stamper:
         # A beat wakes every process, and would take the source's turn.
         self.pulse.put_off(released_ns + self.place.period_ns // 2)
         intervals = self.intervals.take_unreported()
-        told = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
-        self.place.transport.put(self.place.keys.stamped(), encode(told))
+        stamped = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
+        self.place.transport.put(self.place.keys.stamped(), encode(stamped))
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
             self._send(self._ahead, here=False, elsewhere=True)

@@ -123,12 +123,12 @@ class HighestFile:
 
     def load(self) -> tuple[int, int]:
         """Return the highest run and cycle of the good slots; (-1, -1) where none is."""
-        found = (-1, -1)
+        highest = (-1, -1)
         for slot in (0, 1):
             run, cycle, check = _SLOT.unpack_from(self._map, slot * _SLOT.size)
-            if check and check == _checksum(run, cycle) and (run, cycle) > found:
-                found, self._slot = (run, cycle), 1 - slot
-        return found
+            if check and check == _checksum(run, cycle) and (run, cycle) > highest:
+                highest, self._slot = (run, cycle), 1 - slot
+        return highest
 
     def store(self, run: int, cycle: int) -> None:
         """Write the slot that holds the lower one."""

@@ -262,7 +262,7 @@ class Supervisor:
 
     def cpu_seconds(self) -> dict[str, float]:
         """CPU time of every process that runs, since it was started."""
-        found: dict[str, float] = {}
+        seconds: dict[str, float] = {}
         for child in self.children:
             if child.pid is None:
                 continue
@@ -272,16 +272,16 @@ class Supervisor:
                 times = child.watched.cpu_times()
             except psutil.Error:
                 continue
-            found[child.who] = times.user + times.system
-        return found
+            seconds[child.who] = times.user + times.system
+        return seconds
 
     def notes(self) -> str:
         """Return the last troubles of processes that keep dying or growing, or died for memory."""
         since_s = time.monotonic() - STARVED_S
-        found = [child.starved for child in self.children if child.starved_s > since_s]
-        found += [child.note for child in self.children if child.failures > 1]
-        found += [child.growth for child in self.children if child.growth]
-        return "; ".join(found)[:2000]
+        notes = [child.starved for child in self.children if child.starved_s > since_s]
+        notes += [child.note for child in self.children if child.failures > 1]
+        notes += [child.growth for child in self.children if child.growth]
+        return "; ".join(notes)[:2000]
 
     def stop(self, patience_s: float = 2.0) -> None:
         """End all processes; those that do not listen are killed."""
@@ -313,9 +313,9 @@ def _signal(process: psutil.Process, number: int) -> None:
 def survivor(mark: Path) -> psutil.Process | None:
     """Return the process that a mark tells of, if it is still that one."""
     try:
-        told = json.loads(mark.read_text())
-        process = psutil.Process(int(told["pid"]))
-        same = abs(process.create_time() - float(told["started"])) < 0.05
+        content = json.loads(mark.read_text())
+        process = psutil.Process(int(content["pid"]))
+        same = abs(process.create_time() - float(content["started"])) < 0.05
         return process if same and process.status() != psutil.STATUS_ZOMBIE else None
     except (OSError, ValueError, KeyError, TypeError, psutil.Error):
         return None

@@ -207,27 +207,27 @@ def roles(problem: Problem) -> tuple[Role, ...]:
     pipeline = problem.pipeline
     order = pipeline.topological()
     stamper = problem.stamper_node
-    found = [Role(f"stamper@{stamper}", stamper, "stamper")]
-    found += [
+    everybody = [Role(f"stamper@{stamper}", stamper, "stamper")]
+    everybody += [
         Role(f"sink.{task}@{node}", node, "sink", task)
         for task in order
         if not pipeline.outputs(task)
         for node in pipeline.tasks[task].on
     ]
-    found += [Role(f"agent@{node}", node, "agent") for node in problem.fabric.nodes]
+    everybody += [Role(f"agent@{node}", node, "agent") for node in problem.fabric.nodes]
     shadows = _shadows(problem)
     for task in order:
         for node, execution in pipeline.tasks[task].on.items():
-            found.append(Role(f"{task}@{node}", node, "worker", task))
+            everybody.append(Role(f"{task}@{node}", node, "worker", task))
             if (task, node) in shadows:
-                found.append(Role(f"{task}@{node}.shadow", node, "shadow", task))
-            found += [
+                everybody.append(Role(f"{task}@{node}.shadow", node, "shadow", task))
+            everybody += [
                 Role(f"{task}@{node}.{index}", node, "standby", task, index)
                 for index in range(1, execution.standby + 1)
             ]
     node = problem.controller_node
-    found.append(Role(f"controller@{node}", node, "controller"))
-    return tuple(found)
+    everybody.append(Role(f"controller@{node}", node, "controller"))
+    return tuple(everybody)
 
 
 def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
@@ -352,21 +352,21 @@ def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
 
 def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, frozenset[str]]]:
     """Every pair that has to hear each other, by session; each once, in a fixed order."""
-    found: dict[tuple[Session, frozenset[str]], None] = {}
+    pairs: dict[tuple[Session, frozenset[str]], None] = {}
     for one, other in combinations(everybody, 2):
         if _meet(problem, one, other):
-            found["control", frozenset((one.who, other.who))] = None
+            pairs["control", frozenset((one.who, other.who))] = None
     for flow in problem.pipeline.flows:
         for one in _workers(everybody, flow.source):
             for other in _workers(everybody, flow.target):
                 session = _session(flow, one, other)
-                found[session, frozenset((one.who, other.who))] = None
+                pairs[session, frozenset((one.who, other.who))] = None
     for task in problem.pipeline.tasks.values():
         state = lane_of(task.state_bytes)
         for one, other in combinations(_workers(everybody, task.name), 2):
             if one.node != other.node:
-                found[state, frozenset((one.who, other.who))] = None
-    return list(found)
+                pairs[state, frozenset((one.who, other.who))] = None
+    return list(pairs)
 
 
 def _workers(everybody: Iterable[Role], task: str) -> list[Role]:

@@ -65,11 +65,11 @@ class Job:
 
     def hops(self) -> tuple[Hop, ...]:
         """All jobs behind it, each once."""
-        found: dict[tuple[str, str], Hop] = {}
+        hops: dict[tuple[str, str], Hop] = {}
         for header, _, _ in self.inputs.values():
             for hop in header.hops:
-                found[hop.task, hop.node] = hop
-        return tuple(found.values())
+                hops[hop.task, hop.node] = hop
+        return tuple(hops.values())
 
 
 @dataclass(slots=True)
@@ -323,8 +323,8 @@ class Worker:
 
     def _is_forked(self, job: Job) -> bool:
         """Whether a job is here only because the state comes here."""
-        mine = self.routes.runs(self.task, self.place.node, job.header.stamp)
-        return self._stateful and not mine and not job.shadow
+        runs_here = self.routes.runs(self.task, self.place.node, job.header.stamp)
+        return self._stateful and not runs_here and not job.shadow
 
     def _about_state(self, sample: Arrival) -> None:
         if "/snapshot/" in sample.key:
@@ -542,8 +542,8 @@ class Worker:
         self.busy_since_ns = None
         self.state_at = max(self.state_at, job.order)
         place, stamp = self.place, job.header.stamp
-        mine = self.routes.runs(self.task, place.node, stamp)
-        if mine and self._stateful:
+        runs_here = self.routes.runs(self.task, place.node, stamp)
+        if runs_here and self._stateful:
             self._worked_at = max(self._worked_at, job.order)
             self._follows = False
             self._forked.clear()
@@ -568,17 +568,17 @@ class Worker:
         if self.is_sink:
             longest = longest_bytes(0)
             if len(data) > longest:
-                told = _too_long(f"its command of {len(data)}", longest)
-                self._failed(f"cycle {stamp.cycle}: {told}")
-            elif mine or not self._stateful:
+                reason = _too_long(f"its command of {len(data)}", longest)
+                self._failed(f"cycle {stamp.cycle}: {reason}")
+            elif runs_here or not self._stateful:
                 place.transport.put(place.keys.command(self.task), data, head)
-        elif job.shadow or mine:
+        elif job.shadow or runs_here:
             for target, node, to in destinations:
                 declared = self._output_bytes[target]
                 longest = longest_bytes(declared)
                 if len(data) > longest:
-                    told = _too_long(f"its output of {len(data)}", longest, "the flow's bytes")
-                    self._failed(f"cycle {stamp.cycle}: {told}")
+                    reason = _too_long(f"its output of {len(data)}", longest, "the flow's bytes")
+                    self._failed(f"cycle {stamp.cycle}: {reason}")
                     continue
                 key = place.keys.inputs(target, node, to)
                 place.transport.put(key, data, head, lane=lane_of(declared))

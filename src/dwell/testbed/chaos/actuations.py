@@ -94,22 +94,22 @@ class Actuations:
     def since(self, at_ns: int) -> list[Seen]:
         """Calls of the actuator from an instant on."""
         self.look()
-        found = []
+        calls = []
         for seen in reversed(self.all):
             if seen.at_ns < at_ns:
                 break
-            found.append(seen)
-        return found[::-1]
+            calls.append(seen)
+        return calls[::-1]
 
 
 def out_of_order(applied: Sequence[Seen]) -> list[str]:
     """Return commands that came twice, out of order, or with another cycle's number."""
-    found = [
+    violations = [
         f"cycle {later.cycle} actuated after {before.cycle}"
         for before, later in pairwise(applied)
         if later.cycle <= before.cycle
     ]
-    return found + [f"cycle {s.cycle} carries {s.said}" for s in applied if s.cycle != s.said]
+    return violations + [f"cycle {s.cycle} carries {s.said}" for s in applied if s.cycle != s.said]
 
 
 def unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
@@ -118,17 +118,17 @@ def unsafe(seen: Sequence[Seen], limit_ms: float) -> list[str]:
     A sink that is dead or frozen itself tells it nothing; of that no more is asked than that it
     never applies what has become old.
     """
-    found = []
+    silences = []
     commands = [place for place, one in enumerate(seen) if one.what == APPLY]
     for before, later in pairwise(commands):
         gap_ms = (seen[later].at_ns - seen[before].at_ns) / 1e6
-        told = [one.at_ns for one in seen[before + 1 : later] if one.what in (HOLD, ZERO)]
+        stopped_ns = [one.at_ns for one in seen[before + 1 : later] if one.what in (HOLD, ZERO)]
         if gap_ms <= limit_ms:
             continue
-        waited_ms = (told[0] - seen[before].at_ns) / 1e6 if told else gap_ms
+        waited_ms = (stopped_ns[0] - seen[before].at_ns) / 1e6 if stopped_ns else gap_ms
         if waited_ms > limit_ms:
-            found.append(
+            silences.append(
                 f"no command for {gap_ms:.0f} ms after cycle {seen[before].cycle}, "
                 f"and no hold() within {limit_ms:.0f} ms"
             )
-    return found
+    return silences

@@ -125,11 +125,11 @@ class Result:
 
     def counts(self) -> dict[str, int]:
         """Return how many faults of each kind there were."""
-        found: dict[str, int] = {}
+        counts: dict[str, int] = {}
         for one, _ in self.outcomes:
             kind = one.fault.kind or one.fault.how
-            found[kind] = found.get(kind, 0) + 1
-        return dict(sorted(found.items()))
+            counts[kind] = counts.get(kind, 0) + 1
+        return dict(sorted(counts.items()))
 
     def document(self) -> dict[str, Any]:
         """Return it ready for JSON."""
@@ -213,11 +213,11 @@ class FaultCampaign:
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
         testbed, _ = self._staging.testbed(1)
-        there = list(faults_of(testbed.problem, disks=self._disks))
-        found = planned(self._seed, there)
+        faults_here = list(faults_of(testbed.problem, disks=self._disks))
+        timeline = planned(self._seed, faults_here)
         if only is not None:
-            return islice(found, only - 1, only)
-        return iter(found) if faults is None else islice(found, faults)
+            return islice(timeline, only - 1, only)
+        return iter(timeline) if faults is None else islice(timeline, faults)
 
     def _cell(
         self,
@@ -348,13 +348,13 @@ def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outco
 
 def _unread(cell: Harness) -> Sequence[str]:
     """Return which runs cannot be read."""
-    found = []
+    unreadable = []
     for folder in cell.runs:
         try:
             dwell.open_run(folder).cycles.height  # noqa: B018 - reads it
         except DwellError as error:
-            found.append(str(error))
-    return found
+            unreadable.append(str(error))
+    return unreadable
 
 
 def _line(one: PlannedFault, outcome: Outcome) -> str:

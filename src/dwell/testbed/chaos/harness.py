@@ -36,8 +36,8 @@ STARVING_THREADS = 32
 def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) -> dict[str, str]:
     """Return the variables that stages and actuator of a cell in a folder need."""
     folder = folder.resolve()
-    told = {"observed": str(folder / OBSERVED), "exec_ms": exec_ms, **more}
-    return {TOLD: json.dumps(told)}
+    settings = {"observed": str(folder / OBSERVED), "exec_ms": exec_ms, **more}
+    return {TOLD: json.dumps(settings)}
 
 
 def pid_of(mark: Path) -> int | None:
@@ -175,14 +175,14 @@ class Harness(Started):
 
     def names(self, fault: Fault) -> list[str]:
         """Return the processes that a fault strikes."""
-        found = []
+        names = []
         for who in fault.whom:
             if not who.startswith("*"):
-                found.append(who)
+                names.append(who)
                 continue
             # The agent first: it must not bring back what dies next.
-            found += sorted(self._all_of(who[1:]), key=lambda one: not one.startswith("agent"))
-        return found
+            names += sorted(self._all_of(who[1:]), key=lambda one: not one.startswith("agent"))
+        return names
 
     def _all_of(self, node: str) -> list[str]:
         """Return the processes of a node, its controller included."""
@@ -339,13 +339,13 @@ class Harness(Started):
         """
         now_ns = time.monotonic_ns()
         seen = self.actuations.since(now_ns - 6 * self.period_ns)
-        lately = [one for one in seen if one.what == APPLY]
-        if len(lately) < 4:
-            return f"{len(lately)} actuations in six periods"
-        if self.home is not None and lately[-1].placement != self.home:
-            return f"it is at {lately[-1].placement}"
-        said = self.status()
-        if not said:
+        applied = [one for one in seen if one.what == APPLY]
+        if len(applied) < 4:
+            return f"{len(applied)} actuations in six periods"
+        if self.home is not None and applied[-1].placement != self.home:
+            return f"it is at {applied[-1].placement}"
+        status = self.status()
+        if not status:
             return "the controller does not answer"
         wanted: dict[str, object] = {"wanted": None, "moving_to": None, "resting": False}
         if self.home is not None:
@@ -353,9 +353,9 @@ class Harness(Started):
         else:
             wanted["fallback"] = False
         for key, value in wanted.items():
-            if said[key] != value:
-                return f"{key} is {said[key]}"
-        return "; ".join(self._unwell(said["processes"]))
+            if status[key] != value:
+                return f"{key} is {status[key]}"
+        return "; ".join(self._unwell(status["processes"]))
 
     def healthy(self) -> str:
         """Look whether the guard takes the next fault for no relapse."""
@@ -366,13 +366,13 @@ class Harness(Started):
 
     def _unwell(self, processes: Mapping[str, Any]) -> Iterator[str]:
         for who in self.everybody:
-            told = processes.get(who)
-            if told is None:
+            process = processes.get(who)
+            if process is None:
                 yield f"{who} has not been heard"
-            elif not told["ready"]:
-                yield f"{who} is not ready: {told['note']}"
-            elif told["age_ms"] > 15 * self.problem.pipeline.period_ms:
-                yield f"{who} was heard {told['age_ms']:.0f} ms ago"
+            elif not process["ready"]:
+                yield f"{who} is not ready: {process['note']}"
+            elif process["age_ms"] > 15 * self.problem.pipeline.period_ms:
+                yield f"{who} was heard {process['age_ms']:.0f} ms ago"
 
 
 _SIGNALS = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}

@@ -90,8 +90,8 @@ class Judge:
                 case "accepted":
                     return self._accepted(decode(payload, Accepted))
                 case "in":
-                    said = decode(header, Header, limit=MAX_HEADER_BYTES)
-                    return list(self._routed(key, said))
+                    decoded = decode(header, Header, limit=MAX_HEADER_BYTES)
+                    return list(self._routed(key, decoded))
                 case "done":
                     return list(self._done(decode(payload, Completion)))
         except LiveError as error:
@@ -101,16 +101,16 @@ class Judge:
     # ------------------------------------------------------------------------- stamps
 
     def _stamped(self, at_ns: int, stamp: Stamp) -> list[str]:
-        found = []
+        violations = []
         run, cycle, term = self._last
         if run not in (-1, stamp.run):
-            found.append(f"cycle {stamp.cycle} is of run {stamp.run}, after {run}")
+            violations.append(f"cycle {stamp.cycle} is of run {stamp.run}, after {run}")
         elif stamp.cycle <= cycle:
-            found.append(f"cycle {stamp.cycle} is stamped after {cycle}")
+            violations.append(f"cycle {stamp.cycle} is stamped after {cycle}")
         elif stamp.term < term:
-            found.append(f"cycle {stamp.cycle} has term {stamp.term}, after term {term}")
+            violations.append(f"cycle {stamp.cycle} has term {stamp.term}, after term {term}")
         if stamp.placement not in self.problem.candidates:
-            found.append(f"cycle {stamp.cycle} is stamped {stamp.placement!r}, no candidate")
+            violations.append(f"cycle {stamp.cycle} is stamped {stamp.placement!r}, no candidate")
         self._last = stamp.run, stamp.cycle, stamp.term
         self._stamps.append(self._last)
         del self._stamps[:-MEMORY]
@@ -122,10 +122,10 @@ class Judge:
             known.moved = stamp.term in self._moved
             self.terms[stamp.term] = known
         elif known.placement != stamp.placement:
-            found.append(
+            violations.append(
                 f"term {stamp.term} has two placements: {known.placement}, {stamp.placement}"
             )
-        return found
+        return violations
 
     # ------------------------------------------------------------------------- orders
 
@@ -152,25 +152,25 @@ class Judge:
         """Hold an answer against its order, and against what was stamped before it."""
         if (order.run, order.term) == (0, 0):
             return []
-        found = []
+        violations = []
         what = f"order {order.number} of term {order.term}"
         if order.run != answer.run:
-            found.append(f"{what} and run {order.run} is accepted in run {answer.run}")
+            violations.append(f"{what} and run {order.run} is accepted in run {answer.run}")
         if answer.term not in (order.term, order.term + 1):
-            found.append(f"{what} is accepted in term {answer.term}")
+            violations.append(f"{what} is accepted in term {answer.term}")
         later = [one for one in self._stamps if one[1] < answer.cycle and one[2] > order.term]
         if later:
-            found.append(f"{what} is accepted after cycle {later[0][1]} of term {later[0][2]}")
+            violations.append(f"{what} is accepted after cycle {later[0][1]} of term {later[0][2]}")
         if order.placement:
             if order.placement != answer.placement:
-                found.append(f"{what} asks for {order.placement} and gets {answer.placement}")
+                violations.append(f"{what} asks for {order.placement} and gets {answer.placement}")
             if order.placement not in self.problem.candidates:
-                found.append(f"{what} to {order.placement!r}, no candidate, is accepted")
+                violations.append(f"{what} to {order.placement!r}, no candidate, is accepted")
         if answer.term == order.term + 1:
             self._moved.add(answer.term)
             if answer.term in self.terms:
                 self.terms[answer.term].moved = True
-        return found
+        return violations
 
     def migrations(self) -> list[str]:
         """Return the controller's migrations since the last call that came too early.
@@ -178,7 +178,7 @@ class Judge:
         They are N_min + 1 windows apart; the guard's moves do not count.
         """
         apart = (self.problem.controller.min_dwell + 1) * self.problem.window_cycles
-        found = []
+        violations = []
         before: Term | None = None
         previous: Term | None = None
         for term in sorted(self.terms):
@@ -186,14 +186,14 @@ class Judge:
             moved = one.moved and previous is not None and one.placement != previous.placement
             if moved:
                 if before is not None and term > self._looked and one.cycle - before.cycle < apart:
-                    found.append(
+                    violations.append(
                         f"migrations at cycles {before.cycle} (to {before.placement}) and "
                         f"{one.cycle} (to {one.placement}): fewer than {apart} cycles apart"
                     )
                 before = one
             previous = one
         self._looked = max(self.terms, default=-1)
-        return found
+        return violations
 
     def ordered_since(self, at_ns: int) -> int | None:
         """Return the instant of the first stamp from `at_ns` on that an order stands behind.

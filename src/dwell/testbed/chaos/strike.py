@@ -163,37 +163,39 @@ def _last(cell: Harness, fault: Fault, begin_ns: int, lasts: int, bound: int | N
 
 
 def _few(cell: Harness, since_ns: int, count: int) -> str:
-    found = sum(seen.what == APPLY for seen in cell.actuations.since(since_ns))
-    return "" if found >= count else f"{found} of {count} cycles actuated"
+    actuated = sum(seen.what == APPLY for seen in cell.actuations.since(since_ns))
+    return "" if actuated >= count else f"{actuated} of {count} cycles actuated"
 
 
 def _weigh(
-    cell: Harness, fault: Fault, stalls: StallDetector, found: Outcome, cpus: Collection[int]
+    cell: Harness, fault: Fault, stalls: StallDetector, outcome: Outcome, cpus: Collection[int]
 ) -> None:
-    begin_ns, period_ns, problem = found.begin_ns, cell.period_ns, cell.problem
+    begin_ns, period_ns, problem = outcome.begin_ns, cell.period_ns, cell.problem
     seen = cell.actuations.since(begin_ns - 10 * period_ns)
     applied = [one for one in seen if one.what == APPLY]
     for before, later in pairwise(applied):
         if later.at_ns < begin_ns:
             continue
         lost, gap_ms = later.cycle - before.cycle - 1, (later.at_ns - before.at_ns) / 1e6
-        if before.at_ns < found.end_ns:
-            found.lost, found.gap_ms = max(found.lost, lost), max(found.gap_ms, gap_ms)
+        if before.at_ns < outcome.end_ns:
+            outcome.lost, outcome.gap_ms = max(outcome.lost, lost), max(outcome.gap_ms, gap_ms)
         else:
-            found.lost_after = max(found.lost_after, lost)
-            found.gap_after_ms = max(found.gap_after_ms, gap_ms)
-    found.recovery_ms = (found.back_ns - found.end_ns) / 1e6
-    found.silences = sum(one.what in (HOLD, ZERO) for one in seen if one.at_ns >= begin_ns)
+            outcome.lost_after = max(outcome.lost_after, lost)
+            outcome.gap_after_ms = max(outcome.gap_after_ms, gap_ms)
+    outcome.recovery_ms = (outcome.back_ns - outcome.end_ns) / 1e6
+    outcome.silences = sum(one.what in (HOLD, ZERO) for one in seen if one.at_ns >= begin_ns)
     steps = [one.placement for one in applied]
-    found.moved = " ".join(b for a, b in pairwise(["", *steps]) if a != b)
-    found.stall_ms = stalls.worst_ms(begin_ns - period_ns, found.back_ns, but=cpus)
+    outcome.moved = " ".join(b for a, b in pairwise(["", *steps]) if a != b)
+    outcome.stall_ms = stalls.worst_ms(begin_ns - period_ns, outcome.back_ns, but=cpus)
     stamper = f"*{problem.stamper_node}", f"stamper@{problem.stamper_node}"
     if fault.how == "kill" and set(fault.whom) & set(stamper):
-        found.lost = -1
-    found.wrong += out_of_order(applied)
+        outcome.lost = -1
+    outcome.wrong += out_of_order(applied)
     if hit_by(problem, fault) is not None or not _strikes_sink(fault):
         during = [one for one in seen if one.at_ns >= begin_ns - period_ns]
-        found.late += unsafe(during, cell.max_age_ms + problem.pipeline.period_ms + found.stall_ms)
+        outcome.late += unsafe(
+            during, cell.max_age_ms + problem.pipeline.period_ms + outcome.stall_ms
+        )
 
 
 def _strikes_sink(fault: Fault) -> bool:

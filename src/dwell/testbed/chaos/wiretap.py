@@ -30,8 +30,8 @@ HEARD_S = 20.0
 
 def heard(keys: Keys) -> tuple[str, ...]:
     """Return the key expressions that are listened to."""
-    said = keys.stamped(), keys.order(), keys.accepted(), keys.done("*")
-    return (*said, keys.inputs("*", "*", "*"))
+    plain = keys.stamped(), keys.order(), keys.accepted(), keys.done("*")
+    return (*plain, keys.inputs("*", "*", "*"))
 
 
 def entry_for(wiring: Wiring, nodes: Sequence[str]) -> WiringEntry:
@@ -151,8 +151,8 @@ class ActuatorObserver:
         """Return the faults of the messages heard since the last call."""
         news = [one for records in self._records for one in records.news()]
         news.sort(key=lambda one: one[0])
-        found = [wrong for one in news for wrong in self.judge.hear(*one)]
-        return found + self.judge.migrations()
+        violations = [wrong for one in news for wrong in self.judge.hear(*one)]
+        return violations + self.judge.migrations()
 
 
 def main() -> None:
