@@ -26,12 +26,12 @@ from dwell.testbed.loopback import Loopback, on_this_machine
 
 
 class RealCell(Harness):
-    """A cell on this machine whose controller wants to be at one place."""
+    """A cell on this machine whose controller wants to be at one place; `more` of its file."""
 
-    def __init__(self, home: str, folder: Path, *, standby: bool = True, seed: int = 0) -> None:
+    def __init__(self, home: str, folder: Path, *, seed: int = 0, **more: object) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         written = folder / "written.yaml"
-        written.write_text(yaml.safe_dump(document(home, standby=standby)))
+        written.write_text(yaml.safe_dump(document(home) | more))
         problem = on_this_machine(dwell.load(written))
         environment = environment_of(folder, exec_ms(home))
         testbed = Loopback(

@@ -24,13 +24,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import psutil
-import yaml
 
-import dwell
 from dwell.errors import DwellError, LiveError
-from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
-from dwell.testbed.chaos.light_cell import PERIOD_MS, document, exec_ms
-from dwell.testbed.loopback import Loopback, on_this_machine
+from dwell.testbed.chaos.harness import Harness
+from dwell.testbed.chaos.light_cell import PERIOD_MS
+from tests.live.real_cell import RealCell
 
 HOME = "SO"
 #: One second each.
@@ -130,18 +128,6 @@ def table(rows: Rows, minutes: float) -> tuple[list[str], bool]:
 # ---------------------------------------------------------------------------------- cell
 
 
-def _cell(folder: Path) -> Harness:
-    folder.mkdir(parents=True)
-    written = folder / "written.yaml"
-    cell = document(HOME) | {"name": "soak", "window_cycles": WINDOW_CYCLES}
-    written.write_text(yaml.safe_dump(cell))
-    problem = on_this_machine(dwell.load(written))
-    environment = environment_of(folder, exec_ms(HOME))
-    clocks = folder / CLOCK_FILE
-    testbed = Loopback(problem, folder, {}, seed=1, environment=environment, clocks=clocks)
-    return Harness(testbed, home=HOME)
-
-
 def look(processes: Mapping[str, psutil.Process]) -> dict[str, dict[str, float]]:
     """Return what every process has now.
 
@@ -175,7 +161,8 @@ def soak(path: Path, minutes: float, every_s: float) -> None:
     with ExitStack() as stack:
         temporary = stack.enter_context(tempfile.TemporaryDirectory(prefix="dwell-soak-"))
         file = stack.enter_context(path.open("w", newline=""))
-        with _cell(Path(temporary) / "cell") as cell:
+        folder = Path(temporary) / "cell"
+        with RealCell(HOME, folder, seed=1, name="soak", window_cycles=WINDOW_CYCLES) as cell:
             writer = csv.writer(file)
             writer.writerow(["at_s", "process", *BOUNDS])
             cell.wait_for("the whole cell at home", cell.at_home, START_S)

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from itertools import islice
-from pathlib import Path
 
 import pytest
-import yaml
 
-import dwell
+from dwell.cellfile import from_document
 from dwell.model import Problem
 from dwell.testbed.chaos.faults import Fault, bound_of, faults_of, planned
 from dwell.testbed.chaos.light_cell import document
 
 
 @pytest.fixture(scope="module")
-def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    file: Path = tmp_path_factory.mktemp("cell") / "cell.yaml"
-    file.write_text(yaml.safe_dump(document("SO")))
-    return dwell.load(file)
+def problem() -> Problem:
+    return from_document(document("SO"))
 
 
 def of(problem: Problem, name: str) -> Fault:

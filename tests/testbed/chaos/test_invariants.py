@@ -3,9 +3,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import pytest
-import yaml
 
-import dwell
+from dwell.cellfile import from_document
 from dwell.live.keys import Keys
 from dwell.live.messages import (
     Accepted,
@@ -62,10 +61,8 @@ class Wire:
 
 
 @pytest.fixture(scope="module")
-def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
-    file = tmp_path_factory.mktemp("cell") / "cell.yaml"
-    file.write_text(yaml.safe_dump(document("SO")))
-    return dwell.load(file)
+def problem() -> Problem:
+    return from_document(document("SO"))
 
 
 @pytest.fixture
