@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import yaml
 
 import dwell
-from dwell.testbed.chaos.faults import Fault, How
+from dwell.cellfile import from_document
+from dwell.testbed.chaos.faults import Fault, bound_of, faults_of
 from dwell.testbed.chaos.harness import CLOCK_FILE, Harness, environment_of
 from dwell.testbed.chaos.light_cell import (
-    GUARD_CYCLES,
+    HOMES,
     MAX_AGE_MS,
     MIN_DWELL,
     PERIOD_MS,
@@ -92,44 +94,32 @@ def strike(
 # --------------------------------------------------------------------------------- faults
 
 
-def _fault(
-    name: str,
-    home: str,
-    how: How,
-    whom: tuple[str, ...],
-    bound: int | None = GUARD_CYCLES + 1,
-) -> Fault:
-    return Fault(name, how, whom, bound=bound, home=home)
+def _names(home: str) -> Iterator[str]:
+    """Yield the faults that befall the cell at a home."""
+    anchored = ("sensing@R1", "control@R2")
+    agents = ("controller@E", "agent@E", "agent@R1", "agent@R2")
+    for how in ("kill", "freeze"):
+        whom = {
+            "SO": (*agents, "perception@E", "planning@E", *anchored, "all of E"),
+            "LOC": (
+                *("perception@R1", "planning@R2"),
+                # No fallback is without these.
+                *(f"{who} and its standby" for who in anchored),
+                *("stamper@R1", "sink.control@R2", "all of R2"),
+            ),
+        }
+        yield from (f"{how} {who}" for who in whom[home])
+    for a, b in {"SO": (("R1", "E"), ("E", "R2")), "LOC": (("R1", "R2"),)}[home]:
+        yield from (f"cut {a}->{b}", f"cut {b}->{a}", f"cut {a}-{b}")
 
 
 def _faults() -> Iterator[Fault]:
-    anchored = ("sensing@R1", "control@R2")
-    hows: tuple[How, ...] = ("kill", "freeze")
-    for how in hows:
-        for who, home in (
-            ("controller@E", "SO"),
-            ("agent@E", "SO"),
-            ("agent@R1", "SO"),
-            ("agent@R2", "SO"),
-            ("perception@E", "SO"),
-            ("planning@E", "SO"),
-            ("perception@R1", "LOC"),
-            ("planning@R2", "LOC"),
-            *((one, "SO") for one in anchored),
-        ):
-            yield _fault(f"{how} {who}", home, how, (who,))
-        yield _fault(f"{how} all of E", "SO", how, ("*E",))
-        # No fallback is without these.
-        for who in anchored:
-            both = (who, f"{who}.1")
-            yield _fault(f"{how} {who} and its standby", "LOC", how, both, None)
-        yield _fault(f"{how} stamper@R1", "LOC", how, ("stamper@R1",), None)
-        yield _fault(f"{how} sink.control@R2", "LOC", how, ("sink.control@R2",), None)
-        yield _fault(f"{how} all of R2", "LOC", how, ("*R2",), None)
-    for a, b, home in (("R1", "E", "SO"), ("E", "R2", "SO"), ("R1", "R2", "LOC")):
-        yield _fault(f"cut {a}->{b}", home, "cut", (f"{a}->{b}",))
-        yield _fault(f"cut {b}->{a}", home, "cut", (f"{b}->{a}",))
-        yield _fault(f"cut {a}-{b}", home, "cut", (f"{a}->{b}", f"{b}->{a}"))
+    for home in HOMES:
+        problem = from_document(document(home))
+        known = {fault.name: fault for fault in faults_of(problem)}
+        for name in _names(home):
+            fault = known[name]
+            yield replace(fault, home=home, bound=bound_of(problem, fault, home))
 
 
 FAULTS = {fault.name: fault for fault in _faults()}
