@@ -21,11 +21,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from dwell.errors import DwellError
-from dwell.testbed.chaos.faults import Fault
 from dwell.testbed.chaos.light_cell import HOMES, PERIOD_MS
 from dwell.testbed.chaos.stalls import StallDetector
 from dwell.testbed.chaos.strike import Outcome
-from tests.live.real_cell import FAULTS, RealCell, mixed, strike
+from tests.live.real_cell import FAULTS, HomeFault, RealCell, mixed, strike
 
 #: Faults that one cell goes through before another is started.
 A_CELL = 60
@@ -34,7 +33,7 @@ LASTS = 12, 60
 Z = 1.96
 
 
-def phases(fault: Fault, count: int, seed: int) -> list[float]:
+def phases(fault: HomeFault, count: int, seed: int) -> list[float]:
     """One phase in each `count`-th of the period, in random order."""
     drawn = random.Random(f"{seed} {fault.name}")
     found = [(stratum + drawn.random()) / count for stratum in range(count)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -80,7 +80,7 @@ class RealCell(Harness):
 
 
 def strike(
-    cell: RealCell, fault: Fault, stalls: StallDetector, *, phase: float, seed: int, lasts: int
+    cell: RealCell, fault: HomeFault, stalls: StallDetector, *, phase: float, seed: int, lasts: int
 ) -> Outcome:
     """Have a fault befall a cell that is at home, and healthy where it will have to move."""
     cell.wait_for("the whole cell at home", cell.at_home, 30.0)
@@ -92,6 +92,14 @@ def strike(
 
 
 # --------------------------------------------------------------------------------- faults
+
+
+@dataclass(frozen=True, slots=True)
+class HomeFault(Fault):
+    """A fault that befalls the cell at home, and the consecutive cycles that may be lost there."""
+
+    bound: int | None = None
+    home: str = ""
 
 
 def _names(home: str) -> Iterator[str]:
@@ -113,19 +121,20 @@ def _names(home: str) -> Iterator[str]:
         yield from (f"cut {a}->{b}", f"cut {b}->{a}", f"cut {a}-{b}")
 
 
-def _faults() -> Iterator[Fault]:
+def _faults() -> Iterator[HomeFault]:
     for home in HOMES:
         problem = from_document(document(home))
         known = {fault.name: fault for fault in faults_of(problem)}
         for name in _names(home):
             fault = known[name]
-            yield replace(fault, home=home, bound=bound_of(problem, fault, home))
+            bound = bound_of(problem, fault, home)
+            yield HomeFault(**asdict(fault), bound=bound, home=home)
 
 
 FAULTS = {fault.name: fault for fault in _faults()}
 
 
-def moves(fault: Fault) -> bool:
+def moves(fault: HomeFault) -> bool:
     """Whether the guard has to move the cell, for which it should have been healthy before."""
     if fault.how == "cut":
         return True
@@ -133,7 +142,7 @@ def moves(fault: Fault) -> bool:
     return fault.bound is not None and relocatable
 
 
-def mixed(home: str) -> list[Fault]:
+def mixed(home: str) -> list[HomeFault]:
     """Return a home's faults, those that make the cell move apart from one another."""
     mine = [fault for fault in FAULTS.values() if fault.home == home]
     moving = [fault for fault in mine if moves(fault)]

@@ -15,11 +15,10 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
-from dwell.testbed.chaos.faults import Fault
 from dwell.testbed.chaos.light_cell import HOMES, MAX_AGE_MS, PERIOD_MS
 from dwell.testbed.chaos.stalls import StallDetector
 from dwell.testbed.chaos.strike import Outcome
-from tests.live.real_cell import FAULTS, RealCell, mixed, strike
+from tests.live.real_cell import FAULTS, HomeFault, RealCell, mixed, strike
 
 pytestmark = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2,
@@ -73,7 +72,7 @@ class Standing:
         cell.stop()
         return wrong
 
-    def survive(self, fault: Fault) -> str:
+    def survive(self, fault: HomeFault) -> str:
         """Have a fault befall the cell of its home; returns what was wrong."""
         drawn = random.Random(f"{SEED} {fault.name}")
         phase, lasts = drawn.random(), drawn.randint(12, 15)
@@ -111,7 +110,7 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Standing]:
 
 
 @pytest.mark.parametrize("fault", IN_TURN, ids=lambda fault: fault.name)
-def test_cell_survives(fault: Fault, standing: Standing) -> None:
+def test_cell_survives(fault: HomeFault, standing: Standing) -> None:
     wrong = standing.survive(fault)
     assert not wrong, wrong
 

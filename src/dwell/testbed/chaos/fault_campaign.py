@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -67,24 +68,22 @@ class Staging:
         else:
             problem, environment = _witnessed(dwell.load(self.cell), folder)
         clocks = folder / CLOCK_FILE
-        if not self.hosts:
-            problem = on_this_machine(problem)
-            return (
-                Loopback(
-                    *(problem, folder, {}),
-                    seed=self.seed,
-                    environment=environment,
-                    clocks=clocks,
-                ),
-                home,
+        testbed: LocalTestbed
+        if self.hosts:
+            testbed = NetnsTestbed(
+                *(problem, folder),
+                name=f"chaos{os.getpid() % 10_000}",
+                seed=self.seed,
+                environment=environment,
+                clocks=clocks,
             )
-        testbed = NetnsTestbed(
-            *(problem, folder),
-            name=f"chaos{os.getpid() % 10_000}",
-            seed=self.seed,
-            environment=environment,
-            clocks=clocks,
-        )
+        else:
+            testbed = Loopback(
+                *(on_this_machine(problem), folder, {}),
+                seed=self.seed,
+                environment=environment,
+                clocks=clocks,
+            )
         return testbed, home
 
 
@@ -118,18 +117,14 @@ class Result:
     outcomes: list[tuple[PlannedFault, Outcome]] = field(default_factory=list)
     stalled: int = 0
     wrong: list[str] = field(default_factory=list)
-    heard: dict[str, int] = field(default_factory=dict)
+    heard: Counter[str] = field(default_factory=Counter)
     actuated: int = 0
     seconds: float = 0.0
     means: dict[str, str] = field(default_factory=dict)
 
     def counts(self) -> dict[str, int]:
         """Return how many faults of each kind there were."""
-        counts: dict[str, int] = {}
-        for one, _ in self.outcomes:
-            kind = one.fault.kind or one.fault.how
-            counts[kind] = counts.get(kind, 0) + 1
-        return dict(sorted(counts.items()))
+        return dict(sorted(Counter(one.fault.kind for one, _ in self.outcomes).items()))
 
     def document(self) -> dict[str, Any]:
         """Return it ready for JSON."""
@@ -289,15 +284,14 @@ class FaultCampaign:
         self.result.wrong += [f"{one.fault.name}: {what}; again: {again}" for what in wrong]
         self.result.outcomes.append((one, outcome))
         with (self._out / "faults.jsonl").open("a", encoding="utf-8") as file:
-            about = {"number": one.number, "kind": one.fault.kind or one.fault.how}
+            about = {"number": one.number, "kind": one.fault.kind}
             file.write(json.dumps({**about, **asdict(outcome)}) + "\n")
         self._say(_line(one, outcome))
         for what in wrong:
             self._say(f"    VIOLATION {what}; again: {again}")
 
     def _count(self, cell: Harness, observer: ActuatorObserver) -> None:
-        for kind, count in observer.judge.counts.items():
-            self.result.heard[kind] = self.result.heard.get(kind, 0) + count
+        self.result.heard.update(observer.judge.counts)
         self.result.actuated += len(cell.actuations.applied)
 
 

@@ -34,21 +34,18 @@ class Fault:
         the disk that the runs are kept on.
     amount : float
         Jump in ms, drift in parts per million.
-    bound : int, optional
-        Consecutive cycles that may be lost; None where no fallback can be whole.
     kind : str
         Kind that shares its turns; `how` if left out.
-    home : str
-        Placement that the cell has to be at before; empty for any.
     """
 
     name: str
     how: How
     whom: tuple[str, ...]
     amount: float = 0.0
-    bound: int | None = None
     kind: str = ""
-    home: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kind", self.kind or self.how)
 
 
 def faults_of(problem: Problem, *, disks: bool = True) -> Iterator[Fault]:
@@ -144,8 +141,6 @@ def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
     placement : str
         Candidate that holds when it strikes.
     """
-    if fault.bound is not None:
-        return fault.bound
     hit = hit_by(problem, fault)
     if hit is None:
         return None
@@ -185,7 +180,7 @@ def planned(seed: int, faults: Sequence[Fault]) -> Iterator[PlannedFault]:
     """
     kinds: dict[str, list[Fault]] = {}
     for fault in faults:
-        kinds.setdefault(fault.kind or fault.how, []).append(fault)
+        kinds.setdefault(fault.kind, []).append(fault)
     draw = random.Random(f"chaos {seed}")  # noqa: S311 - no secret
     waiting: dict[str, list[Fault]] = {kind: [] for kind in kinds}
     number = 0

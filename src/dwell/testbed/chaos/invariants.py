@@ -6,6 +6,7 @@ cell file.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -66,7 +67,7 @@ class Judge:
     """
 
     problem: Problem
-    counts: dict[str, int] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
     terms: dict[int, Term] = field(default_factory=dict)
     stamped_ns: dict[int, int] = field(default_factory=dict)
     _stamps: list[tuple[int, int, int]] = field(default_factory=list)
@@ -80,7 +81,7 @@ class Judge:
     def hear(self, at_ns: int, key: str, payload: bytes, header: bytes) -> Iterable[str]:
         """Take a message in; returns its violations."""
         word = Keys(self.problem.name).word(key)
-        self.counts[word] = self.counts.get(word, 0) + 1
+        self.counts[word] += 1
         try:
             match word:
                 case "stamped":
