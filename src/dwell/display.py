@@ -1,4 +1,4 @@
-"""What shows itself: as a summary on a screen, and as a picture in a notebook.
+"""Display of results: a summary on a screen, and a picture in a notebook.
 
 Both are made by `dwell.report`, which is imported when something is shown.
 """

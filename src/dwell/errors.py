@@ -130,7 +130,7 @@ class UnwritableError(RunError):
 
 
 class ProfileError(DwellError, ValueError):
-    """What is to be measured is not there, or a file is not a profile of measurements."""
+    """A subject of measurement is not there, or a file is not a profile of measurements."""
 
 
 class MeasurementError(DwellError, RuntimeError):

@@ -30,10 +30,6 @@ def load(path: str | PathLike[str], *, traces: str | PathLike[str] | None = None
     traces : str or path, optional
         Folder where the relative names of trace files start; the cell's own where None.
 
-    Returns
-    -------
-    Problem
-
     Raises
     ------
     ProblemError
@@ -93,10 +89,6 @@ def from_document(
         Where the traces that it names are.
     source : str, optional
         Name of the document in messages.
-
-    Returns
-    -------
-    Problem
 
     Raises
     ------

@@ -60,7 +60,7 @@ class Form(Generic[E]):
 
     @property
     def begin(self) -> str:
-        """How such a file begins."""
+        """First line of such a file."""
         return f"{self.key}: {self.version}"
 
 
@@ -95,7 +95,7 @@ def read_structure(document: object, faults: Faults, form: Form[E]) -> E:
     Returns
     -------
     Entry
-        Of the form; valid. None stands for elements that could not be read.
+        A valid entry of the form. None stands for elements that could not be read.
 
     Raises
     ------

@@ -58,7 +58,7 @@ class DeclaredPoint:
 
 @dataclass(frozen=True, slots=True)
 class DeclaredStudy:
-    """What a study file declares, with every default filled in."""
+    """A study as its file declares it, every default filled in."""
 
     name: str
     points: tuple[DeclaredPoint, ...]
@@ -113,7 +113,7 @@ class _Override:
 
     @property
     def path(self) -> str:
-        """Where it goes."""
+        """Dotted path of the value in the cell."""
         return dotted(self.steps)
 
 

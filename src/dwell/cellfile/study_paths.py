@@ -35,10 +35,6 @@ def steps_of(path: str, document: object) -> tuple[Step, ...]:
     document : object
         The cell's, as it is in the file.
 
-    Returns
-    -------
-    tuple of str and int
-
     Raises
     ------
     ProblemError
@@ -104,11 +100,7 @@ def _fault(path: str, message: str) -> ProblemError:
 def put(document: Any, steps: tuple[Step, ...], value: object) -> Any:
     """Return a document with a value at a place; the given one is not changed.
 
-    Parameters
-    ----------
-    document : dict or list
-    steps : tuple of str and int
-        See `steps_of`; mappings on the way are made where there are none.
+    Mappings on the way are made where there are none (see `steps_of`).
     """
     if not steps:
         return value

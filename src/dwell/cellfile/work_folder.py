@@ -26,7 +26,7 @@ Description = Mapping[str, Any]
 
 
 class FolderMark(NamedTuple):
-    """What marks a folder.
+    """Mark of the folders of one kind of work.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class FolderMark(NamedTuple):
     file : str
         Name of the file with the description.
     version : int
-        Of the folder's form.
+        Version of the folder's layout.
     folders : tuple of str
         Those inside that the work fills.
     """

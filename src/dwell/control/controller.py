@@ -58,7 +58,7 @@ class ClosedWindow:
 
 @dataclass(slots=True)
 class DecisionLog:
-    """What the controller saw and decided: one row of plain values a window.
+    """Log of the metrics seen and the decisions made: one row of plain values a window.
 
     Rows are tuples of numbers and names, not the objects they came from: a run has many windows,
     and the garbage collector need not look at such tuples again.

@@ -29,7 +29,7 @@ def rest_cycles(probe_cycles: int, own_moves: int) -> int:
 
 
 class _Silence:
-    """How long the cycle after the newest completed one has been waited for.
+    """Wait for the cycle after the newest completed one.
 
     Cycles older than the patience are all alike, so no more of them are kept than were released
     within it, and one.
@@ -66,7 +66,7 @@ class _Silence:
 
     @property
     def due_ns(self) -> int | None:
-        """When the patience ends; None where nothing is waited for."""
+        """Instant at which the patience ends; None where no cycle is waited for."""
         return self.waiting[0][1] + self.patience_ns if self.waiting else None
 
     def over(self, now_ns: int) -> bool:
@@ -183,7 +183,7 @@ class Guard:
 
     @property
     def patience_ns(self) -> int:
-        """What is waited for a cycle: g periods."""
+        """Longest wait for a cycle: g periods."""
         return self._silence.patience_ns
 
     @property
@@ -271,12 +271,12 @@ def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
 
 
 class Presence:
-    """When every node, link and worker was last heard, and which candidates are whole.
+    """Last sign of life of every node, link and worker, and the candidates that are whole.
 
     Parameters
     ----------
     parts : mapping of str to collection of str
-        Of each candidate; see `parts_of`.
+        Parts of each candidate; see `parts_of`.
     within_ns : int
         Age beyond which a sign of life counts no more.
     """
@@ -325,7 +325,7 @@ class Presence:
 
 
 class Probation:
-    """When an order may leave the fallback: after h probes through the placement it wants.
+    """Permission for an order to leave the fallback: h probes through the wanted placement.
 
     A *probe* is the shadow of a cycle through the placement that is wanted. While somebody wants to
     leave, every cycle brings one. Once h of them have completed since the wish began, the placement
@@ -394,7 +394,7 @@ class Probation:
         return f"Probation({self._count} of {self.needed} through {self.wanted!r})"
 
     def want(self, candidate: str | None) -> None:
-        """Say which placement the fallback shall be left for; another wish begins anew."""
+        """Set the placement that the fallback shall be left for; another wish begins anew."""
         if candidate != self.wanted:
             self.wanted, self._count = candidate, 0
             self._first = self._silence.released + 1

@@ -1,4 +1,4 @@
-"""Which cycles are also sent through which alternative."""
+"""Stamps of shadows: the alternative that a cycle is also sent through."""
 
 from __future__ import annotations
 

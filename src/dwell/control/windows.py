@@ -1,4 +1,4 @@
-"""What a closed window shows: L95, violation rate, utilisation.
+"""Metrics of a closed window: L95, violation rate, utilisation.
 
 Everything works on one window, or on the rows of many at once, with the same arithmetic: a window
 that the live runtime closes, one that the simulator closes, and all windows of a static run closed
@@ -66,12 +66,7 @@ def seen_l95_ns(latency_ns: Ints, age_ns: Ints, censor_ns: int) -> Ints:
 
 
 def final_l95_ms(latency_ns: Ints) -> Floats:
-    """L95 of final latencies, milliseconds; infinite where too many never completed.
-
-    Parameters
-    ----------
-    latency_ns : int64 array, shape (..., W)
-    """
+    """L95 of final latencies, shape (..., W), in ms; infinite where too many never completed."""
     rank = l95_rank(latency_ns.shape[-1])
     l95 = np.partition(latency_ns, rank - 1, axis=-1)[..., rank - 1]
     ms: Floats = np.where(l95 >= NEVER_NS, np.inf, l95 / 1e6)

@@ -201,7 +201,7 @@ class Corrected:
                 self._correct(part, [other for other in others if other in tested] or others)
 
     def support(self) -> dict[str, Support]:
-        """How much stands behind each candidate's estimate: that of its weakest part."""
+        """Support of each candidate's estimate: that of its weakest part."""
         return {
             name: Support(
                 min([pool.measured for pool in route.pools]),

@@ -22,7 +22,7 @@ UNKNOWN = -1
 
 @dataclass(frozen=True, slots=True)
 class Instants:
-    """When the jobs and messages of a window's cycles did what, nanoseconds; `UNKNOWN` if never.
+    """Instants of the jobs and messages of a window's cycles, nanoseconds; `UNKNOWN` if never.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Evidence:
     shadow_placement : int array, shape (W,)
         Index of the candidate that a cycle was also sent through; -1 for none.
     shadows : Instants or None
-        Of the jobs and messages that the shadow did not share with the cycle itself. A shadow
+        Instants of the jobs and messages that a shadow did not share with the cycle itself. It
         stops before the sinks: its last messages arrive there and are discarded.
     """
 

@@ -1,4 +1,4 @@
-"""What a window measured of each part: a task on a node, or a flow on a link."""
+"""Times that a window measured of each part: a task on a node, or a flow on a link."""
 
 from __future__ import annotations
 
@@ -109,11 +109,10 @@ class Meter:
 
 
 class _Shadows(NamedTuple):
-    """What is known of shadows of cycles under one candidate, by the candidate they go through.
+    """Layout of shadows of cycles under one candidate, by the candidate they go through.
 
     Parameters
     ----------
-    columns : list of _Columns
     shared : bool array, shape (candidates, flows)
         Whether a shadow shares the source of a flow.
     """
@@ -123,7 +122,7 @@ class _Shadows(NamedTuple):
 
 
 class _Columns:
-    """Which column of the spans is of which part, for cycles or for shadows through a placement.
+    """Part of each column of the spans, for cycles or for shadows through a placement.
 
     Parameters
     ----------

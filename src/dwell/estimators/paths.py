@@ -38,7 +38,6 @@ class Step(NamedTuple):
         Place of the task in the pipeline.
     offset_ms : float
         Start of a source after the release.
-    inputs : tuple of Input
     sink : bool
         Whether it has no outputs.
     """
@@ -74,7 +73,7 @@ def longest_path(
     Parameters
     ----------
     steps : sequence of Step
-        Of the pipeline (see `steps_of`).
+        Steps of the pipeline (see `steps_of`).
     executed : sequence of float64 array, shape (n,)
         Time of every task's job in each cycle, in the pipeline's order.
     sent : sequence of float64 array of shape (n,), or float

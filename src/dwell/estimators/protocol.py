@@ -1,4 +1,4 @@
-"""What an estimator is."""
+"""Protocols of estimators: with and without learning."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dwell.model.qos import QoS
 
 
 class Support(NamedTuple):
-    """How much stands behind an estimate.
+    """Support of an estimate: number and age of the samples behind it.
 
     Parameters
     ----------

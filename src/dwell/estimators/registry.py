@@ -128,7 +128,7 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     Parameters
     ----------
     meta : mapping
-        Of the run: ``estimator`` is a name, or the class of one.
+        What the run says of itself; ``estimator`` is a name, or the name of a class.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How much foreign threads slow a job on the CPU, and how many explain a slowdown.
+"""Slowdown of a job on the CPU by foreign threads, and the threads that explain a slowdown.
 
 The slowdown is over a job alone on its node, as the profile has it. On a `fair` node a job of k
 threads beside s foreign threads runs at min(1, c / (k + s)) of its speed, c being the cores that

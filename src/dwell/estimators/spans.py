@@ -1,4 +1,4 @@
-"""How long the jobs and messages of a window took."""
+"""Durations of the jobs and messages of a window."""
 
 from __future__ import annotations
 

@@ -13,13 +13,7 @@ from dwell.errors import DwellError
 
 
 def class_at(path: str) -> Any:
-    """Import a class of ours.
-
-    Parameters
-    ----------
-    path : str
-        ``module:Class``.
-    """
+    """Import a class of ours from ``module:Class``."""
     module, _, attribute = path.partition(":")
     return getattr(import_module(module), attribute)
 
@@ -36,12 +30,11 @@ def class_named(name: str, path: str | None, group: str, what: str, error: type[
     Parameters
     ----------
     path : str, optional
-        Of ours, as `class_at` takes it; None where the name is none of ours.
+        Path of our class, as `class_at` takes it; None where no class of ours has the name.
     group : str
-        Of the entry points of other packages.
+        Group of the entry points of other packages.
     what : str
         What it is, for the message: ``policy``.
-    error : type of DwellError
 
     Returns
     -------
@@ -51,7 +44,8 @@ def class_named(name: str, path: str | None, group: str, what: str, error: type[
     Raises
     ------
     DwellError
-        Of type `error`, if another package's cannot be imported; the message names the package.
+        An `error`, if the class of another package cannot be imported; the message names the
+        package.
     """
     if path is not None:
         return class_at(path)

@@ -45,7 +45,7 @@ class FrozenDict(dict[K, V]):
 
 
 class Named(Protocol):
-    """What carries the name that it is found by."""
+    """An item that carries its own key as its name."""
 
     @property
     def name(self) -> str:

@@ -1,4 +1,4 @@
-"""Where the nodes of a live cell are reached, and how its processes behave."""
+"""Addresses of the nodes of a live cell, and settings of its processes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Host:
-    """Where a node's processes listen.
+    """Address and ports of a node's processes.
 
     Parameters
     ----------
@@ -48,13 +48,13 @@ class Host:
         object.__setattr__(self, "seen_from", FrozenDict(self.seen_from))
 
     def endpoint(self, node: str) -> Endpoint:
-        """Where it is reached from a node."""
+        """Address and port by which another node reaches it."""
         return self.seen_from.get(node) or Endpoint(self.address, self.port)
 
 
 @dataclass(frozen=True, slots=True)
 class LiveSettings:
-    """What a live cell needs to know beside its problem.
+    """Settings of the live runtime, beside the problem.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ from dwell.model.process import Constant, Process
 
 @dataclass(frozen=True, slots=True)
 class Execution:
-    """How a task runs on one feasible node.
+    """A task on one of its feasible nodes: execution time, threads and workers.
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ MIGRATIONS = ("warm", "cold")
 
 @dataclass(frozen=True, slots=True)
 class ControllerSettings:
-    """Where the controller sits, which policy it runs, and how its orders travel.
+    """The controller: its node, its policy and estimator, and the delays of its orders.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class Problem(Displayed):
             raise ProblemError(faults)
 
     def __repr__(self) -> str:
-        """Say what it is made of; `dwell.model.document` has all of it."""
+        """Return a summary of its parts; `dwell.model.document` has all of it."""
         pipeline, controller = self.pipeline, self.controller
         counted = {"scenario": self.scenarios, "candidate": self.candidates}
         names = [f"{what}s: {shortened(these)}" for what, these in counted.items()]

@@ -116,8 +116,20 @@ class Normal:
         return np.maximum(values, self.min, out=values)
 
 
+class _ByMean:
+    """A process that is declared by its mean."""
+
+    __slots__ = ()
+    mean: float
+
+    @property
+    def expectation(self) -> float:
+        """The mean."""
+        return self.mean
+
+
 @dataclass(frozen=True, slots=True)
-class LogNormal:
+class LogNormal(_ByMean):
     """Lognormal with the mean and coefficient of variation of the value itself, not of its log."""
 
     mean: float
@@ -126,11 +138,6 @@ class LogNormal:
     def __post_init__(self) -> None:
         MEAN.check("lognormal.mean", self.mean)
         CV.check("lognormal.cv", self.cv)
-
-    @property
-    def expectation(self) -> float:
-        """The mean."""
-        return self.mean
 
     @property
     def log_parameters(self) -> tuple[float, float]:
@@ -150,7 +157,7 @@ class LogNormal:
 
 
 @dataclass(frozen=True, slots=True)
-class Gamma:
+class Gamma(_ByMean):
     """Gamma with the given mean and coefficient of variation."""
 
     mean: float
@@ -160,11 +167,6 @@ class Gamma:
         MEAN.check("gamma.mean", self.mean)
         GAMMA_CV.check("gamma.cv", self.cv)
 
-    @property
-    def expectation(self) -> float:
-        """The mean."""
-        return self.mean
-
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
         shape = 1 / (self.cv * self.cv)
@@ -172,7 +174,7 @@ class Gamma:
 
 
 @dataclass(frozen=True, slots=True)
-class Exponential:
+class Exponential(_ByMean):
     """Exponential with the given mean."""
 
     mean: float
@@ -180,18 +182,13 @@ class Exponential:
     def __post_init__(self) -> None:
         MEAN.check("exponential.mean", self.mean)
 
-    @property
-    def expectation(self) -> float:
-        """The mean."""
-        return self.mean
-
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
         return rng.exponential(self.mean, size)
 
 
 @dataclass(frozen=True, slots=True)
-class AR1:
+class AR1(_ByMean):
     """Positive first-order autoregression: lognormal marginal, lag-1 correlation `rho`.
 
     The logarithm is a Gaussian AR(1) process. Its own correlation is chosen so that the *value*
@@ -212,11 +209,6 @@ class AR1:
         require(
             reachable, "ar1.rho", self.rho, f"reachable by a positive process of cv {self.cv:g}"
         )
-
-    @property
-    def expectation(self) -> float:
-        """The mean."""
-        return self.mean
 
     @property
     def log_correlation(self) -> float:

@@ -37,7 +37,7 @@ class Episodes:
     Parameters
     ----------
     name : str
-        Of the streams it is drawn from: disturbances of one scenario whose episodes have one name
+        Name of the random streams; disturbances of one scenario whose episodes have the same name
         come and go together.
     every_s, for_s : Process
         Seconds, independent of each other; their means are above 1e-5.
@@ -82,7 +82,7 @@ class NodeDisturbance:
 
     @property
     def end_s(self) -> float:
-        """When it ends, seconds; infinite where it lasts."""
+        """End, seconds; infinite where it lasts."""
         return self.at_s + self.for_s
 
     @property
@@ -119,7 +119,7 @@ class LinkDisturbance:
 
     @property
     def end_s(self) -> float:
-        """When it ends, seconds; infinite where it lasts."""
+        """End, seconds; infinite where it lasts."""
         return self.at_s + self.for_s
 
     @property

@@ -1,4 +1,4 @@
-"""What a cell must satisfy as a whole: names that resolve, an acyclic DAG, links that exist.
+"""Checks of a cell as a whole: names that resolve, an acyclic DAG, links that exist.
 
 The checks work on parts, so that a file whose structure is broken in one place is still checked
 everywhere else, and every fault is reported at once.
@@ -394,7 +394,7 @@ def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fa
 
 
 def too_many_shadows(fraction: float, candidates: int) -> str:
-    """Say what is wrong with a share of the cycles for each alternative, or nothing.
+    """Return the fault of a share of the cycles for each alternative; empty where it has none.
 
     A cycle is sent through one alternative at most.
     """

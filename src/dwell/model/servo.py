@@ -14,7 +14,7 @@ PLANTS: tuple[Plant, ...] = ("integrator", "double-integrator")
 
 @dataclass(frozen=True, slots=True)
 class MovingTarget:
-    """What the robot follows: r(t) = amplitude · sin(2 pi t / period), t from the first release.
+    """Moving target: r(t) = amplitude · sin(2 pi t / period), t from the first release.
 
     Parameters
     ----------

@@ -48,12 +48,11 @@ def make_user_class(
         Which the object must have.
     what : str
         What it is, for messages: ``policy``.
-    error : type of DwellError
 
     Raises
     ------
     DwellError
-        Of type `error`, if there is no such module or class, the module raises when it is imported,
+        An `error`, if there is no such module or class, the module raises when it is imported,
         the class wants arguments or raises, or its object has no such method.
     """
     who = f"{what} {name!r}"

@@ -48,7 +48,7 @@ from dwell.policies.incumbent import check_parameter
 
 
 class _Shown(NamedTuple):
-    """What the rule looks at of a window, observed or estimated: L95 (ms), U_r, U_e and U_c."""
+    """Metrics of a window that the rule reads, observed or estimated: L95 (ms), U_r, U_e, U_c."""
 
     l95_ms: float
     used: TierUtilisation

@@ -100,13 +100,6 @@ class Cusum(PricingPolicy):
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> Decision:
         """Add a window to the sums and decide the placement for the next one.
 
-        Parameters
-        ----------
-        observed : QoS
-            Metrics of the window under the incumbent.
-        estimates : mapping of str to QoS
-            Metrics by candidate.
-
         Returns
         -------
         Decision

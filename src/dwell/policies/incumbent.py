@@ -75,11 +75,10 @@ def check_parameter(field: str, value: Number, bound: Bound) -> Number:
 
 
 class Incumbent:
-    """Which candidate is active, which one was before the last decision, and since when.
+    """The active candidate, the candidate before the last decision, and the windows since a move.
 
     Parameters
     ----------
-    candidates : mapping of str to Placement
     name : str
         The candidate to begin with.
 
@@ -139,7 +138,7 @@ class Incumbent:
 
 
 class CandidatePolicy:
-    """What policies of ours have in common: candidates, the active one among them, and their J.
+    """Base of our policies: the candidates, the active one among them, and their J.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a policy was made with, as its run's record keeps it."""
+"""Parameters of a policy, as its run's record keeps them."""
 
 from __future__ import annotations
 

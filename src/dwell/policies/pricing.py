@@ -53,12 +53,7 @@ def _shares(nodes: tuple[str, ...]) -> Callable[[Mapping[str, float]], tuple[flo
 
 
 class Pricing:
-    """Prices the candidates of one policy.
-
-    Parameters
-    ----------
-    candidates : mapping of str to Placement
-    """
+    """Prices the candidates of one policy."""
 
     __slots__ = ("_cloud", "_edge", "_robot", "_rows", "candidates", "objective")
 
@@ -177,7 +172,7 @@ class Pricing:
         )
 
     def _explain(self, qos: object, whose: str) -> NoReturn:
-        """Say what is wrong with metrics that could not be priced (off the fast path)."""
+        """Raise the MetricError of metrics that could not be priced (off the fast path)."""
         metrics = check_metrics(qos, whose)
         for node in self.objective.tiers:
             if node not in metrics.utilisation:

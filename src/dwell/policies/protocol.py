@@ -1,4 +1,4 @@
-"""What a policy is."""
+"""Protocols of policies: the least that one needs, and a full policy."""
 
 from __future__ import annotations
 

@@ -37,8 +37,8 @@ class PolicyEntry:
     label : str
         The name in tables and figures.
     colour : str
-        Of its lines: ``#rrggbb``, the same on light and dark pages, or ``ink`` or ``muted``, which
-        a page gives values to.
+        Colour of its lines: ``#rrggbb``, the same on light and dark pages, or ``ink`` or
+        ``muted``, which a page gives values to.
     sentence : str
         What it does, for the legend of a report; empty where it is a variant of another policy.
     variant_of : str

@@ -151,30 +151,6 @@ class _Table:
 
 
 @dataclass(slots=True)
-class Recovered:
-    """What a journal holds.
-
-    Parameters
-    ----------
-    run : str
-        Id of the run.
-    meta : dict
-        What the writer said of the run, and under ``recovered`` what was lost.
-    columns : mapping
-        Of every table.
-    tables : dict of str to DataFrame
-    following : dict of str to int
-        By numbered table, the number after its last row's.
-    """
-
-    run: str
-    meta: dict[str, Any]
-    columns: Columns
-    tables: dict[str, pl.DataFrame]
-    following: dict[str, int]
-
-
-@dataclass(slots=True)
 class _Contents:
     """Frames of a journal put together, with or without their rows."""
 
@@ -218,8 +194,16 @@ def _read(data: bytes | mmap.mmap, *, keep: bool = True) -> tuple[_Contents, _Sc
     return contents, scan
 
 
-def read_journal(folder: str | os.PathLike[str]) -> Recovered:
+def read_journal(
+    folder: str | os.PathLike[str],
+) -> tuple[dict[str, Any], dict[str, pl.DataFrame]]:
     """Read what a folder's journal holds, also while it is written.
+
+    Returns
+    -------
+    meta : dict
+        What the writer said of the run, and under ``recovered`` what was lost.
+    tables : dict of str to DataFrame
 
     Raises
     ------
@@ -259,8 +243,7 @@ def read_journal(folder: str | os.PathLike[str]) -> Recovered:
         },
     }
     windows = len(tables["windows"]) if "windows" in tables else 0
-    meta = {"windows": windows, **contents.meta, "recovered": recovered}
-    return Recovered(contents.run, meta, contents.columns, tables, contents.following)
+    return {"windows": windows, **contents.meta, "recovered": recovered}, tables
 
 
 class Journal:
@@ -383,7 +366,7 @@ class Journal:
     def _write(self, data: bytes) -> None:
         """Hand bytes to the operating system: they survive the process, not a loss of power.
 
-        Of what does not fit as a whole nothing stays.
+        What does not fit as a whole leaves nothing behind.
         """
         if self._descriptor < 0:
             raise RunError(f"{self.file}: the journal is closed")

@@ -95,7 +95,7 @@ class Run(Displayed):
 
     @property
     def disturbances(self) -> Scenario:
-        """What was done to nodes and links: as it was played, else as its scenario has it.
+        """Disturbances of nodes and links: as they were played, else as the scenario has them.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class Run(Displayed):
 
     @property
     def run_id(self) -> str | None:
-        """What the stamps of a live run carry, unlike any other run's; None of a simulated one."""
+        """Id that the stamps of a live run carry; None for a simulated run."""
         if "run" not in self.cycles.columns or self.cycles.is_empty():
             return None
         return str(self.cycles["run"][0])
@@ -271,7 +271,7 @@ def _replace(draft: Path, target: Path) -> None:
 def open_run(path: str | os.PathLike[str]) -> Run:
     """Open a run's folder; tables are read when first asked for.
 
-    Of a live run that is still going on, or was killed, the folder has a journal only: everything
+    The folder of a live run that is still going on, or was killed, has a journal only: everything
     is read from it, and the meta say under ``recovered`` what was lost.
 
     Raises
@@ -284,11 +284,11 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         raise RunError(f"{folder}: no such folder")
     file = folder / "run.json"
     if (folder / JOURNAL).is_file() and not file.is_file():
-        found = read_journal(folder)
-        missing = [name for name in ALWAYS if name not in found.tables]
+        meta, tables = read_journal(folder)
+        missing = [name for name in ALWAYS if name not in tables]
         if missing:
             raise RunError(f"{folder / JOURNAL}: no run, without {', '.join(missing)}")
-        return Run(found.meta, found.tables)
+        return Run(meta, tables)
     try:
         meta = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -336,23 +336,20 @@ def seal_run(path: str | os.PathLike[str], **meta: object) -> Run:
     """
     folder = Path(path)
     journal, file = folder / JOURNAL, folder / "run.json"
-    if not file.is_file():
-        if Journal.written(folder):
-            raise RunError(f"{journal}: the run is still going on; stop it first")
-        found = open_run(folder)
-        recovered = {**found.meta.get("recovered", {}), "sealed": True}
-        text = json.dumps({**found.meta, **meta, "recovered": recovered}, indent=2) + "\n"
+    sealed = file.is_file()
+    if not sealed and Journal.written(folder):
+        raise RunError(f"{journal}: the run is still going on; stop it first")
+    if meta or not sealed:
+        run = open_run(folder)
+        told = {**run.meta, **meta}
+        if not sealed:
+            told["recovered"] = {**run.meta.get("recovered", {}), "sealed": True}
+        text = json.dumps(told, indent=2) + "\n"
         try:
-            for name, table in found._tables.items():
-                frame = table() if callable(table) else table
-                write_whole(folder / f"{name}.parquet", partial(_write_table, frame))
+            for name in () if sealed else run._tables:
+                table = partial(_write_table, run._table(name))
+                write_whole(folder / f"{name}.parquet", table)
             # From here on the folder is a finished run.
-            write_whole(file, text)
-        except OSError as error:
-            raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None
-    elif meta:
-        text = json.dumps({**open_run(folder).meta, **meta}, indent=2) + "\n"
-        try:
             write_whole(file, text)
         except OSError as error:
             raise RunError(f"{folder}: cannot be written ({error.strerror or error})") from None

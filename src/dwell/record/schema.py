@@ -108,236 +108,199 @@ class TableSchema:
 
 
 LOST = "no sink completed the cycle"
-APART = f"{LOST}, or the clocks were not compared"
+UNCOMPARED = "the clocks were not compared"
+APART = f"{LOST}, or {UNCOMPARED}"
 UNSEEN = "the controller did not see the close"
 GUARD = "a move of the guard's own"
 UNTOLD = "not counted"
+LIVE: tuple[Feature, ...] = ("live",)
+SHADOWS: tuple[Feature, ...] = ("shadows",)
+SUPPORT: tuple[Feature, ...] = ("support",)
+
+CYCLES = (
+    Column("cycle", "Int64", "Number of the cycle, from 0 without gaps."),
+    Column("release_ns", "Int64", "Its release, since the beginning of the run.", "ns"),
+    Column("placement", "candidate", "The candidate that it was stamped with."),
+    Column("latency_ns", "Int64", "Release to completion of the last sink.", "ns", LOST),
+    Column("missed", "Boolean", "Later than D, or unfinished when its window closed."),
+    Column("outcome", "outcome", "What became of it."),
+    Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
+    Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),
+    Column("network_ns", "Int64", "Part of the latency: links.", "ns", APART),
+    Column("run", "Int64", "Id of the run, as stamped.", of=LIVE),
+    Column("number", "Int64", "Number of the cycle, as stamped.", of=LIVE),
+    Column("term", "Int64", "Term of the order, as stamped.", of=LIVE),
+    Column("lead", "Boolean", "Whether it belongs to no window.", of=LIVE),
+    Column("heard", "Boolean", "False where it is known by its neighbours only.", of=LIVE),
+    Column("actuated", "Boolean", "Whether all its commands were applied.", of=LIVE),
+    Column(
+        "interval_ns",
+        "Int64",
+        "From its stamp to its last completion, as both arrived at the controller: one clock "
+        "alone, but with what the two messages' ways differ by.",
+        "ns",
+        "one of them was not heard",
+        LIVE,
+    ),
+    Column(
+        "stamper_interval_ns",
+        "Int64",
+        "From its release to the arrival of its last completion at the stamper, less half the "
+        "best round trip to the sink's node: the stamper's clock alone, with what the completion "
+        "was late.",
+        "ns",
+        "it came over the detour, or not at all",
+        LIVE,
+    ),
+    Column(
+        "bound_ns",
+        "Int64",
+        "Bound of the error of its latency, by the clocks.",
+        "ns",
+        UNCOMPARED,
+        LIVE,
+    ),
+)
+WINDOWS = (
+    Column("window", "Int64", "Number of the window, from 0."),
+    Column("first_cycle", "Int64", "Its first cycle."),
+    Column("warmup", "Boolean", "Whether statistics leave it out."),
+    Column("placement", "candidate", "The candidate of its first cycle."),
+    Column("mixed", "Boolean", "Whether its cycles had more than one placement."),
+    Column("l95_ms", "Float64", "L95 of final latencies; infinite of a lost cycle.", "ms"),
+    Column("violation_rate", "Float64", "V_D: share of its cycles that missed."),
+    Column("seen_l95_ms", "Float64", "L95 as seen at the close.", "ms", UNSEEN),
+    Column("seen_violation_rate", "Float64", "V_D as seen at the close.", null=UNSEEN),
+    Column("u_{node}", "Float64", "Utilisation of a node, foreign work included."),
+    Column("cost", "Float64", "J of what was seen.", null=UNSEEN),
+    Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
+    Column("shadow_bytes", "Int64", "What their shadows put on links.", "bytes", of=SHADOWS),
+    Column("shadow_{node}", "Float64", "Share of a node's cores for shadows.", of=SHADOWS),
+    Column("term", "Int64", "Term of its last cycle.", of=LIVE),
+    Column("lead", "Int64", "Cycles before it that belong to no window.", of=LIVE),
+    Column("heard", "Int64", "Cycles of which anything was heard.", of=LIVE),
+    Column("bound_ms", "Float64", "The largest bound of its cycles.", "ms", UNCOMPARED, LIVE),
+    Column("unproven", "Boolean", "Whether that is over 20 % of D.", of=LIVE),
+    Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=LIVE),
+)
+DECISIONS = (
+    Column("window", "Int64", "The window that it was made on."),
+    Column("incumbent", "candidate", "The placement before."),
+    Column("placement", "candidate", "The placement after."),
+    Column("migrated", "Boolean", "Whether they differ."),
+    Column("reason", "reason", "Which rule made it."),
+    Column("dwell", "Int64", "n_d after it: windows since the last migration."),
+    Column(
+        "delta_j",
+        "Float64",
+        "Measured J of the incumbent less the estimated J of the best candidate.",
+        null="the policy computes none",
+    ),
+    Column(
+        "j_{candidate}",
+        "Float64",
+        "Estimated J of a candidate against the incumbent.",
+        null="the policy prices none",
+    ),
+    Column("est_l95_ms_{candidate}", "Float64", "Its estimated L95.", "ms", GUARD),
+    Column("est_violation_rate_{candidate}", "Float64", "Its estimated V_D.", null=GUARD),
+    Column(
+        "est_u_{node}_{candidate}", "Float64", "Its estimated utilisation of a node.", null=GUARD
+    ),
+    Column("eligible_{candidate}", "Boolean", "Whether it is within the caps.", null=GUARD),
+    Column(
+        "excess_{candidate}", "Float64", "Its largest value / cap − 1.", null=f"{GUARD}, or no caps"
+    ),
+    Column(
+        "est_samples_{candidate}", "Float64", "Samples behind its estimate.", null=GUARD, of=SUPPORT
+    ),
+    Column(
+        "est_age_windows_{candidate}",
+        "Float64",
+        "Age of the newest of them.",
+        "windows",
+        GUARD,
+        SUPPORT,
+    ),
+    Column(
+        "refused",
+        "String",
+        "What was decided and not done, and why: `migrated` is false then, `placement` the old "
+        "one, and `reason` the policy's.",
+        null="what was decided was done",
+        of=LIVE,
+    ),
+)
+JOBS = (
+    Column("cycle", "Int64", "Its cycle."),
+    Column("task", "task", "Its task."),
+    Column("node", "node", "Where it ran."),
+    Column("ready_ns", "Int64", "When it became ready, as `release_ns`.", "ns"),
+    Column("start_ns", "Int64", "When it started.", "ns", "it did not, or was replaced"),
+    Column("end_ns", "Int64", "When it ended.", "ns", "it did not, or was replaced"),
+    Column("outcome", "outcome", "What became of it."),
+    Column("shadow", "Boolean", "Whether it is a shadow's.", of=("live", "shadows")),
+    Column(
+        "cpu_ns",
+        "Int64",
+        "CPU time from its start until the stage's `process()` has returned, reading the inputs "
+        "included.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "others_ns",
+        "Int64",
+        "CPU time of all other processes of its node meanwhile.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "outside_ns",
+        "Int64",
+        "CPU time of everybody else on its node's CPUs meanwhile.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "handover_ns",
+        "Int64",
+        "CPU time of its node between a release, or the end of the job before on the same node, "
+        "and its start.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "ending_ns",
+        "Int64",
+        "CPU time of its node between the end of a sink's and the hand-over of its command.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+)
+PROCESSES = (
+    Column("window", "Int64", "The window."),
+    Column("process", "String", "Name of the process."),
+    Column("node", "node", "Its node."),
+    Column(
+        "cpu_ns",
+        "Int64",
+        "CPU time that it took from the release of the window's first cycle to its close.",
+        "ns",
+    ),
+)
 
 TABLES: Mapping[str, TableSchema] = {
-    "cycles": TableSchema(
-        "a cycle",
-        (
-            Column("cycle", "Int64", "Number of the cycle, from 0 without gaps."),
-            Column("release_ns", "Int64", "Its release, since the beginning of the run.", "ns"),
-            Column("placement", "candidate", "The candidate that it was stamped with."),
-            Column("latency_ns", "Int64", "Release to completion of the last sink.", "ns", LOST),
-            Column("missed", "Boolean", "Later than D, or unfinished when its window closed."),
-            Column("outcome", "outcome", "What became of it."),
-            Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
-            Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),
-            Column("network_ns", "Int64", "Part of the latency: links.", "ns", APART),
-            Column("run", "Int64", "Id of the run, as stamped.", of=("live",)),
-            Column("number", "Int64", "Number of the cycle, as stamped.", of=("live",)),
-            Column("term", "Int64", "Term of the order, as stamped.", of=("live",)),
-            Column("lead", "Boolean", "Whether it belongs to no window.", of=("live",)),
-            Column(
-                "heard", "Boolean", "False where it is known by its neighbours only.", of=("live",)
-            ),
-            Column("actuated", "Boolean", "Whether all its commands were applied.", of=("live",)),
-            Column(
-                "interval_ns",
-                "Int64",
-                "From its stamp to its last completion, as both arrived at the controller: one "
-                "clock alone, but with what the two messages' ways differ by.",
-                "ns",
-                "one of them was not heard",
-                ("live",),
-            ),
-            Column(
-                "stamper_interval_ns",
-                "Int64",
-                "From its release to the arrival of its last completion at the stamper, less half "
-                "the best round trip to the sink's node: the stamper's clock alone, with what the "
-                "completion was late.",
-                "ns",
-                "it came over the detour, or not at all",
-                ("live",),
-            ),
-            Column(
-                "bound_ns",
-                "Int64",
-                "Bound of the error of its latency, by the clocks.",
-                "ns",
-                "the clocks were not compared",
-                ("live",),
-            ),
-        ),
-        numbered=True,
-    ),
-    "windows": TableSchema(
-        "a window",
-        (
-            Column("window", "Int64", "Number of the window, from 0."),
-            Column("first_cycle", "Int64", "Its first cycle."),
-            Column("warmup", "Boolean", "Whether statistics leave it out."),
-            Column("placement", "candidate", "The candidate of its first cycle."),
-            Column("mixed", "Boolean", "Whether its cycles had more than one placement."),
-            Column("l95_ms", "Float64", "L95 of final latencies; infinite of a lost cycle.", "ms"),
-            Column("violation_rate", "Float64", "V_D: share of its cycles that missed."),
-            Column("seen_l95_ms", "Float64", "L95 as seen at the close.", "ms", UNSEEN),
-            Column("seen_violation_rate", "Float64", "V_D as seen at the close.", null=UNSEEN),
-            Column("u_{node}", "Float64", "Utilisation of a node, foreign work included."),
-            Column("cost", "Float64", "J of what was seen.", null=UNSEEN),
-            Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=("shadows",)),
-            Column(
-                "shadow_bytes",
-                "Int64",
-                "What their shadows put on links.",
-                "bytes",
-                of=("shadows",),
-            ),
-            Column(
-                "shadow_{node}", "Float64", "Share of a node's cores for shadows.", of=("shadows",)
-            ),
-            Column("term", "Int64", "Term of its last cycle.", of=("live",)),
-            Column("lead", "Int64", "Cycles before it that belong to no window.", of=("live",)),
-            Column("heard", "Int64", "Cycles of which anything was heard.", of=("live",)),
-            Column(
-                "bound_ms",
-                "Float64",
-                "The largest bound of its cycles.",
-                "ms",
-                "the clocks were not compared",
-                ("live",),
-            ),
-            Column("unproven", "Boolean", "Whether that is over 20 % of D.", of=("live",)),
-            Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=("live",)),
-        ),
-        numbered=True,
-    ),
-    "decisions": TableSchema(
-        "a decision, or a move of the guard",
-        (
-            Column("window", "Int64", "The window that it was made on."),
-            Column("incumbent", "candidate", "The placement before."),
-            Column("placement", "candidate", "The placement after."),
-            Column("migrated", "Boolean", "Whether they differ."),
-            Column("reason", "reason", "Which rule made it."),
-            Column("dwell", "Int64", "n_d after it: windows since the last migration."),
-            Column(
-                "delta_j",
-                "Float64",
-                "Measured J of the incumbent less the estimated J of the best candidate.",
-                null="the policy computes none",
-            ),
-            Column(
-                "j_{candidate}",
-                "Float64",
-                "Estimated J of a candidate against the incumbent.",
-                null="the policy prices none",
-            ),
-            Column("est_l95_ms_{candidate}", "Float64", "Its estimated L95.", "ms", GUARD),
-            Column("est_violation_rate_{candidate}", "Float64", "Its estimated V_D.", null=GUARD),
-            Column(
-                "est_u_{node}_{candidate}",
-                "Float64",
-                "Its estimated utilisation of a node.",
-                null=GUARD,
-            ),
-            Column("eligible_{candidate}", "Boolean", "Whether it is within the caps.", null=GUARD),
-            Column(
-                "excess_{candidate}",
-                "Float64",
-                "Its largest value / cap − 1.",
-                null=f"{GUARD}, or no caps",
-            ),
-            Column(
-                "est_samples_{candidate}",
-                "Float64",
-                "Samples behind its estimate.",
-                null=GUARD,
-                of=("support",),
-            ),
-            Column(
-                "est_age_windows_{candidate}",
-                "Float64",
-                "Age of the newest of them.",
-                "windows",
-                GUARD,
-                ("support",),
-            ),
-            Column(
-                "refused",
-                "String",
-                "What was decided and not done, and why: `migrated` is false then, `placement` "
-                "the old one, and `reason` the policy's.",
-                null="what was decided was done",
-                of=("live",),
-            ),
-        ),
-    ),
-    "jobs": TableSchema(
-        "a job that is known to have become ready",
-        (
-            Column("cycle", "Int64", "Its cycle."),
-            Column("task", "task", "Its task."),
-            Column("node", "node", "Where it ran."),
-            Column("ready_ns", "Int64", "When it became ready, as `release_ns`.", "ns"),
-            Column("start_ns", "Int64", "When it started.", "ns", "it did not, or was replaced"),
-            Column("end_ns", "Int64", "When it ended.", "ns", "it did not, or was replaced"),
-            Column("outcome", "outcome", "What became of it."),
-            Column("shadow", "Boolean", "Whether it is a shadow's.", of=("live", "shadows")),
-            Column(
-                "cpu_ns",
-                "Int64",
-                "CPU time from its start until the stage's `process()` has returned, reading the "
-                "inputs included.",
-                "ns",
-                UNTOLD,
-                ("live",),
-            ),
-            Column(
-                "others_ns",
-                "Int64",
-                "CPU time of all other processes of its node meanwhile.",
-                "ns",
-                UNTOLD,
-                ("live",),
-            ),
-            Column(
-                "outside_ns",
-                "Int64",
-                "CPU time of everybody else on its node's CPUs meanwhile.",
-                "ns",
-                UNTOLD,
-                ("live",),
-            ),
-            Column(
-                "handover_ns",
-                "Int64",
-                "CPU time of its node between a release, or the end of the job before on the same "
-                "node, and its start.",
-                "ns",
-                UNTOLD,
-                ("live",),
-            ),
-            Column(
-                "ending_ns",
-                "Int64",
-                "CPU time of its node between the end of a sink's and the hand-over of its "
-                "command.",
-                "ns",
-                UNTOLD,
-                ("live",),
-            ),
-        ),
-        on_request=True,
-    ),
-    "processes": TableSchema(
-        "a window and a process of a live cell",
-        (
-            Column("window", "Int64", "The window."),
-            Column("process", "String", "Name of the process."),
-            Column("node", "node", "Its node."),
-            Column(
-                "cpu_ns",
-                "Int64",
-                "CPU time that it took from the release of the window's first cycle to its close.",
-                "ns",
-            ),
-        ),
-        on_request=True,
-    ),
+    "cycles": TableSchema("a cycle", CYCLES, numbered=True),
+    "windows": TableSchema("a window", WINDOWS, numbered=True),
+    "decisions": TableSchema("a decision, or a move of the guard", DECISIONS),
+    "jobs": TableSchema("a job that is known to have become ready", JOBS, on_request=True),
+    "processes": TableSchema("a window and a process of a live cell", PROCESSES, on_request=True),
 }
 
 
@@ -382,8 +345,8 @@ def row_of(types: Types, values: Values) -> Row:
 
     Parameters
     ----------
-    types : mapping
-        Of the table's columns.
+    types : mapping of str to str, or to the names of an Enum
+        Types of the table's columns.
     values : mapping of str to object
         By column.
 
@@ -397,10 +360,7 @@ def row_of(types: Types, values: Values) -> Row:
 
 
 def frame_of(
-    table: str,
-    problem: Problem,
-    values: Mapping[str, object],
-    features: Collection[Feature] = (),
+    table: str, problem: Problem, values: Mapping[str, object], features: Collection[Feature] = ()
 ) -> pl.DataFrame:
     """Return a table; NaN of a column that may be null is null.
 

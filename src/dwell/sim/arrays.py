@@ -77,7 +77,6 @@ def lay_out(
 
     Parameters
     ----------
-    cells : sequence of (Problem, Realisation)
     shared : collection of str
         Names of nodes that all cells have in common; such a node, with its stress and outages, is
         that of the first cell. Links are never shared.
@@ -479,7 +478,7 @@ def ordered_flows(pipeline: Pipeline) -> list[Flow]:
 
 
 def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[int]:
-    """What each task is to the shadow of a cycle that runs under `active`, sent through `other`.
+    """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 
     A task is shadowed where it, or any task before it, runs on another node; a sink behind such
     tasks discards what arrives. All other tasks are shared: their outputs are sent twice.

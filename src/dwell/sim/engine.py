@@ -70,10 +70,6 @@ def simulate(
     guard : bool
         Whether the cell's guard acts, where it has fallbacks and the policy may move.
 
-    Returns
-    -------
-    Run
-
     Raises
     ------
     ProblemError, PolicyError, TraceError, SimulationError
@@ -171,10 +167,22 @@ def _play(
     log_jobs = jobs or controller.learns or shadow
     arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
     sees_all = not _host_changes(problem, realisation)[:, 3].any()
-    if controller.fixed_profile is not None and sees_all and not by_window:
-        return _play_static(problem, realisation, controller, arrays)
-    guarded = guard and controller.guarded
-    return _play_windows(problem, realisation, controller, arrays, guarded=guarded)
+    with _quiet():
+        if controller.fixed_profile is not None and sees_all and not by_window:
+            # No decision can change anything: one call plays everything.
+            arrays.tables.stamps[:] = list(problem.candidates).index(controller.incumbent)
+            play(arrays)
+            first = np.arange(realisation.windows) * problem.window_cycles
+        else:
+            guarded = guard and controller.guarded
+            stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
+            while (status := play(arrays)) != k.FINISHED:
+                if status == k.STEP:
+                    stamper.step()
+                else:
+                    stamper.close_window()
+            first = np.array(stamper.first, np.int64)
+    return PlayedRealisation(problem, realisation, controller, arrays, first)
 
 
 def play(arrays: Arrays) -> int:
@@ -222,38 +230,6 @@ def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int6
     changes = NodeChanges.of(realisation.node_changes)
     mine = [i for i, name in enumerate(changes.nodes) if name == problem.controller_node]
     return changes.table[np.isin(changes.table[:, 1], mine)]
-
-
-def _play_static(
-    problem: Problem, realisation: Realisation, controller: Controller, arrays: Arrays
-) -> PlayedRealisation:
-    """Play everything in one call: no decision can change anything."""
-    arrays.tables.stamps[:] = list(problem.candidates).index(controller.incumbent)
-    with _quiet():
-        play(arrays)
-    first = np.arange(realisation.windows) * problem.window_cycles
-    return PlayedRealisation(problem, realisation, controller, arrays, first)
-
-
-def _play_windows(
-    problem: Problem,
-    realisation: Realisation,
-    controller: Controller,
-    arrays: Arrays,
-    *,
-    guarded: bool,
-) -> PlayedRealisation:
-    """Play window by window; the controller looks at each and stamps what follows."""
-    stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
-    with _quiet():
-        while (status := play(arrays)) != k.FINISHED:
-            if status == k.STEP:
-                stamper.step()
-            else:
-                stamper.close_window()
-    return PlayedRealisation(
-        problem, realisation, controller, arrays, np.array(stamper.first, np.int64)
-    )
 
 
 class _Stamper:

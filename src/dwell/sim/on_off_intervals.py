@@ -1,4 +1,4 @@
-"""When a disturbance is on, and how strongly: all its time, in episodes, or along a ramp."""
+"""Times and strengths of a disturbance: all its time, in episodes, or along a ramp."""
 
 from __future__ import annotations
 

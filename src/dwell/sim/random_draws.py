@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -67,10 +67,6 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
     windows : int
         Number of windows, at least 1; the run has ``windows * window_cycles`` cycles.
 
-    Returns
-    -------
-    Realisation
-
     Raises
     ------
     ProblemError
@@ -92,12 +88,7 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
 
 
 def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) -> Scenario:
-    """Return a scenario as a realisation has it: a disturbance for each of the episodes drawn.
-
-    Parameters
-    ----------
-    problem, scenario, seed, windows
-        See `draw`.
+    """Return a scenario as a realisation has it (see `draw`): its drawn episodes as disturbances.
 
     Raises
     ------
@@ -114,19 +105,7 @@ def draw_changes(
 ) -> tuple[Scenario, NodeChanges, LinkSegments]:
     """Draw what a realisation says of nodes and links, and nothing of its jobs and messages.
 
-    First comes the scenario that they are of, as of `drawn_scenario`.
-
-    Parameters
-    ----------
-    problem, scenario, seed, windows
-        See `draw`.
-
-    Raises
-    ------
-    ProblemError
-        If there is no such scenario.
-    TraceError
-        If the times of episodes are a trace that is too short or is not there.
+    First comes the scenario that they are of, as `drawn_scenario` returns it and with its errors.
     """
     drawing = _Draw(problem, scenario, problem.scenario(scenario), seed, windows)
     return drawing.episodes(), *drawing.changes()
@@ -253,28 +232,27 @@ class _Draw:
         if isinstance(process, Constant) and scale is None:
             out[:] = round(min(process.value * NS_PER_MS, LONGEST_NS))
             return
-        rng = self._rng(name)
-        state = math.nan
-        for begin in range(0, len(out), BLOCK):
-            end = min(begin + BLOCK, len(out))
-            values, state = self._block(process, rng, begin, end, state)
+        for rows, values in self._blocks(process, name, len(out)):
             if scale is not None:
-                values *= scale[begin:end]
-            nanoseconds(values, NS_PER_MS, LONGEST_NS, out[begin:end])
+                np.multiply(values, scale[rows], out=values)
+            nanoseconds(values, NS_PER_MS, LONGEST_NS, out[rows])
 
-    def _block(
-        self, process: Process, rng: np.random.Generator, begin: int, end: int, state: float
-    ) -> tuple[Floats, float]:
-        if isinstance(process, Trace):
-            return process.values[self._table_rows(process.table)[begin:end]], state
-        if not isinstance(process, AR1):
-            return process.marginal(rng, end - begin), state
-        noise = rng.standard_normal(end - begin)
-        state = ar1_path(noise, process.log_correlation, state, begin == 0)
-        mu, sigma = LogNormal(process.mean, process.cv).log_parameters
-        noise *= sigma
-        noise += mu
-        return np.exp(noise, out=noise), state
+    def _blocks(self, process: Process, name: str, count: int) -> Iterator[tuple[slice, Floats]]:
+        """Draw a path of a process; each block may be changed."""
+        rng, state = self._rng(name), math.nan
+        for begin in range(0, count, BLOCK):
+            rows = slice(begin, min(begin + BLOCK, count))
+            if isinstance(process, Trace):
+                yield rows, process.values[self._table_rows(process.table)[rows]]
+            elif isinstance(process, AR1):
+                noise = rng.standard_normal(rows.stop - begin)
+                state = ar1_path(noise, process.log_correlation, state, begin == 0)
+                mu, sigma = LogNormal(process.mean, process.cv).log_parameters
+                noise *= sigma
+                noise += mu
+                yield rows, np.exp(noise, out=noise)
+            else:
+                yield rows, process.marginal(rng, rows.stop - begin)
 
     def _executions(self, sites: tuple[tuple[str, str], ...]) -> Ints:
         pipeline = self.problem.pipeline
@@ -283,19 +261,16 @@ class _Draw:
         for row, (task, node) in enumerate(sites):
             name = pipeline.tasks[task].scale
             if name is not None and name not in scales:
-                scales[name] = self._factors(pipeline.scales, name)
+                scales[name] = self._factors(pipeline.scales[name], name)
             scale = scales[name] if name is not None else None
             process = pipeline.tasks[task].on[node].exec_ms
             self._fill(exec_ns[row], process, f"exec/{task}/{node}", scale)
         return exec_ns
 
-    def _factors(self, scales: Mapping[str, Process], name: str) -> Floats:
+    def _factors(self, scale: Process, name: str) -> Floats:
         factors = np.empty(self.cycles)
-        rng = self._rng(f"scale/{name}")
-        state = math.nan
-        for begin in range(0, self.cycles, BLOCK):
-            end = min(begin + BLOCK, self.cycles)
-            factors[begin:end], state = self._block(scales[name], rng, begin, end, state)
+        for rows, values in self._blocks(scale, f"scale/{name}", self.cycles):
+            factors[rows] = values
         return factors
 
     def _delays(self, hops: tuple[tuple[str, str, str], ...]) -> Ints:
@@ -341,7 +316,7 @@ class _Draw:
         return drawn_intervals(every, length, NS_PER_MS, rngs, 0, int(self.release_ns[-1]))
 
     def _intervals(self, item: Disturbance) -> OnOffIntervals:
-        """Say when a disturbance is on, up to the end of the run."""
+        """Return the times at which a disturbance is on, up to the end of the run."""
         begin_ns = round(item.at_s * NS_PER_S)
         end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS)))
         if item.ramp_s:

@@ -45,7 +45,7 @@ class LinkSegment(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """When the kernel of a node looks at its quota.
+    """Instants at which the kernel of a node looks at its quota.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ class SimulatedGuard:
             self._look_at(tables, self._due_ns(first))
 
     def _due_ns(self, first: int) -> int:
-        """When the guard fires if no cycle from `first` on completes."""
+        """Instant at which the guard fires if no cycle from `first` on completes."""
         return int(self.release_ns[first]) + self.patience_ns if first < self.cycles else NEVER_NS
 
     def _look_at(self, tables: k.Tables, at_ns: int) -> None:
@@ -181,7 +181,7 @@ class SimulatedGuard:
 
 
 class _Outages:
-    """When nodes, links and workers cannot be heard."""
+    """Outages of nodes, links and workers."""
 
     def __init__(self, problem: Problem, realisation: Realisation) -> None:
         self.problem = problem
@@ -249,7 +249,7 @@ class _ProbeRequest:
 
 
 class _Probes:
-    """Which cycles are probes, and what became of them."""
+    """Probes: the cycles that are sent as probes, and their completions."""
 
     def __init__(self, problem: Problem, realisation: Realisation) -> None:
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
@@ -312,7 +312,7 @@ class _Probes:
         return sorted(found, key=order)
 
     def _heard_ns(self, tables: k.Tables, cycle: int) -> int | None:
-        """When the completion of a probe is heard: all sinks have, or would have, what they need.
+        """Instant at which the completion of a probe is heard: all sinks have their inputs.
 
         A sink that the probe shares with its cycle must have completed.
         """

@@ -46,7 +46,7 @@ class PlayedRealisation:
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """What the run has that not every run has, beside what its estimator says."""
+        """Features of the run that not every run has, beside those of its estimator."""
         return ("shadows",) if len(self.arrays.tables.cells) > 1 else ()
 
     @property
@@ -194,7 +194,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> pl.DataFrame
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, NDArray[np.generic]]:
-    """What shadow jobs cost in each window: cycles sent twice, bytes, and share of the cores."""
+    """Cost of shadow jobs in each window: cycles sent twice, bytes, and share of the cores."""
     tables = played.arrays.tables
     if not played.features:
         return {}
