@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import time
 from pathlib import Path
 from typing import Annotated
 
@@ -60,11 +59,11 @@ def chaos(
         f"dwell testbed chaos{what} --seed {seed}",
         say,
     )
-    until_s = None if minutes is None else time.monotonic() + 60 * minutes
+    seconds = None if minutes is None else 60 * minutes
     result = campaign.result
     with interruptible():
         try:
-            campaign.run(until_s=until_s, faults=1 if only is not None else faults, only=only)
+            campaign.run(seconds=seconds, faults=1 if only is not None else faults, only=only)
         except KeyboardInterrupt:
             result.wrong.append("interrupted")
     document = result.document()

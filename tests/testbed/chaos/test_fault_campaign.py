@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from itertools import islice
 from pathlib import Path
 
@@ -33,10 +32,16 @@ def test_the_cell_keeps_its_promises(
     staging = Staging(None, tmp_path, SEED, hosts=place == "hosts")
     command = "dwell testbed chaos" + (" --hosts" if place == "hosts" else "")
     campaign = FaultCampaign(staging, f"{command} --seed {SEED}", print)
-    result = campaign.run(until_s=time.monotonic() + SECONDS, faults=faults)
+    result = campaign.run(seconds=SECONDS, faults=faults)
     assert not result.wrong, "\n".join([*result.wrong, capsys.readouterr().out])
     assert len(result.outcomes) >= fewest
     # Who hears nothing finds nothing wrong.
     assert result.heard["stamped"] > 0.5 * result.actuated > 100
     assert {"accepted", "done", "in", "order"} <= result.heard.keys()
     assert [one.number for one, _ in islice(result.outcomes, 3)] == [1, 2, 3]
+
+
+def test_a_campaign_without_a_fault_has_failed(tmp_path: Path) -> None:
+    campaign = FaultCampaign(Staging(None, tmp_path, SEED), "dwell testbed chaos", print)
+    result = campaign.run(faults=0)
+    assert result.wrong == ["no fault has befallen the cell: nothing was watched"]

@@ -167,6 +167,8 @@ class FaultCampaign:
         self._staging, self._out, self._seed = staging, staging.out, staging.seed
         self._again, self._say = again, say
         self._disks = may_mount()
+        # On `time.monotonic`, once the first cell has come up.
+        self._until_s: float | None = None
         self.result = Result(self._seed)
         self.result.means = {
             "full disk": "a tmpfs in place of each folder, made as small as what is on it"
@@ -178,14 +180,14 @@ class FaultCampaign:
         }
 
     def run(
-        self, *, until_s: float | None = None, faults: int | None = None, only: int | None = None
+        self, *, seconds: float | None = None, faults: int | None = None, only: int | None = None
     ) -> Result:
         """Have faults befall cells, and judge what they do.
 
         Parameters
         ----------
-        until_s : float, optional
-            On `time.monotonic`: no fault begins later.
+        seconds : float, optional
+            No fault begins later than that after the first cell has come up.
         faults : int, optional
             How many.
         only : int, optional
@@ -202,8 +204,10 @@ class FaultCampaign:
         with StallDetector() as stalls:
             while waiting is not None or number == 0:
                 number += 1
-                waiting = self._cell(number, plan, waiting, stalls, until_s)
+                waiting = self._cell(number, plan, waiting, stalls, seconds)
         self.result.seconds = time.monotonic() - begin_s
+        if not self.result.outcomes:
+            self.result.wrong.append("no fault has befallen the cell: nothing was watched")
         return self.result
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
@@ -220,17 +224,20 @@ class FaultCampaign:
         plan: Any,
         first: PlannedFault | None,
         stalls: StallDetector,
-        until_s: float | None,
+        seconds: float | None,
     ) -> PlannedFault | None:
         """Have one cell go through faults; returns the next fault where the cell is past help."""
         testbed, home = self._staging.testbed(number)
         with ExitStack() as stack:
             cell = stack.enter_context(Harness(testbed, home=home, disks=self._disks))
             observer = stack.enter_context(ActuatorObserver(testbed, testbed.folder / "cell.yaml"))
+            if seconds is not None and self._until_s is None:
+                self._until_s = time.monotonic() + seconds
             while True:
                 one = first or next(plan, None)
                 first = None
-                if one is None or (until_s is not None and time.monotonic() > until_s):
+                late = self._until_s is not None and time.monotonic() > self._until_s
+                if one is None or late:
                     break
                 stalls.stalls.clear()
                 if not self._one(cell, observer, one, stalls):
