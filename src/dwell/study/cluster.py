@@ -39,7 +39,7 @@ def spread_on_dask(
     task : callable
         It, the units and the results must pickle.
     address : str
-        Of the scheduler, as ``tcp://host:8786``.
+        The scheduler's, as ``tcp://host:8786``.
     take : callable
         Called in this process with each unit and its result, as soon as that is ready.
 

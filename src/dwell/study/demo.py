@@ -17,8 +17,9 @@ from typing import TypeAlias
 from dwell.errors import TraceError
 from dwell.model import Problem
 from dwell.study.comparison import Comparison, compare
-from dwell.study.runner import Progress, StudyResult, run_study
+from dwell.study.runner import StudyResult, run_study
 from dwell.study.study import Contender, load_study
+from dwell.study.workers import Progress
 
 #: Policies beside every candidate as a static placement.
 POLICIES = (

@@ -30,7 +30,7 @@ def drawn_disturbances(problem: Problem, scenario: str, seed: int, windows: int)
     Parameters
     ----------
     seed, windows : int
-        Of the run; episodes are drawn as far as it reaches.
+        The run's; episodes are drawn as far as it reaches.
     """
     try:
         return drawn_scenario(problem, scenario=scenario, seed=seed, windows=windows)

@@ -65,8 +65,6 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
     ----------
     values : sequence of float
         One a seed, finite, at least one.
-    seed : int
-        Seed of the resamples.
 
     Returns
     -------
@@ -102,12 +100,8 @@ def share_interval(values: Values) -> Interval:
         `rule_of_three` where all are 0, or all are 1. NaN at the ends for a single value.
     """
     sample = np.asarray(values, np.float64)
-    if not sample.any():
-        return Interval(0.0, 0.0, rule_of_three(len(sample)))
-    if (sample == 1.0).all():
-        return Interval(1.0, 1.0 - rule_of_three(len(sample)), 1.0)
     mean = float(sample.mean())
-    if len(sample) < 2:
+    if len(sample) == 1 and 0.0 < mean < 1.0:
         return Interval(mean, math.nan, math.nan)
     return Interval(mean, *_share_limits(sample, (1 - CONFIDENCE) / 2))
 
@@ -125,8 +119,6 @@ def share_difference_interval(
     ----------
     first, second : sequence of float
         One a seed, in the same order, in [0, 1], at least one.
-    seed : int
-        Seed of the resamples.
 
     Returns
     -------
@@ -173,14 +165,7 @@ def share_limits(values: Values) -> tuple[float, float]:
     at_least, at_most : float
         0 and 1 for a single value, which limits nothing.
     """
-    sample = np.asarray(values, np.float64)
-    if not sample.any():
-        return 0.0, rule_of_three(len(sample))
-    if (sample == 1.0).all():
-        return 1.0 - rule_of_three(len(sample)), 1.0
-    if len(sample) == 1:
-        return 0.0, 1.0
-    return _share_limits(sample, 1 - CONFIDENCE)
+    return _share_limits(np.asarray(values, np.float64), 1 - CONFIDENCE)
 
 
 def under(values: Values, limit: float = 0.05) -> Verdict:
@@ -268,8 +253,6 @@ def studentised_limits(
         One a seed, finite, at least one.
     tail : float
         Probability with which each limit may be wrong: 0.025 or 0.05.
-    seed : int
-        Seed of the resamples.
 
     Returns
     -------
@@ -304,8 +287,8 @@ def _studentised(values: tuple[float, ...], tail: float, seed: int) -> tuple[flo
     def angle(resample: Floats, axis: int = -1) -> Floats:
         """Arctangent of t*: in the same order, and finite where t* is not."""
         error = resample.std(axis=axis, ddof=1) / root
-        found: Floats = np.arctan2(resample.mean(axis=axis), np.where(error > least, error, 0.0))
-        return found
+        angles: Floats = np.arctan2(resample.mean(axis=axis), np.where(error > least, error, 0.0))
+        return angles
 
     resampled = bootstrap(
         (centred,),
@@ -325,12 +308,18 @@ def _tangent(angle: float) -> float:
 
 
 def _share_limits(sample: Floats, tail: float) -> tuple[float, float]:
-    """Limits of a mean of shares, each wrong with probability `tail`; for at least two values.
+    """Limits of a mean of shares, each wrong with probability `tail`.
 
     With confidence 1 - `tail`, a further run lies above the largest of n with a probability of at
     most p = 1 - tail^(1/n) (Wilks 1941, DOI 10.1214/aoms/1177731788), and then it shows at most 1:
     the mean is at most (1 - p) · largest + p. That is `rule_of_three` where the largest is 0.
     """
+    if not sample.any():
+        return 0.0, rule_of_three(len(sample))
+    if (sample == 1.0).all():
+        return 1.0 - rule_of_three(len(sample)), 1.0
+    if len(sample) == 1:
+        return 0.0, 1.0
     low, high = studentised_limits(sample, tail)
     if low == high:
         return low, high

@@ -64,7 +64,7 @@ def profiles_of(jobs: pl.DataFrame | None, problem: Problem) -> pl.DataFrame:
     Parameters
     ----------
     jobs : DataFrame or None
-        Of all runs; None where none kept them.
+        Jobs of all runs; None where no run kept them.
 
     Returns
     -------
@@ -81,14 +81,16 @@ def profiles_of(jobs: pl.DataFrame | None, problem: Problem) -> pl.DataFrame:
         baseline = jobs.filter(pl.col("scenario") == BASELINE)
         for task in problem.pipeline.tasks:
             for node in problem.fabric.nodes:
-                mine = baseline.filter((pl.col("task") == task) & (pl.col("node") == node))
-                if mine.is_empty():
+                here = baseline.filter(task=task, node=node)
+                if here.is_empty():
                     continue
-                mine = mine.with_columns(wall_ns=pl.col("end_ns") - pl.col("start_ns"))
-                row: dict[str, object] = {"task": task, "node": node, "jobs": mine.height}
-                row |= {"runs": mine["run"].n_unique(), **_spread(mine, "wall")}
-                row |= _spread(mine, "cpu") if "cpu_ns" in mine.columns else {}
-                rows.append(row | {"told_ms": _told_ms(problem, task, node)})
+                here = here.with_columns(wall_ns=pl.col("end_ns") - pl.col("start_ns"))
+                on = problem.pipeline.tasks[task].on.get(node)
+                row: dict[str, object] = {"task": task, "node": node, "jobs": here.height}
+                row |= {"runs": here["run"].n_unique(), **_spread(here, "wall")}
+                row |= _spread(here, "cpu") if "cpu_ns" in here.columns else {}
+                row["told_ms"] = None if on is None else float(on.exec_ms.expectation)
+                rows.append(row)
     names = [f"{kind}_ms{end}" for kind in ("wall", "cpu") for end in ENDS]
     schema = {"task": pl.String(), "node": pl.String(), "jobs": pl.Int64(), "runs": pl.Int64()}
     schema |= {name: pl.Float64() for name in (*names, "told_ms")}
@@ -110,20 +112,11 @@ def _spread(jobs: pl.DataFrame, kind: str) -> dict[str, float | None]:
     return dict(zip((f"{kind}_ms{end}" for end in ENDS), values, strict=True))
 
 
-def _told_ms(problem: Problem, task: str, node: str) -> float | None:
-    on = problem.pipeline.tasks[task].on.get(node)
-    return None if on is None else float(on.exec_ms.expectation)
-
-
 def links_of(jobs: pl.DataFrame | None, problem: Problem) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Return what messages took, from the end of the job that sent one until it was there.
 
     Only of flows into tasks with a single input: what becomes ready when the last of several inputs
     is there says nothing of the others.
-
-    Parameters
-    ----------
-    jobs : DataFrame or None
 
     Returns
     -------
@@ -232,13 +225,12 @@ def job_times(
     if not measured:
         return pl.DataFrame(schema=schema)
     seen = pl.concat(measured, how="diagonal_relaxed")
-    said = pl.concat(predicted, how="diagonal_relaxed")
+    simulated = pl.concat(predicted, how="diagonal_relaxed")
     rows = []
     for task in problem.pipeline.tasks.values():
         for node in task.on:
-            here = (pl.col("task") == task.name) & (pl.col("node") == node)
-            mine, theirs = seen.filter(here), said.filter(here)
-            if mine.is_empty():
+            here, there = (jobs.filter(task=task.name, node=node) for jobs in (seen, simulated))
+            if here.is_empty():
                 continue
             rows.append(
                 {
@@ -246,10 +238,10 @@ def job_times(
                     "policy": policy,
                     "task": task.name,
                     "node": node,
-                    "jobs": mine.height,
-                    **_times("measured", mine["wall_ns"].to_numpy()),
-                    **_times("predicted", theirs["wall_ns"].to_numpy()),
-                    **_times("core", mine["cpu_ns"].drop_nulls().to_numpy()),
+                    "jobs": here.height,
+                    **_times("measured", here["wall_ns"].to_numpy()),
+                    **_times("predicted", there["wall_ns"].to_numpy()),
+                    **_times("core", here["cpu_ns"].drop_nulls().to_numpy()),
                     **_times("cell", _drawn(problem, task.name, node) * 1e6),
                 }
             )

@@ -41,7 +41,7 @@ class Judged:
     measured, predicted : Interval
         In the metric's unit.
     error : Interval
-        Of the prediction: relative for ``l95_ms``, elsewhere the difference.
+        The prediction's error: relative for ``l95_ms``, elsewhere the difference.
     allowed : float
         Largest error that is good enough; NaN where nothing is asked.
     verdict : {"met", "explained", "open", "missed", ""}
@@ -49,7 +49,7 @@ class Judged:
     baseline : float
         What the sum-of-means predictor says; NaN where it says nothing.
     note : str
-        What there is to say.
+        Remark that belongs to the verdict.
     """
 
     metric: str
@@ -82,8 +82,8 @@ def relative(predicted: Floats | float, measured: Floats | float) -> Floats:
     """Relative error of predictions; 0 where both are infinite."""
     with np.errstate(invalid="ignore", divide="ignore"):
         error = np.divide(predicted, measured) - 1
-    found: Floats = np.where(np.equal(predicted, measured), 0.0, error)
-    return found
+    errors: Floats = np.where(np.equal(predicted, measured), 0.0, error)
+    return errors
 
 
 def chance(held: NDArray[np.bool_]) -> Outcome:
@@ -101,15 +101,18 @@ def worst(verdicts: Sequence[Outcome]) -> Outcome:
 class Both(NamedTuple):
     """A figure as it was measured and predicted, and both in every resample."""
 
-    value: float
-    guess: float
-    seen: Floats
-    said: Floats
+    measured: float
+    predicted: float
+    measured_resamples: Floats
+    predicted_resamples: Floats
 
     @property
     def relative_error(self) -> Interval:
-        """Of the prediction, as a share of what was measured."""
-        return within(float(relative(self.guess, self.value)), relative(self.said, self.seen))
+        """The prediction's error as a share of the measured figure."""
+        return within(
+            float(relative(self.predicted, self.measured)),
+            relative(self.predicted_resamples, self.measured_resamples),
+        )
 
 
 class GroupJudge:
@@ -144,7 +147,7 @@ class GroupJudge:
     def figures(self) -> dict[str, Judged]:
         """Return every figure of the group (see `dwell.study.validation.Group`)."""
         l95 = self._l95()
-        found = [
+        figures = [
             l95,
             self._difference("window_l95_ms"),
             self._violations(l95.verdict),
@@ -154,7 +157,7 @@ class GroupJudge:
             *(self._difference(f"share_{name}") for name in self.problem.candidates),
             self._migrations(),
         ]
-        return {one.metric: one for one in found}
+        return {figure.metric: figure for figure in figures}
 
     def _both(self, name: str) -> Both:
         if name not in self._known:
@@ -169,14 +172,14 @@ class GroupJudge:
     def _l95(self) -> Judged:
         both, note = self._both("l95_ms"), ""
         error = both.relative_error
-        if math.isinf(both.value) and math.isinf(both.guess):
+        if math.isinf(both.measured) and math.isinf(both.predicted):
             # More than 5 % are lost, as predicted: what is left to judge is what windows showed.
             error = self._both("window_l95_ms").relative_error
             note = "more than 5 % of the cycles are lost: judged by the mean of windows"
         return Judged(
             "l95_ms",
-            within(both.value, both.seen),
-            within(both.guess, both.said),
+            within(both.measured, both.measured_resamples),
+            within(both.predicted, both.predicted_resamples),
             error,
             L95_ALLOWED,
             judge(error, L95_ALLOWED),
@@ -185,20 +188,20 @@ class GroupJudge:
         )
 
     def _difference(self, name: str) -> Judged:
-        value, guess, seen, said = self._both(name)
-        error = within(guess - value, said - seen)
-        return Judged(name, within(value, seen), within(guess, said), error)
+        measured, predicted, seen, simulated = self._both(name)
+        error = within(predicted - measured, simulated - seen)
+        return Judged(name, within(measured, seen), within(predicted, simulated), error)
 
     def _migrations(self) -> Judged:
         judged = self._difference("migrations")
         if len(self.measured.lengths) > 1:
             return judged
         # One run has one number of migrations: its windows say nothing of another run's.
-        measured, error = judged.measured, judged.error
+        open_ends = {"low": math.nan, "high": math.nan}
         return replace(
             judged,
-            measured=Interval(measured.value, math.nan, math.nan),
-            error=Interval(error.value, math.nan, math.nan),
+            measured=judged.measured._replace(**open_ends),
+            error=judged.error._replace(**open_ends),
         )
 
     def _use(self, name: str) -> Judged:
@@ -241,8 +244,8 @@ class GroupJudge:
     def _placed(self) -> Judged:
         """Judge whether the same placement has the most windows."""
         both = [self._both(f"share_{name}") for name in self.problem.candidates]
-        seen, said = ([one.seen for one in both], [one.said for one in both])
-        same = np.argmax(seen, axis=0) == np.argmax(said, axis=0)
+        seen = np.argmax([one.measured_resamples for one in both], axis=0)
+        same = seen == np.argmax([one.predicted_resamples for one in both], axis=0)
         verdict = chance(same)
         # What most resamples show is not against what the runs themselves show.
         agree = self.dominant[0] == self.dominant[1]
@@ -259,17 +262,18 @@ class GroupJudge:
 
     def _better(self) -> Judged:
         """Judge whether the prediction is nearer to what was measured than the sum of means."""
-        value, guess, seen, said = self._both("l95_ms")
+        measured, predicted, seen, simulated = self._both("l95_ms")
         sums = np.full_like(seen, self.sum_ms)
-        ours, theirs = np.abs(relative(said, seen)), np.abs(relative(sums, seen))
+        ours, theirs = np.abs(relative(simulated, seen)), np.abs(relative(sums, seen))
         rates = self._both("violation_rate")
-        off, off_sum = np.abs(rates.said - rates.seen), np.abs(self.sum_rate - rates.seen)
+        off = np.abs(rates.predicted_resamples - rates.measured_resamples)
+        off_sum = np.abs(self.sum_rate - rates.measured_resamples)
         not_worse = (off <= off_sum) | (np.maximum(off, off_sum) <= POINTS_ALLOWED)
         return Judged(
             "sum_of_means",
-            within(value, seen),
-            within(guess, said),
-            within(float(relative(self.sum_ms, value)), relative(sums, seen)),
+            within(measured, seen),
+            within(predicted, simulated),
+            within(float(relative(self.sum_ms, measured)), relative(sums, seen)),
             math.nan,
             chance((ours < theirs) & not_worse),
             self.sum_ms,

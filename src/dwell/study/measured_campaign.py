@@ -35,7 +35,7 @@ class MeasuredCampaign:
     Parameters
     ----------
     comparison : Comparison
-        Of its runs; repetitions are the seeds.
+        The comparison of its runs; repetitions are the seeds.
     estimators : mapping of str to str
         By policy.
     kinds : frozenset of str
@@ -43,7 +43,7 @@ class MeasuredCampaign:
     where : str
         ``testbed``, or the inventory.
     seconds : float
-        Of each run.
+        Length of each run.
     planned : int
         Runs of the campaign, done or not.
     log : DataFrame

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -32,7 +33,11 @@ if TYPE_CHECKING:
 
 Document: TypeAlias = Mapping[str, Any]
 
-NODE_FIELDS = ("tier", "cores", "scheduler", "accelerators", "quota")
+#: What calibration does not change of nodes and tasks.
+MADE_OF = {
+    "nodes": ("tier", "cores", "scheduler", "accelerators", "quota"),
+    "tasks": ("input",),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +47,7 @@ class MeasuredRun:
     Parameters
     ----------
     name : str
-        Of the run's folder.
+        Name of the run's folder.
     problem : Problem
         The calibrated cell with this run's warm-up, its scenario as it was played and, where it
         never moved, its placement.
@@ -82,10 +87,6 @@ def read_measured(name: str, run: Run, problem: Problem, usual: Usual | None = N
 
     Parameters
     ----------
-    name : str
-        Of the run, for messages.
-    run : Run
-        Live, or simulated.
     problem : Problem
         The calibrated cell.
     usual : Usual, optional
@@ -203,17 +204,11 @@ def _other_cell(theirs: Document, own: Document) -> Iterator[str]:
         if set(there) != set(here):
             was, now = _names(there), _names(here)
             yield f"it is a run of another cell: its {field} are {was}, not {now}"
-    for name in own["nodes"].keys() & theirs["nodes"].keys():
-        there, here = theirs["nodes"][name], own["nodes"][name]
-        for field in NODE_FIELDS:
-            was, now = there.get(field), here.get(field)
+    for kind, fields in MADE_OF.items():
+        for name, field in product(own[kind].keys() & theirs[kind].keys(), fields):
+            was, now = (cell[kind][name].get(field) for cell in (theirs, own))
             if _allowance(was) != _allowance(now):
-                yield f"nodes.{name}.{field} was {was!r} in the run and is {now!r} in the cell"
-    for name in own["tasks"].keys() & theirs["tasks"].keys():
-        there, here = theirs["tasks"][name], own["tasks"][name]
-        if there.get("input") != here.get("input"):
-            was, now = there.get("input"), here.get("input")
-            yield f"tasks.{name}.input was {was!r} in the run and is {now!r} in the cell"
+                yield f"{kind}.{name}.{field} was {was!r} in the run and is {now!r} in the cell"
     there, here = ({f"{one['from']}->{one['to']}" for one in doc["flows"]} for doc in (theirs, own))
     if there != here:
         yield f"it is a run of another cell: its flows are {_names(there)}, not {_names(here)}"

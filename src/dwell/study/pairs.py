@@ -192,8 +192,8 @@ def sign_flip_p(differences: Values, *, seed: int = RESAMPLING_SEED) -> float:
     differences : sequence of float
         One a pair, finite.
     seed : int
-        Of the flips that are drawn above `EXACT_PAIRS` pairs. Then p is (hits + 1) / (`FLIPS` + 1),
-        which is never too small (Phipson & Smyth 2010, DOI 10.2202/1544-6115.1585).
+        Seed of the flips that are drawn above `EXACT_PAIRS` pairs. Then p is (hits + 1) /
+        (`FLIPS` + 1), which is never too small (Phipson & Smyth 2010, DOI 10.2202/1544-6115.1585).
     """
     sample = np.asarray(differences, np.float64)
     sizes = np.abs(sample[sample != 0])

@@ -50,7 +50,7 @@ class PlayedItem:
     Parameters
     ----------
     summaries : tuple of (int, Summary)
-        Of every run, with the index of its point.
+        The summary of every run, with the index of its point.
     examples : mapping of (int, str) to Example
         The runs that are kept whole, by point and policy.
     """
@@ -66,7 +66,7 @@ class Player:
     Parameters
     ----------
     software : mapping of str to str
-        Of the process that asks; a process with other software refuses to play.
+        That of the process that asks; a process with other software refuses to play.
     kept : tuple of int
         Seeds whose runs are kept whole.
     """

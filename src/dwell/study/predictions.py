@@ -287,7 +287,7 @@ def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -
     Parameters
     ----------
     comparison : StudyRuns
-        Of a single point; compares the candidates LOC, SO and HYB, in some of the paper's
+        Runs at a single point of the candidates LOC, SO and HYB, in some of the paper's
         scenarios.
     policies : sequence of str
         Those that the predictions about DTP are held against.

@@ -199,7 +199,7 @@ class QosSample:
         Parameters
         ----------
         name : str
-            Of `sums`, or ``l95_ms``.
+            A figure of `sums`, or ``l95_ms``.
         weights : float64 array, shape (draws, units)
             How often each unit counts.
         """
@@ -207,15 +207,15 @@ class QosSample:
             return self._resampled_l95(weights)
         total, count = (weights @ self.sums[name]).T
         with np.errstate(invalid="ignore", divide="ignore"):
-            found: Floats = total / count
-        return found
+            figures: Floats = total / count
+        return figures
 
     def _resampled_l95(self, weights: Floats) -> Floats:
         within = (weights @ self.counts).cumsum(axis=1)
         rank = np.ceil(0.95 * within[:, -1:] - 1e-9)
         place = (within < rank).sum(axis=1)
-        found: Floats = np.append(self.grid_ms, np.inf)[place]
-        return found
+        l95_ms: Floats = np.append(self.grid_ms, np.inf)[place]
+        return l95_ms
 
     def rate_if(self, factor: float) -> float:
         """V_D, if every latency were `factor` times what it is."""
@@ -239,10 +239,9 @@ class QosSample:
 
     def share_within(self, limits_ms: Floats) -> Floats:
         """Share of the cycles that took no longer than each of several limits."""
-        found: Floats = np.searchsorted(self.latency_ms, limits_ms, side="right") / len(
-            self.latency_ms
-        )
-        return found
+        within = np.searchsorted(self.latency_ms, limits_ms, side="right")
+        shares: Floats = within / len(self.latency_ms)
+        return shares
 
     def share_near(self, allowed: float) -> float:
         """Share of the cycles whose latency lies within `allowed` of the deadline."""
@@ -255,9 +254,9 @@ def _grid(ascending: Floats) -> Floats:
     values = np.unique(ascending[np.isfinite(ascending)])
     if len(values) <= POINTS:
         return values
-    picked = np.rint(np.linspace(0, len(values) - 1, POINTS)).astype(np.int64)
-    found: Floats = values[picked]
-    return found
+    places = np.rint(np.linspace(0, len(values) - 1, POINTS)).astype(np.int64)
+    quantiles: Floats = values[places]
+    return quantiles
 
 
 def _counts(place: Ints, unit: Ints, units: int, points: int) -> Floats:

@@ -91,12 +91,12 @@ def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
     Parameters
     ----------
     release_ns, latency_ns : int64 array, shape (n,)
-        Of every cycle from the first; at least one. `NEVER_NS` is one that never finished.
+        Every cycle from the first; at least one. `NEVER_NS` is one that never finished.
 
     Returns
     -------
     EffectiveCommands
-        Of several at one instant, the newest alone.
+        The newest alone where several complete at one instant.
     """
     start_ns = int(release_ns[0])
     done = latency_ns < NEVER_NS
@@ -122,8 +122,8 @@ def age_of_information(actuated: EffectiveCommands, begin_ns: int, end_ns: int) 
     Returns
     -------
     Age
-        Of a sawtooth that rises by 1 ms a ms and falls at actuations; the percentile is that of its
-        distribution over time, to the nanosecond.
+        The age is a sawtooth that rises by 1 ms a ms and falls at actuations; the percentile is
+        that of its distribution over time, to the nanosecond.
     """
     first = int(np.searchsorted(actuated.at_ns, begin_ns, side="right"))
     last = int(np.searchsorted(actuated.at_ns, end_ns, side="left"))

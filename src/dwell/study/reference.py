@@ -205,8 +205,8 @@ def kept(run: Run, references: References, problem: Problem, limit: float = 0.05
     Returns
     -------
     float
-        Of W cycles each after the warm-up, the same for both, wherever their own windows begin;
-        1 where the reference misses more in all of them: nothing was asked.
+        Windows have W cycles each, after the warm-up, and are the same for both, wherever their own
+        windows begin; 1 where the reference misses more in all of them: nothing was asked.
     """
     width, first = problem.window_cycles, problem.warmup_windows * problem.window_cycles
     missed = [one.cycles["missed"].to_numpy()[first:] for one in (references.run, run)]

@@ -38,8 +38,6 @@ def resample_windows(lengths: Sequence[int], *, seed: int = RESAMPLING_SEED) -> 
     ----------
     lengths : sequence of int
         Windows of every run, each at least 1.
-    seed : int
-        Seed of the resamples.
 
     Returns
     -------

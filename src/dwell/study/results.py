@@ -28,10 +28,9 @@ class StudyRuns(Displayed):
     Parameters
     ----------
     problem : Problem
-        Of the first point.
+        The first point's.
     scenarios, policies : tuple of str
         In the order of tables and figures; a policy that has a candidate's name never moves.
-    seeds : tuple of int
     windows : int
         Length of every run, the warm-up included.
     runs : DataFrame
@@ -119,7 +118,7 @@ class StudyRuns(Displayed):
         Parameters
         ----------
         columns : sequence of str, optional
-            Of `runs`; all that hold numbers where None.
+            Columns of `runs`; all that hold numbers where None.
 
         Returns
         -------

@@ -23,12 +23,11 @@ from dwell.study.software import describe, versions
 from dwell.study.study import Item, Study
 from dwell.study.study_folder import PARTS, STUDY, TABLES, finished, read_parts, write_table
 from dwell.study.summary import latency_grid_ms
-from dwell.study.workers import available_processes, spread
+from dwell.study.workers import Progress, available_processes, spread
 
 if TYPE_CHECKING:
     import polars as pl
 
-Progress: TypeAlias = Callable[[int, int], None]
 #: By their names, see `TABLES`.
 Tables: TypeAlias = "dict[str, pl.DataFrame]"
 
@@ -110,11 +109,6 @@ def play_in_memory(
     progress: Progress | None = None,
 ) -> tuple[Tables, dict[tuple[Item, int, str], Example]]:
     """Simulate a study and write nothing.
-
-    Parameters
-    ----------
-    processes, dask, progress
-        See `run_study`.
 
     Returns
     -------

@@ -128,9 +128,6 @@ class Study:
     ----------
     points : tuple of Point
         All with the same parameters, candidates and nodes, and different values.
-    scenarios : tuple of str
-    contenders : tuple of Contender
-    seeds : tuple of int
     windows : int
         Length of every run, the warm-up included.
     references : bool
@@ -259,10 +256,6 @@ def _drawn(problem: Problem) -> str:
 
 def load_study(path: str | PathLike[str]) -> Study:
     """Read a study file.
-
-    Parameters
-    ----------
-    path : str or path
 
     Raises
     ------

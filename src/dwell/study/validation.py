@@ -18,9 +18,9 @@ What a prediction has to reach was set before anything was measured:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,15 +33,13 @@ from dwell.study.measured_run import MeasuredRun, Simulated, Simulator, Unit, re
 from dwell.study.qos_sample import Piece, QosSample, piece_of
 from dwell.study.software import versions
 from dwell.study.sum_of_means import sum_of_means, sums_of_shares
-from dwell.study.workers import available_processes, spread
+from dwell.study.workers import Progress, available_processes, spread
 
 if TYPE_CHECKING:
     import polars as pl
 
     from dwell.calibration.speeds import Usual
     from dwell.record import Run
-
-Progress: TypeAlias = Callable[[int, int], None]
 
 #: Measured time of a group below which its verdicts say little.
 LEAST_MINUTES = 5.0
@@ -61,7 +59,6 @@ class Group:
     ----------
     policy : str
         With its estimator where it may move: ``dtp+corrected``.
-    runs : tuple of str
     minutes : float
         Measured time that counts.
     excluded : int
@@ -119,7 +116,7 @@ class Validation(Displayed):
     groups : tuple of Group
         By scenario in the cell's order, and then by policy.
     seeds : int
-        Number of simulations of each run.
+        Simulations of each run.
     table : DataFrame
         One row a group and figure: ``scenario``, ``policy``, ``metric``, and ``measured``,
         ``predicted`` and ``error`` with their ends (``_low``, ``_high``), ``allowed``,
@@ -207,7 +204,7 @@ def validate(
         raise RunError(f"seeds is {seeds}; at least 2 are needed, for intervals")
     measured = _read(named, problem, frozenset[str | None](calibrated_from), usual)
     groups = list(_grouped(measured, problem))
-    found: dict[int, tuple[Group, pl.DataFrame]] = {}
+    complete: dict[int, tuple[Group, pl.DataFrame]] = {}
     waiting: dict[int, dict[Unit, Simulated]] = {place: {} for place in range(len(groups))}
     simulator = Simulator(tuple(map(tuple, groups)), seeds)
     units = simulator.units
@@ -217,19 +214,19 @@ def validate(
         # A group is judged as soon as it is complete: its simulations are not needed any longer.
         nonlocal done
         done += 1
-        mine = waiting[unit.group]
-        mine[unit] = simulated
-        if len(mine) == seeds * len(groups[unit.group]):
-            ordered = [mine[known] for known in sorted(mine)]
-            found[unit.group] = _group(groups[unit.group], named, ordered)
-            mine.clear()
+        of_group = waiting[unit.group]
+        of_group[unit] = simulated
+        if len(of_group) == seeds * len(groups[unit.group]):
+            ordered = [of_group[known] for known in sorted(of_group)]
+            complete[unit.group] = _group(groups[unit.group], named, ordered)
+            of_group.clear()
         if progress is not None:
             progress(done, len(units))
 
     if processes is None:
         processes = available_processes() if len(units) >= WORTH_SPREADING else 1
     spread(simulator, units, processes=processes, take=take)
-    judged, jobs = zip(*(found[place] for place in range(len(groups))), strict=True)
+    judged, jobs = zip(*(complete[place] for place in range(len(groups))), strict=True)
     return Validation(
         problem=problem,
         groups=judged,
@@ -247,7 +244,7 @@ def _read(
     usual: Usual | None,
 ) -> list[MeasuredRun]:
     """Read every run; what is wrong with any of them is told at once."""
-    found: list[MeasuredRun] = []
+    measured: list[MeasuredRun] = []
     faults: list[str] = []
     for name, run in named.items():
         if name in used or run.run_id in used:
@@ -256,14 +253,14 @@ def _read(
         try:
             one = read_measured(name, run, problem, usual)
             piece_of(run, one.problem, one.excluded)
-            found.append(one)
+            measured.append(one)
         except RunError as error:
             faults.append(str(error))
         except DwellError as error:
             faults.append(f"{name}: {error}")
     if faults:
         raise RunError("\n".join(faults))
-    return found
+    return measured
 
 
 def _grouped(measured: Sequence[MeasuredRun], problem: Problem) -> Iterator[list[MeasuredRun]]:
@@ -273,9 +270,9 @@ def _grouped(measured: Sequence[MeasuredRun], problem: Problem) -> Iterator[list
     policies.sort(key=lambda name: places.get(name, len(places)))
     for scenario in problem.scenarios:
         for policy in policies:
-            mine = [one for one in measured if (one.scenario, one.contender) == (scenario, policy)]
-            if mine:
-                yield mine
+            runs = [one for one in measured if (one.scenario, one.contender) == (scenario, policy)]
+            if runs:
+                yield runs
 
 
 def _group(
