@@ -235,13 +235,7 @@ def _failed(measured: MeasuredCampaign) -> Iterator[Table]:
 
 
 def campaign_text(measured: MeasuredCampaign, *, width: int | None = None) -> str:
-    """Return the results of a campaign as text for a terminal, the answers last.
-
-    Parameters
-    ----------
-    width : int, optional
-        Columns of the terminal; as wide as it takes where None.
-    """
+    """Return the results of a campaign as `dwell.report.table.table_text`, the answers last."""
     comparison = measured.comparison
     blocks = PolicyBlocks(comparison)
     parts = [blocks.results(compact=True), blocks.counts()]

@@ -193,7 +193,7 @@ def intervals(
         ),
     ]
     layers = [*limit_rule("x", *limit), {"encoding": shared, "layer": marks}]
-    return _named_rows(frame, list(styles), layers, seeds=True)
+    return _panels(frame, list(styles), lambda _: layers, seeds=True)
 
 
 def stacked(
@@ -223,7 +223,7 @@ def stacked(
         "tooltip": [*names("policy", "part"), quantity("value", heading)],
     }
     bars = in_order(layer("bar", encoding, where=[CHOSEN], height={"band": 0.7}), parts)
-    return _named_rows(frame, policies, [bars, *limit_rule("x", *limit)])
+    return _panels(frame, policies, lambda _: [bars, *limit_rule("x", *limit)])
 
 
 def in_order(bars: Spec, parts: Mapping[str, str]) -> Spec:
@@ -297,12 +297,13 @@ def _steps(
         quantity(up["field"], up["field"], format=".3~%"),
     ]
 
-    def layers(look: Mapping[str, Spec]) -> list[Spec]:
+    def layers(width: float) -> list[Spec]:
+        look = styled(styles, width)
         line = {"x": across, "y": up, **_of(look, "color", "strokeDash"), "tooltip": about}
         style: Spec = {"interpolate": "step-after", "strokeWidth": 1.5, "clip": True}
         return [layer("line", line, where=[CHOSEN], **style), *rules]
 
-    return _plots(frame, styles, layers, tallest_px)
+    return _panels(frame, list(styles), layers, tallest_px)
 
 
 def curves(
@@ -333,7 +334,8 @@ def curves(
     up = quantity("mean", measure.heading, axis={"tickCount": 5})
     about = [*names("policy"), at, *_mean_and_ends(measure)]
 
-    def layers(look: Mapping[str, Spec]) -> list[Spec]:
+    def layers(width: float) -> list[Spec]:
+        look = styled(styles, width)
         ends = {"y": {"field": "low"}, "y2": {"field": "high"}}
         point = {**_of(look, "shape"), "tooltip": about}
         marks = [
@@ -351,7 +353,7 @@ def curves(
         shared = {"x": across, "y": up, **_of(look, "color")}
         return [*limit_rule("y", *limit), {"encoding": shared, "layer": marks}]
 
-    return _plots(frame, styles, layers, 170, most=3)
+    return _panels(frame, list(styles), layers, 170, most=3)
 
 
 def _mean_and_ends(measure: Measure) -> list[Spec]:
@@ -362,65 +364,49 @@ def _of(look: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:
     return {channel: look[channel] for channel in channels}
 
 
-def _named_rows(
-    frame: pl.DataFrame, policies: Sequence[str], layers: list[Spec], *, seeds: bool = False
-) -> Draw:
-    """Draw layers with a row for each policy; with `seeds`, a reader can choose one of these."""
-
-    def draw(width: float) -> Spec:
-        height = ROW_PX * max(len(policies), 1)
-        return _panels(frame, policies, layers, lambda _: height, width - NAMES_PX, seeds=seeds)
-
-    return draw
-
-
-def _plots(
-    frame: pl.DataFrame,
-    styles: Mapping[str, Style],
-    layers: Callable[[Mapping[str, Spec]], list[Spec]],
-    tallest_px: int,
-    *,
-    most: int = 4,
-) -> Draw:
-    """Draw layers over two numbers, made of the encodings of how policies look."""
-
-    def draw(width: float) -> Spec:
-        return _panels(
-            frame,
-            list(styles),
-            layers(styled(styles, width)),
-            lambda across_px: min(tallest_px, round(0.6 * across_px)),
-            width - AXIS_PX,
-            most=most,
-        )
-
-    return draw
-
-
 def _panels(
     frame: pl.DataFrame,
     policies: Sequence[str],
-    layers: list[Spec],
-    height_px: Callable[[int], int],
-    room_px: float,
+    layers: Callable[[float], list[Spec]],
+    tallest_px: int | None = None,
     *,
     most: int = 4,
     seeds: bool = False,
-) -> Spec:
-    """Draw layers, a panel for each value of ``scenario``; a single one has no heading."""
+) -> Draw:
+    """Draw layers, a panel for each value of ``scenario``; a single one has no heading.
+
+    Parameters
+    ----------
+    layers : callable
+        Takes the width of the whole, pixels.
+    tallest_px : int, optional
+        Height of a panel at most; if left out it has a row for each policy.
+    most : int
+        Panels beside each other.
+    seeds : bool
+        Whether a reader can choose a seed, beside policies.
+    """
     facets = [str(name) for name in frame["scenario"].unique(maintain_order=True)]
-    columns = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
-    across_px = max(60, int((room_px - (columns - 1) * GAP_PX) / columns))
-    spec: Spec = {"width": across_px, "height": height_px(across_px), "layer": layers}
-    if len(facets) > 1:
-        header = {"labelLimit": across_px + GAP_PX}
-        spec = {
-            "facet": name_of("scenario", sort=facets, header=header),
-            "columns": columns,
-            "spacing": {"row": 14, "column": GAP_PX},
-            "spec": spec,
-        }
     params: list[Spec] = [{"name": "policies", "value": list(policies)}]
     if seeds:
         params.append({"name": "seed", "value": None})
-    return {"data": {"name": "rows"}, **spec, "params": params}
+
+    def draw(width: float) -> Spec:
+        room_px = width - (NAMES_PX if tallest_px is None else AXIS_PX)
+        columns = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
+        across_px = max(60, int((room_px - (columns - 1) * GAP_PX) / columns))
+        height_px = ROW_PX * max(len(policies), 1)
+        if tallest_px is not None:
+            height_px = min(tallest_px, round(0.6 * across_px))
+        spec: Spec = {"width": across_px, "height": height_px, "layer": layers(width)}
+        if len(facets) > 1:
+            header = {"labelLimit": across_px + GAP_PX}
+            spec = {
+                "facet": name_of("scenario", sort=facets, header=header),
+                "columns": columns,
+                "spacing": {"row": 14, "column": GAP_PX},
+                "spec": spec,
+            }
+        return {"data": {"name": "rows"}, **spec, "params": params}
+
+    return draw

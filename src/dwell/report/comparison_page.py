@@ -35,9 +35,9 @@ def comparison_html(
     *comparisons : Comparison
         At least one, of cells with different names.
     tenants : StudyResult, optional
-        Of `dwell.study.tenants_demo`; a section of its own.
+        Runs of `dwell.study.tenants_demo`; a section of its own.
     static : bool
-        Whether scripts are left out; see `dwell.report.page.page_html`.
+        See `dwell.report.page.page_html`.
     """
     return page_html(comparison_page(*comparisons, tenants=tenants), static=static)
 
@@ -45,13 +45,7 @@ def comparison_html(
 def comparison_page(
     *comparisons: Comparison, tenants: StudyResult | None = None, sections: int | None = None
 ) -> Page:
-    """Return what there is to show of comparisons; see `comparison_html`.
-
-    Parameters
-    ----------
-    sections : int, optional
-        How many are made of each, from the first, the answer; all if left out.
-    """
+    """Return what there is to show of comparisons; the first `sections` only of each."""
     several = len(comparisons) > 1
     parts: list[Section] = []
     policies: dict[str, str] = {}
@@ -217,13 +211,7 @@ def _share_of_bursts(node: Node) -> float:
 
 
 def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
-    """Return the tables of a comparison as text for a terminal, the answer last.
-
-    Parameters
-    ----------
-    width : int, optional
-        Columns of the terminal: cells fold where they are too few. As wide as it takes where None.
-    """
+    """Return the tables of a comparison as `dwell.report.table.table_text`, the answer last."""
     blocks = PolicyBlocks(comparison)
     tables = [blocks.results(compact=True), predictions_table(comparison, blocks), blocks.counts()]
     return "\n".join(table_text(one, width=width) for one in tables if one.rows)

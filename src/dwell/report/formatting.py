@@ -23,11 +23,11 @@ class Measure(NamedTuple):
     Parameters
     ----------
     column : str
-        Of ``Comparison.runs``.
+        Key of the rows; of those of many runs a column of ``Comparison.runs``.
     name : str
-        Its heading.
+        Heading.
     unit : str
-        Behind the name; empty where there is none.
+        Stands behind the name; empty where there is none.
     factor : float
         From the column's unit to the one shown.
     ends : bool

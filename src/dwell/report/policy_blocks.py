@@ -69,9 +69,9 @@ class PolicyBlocks:
     Parameters
     ----------
     found : StudyRuns
-        Of a comparison, a study or a campaign.
+        The runs of a comparison, a study or a campaign.
     prefix : str
-        Of the names of figures and tables, where a page has several of these.
+        Begins the names of figures and tables, where a page has several of these.
     """
 
     def __init__(self, found: StudyRuns, prefix: str = "") -> None:

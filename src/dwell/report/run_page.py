@@ -56,14 +56,7 @@ PROVEN_SHARE = 0.2
 
 
 def run_html(run: Run, *, static: bool = False) -> str:
-    """Return a page about a run; see `dwell.report.page.page_html`.
-
-    Parameters
-    ----------
-    run : Run
-        Simulated or live, just made or opened from its folder.
-    static : bool
-        Whether scripts are left out.
+    """Return a page about a run, simulated or live; see `dwell.report.page.page_html`.
 
     Raises
     ------
@@ -76,13 +69,7 @@ def run_html(run: Run, *, static: bool = False) -> str:
 
 
 def run_page(run: Run, *, sections: int | None = None) -> Page:
-    """Return what there is to show of a run; see `run_html`.
-
-    Parameters
-    ----------
-    sections : int, optional
-        How many are made, from the first, the answer; all if left out.
-    """
+    """Return what there is to show of a run; its first `sections` only, the answer first."""
     header = RunHeader.of(run)
     counted = count_in(run, header.window_cycles)
     return _RunPage(run, header, counted, sections).page()

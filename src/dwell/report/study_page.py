@@ -28,13 +28,7 @@ def study_html(study: StudyRuns, *, static: bool = False) -> str:
 
 
 def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
-    """Return what there is to show of a study; see `study_html`.
-
-    Parameters
-    ----------
-    sections : int, optional
-        How many are made, from the first, the answer; all if left out.
-    """
+    """Return what there is to show of a study; its first `sections` only, the answer first."""
     blocks = PolicyBlocks(study)
     points = study.runs.select(study.parameters).unique().height if study.parameters else 1
     return Page(

@@ -46,9 +46,9 @@ class Text(NamedTuple):
     Parameters
     ----------
     column : str
-        Of the rows.
+        Key of the rows.
     name : str
-        Its heading.
+        Heading.
     kind : {"text", "policy", "placement", "scenario", "word"}
         Names are written as they are everywhere and have their colour; words of verdicts are
         marked (see `WORDS`).
@@ -96,8 +96,6 @@ class Table:
     ----------
     slug : str
         Its name in files and links.
-    title : str
-        Heading.
     columns : sequence of Text or Measure
         Numbers have an interval where a row has the ends of one (``NAME_low``, ``NAME_high``).
     rows : sequence of mapping of str to value

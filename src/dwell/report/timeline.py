@@ -80,13 +80,10 @@ def run_timeline(
 
     Parameters
     ----------
-    windows, decisions : DataFrame
-        Of the run.
     begin_s : float64 array, shape (windows,)
         When each window began, seconds.
     palette : Palette
-        Of the candidates.
-    nodes : sequence of str
+        Colours of the candidates.
     disturbed : iterable of Disturbed
         What happened meanwhile. What went on beyond the run is cut.
     links : mapping of int to str, optional
@@ -127,10 +124,10 @@ def run_timeline(
     )
     frames["nodes"] = long.with_columns(node=pl.col("node").str.slice(2))
     frames["windows"] = frames["windows"].drop([f"u {node}" for node in nodes])
-    shown = [name for name in candidates if name in set(frame["placement"])]
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
-    colours = {name: palette.placements[name] for name in shown}
+    used = set(frame["placement"])
+    colours = {name: colour for name, colour in palette.placements.items() if name in used}
     panels: list[tuple[int, list[Spec]]] = [
         (PANEL_PX, [*aim, _marks("v_d", "V_D (%)", colours)]),
         (PANEL_PX, [*due, _marks("l95", L95, colours, log=wide)]),

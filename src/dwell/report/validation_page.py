@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.report.charts import (
+    NO_LIMIT,
     PART_COLOURS,
     PARTS_SHOWN,
     Limit,
     coloured,
     cumulative,
     layer,
+    limit_rule,
     name_of,
     names,
     quantity,
@@ -64,13 +66,7 @@ def validation_html(validation: Validation, *, static: bool = False) -> str:
 
 
 def validation_page(validation: Validation, *, sections: int | None = None) -> Page:
-    """Return what there is to show of a validation; see `validation_html`.
-
-    Parameters
-    ----------
-    sections : int, optional
-        How many are made, from the first, the answer; all if left out.
-    """
+    """Return what there is to show of a validation; its first `sections` only, the answer first."""
     runs = sum(len(group.runs) for group in validation.groups)
     minutes = sum(group.minutes for group in validation.groups)
     return Page(
@@ -82,13 +78,7 @@ def validation_page(validation: Validation, *, sections: int | None = None) -> P
 
 
 def validation_text(validation: Validation, *, width: int | None = None) -> str:
-    """Return the tables of a validation as text for a terminal, the verdicts on goals last.
-
-    Parameters
-    ----------
-    width : int, optional
-        Columns of the terminal; as wide as it takes where None.
-    """
+    """Return a validation as `dwell.report.table.table_text`, the verdicts on goals last."""
     page = validation_page(validation)
     tables = [_verdicts(validation, compact=True), _goals(validation)]
     texts = [table_text(one, width=width) for one in tables]
@@ -275,23 +265,28 @@ def _over(validation: Validation) -> Figure:
         {"rows": frame},
         lambda width: {
             "hconcat": [
-                _scatter(frame, goal, title, policies, (width - 180) / 3)
+                _scatter(frame, goal, title, policies, _deadline(validation), (width - 180) / 3)
                 for goal, title in titles.items()
             ],
             "resolve": {"legend": {"color": "shared", "shape": "shared"}},
         },
         "A mark is a group, the bar through it the interval of what was measured. Shaded: what is "
-        "allowed.",
+        "allowed. Dashed: deadline.",
     )
 
 
 def _scatter(
-    frame: pl.DataFrame, goal: str, title: str, policies: dict[str, str], size: float
+    frame: pl.DataFrame,
+    goal: str,
+    title: str,
+    policies: dict[str, str],
+    deadline: Limit,
+    size: float,
 ) -> Spec:
-    import polars as pl
-
-    mine = frame.filter(pl.col("goal") == goal)
+    mine = frame.filter(goal=goal)
     numbers = [*mine["measured"].drop_nulls(), *mine["predicted"].drop_nulls()]
+    limit = deadline if goal == "l95_ms" else NO_LIMIT
+    numbers += [limit.value] if limit is deadline else []
     high = 1.05 * max(numbers, default=1.0) or 1.0
     share = L95_ALLOWED if goal == "l95_ms" else 0.0
     points = {"l95_ms": 0.0, "violation_rate": 100 * POINTS_ALLOWED, "use": 100 * USE_ALLOWED}[goal]
@@ -315,11 +310,9 @@ def _scatter(
         "encoding": {"x": across, "y": up, "color": coloured("policy", policies)},
         "layer": marks,
     }
-    shade = {
-        "data": {"values": band},
-        **layer("area", allowed, color=SHADE, clip=True),
-    }
-    return {"width": size, "height": size, "layer": [shade, groups]}
+    shade = {"data": {"values": band}, **layer("area", allowed, color=SHADE, clip=True)}
+    rules = [*limit_rule("x", *limit), *limit_rule("y", *limit)]
+    return {"width": size, "height": size, "layer": [shade, *rules, groups]}
 
 
 def _panel(group: Group) -> str:
