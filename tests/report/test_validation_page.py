@@ -68,6 +68,15 @@ def test_page_tells_what_is_missed_and_what_was_left_out() -> None:
     assert slower_by < -1
 
 
+def test_the_deadline_is_on_both_axes_of_latency() -> None:
+    figure = next(one for one in validation_page(validation()).figures if one.slug == "over")
+    deadline = {"datum": validation().problem.pipeline.deadline_ms}
+    latencies, *others = figure.spec()["hconcat"]
+    assert [axis for part in latencies["layer"] for axis in ("x", "y")
+            if part["encoding"][axis] == deadline] == ["x", "y"]  # fmt: skip
+    assert str(deadline) not in str(others)
+
+
 def test_text_fits_a_terminal() -> None:
     text = validation_text(validation(), width=100)
     assert max(map(len, text.splitlines())) <= 100
