@@ -70,8 +70,6 @@ class Gauge:
     ----------
     read : callable
         Returns a share from 0 to 1.
-    every_s : float
-        Time between two calls.
     """
 
     def __init__(self, read: Callable[[], float], every_s: float = LOAD_NS / 1e9) -> None:
@@ -109,13 +107,7 @@ class Gauge:
 
 
 class Agent:
-    """See the module.
-
-    Parameters
-    ----------
-    accelerator : Gauge, optional
-        Tells the utilisation of the node's accelerator.
-    """
+    """See the module."""
 
     def __init__(
         self,

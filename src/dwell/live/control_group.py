@@ -132,13 +132,7 @@ class ControlGroup:
 
 
 def own_group(process: Path = PROCESS) -> ControlGroup | None:
-    """Return the control group of this process; None where that is the root, or nothing counts.
-
-    Parameters
-    ----------
-    process : Path
-        Folder of the process below ``/proc``.
-    """
+    """Return the control group of this process; None where that is the root, or nothing counts."""
     try:
         groups = _groups((process / "cgroup").read_text())
         mounts = list(_mounts((process / "mountinfo").read_text()))

@@ -205,15 +205,7 @@ class ControlledCell:
             )
 
     def _goes_on(self, stamp: Stamp, who: str, now_ns: int, *, alone: bool = False) -> bool:
-        """Whether a cycle goes on from those before it; complains of the first that does not.
-
-        Parameters
-        ----------
-        who : str
-            Process that speaks of it.
-        alone : bool
-            As `Continuity.takes` has it.
-        """
+        """Whether a cycle goes on from those before it; complains of the first that does not."""
         continuity, cycle = self.continuity, stamp.key
         newest, ahead = continuity.newest, continuity.ahead(now_ns)
         held = self.held
@@ -277,22 +269,20 @@ class ControlledCell:
         self._unwritten = True
         move, self._move = self._move, None
         self.refused = ""
-        if not by_guard:
-            if self.windows is not None:
-                if move is None or move.name == placement:
-                    self.windows.record.end_order()
-                else:
-                    self.windows.refused(f"the placement became {placement} meanwhile")
-            self.migrations += 1
-            if placement != self.controller.incumbent:
-                # A person's choice, not the policy's.
-                self.controller.resume(placement)
-            self.controller.on_fallback = False
-            return
         if self.windows is not None:
-            self.windows.refused(f"the placement became {placement} meanwhile")
-        self.guard_moves += 1
-        self.controller.adopt(placement, left=before)
+            if not by_guard and (move is None or move.name == placement):
+                self.windows.record.end_order()
+            else:
+                self.windows.refused(f"the placement became {placement} meanwhile")
+        if by_guard:
+            self.guard_moves += 1
+            self.controller.adopt(placement, left=before)
+            return
+        self.migrations += 1
+        if placement != self.controller.incumbent:
+            # A person's choice, not the policy's.
+            self.controller.resume(placement)
+        self.controller.on_fallback = False
 
     def _begin_run(self, answer: Accepted) -> None:
         """Begin where the stamper says that the cell is."""

@@ -46,8 +46,6 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
     Parameters
     ----------
-    placement, shadow : str
-        As stamped.
     at_ns : int
         Release since the origin.
     origin_ns : int
@@ -65,7 +63,6 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         By sink.
     heard_ns : dict of str to int
         When they were heard, where that is known.
-    shadows : tuple of Completion
     replaced : dict of str to Completion
         By task where a newer cycle took its place.
     latency_ns : int

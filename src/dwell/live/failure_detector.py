@@ -28,8 +28,6 @@ class FailureDetector:
 
     Parameters
     ----------
-    who : str
-        The process that listens.
     patience_ns : int
         Age beyond which what was heard counts no more; g periods.
     """

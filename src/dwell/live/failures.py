@@ -48,17 +48,7 @@ def end_process(what: str, error: BaseException) -> NoReturn:
 
 
 def start_thread(name: str, run: Callable[..., object], *arguments: object) -> threading.Thread:
-    """Start a thread that ends its process where it fails, and with the process.
-
-    Parameters
-    ----------
-    run : callable
-        Called with the arguments.
-
-    Returns
-    -------
-    Thread
-    """
+    """Start a thread that ends its process where it fails, and with the process."""
 
     def watched() -> None:
         try:

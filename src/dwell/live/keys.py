@@ -10,13 +10,7 @@ TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
 
 
 class Keys:
-    """Keys of one cell.
-
-    Parameters
-    ----------
-    cell : str
-        Its name.
-    """
+    """Keys of one cell."""
 
     def __init__(self, cell: str) -> None:
         self.root = f"dwell/{cell}"

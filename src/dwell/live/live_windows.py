@@ -56,8 +56,6 @@ class LiveWindows:
     ----------
     origin_ns : int or None
         First release of the run, on the stamper's clock; None before a stamp was heard.
-    last : LiveWindow or None
-        The window that closed last.
     ignored : int
         Messages about unknown placements, sinks or nodes, or cycles of long ago.
     """
@@ -107,8 +105,6 @@ class LiveWindows:
 
         Parameters
         ----------
-        stamp : Stamp
-            A `Stamped` says more of it.
         at_ns : int, optional
             When this was heard, on the controller's clock.
         """
@@ -321,11 +317,6 @@ class LiveWindows:
 
     def close(self, *, unix_ns: int | None = None) -> ClosedWindow:
         """Close the window that is due.
-
-        Parameters
-        ----------
-        unix_ns : int, optional
-            Time of day, for the record.
 
         Returns
         -------

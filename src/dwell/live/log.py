@@ -51,8 +51,6 @@ class Log:
 
     Parameters
     ----------
-    say : callable
-        Takes the lines.
     clock : callable
         Seconds.
     """

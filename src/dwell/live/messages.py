@@ -47,8 +47,6 @@ class Stamp(_Array, frozen=True):
         Run id; later runs have larger ones.
     term : int
         Grows at every change of placement.
-    placement : str
-        Candidate.
     released_ns : int
         Release on the stamper's clock.
     shadow : str
@@ -156,8 +154,6 @@ class Completion(_Array, frozen=True):
 
     Parameters
     ----------
-    sink : str
-        Task.
     done_ns : int
         When the command was handed to the actuator, on the sink's clock.
     outcome : str
@@ -202,8 +198,6 @@ class Beat(_Array, frozen=True):
 
     Parameters
     ----------
-    who, node : str
-        Process and its node.
     life : int
         Grows with every start of the process.
     ready : bool
@@ -216,8 +210,6 @@ class Beat(_Array, frozen=True):
         Digest of the cell file, so that different files are noticed.
     note : str
         Why it is not ready, or the last failure.
-    version : str
-        Version of Dwell.
     """
 
     who: Name
@@ -240,8 +232,6 @@ class Order(_Array, frozen=True):
     ----------
     number : int
         Grows with every order of this controller; a repeated one is the same order.
-    controller : str
-        Name of the controller that orders.
     run, term : int
         Run and term it was computed on; 0 and 0 only to ask how things are (`placement` empty).
     placement : str
@@ -416,8 +406,6 @@ class Accepted(_Array, frozen=True):
         Empty where it was accepted; else ``stale term``, ``stale run``, ``stale order``,
         ``infeasible``, ``not ready``, ``not proven`` (probes are missing), ``another controller``,
         with details.
-    placement : str
-        Candidate that holds.
     cycle : int
         The next one that will be stamped, with what was ordered.
     fallback : bool
@@ -468,13 +456,6 @@ def encode(message: msgspec.Struct) -> bytes:
 
 def decode(data: bytes, kind: type[T], *, limit: int = MAX_CONTROL_BYTES) -> T:
     """Read a message.
-
-    Parameters
-    ----------
-    kind : type
-        Type that it has to be.
-    limit : int
-        Longest length accepted.
 
     Raises
     ------

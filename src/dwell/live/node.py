@@ -50,14 +50,10 @@ def run_agent(
 
     Parameters
     ----------
-    folder : Path
-        Folder of their files.
     program : sequence of str
         Command of the process that the others are forked from (`ForkServer`).
     words : callable
         Returns the words that start a process, by the process's name.
-    cpus : iterable of int, optional
-        CPUs that the node may use.
     accelerator : callable, optional
         Returns the utilisation of the node's accelerator, a share from 0 to 1.
     environment : mapping of str to str, optional
@@ -65,8 +61,6 @@ def run_agent(
         process's own if left out.
     platform : Platform, optional
         Clock and transport of the agent; without faults if left out.
-    say : callable
-        Takes lines for the log.
 
     Raises
     ------
@@ -170,8 +164,6 @@ def run_controller(
         With the variables of `dwell.live.security`; this process's own if left out.
     platform : Platform, optional
         Clock and transport of the controller; without faults if left out.
-    say : callable
-        Takes lines for the log.
 
     Returns
     -------

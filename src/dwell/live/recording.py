@@ -32,14 +32,8 @@ class RunRecorder:
 
     Parameters
     ----------
-    out : Path
-        Folder of folders.
-    say : callable
-        Takes lines for the log.
     jobs : bool
         Whether to keep the jobs, and what each process took of the CPUs, too.
-    most_waiting : int
-        Rows that wait at most.
 
     Attributes
     ----------

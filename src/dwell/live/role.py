@@ -81,8 +81,6 @@ class RolePlace:
         Grows with every start of the process.
     complaints : dict of str to int
         How often something arrived that could not be used, by what was wrong with it.
-    say : callable, optional
-        Takes every complaint for the process's log.
     seals : Seals, optional
         Signs what it says and checks what it hears; without, nothing is signed.
     """
@@ -141,8 +139,6 @@ class RolePlace:
 
         Parameters
         ----------
-        kind : type
-            Type that it has to be.
         by : callable
             Returns the subject who has to have signed it: a node, or the controller.
 

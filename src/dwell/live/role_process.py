@@ -40,8 +40,6 @@ def run_process(
     ----------
     who : str
         As in `wiring.roles`: a stamper, worker, shadow, standby or sink.
-    folder : Path
-        Where the node's processes keep their files.
     platform : Platform, optional
         Its clock and transport; without faults if left out.
 

@@ -66,8 +66,6 @@ class LiveWindow:
         Whether that is more than 20 % of D.
     used : float64 array, shape (3, nodes)
         Busy, own and shadow share of the cores.
-    closed_unix_ns : int, optional
-        Time of day of its close.
     """
 
     number: int
@@ -108,8 +106,6 @@ class RunRows:
 
     Parameters
     ----------
-    processes : ProcessLoads
-        CPU time of the cell's processes.
     kept : int
         Cycles that are remembered, so that late completions may change their rows.
     """
@@ -328,12 +324,8 @@ def decision_values(
 
     Parameters
     ----------
-    row : sequence
-        Row of the controller's log.
     why : str, optional
         Why it was not followed; None where it was.
-    first_window : int
-        Number of the controller's first window.
     """
     values = dict(zip(controller.decision_columns, map(_known, row), strict=True))
     values["window"] = first_window + cast("int", values["window"])

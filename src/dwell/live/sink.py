@@ -34,8 +34,6 @@ class Sink:
 
     Parameters
     ----------
-    task : str
-        Sink task whose commands it takes.
     expected : type, optional
         Struct that the actuator takes.
     """

@@ -43,8 +43,6 @@ class StamperState:
 
     Parameters
     ----------
-    run : int
-        Run id.
     reserved : int
         No cycle from this number on has been stamped.
     on_fallback : bool

@@ -42,13 +42,7 @@ LOG_BYTES = 8 << 20
 
 @dataclass(slots=True)
 class SupervisedProcess:
-    """A process that is kept running.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of its files.
-    """
+    """A process that is kept running."""
 
     who: str
     command: Sequence[str]

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.control_group import UNKNOWN, Counts
@@ -34,6 +35,8 @@ from dwell.model.instants import NEVER_NS
 MAX_JOINS = 64
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
+#: By source task: header, payload, and when it was handed over.
+Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
 NOT_COUNTED = Counts(), UNKNOWN, Counts()
 
 
@@ -45,12 +48,10 @@ class Job:
     ----------
     header : Header
         Header of any of the inputs; its stamp is the cycle's.
-    inputs : dict of str to (Header, bytes, int)
-        By source task: header, payload, and when it was handed over.
     """
 
     header: Header
-    inputs: dict[str, tuple[Header, bytes, int]]
+    inputs: Inputs
     shadow: bool
 
     @property
@@ -65,11 +66,8 @@ class Job:
 
     def hops(self) -> tuple[Hop, ...]:
         """All jobs behind it, each once."""
-        hops: dict[tuple[str, str], Hop] = {}
-        for header, _, _ in self.inputs.values():
-            for hop in header.hops:
-                hops[hop.task, hop.node] = hop
-        return tuple(hops.values())
+        hops = (hop for header, _, _ in self.inputs.values() for hop in header.hops)
+        return tuple({(hop.task, hop.node): hop for hop in hops}.values())
 
 
 @dataclass(slots=True)
@@ -77,14 +75,10 @@ class _Joins:
     """Inputs of cycles that wait for the rest; a later complete cycle evicts the earlier ones."""
 
     sources: frozenset[str]
-    waiting: dict[tuple[int, int], dict[str, tuple[Header, bytes, int]]] = field(
-        default_factory=dict
-    )
+    waiting: dict[tuple[int, int], Inputs] = field(default_factory=dict)
     newest: tuple[int, int] = (-1, -1)
 
-    def add(
-        self, header: Header, payload: bytes, at_ns: int
-    ) -> dict[str, tuple[Header, bytes, int]] | None:
+    def add(self, header: Header, payload: bytes, at_ns: int) -> Inputs | None:
         """Take an input; returns the complete set that it completes."""
         cycle = header.stamp.key
         if cycle <= self.newest or header.source not in self.sources:
@@ -168,8 +162,6 @@ class Worker:
 
     Parameters
     ----------
-    shadow : bool
-        Whether it runs shadows.
     stands_by : str
         Process that it stands by for; empty for none.
     """

@@ -28,8 +28,6 @@ class Keyring:
     ----------
     folder : Path
         With ``ca.pem``, ``cert.pem``, ``key.pem`` and ``roster.json``.
-    expires : datetime
-        When its certificate ends.
     """
 
     folder: Path

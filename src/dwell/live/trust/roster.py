@@ -39,8 +39,6 @@ class Subject:
     generation : int
         Counts its certificates from 1: the name in a certificate has it, so that one that was
         revoked is not taken for the one that followed.
-    serial : int
-        Serial number of its certificate.
     public_key : str
         Ed25519, base64.
     expires : str
@@ -94,8 +92,6 @@ class Roster:
 
     Parameters
     ----------
-    cell : str
-        Name of the cell.
     number : int
         Grows with every change.
     subjects : mapping of str to Subject

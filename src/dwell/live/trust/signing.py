@@ -19,13 +19,7 @@ REMEMBERED = 512
 
 
 class Seals:
-    """Signs a process's messages, and checks those of others.
-
-    Parameters
-    ----------
-    keyring : Keyring
-        The process's own.
-    """
+    """Signs a process's messages, and checks those of others."""
 
     def __init__(self, keyring: Keyring) -> None:
         self._keyring = keyring

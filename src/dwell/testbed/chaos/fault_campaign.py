@@ -43,8 +43,6 @@ class Staging:
     ----------
     cell : Path, optional
         Cell file; the light cell if left out.
-    seed : int
-        Seed of delays and losses.
     hosts : bool
         Whether every node gets a host of its own of a testbed, which only root can give; else all
         are on this computer's loopback.
@@ -154,8 +152,6 @@ class FaultCampaign:
         Its folder also gets ``faults.jsonl``.
     again : str
         Command that repeats it; the number of a fault is added.
-    say : callable
-        Takes a line for each fault.
     """
 
     def __init__(
@@ -188,8 +184,6 @@ class FaultCampaign:
         ----------
         seconds : float, optional
             No fault begins later than that after the first cell has come up.
-        faults : int, optional
-            How many.
         only : int, optional
             Nothing but this fault of the timeline.
 

@@ -57,14 +57,7 @@ class Term:
 
 @dataclass(slots=True)
 class Judge:
-    """Hears all messages in the order of their arrival, and finds violations.
-
-    Attributes
-    ----------
-    counts : dict of str to int
-        Messages heard, by their kind.
-    terms : dict of int to Term
-    """
+    """Hears all messages in the order of their arrival, and finds violations."""
 
     problem: Problem
     counts: Counter[str] = field(default_factory=Counter)

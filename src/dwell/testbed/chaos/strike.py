@@ -88,8 +88,6 @@ def strike(
     ----------
     cell : Harness
         At home, and healthy where the fault makes it move.
-    phase : float
-        Fraction of the period, after a release.
     seed : int
         Seed that `phase` and `lasts` were drawn with.
     lasts : int

@@ -51,12 +51,8 @@ class Wiretap(Child):
 
     Parameters
     ----------
-    cell : Path
-        Cell file.
     nodes : sequence of str
         Whose processes are listened to.
-    out : Path
-        File that it writes.
     prefix : sequence of str
         Words of a command that runs what follows where these nodes are reached.
     """
@@ -101,15 +97,7 @@ class Records:
 
 
 class ActuatorObserver:
-    """Hears a cell by wiretaps on all its nodes, and judges what it hears; a context manager.
-
-    Parameters
-    ----------
-    testbed : LocalTestbed
-        Testbed of the cell, which runs.
-    cell : Path
-        Its cell file.
-    """
+    """Hears a cell by wiretaps on all its nodes, and judges what it hears; a context manager."""
 
     def __init__(self, testbed: LocalTestbed, cell: Path) -> None:
         self.judge = Judge(testbed.problem)
