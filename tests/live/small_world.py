@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import dwell
@@ -12,6 +13,7 @@ from dwell.live.agent import Agent, CpuCount
 from dwell.live.controlled_cell import ControlledCell
 from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
+from dwell.live.recording import RunRecorder
 from dwell.live.role import RolePlace
 from dwell.live.run_rows import Resume, Rows
 from dwell.live.sink import Sink
@@ -150,16 +152,17 @@ class Counting(Passing):
 
 
 class MemoryRecorder:
-    """Rows as they come."""
+    """Rows as they come; those of jobs, too, on request."""
 
     trouble = ""
 
-    def __init__(self) -> None:
+    def __init__(self, *, jobs: bool = False) -> None:
+        self.jobs = jobs
         self.rows: dict[str, list[tuple[object, ...]]] = {}
 
     def open(self, run: int) -> Resume:
         cycles = self.rows.get("cycles", [])
-        return Resume(len(self.rows.get("windows", [])), len(cycles))
+        return Resume(len(self.rows.get("windows", [])), len(cycles), jobs=self.jobs)
 
     def append(self, rows: Rows, **meta: object) -> None:
         for table, found in rows.items():
@@ -231,6 +234,7 @@ class World:
         stages: Mapping[str, Callable[[str], Passing]] | None = None,
         policy: str | MinimalPolicy | None = None,
         seals: Mapping[str, Seals] | None = None,
+        jobs: bool = False,
     ) -> None:
         hosts = {
             node: Host("127.0.0.1", 10_000 + 1_000 * i)
@@ -255,7 +259,7 @@ class World:
         self.number = 0
         self.policy = policy
         self.seals = seals or {}
-        self.recorder = MemoryRecorder()
+        self.recorder = MemoryRecorder(jobs=jobs)
         for role in roles(problem):
             if role.kind != "controller" or policy is not None:
                 self.start(role.who)
@@ -359,6 +363,37 @@ class World:
     def cycles(self) -> list[int]:
         """Cycles that were actuated, in order."""
         return [cycle for cycle, _ in self.arm.applied]
+
+
+class Recorded(World):
+    """A cell in memory whose controller keeps its runs in a folder."""
+
+    def __init__(self, problem: Problem, out: Path, **recording: Any) -> None:
+        self.out, self.recording = out, recording
+        self.log: list[str] = []
+        super().__init__(problem, policy="LOC")
+
+    def start(self, who: str) -> None:
+        if who.startswith("controller"):
+            controller = Controller(self.problem, self.policy)
+            kept = self.out, self.problem, controller, self.log.append
+            self.kept = RunRecorder(*kept, **self.recording)
+            self.recorder = self.kept  # type: ignore[assignment]
+        super().start(who)
+
+    @property
+    def windows(self) -> int:
+        """How many have closed."""
+        assert self.cell.windows is not None
+        return int(str(self.cell.windows.status()["windows"]))
+
+    def finish(self) -> Path:
+        """End the run as its controller does."""
+        assert self.cell.windows is not None
+        self.cell.write()
+        folder = self.kept.finish(self.cell.windows.record.rows(last=True))
+        assert folder is not None
+        return folder
 
 
 class Quiet(Agent):

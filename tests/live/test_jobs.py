@@ -13,12 +13,11 @@ import dwell
 from dwell.live import payloads
 from dwell.live.control_group import Counts
 from dwell.live.controlled_cell import ControlledCell
-from dwell.live.recording import RunRecorder
-from dwell.live.run_rows import Resume, Rows, columns_of
+from dwell.live.run_rows import Rows, columns_of
 from dwell.live.sink import Sink
 from dwell.model import Problem
 from dwell.record import column_types
-from tests.live.small_world import EXEC_MS, MS, MemoryRecorder, World
+from tests.live.small_world import EXEC_MS, MS, Recorded, World
 
 CPU_NS = 1_234_567
 OTHERS_NS = 70_000
@@ -35,13 +34,6 @@ def problem() -> Problem:
     )
 
 
-class JobRecorder(MemoryRecorder):
-    """Rows as they come, those of jobs as well."""
-
-    def open(self, run: int) -> Resume:
-        return replace(super().open(run), jobs=True)
-
-
 class Spent:
     """A clock of CPU time that goes on by a fixed time between two looks."""
 
@@ -53,16 +45,9 @@ class Spent:
         return self.at_ns
 
 
-def world_of(problem: Problem, policy: str, **more: object) -> World:
+def world_of(problem: Problem, policy: str, **more: Any) -> World:
     """Return a cell whose controller keeps the jobs."""
-
-    class Small(World):
-        def start(self, who: str) -> None:
-            if who.startswith("controller") and not isinstance(self.recorder, JobRecorder):
-                self.recorder = JobRecorder()
-            super().start(who)
-
-    return Small(problem, policy=policy, **more)  # type: ignore[arg-type]
+    return World(problem, policy=policy, jobs=True, **more)
 
 
 def frames(problem: Problem, rows: Rows | dict[str, list[tuple[object, ...]]]) -> pl.DataFrame:
@@ -203,21 +188,9 @@ def test_what_processes_take_is_kept_by_window(problem: Problem) -> None:
 
 
 def test_jobs_survive_in_the_folder(problem: Problem, tmp_path: Path) -> None:
-    class Kept(World):
-        def start(self, who: str) -> None:
-            if who.startswith("controller"):
-                controller = dwell.control.Controller(self.problem, self.policy)
-                self.kept = RunRecorder(tmp_path, self.problem, controller, print, jobs=True)
-                self.recorder = self.kept  # type: ignore[assignment]
-            super().start(who)
-
-    world = Kept(problem, policy="LOC")
+    world = Recorded(problem, tmp_path, jobs=True)
     world.run(4_000)
-    cell = world.cell
-    assert cell.windows is not None
-    folder = world.kept.finish(cell.windows.record.rows(last=True))
-    assert folder is not None
-    run = dwell.open_run(folder)
+    run = dwell.open_run(world.finish())
     assert run.has_jobs
     assert run.has_processes
     in_windows = run.cycles.filter(~pl.col("lead"))["cycle"]

@@ -18,16 +18,14 @@ from typer.testing import CliRunner
 
 import dwell
 from dwell.cli.commands import app
-from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.node import run_controller
-from dwell.live.recording import RunRecorder
 from dwell.model import Problem
 from dwell.record import open_run
 from dwell.record.journal import JOURNAL, MARK
 from dwell.report.run_page import run_page
 from dwell.testbed.chaos.disk import limit_file_size
-from tests.live.small_world import World, canonical
+from tests.live.small_world import Recorded, canonical
 from tests.report.pages import table_of
 
 #: A cell in memory, at full speed; its controller records as that of real processes does.
@@ -58,39 +56,6 @@ WITHOUT_POLARS = (
     )
     + "cell._recorder.finish()\n"
 )
-
-
-class Recorded(World):
-    """A cell in memory whose controller keeps its runs in a folder."""
-
-    def __init__(self, problem: Problem, out: Path, *, most_waiting: int = 50_000) -> None:
-        self.out, self.most_waiting = out, most_waiting
-        self.log: list[str] = []
-        super().__init__(problem, policy="LOC")
-
-    def start(self, who: str) -> None:
-        if who.startswith("controller"):
-            controller = Controller(self.problem, self.policy)
-            self.kept = RunRecorder(
-                *(self.out, self.problem, controller, self.log.append),
-                most_waiting=self.most_waiting,
-            )
-            self.recorder = self.kept  # type: ignore[assignment]
-        super().start(who)
-
-    @property
-    def windows(self) -> int:
-        """How many have closed."""
-        assert self.cell.windows is not None
-        return int(str(self.cell.windows.status()["windows"]))
-
-    def finish(self) -> Path:
-        """End the run as its controller does."""
-        assert self.cell.windows is not None
-        self.cell.write()
-        folder = self.kept.finish(self.cell.windows.record.rows(last=True))
-        assert folder is not None
-        return folder
 
 
 @pytest.fixture
