@@ -1,4 +1,4 @@
-"""All commands: each is declared in its module, which imports the work when it is called."""
+"""All commands: each is declared in a light module, which imports its work when it is called."""
 
 from __future__ import annotations
 
