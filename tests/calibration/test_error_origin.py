@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dwell.calibration.error_origin import LONGEST, blamed
+from dwell.calibration.error_origin import LONGEST, describe_raised
 
 
 def raised(code: str, name: str) -> BaseException:
@@ -26,13 +26,13 @@ def raised(code: str, name: str) -> BaseException:
     ],
 )
 def test_the_line_names_error_and_place(code: str, line: str) -> None:
-    assert blamed(raised(code, "/home/me/stages.py")) == line
+    assert describe_raised(raised(code, "/home/me/stages.py")) == line
 
 
 def test_a_file_that_is_no_python_is_named_with_its_line() -> None:
-    assert blamed(raised("def (:", "stages.py")).endswith("(stages.py:1)")
+    assert describe_raised(raised("def (:", "stages.py")).endswith("(stages.py:1)")
 
 
 def test_long_messages_are_cut() -> None:
-    line = blamed(raised("raise ValueError('x' * 1000)", "stages.py"))
+    line = describe_raised(raised("raise ValueError('x' * 1000)", "stages.py"))
     assert line == f"ValueError: {'x' * LONGEST} (stages.py:1)"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from dwell.cellfile.work_folder import FolderMark, claimed
+from dwell.cellfile.work_folder import FolderMark, open_work_folder
 from dwell.errors import RunError, SimulationError
 
 STUDY = FolderMark("study", "study.json", 1, ("parts",))
@@ -13,21 +13,21 @@ STUDY = FolderMark("study", "study.json", 1, ("parts",))
 
 def test_the_same_work_goes_on_in_its_folder(tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    with claimed(folder, STUDY, {"seeds": [1, 2]}):
+    with open_work_folder(folder, STUDY, {"seeds": [1, 2]}):
         (folder / "parts" / "one").write_text("done")
         (folder / "parts" / ".two.draft").write_text("half")
-    with claimed(folder, STUDY, {"seeds": [1, 2]}):
+    with open_work_folder(folder, STUDY, {"seeds": [1, 2]}):
         assert sorted(one.name for one in (folder / "parts").iterdir()) == ["one"]
     assert json.loads((folder / "study.json").read_text())["seeds"] == [1, 2]
 
 
 def test_other_work_is_told_what_differs_and_touches_nothing(tmp_path: Path) -> None:
-    with claimed(tmp_path / "out", STUDY, {"seeds": [1], "cell": {"period_ms": 40}}):
+    with open_work_folder(tmp_path / "out", STUDY, {"seeds": [1], "cell": {"period_ms": 40}}):
         pass
     before = (tmp_path / "out" / "study.json").read_bytes()
     with (
         pytest.raises(RunError, match=r"(?s)another study.*cell\.period_ms: 40 there, 50 now"),
-        claimed(tmp_path / "out", STUDY, {"seeds": [1], "cell": {"period_ms": 50}}),
+        open_work_folder(tmp_path / "out", STUDY, {"seeds": [1], "cell": {"period_ms": 50}}),
     ):
         pass
     assert (tmp_path / "out" / "study.json").read_bytes() == before
@@ -35,18 +35,21 @@ def test_other_work_is_told_what_differs_and_touches_nothing(tmp_path: Path) -> 
 
 def test_one_process_at_a_time(tmp_path: Path) -> None:
     with (
-        claimed(tmp_path / "out", STUDY, {}),
+        open_work_folder(tmp_path / "out", STUDY, {}),
         pytest.raises(RunError, match="in use: another process works on this study"),
-        claimed(tmp_path / "out", STUDY, {}),
+        open_work_folder(tmp_path / "out", STUDY, {}),
     ):
         pass
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("precious")
-    with pytest.raises(RunError, match="is no study"), claimed(tmp_path, STUDY, {}):
+    with pytest.raises(RunError, match="is no study"), open_work_folder(tmp_path, STUDY, {}):
         pass
-    with pytest.raises(RunError, match="is no folder"), claimed(tmp_path / "thesis.tex", STUDY, {}):
+    with (
+        pytest.raises(RunError, match="is no folder"),
+        open_work_folder(tmp_path / "thesis.tex", STUDY, {}),
+    ):
         pass
     assert [one.name for one in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -55,7 +58,7 @@ def test_a_place_that_cannot_be_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(SimulationError, match="cannot be written"),
-        claimed(tmp_path / "file" / "out", STUDY, {}),
+        open_work_folder(tmp_path / "file" / "out", STUDY, {}),
     ):
         pass
 
@@ -63,6 +66,6 @@ def test_a_place_that_cannot_be_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["{", "[1]"])
 def test_a_mark_that_says_nothing_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "study.json").write_text(text)
-    with pytest.raises(RunError), claimed(tmp_path, STUDY, {}):
+    with pytest.raises(RunError), open_work_folder(tmp_path, STUDY, {}):
         pass
     assert (tmp_path / "study.json").read_text() == text

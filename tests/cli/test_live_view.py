@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 import dwell
-from dwell.cli.live_view import Lines, Look, Screen
+from dwell.cli.live_view import CellState, Lines, Screen
 from dwell.model import Problem
 from dwell.report.phases import Disturbed, disturbed
 
@@ -62,9 +62,9 @@ class Terminal:
         return capture.get().splitlines()
 
 
-def look(at_s: float, told: dict[str, Any], active: list[Disturbed], **more: float) -> Look:
+def state(at_s: float, told: dict[str, Any], active: list[Disturbed], **more: float) -> CellState:
     answered_s = more.get("answered_s", at_s)
-    return Look(at_s, told, answered_s, {"error_mm": 3.25, "error_px": 5.5}, active)
+    return CellState(at_s, told, answered_s, {"error_mm": 3.25, "error_px": 5.5}, active)
 
 
 @pytest.mark.parametrize(("columns", "width"), [(80, 80), (100, 100), (180, 100)])
@@ -77,7 +77,7 @@ def test_it_fits_a_terminal_at_every_moment(
         active = [one for one in plan if one.begin_s <= second < one.end_s]
         placement = ("LOC", "SO", "HYB")[second % 3]
         moved = status(second, placement=placement, fallback=second % 2 == 0)
-        terminal.screen.show(look(second, moved, active))
+        terminal.screen.show(state(second, moved, active))
         lines = terminal.lines()
         assert {len(line) for line in lines} == {width}
         heights.add(len(lines))
@@ -88,17 +88,17 @@ def test_it_fits_a_terminal_at_every_moment(
 
 def test_it_shows_what_is_known_of_the_cell(problem: Problem, plan: list[Disturbed]) -> None:
     terminal = Terminal(problem, plan, 80)
-    terminal.screen.show(look(10, {}, []))
+    terminal.screen.show(state(10, {}, []))
     assert "nothing disturbs it" in "\n".join(terminal.lines())
-    terminal.screen.show(look(20, status(4), plan[:1]))
-    terminal.screen.show(look(21, status(5, placement="SO", guard_moves=1, fallback=True), []))
+    terminal.screen.show(state(20, status(4), plan[:1]))
+    terminal.screen.show(state(21, status(5, placement="SO", guard_moves=1, fallback=True), []))
     text = "\n".join(terminal.lines())
     for part in ("31.2 ms", "2.5 %", "3.2 mm", "3 migrations, 1 by the guard", "R1 ", " 60 %"):
         assert part in text, part
     assert "at 21 s by the guard: LOC → SO" in text
     assert "perception E" in text
     assert "▒" in text
-    terminal.screen.show(look(30, status(5), [], answered_s=21))
+    terminal.screen.show(state(30, status(5), [], answered_s=21))
     assert "no answer from the controller for 9 s" in "\n".join(terminal.lines())
 
 
@@ -108,7 +108,7 @@ def test_logs_get_a_line_whenever_something_has_changed(
     lines = Lines()
     for second in range(10):
         active = plan[:1] if second >= 5 else []
-        lines.show(look(second, status(second, placement="LOC" if second < 7 else "SO"), active))
+        lines.show(state(second, status(second, placement="LOC" if second < 7 else "SO"), active))
     told = capsys.readouterr().err.splitlines()
     assert [line.split()[0] for line in told] == ["0.0", "5.0", "7.0"]
     assert "robot stress (R1: 2 busy threads)" in told[1]

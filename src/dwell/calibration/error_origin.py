@@ -9,7 +9,7 @@ from types import TracebackType
 LONGEST = 300
 
 
-def blamed(error: BaseException) -> str:
+def describe_raised(error: BaseException) -> str:
     """Return ``ValueError: no frame (stages.py:12)``; only the first line of a long message."""
     lines = str(error).strip().splitlines()
     message = f": {lines[0][:LONGEST]}" if lines else ""

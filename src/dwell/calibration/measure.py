@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.calibration.error_origin import blamed, raised_here
+from dwell.calibration.error_origin import describe_raised, raised_here
 from dwell.calibration.machine_conditions import MachineConditions, MachineCounters, processor
 from dwell.calibration.profile_file import Measurement, stamp, task_name
 from dwell.errors import MeasurementError
@@ -198,7 +198,7 @@ def _series(
             given, when = "the number of the run", f"inputs of {when}"
         wrong_call = isinstance(error, TypeError) and raised_here(error.__traceback__)
         hint = f"; it is called with {given}" if wrong_call else ""
-        raise MeasurementError(f"{when}: {blamed(error)}{hint}") from error
+        raise MeasurementError(f"{when}: {describe_raised(error)}{hint}") from error
     return wall_ns, cpu_ns
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dwell.calibration.error_origin import blamed
+from dwell.calibration.error_origin import describe_raised
 from dwell.errors import ProfileError
 
 
@@ -66,7 +66,9 @@ def _import(module_name: str, name: str, option: str) -> object:
                 f"{option}: there is no module {error.name!r} (from {name!r}), neither in "
                 f"{Path.cwd()} nor among the installed ones"
             ) from None
-        raise ProfileError(f"{option}: importing {module_name!r} failed: {blamed(error)}") from None
+        raise ProfileError(
+            f"{option}: importing {module_name!r} failed: {describe_raised(error)}"
+        ) from None
 
 
 def _is_part(missing: str | None, module_name: str) -> bool:

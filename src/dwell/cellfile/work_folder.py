@@ -47,7 +47,7 @@ class FolderMark(NamedTuple):
 
 
 @contextmanager
-def claimed(folder: Path, claim: FolderMark, description: Description) -> Iterator[None]:
+def open_work_folder(folder: Path, mark: FolderMark, description: Description) -> Iterator[None]:
     """Open a folder for this process alone, and make it where there is none.
 
     Parameters
@@ -64,16 +64,16 @@ def claimed(folder: Path, claim: FolderMark, description: Description) -> Iterat
     """
     try:
         if folder.exists():
-            _require_kind(folder, claim)
-        for inner in claim.folders:
+            _require_kind(folder, mark)
+        for inner in mark.folders:
             (folder / inner).mkdir(parents=True, exist_ok=True)
         handle = os.open(folder, os.O_RDONLY)
     except OSError as error:
         raise unwritable(folder, error) from None
     try:
-        _lock(folder, handle, claim.what)
-        _take(folder, claim, description)
-        for place in (folder, *(folder / inner for inner in claim.folders)):
+        _lock(folder, handle, mark.what)
+        _take(folder, mark, description)
+        for place in (folder, *(folder / inner for inner in mark.folders)):
             for draft in place.glob(".*.draft"):
                 draft.unlink(missing_ok=True)
         yield
@@ -89,22 +89,22 @@ def _lock(folder: Path, handle: int, what: str) -> None:
         raise RunError(f"{folder} is in use: another process works on this {what}") from None
 
 
-def _require_kind(folder: Path, claim: FolderMark) -> None:
+def _require_kind(folder: Path, mark: FolderMark) -> None:
     """Refuse a folder that holds something else."""
     if not folder.is_dir():
         raise RunError(f"{folder} is no folder; choose another one")
-    if (folder / claim.file).is_file():
+    if (folder / mark.file).is_file():
         return
     # Killed at its very beginning, the work leaves these.
-    drafts = f".{claim.file}*.draft"
-    if any(one.name not in claim.folders and not one.match(drafts) for one in folder.iterdir()):
-        raise RunError(f"{folder} exists and is no {claim.what}; choose another folder")
+    drafts = f".{mark.file}*.draft"
+    if any(one.name not in mark.folders and not one.match(drafts) for one in folder.iterdir()):
+        raise RunError(f"{folder} exists and is no {mark.what}; choose another folder")
 
 
-def _take(folder: Path, claim: FolderMark, description: Description) -> None:
+def _take(folder: Path, mark: FolderMark, description: Description) -> None:
     """Write whose folder it is, or refuse it where it is another's."""
-    path = folder / claim.file
-    text = json.dumps({f"dwell-{claim.what}-folder": claim.version, **description}, allow_nan=False)
+    path = folder / mark.file
+    text = json.dumps({f"dwell-{mark.what}-folder": mark.version, **description}, allow_nan=False)
     whole = json.loads(text)
     whole["digest"] = hashlib.sha256(text.encode()).hexdigest()
     if path.is_file():
@@ -113,9 +113,9 @@ def _take(folder: Path, claim: FolderMark, description: Description) -> None:
         except (OSError, ValueError) as error:
             raise RunError(f"{path}: cannot be read ({error})") from None
         if not isinstance(known, dict):
-            raise RunError(f"{path} describes no {claim.what}; choose another folder")
+            raise RunError(f"{path} describes no {mark.what}; choose another folder")
         if known.get("digest") != whole["digest"]:
-            raise RunError(_difference(folder, claim.what, known, whole))
+            raise RunError(_difference(folder, mark.what, known, whole))
         return
     try:
         text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)

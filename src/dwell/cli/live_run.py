@@ -14,7 +14,7 @@ import typer
 
 import dwell
 from dwell.cli.exit_codes import ExitCode
-from dwell.cli.live_view import Look, View, live_view
+from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.errors import LiveError, missing_package
 from dwell.model import Problem, Scenario
@@ -196,16 +196,16 @@ def _watch(cell: Loopback, seconds: float, played: _ObservedRun, view: View) -> 
     status: Mapping[str, Any] = {}
     answered_s = 0.0
 
-    def look(at_s: float) -> None:
+    def show(at_s: float) -> None:
         nonlocal status, answered_s
         try:
             status = cell.sample(LOOK_S)
             answered_s = (time.monotonic_ns() - cell.begun_ns) / 1e9
         except LiveError:
             pass  # the view shows for how long nobody has answered
-        view.show(Look(at_s, status, answered_s, played.look(), played.on()))
+        view.show(CellState(at_s, status, answered_s, played.look(), played.on()))
 
-    play_on(cell, played, seconds, look)
+    play_on(cell, played, seconds, show)
 
 
 def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""What a live cell looks like on a terminal while it runs."""
+"""View of a live cell on a terminal while it runs."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ GREY, MISSED, HELD = "bright_black", "red", "yellow"
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """One look at a cell.
+class CellState:
+    """State of a cell at an instant.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Look:
 class View(Protocol):
     """Shows a cell."""
 
-    def show(self, look: Look) -> None:
+    def show(self, state: CellState) -> None:
         """Show how it is now."""
         ...
 
@@ -113,24 +113,24 @@ class Lines:
 
     last: tuple[object, ...] = ()
 
-    def show(self, look: Look) -> None:
+    def show(self, state: CellState) -> None:
         """Print a line if there is news."""
-        status, window = look.status, look.window
-        silent = look.silent_s > 0
+        status, window = state.status, state.window
+        silent = state.silent_s > 0
         headline = "" if silent else status.get("headline") or ""
         moved = status.get("placement"), status.get("guard_moves")
-        key = (*moved, silent, status.get("health"), look.disturbances)
+        key = (*moved, silent, status.get("health"), state.disturbances)
         if key == self.last:
             return
         self.last = key
         by_guard = "  by the guard" if status.get("fallback") else ""
         typer.echo(
-            f"{look.at_s:6.1f} s  {status.get('placement') or '-'}{by_guard}"
+            f"{state.at_s:6.1f} s  {status.get('placement') or '-'}{by_guard}"
             f"  L95 {_number(window.get('l95_ms'), 'ms')}"
             f"  V_D {_number(_hundred(window.get('violation_rate')), '%')}"
-            f"{_error(look)}"
+            f"{_error(state)}"
             f"{'  the controller is silent' if silent else ''}"
-            f"  {look.disturbances or 'nothing disturbs it'}"
+            f"  {state.disturbances or 'nothing disturbs it'}"
             f"{f'  {headline}' if headline else ''}",
             err=True,
         )
@@ -138,7 +138,7 @@ class Lines:
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Columns of equal time, which looks are laid out in anew: a terminal may change its width."""
+    """Columns of equal time, which states are laid out in anew: a terminal may change its width."""
 
     count: int
     seconds: float
@@ -147,13 +147,13 @@ class _Columns:
         """Return the column of an instant."""
         return min(max(int(at_s / self.seconds * self.count), 0), self.count - 1)
 
-    def placements(self, looks: Iterable[Look]) -> list[tuple[str, bool]]:
+    def placements(self, states: Iterable[CellState]) -> list[tuple[str, bool]]:
         """Return the last placement of each column so far, and whether it is a fallback."""
         placed: list[tuple[str, bool]] = []
-        for look in looks:
-            if name := look.status.get("placement"):
-                column = self.column(look.at_s)
-                newest = name, bool(look.status.get("fallback"))
+        for state in states:
+            if name := state.status.get("placement"):
+                column = self.column(state.at_s)
+                newest = name, bool(state.status.get("fallback"))
                 placed += [newest] * (column + 1 - len(placed))
                 placed[column] = newest
         return placed
@@ -190,65 +190,65 @@ class Screen:
         self.problem, self.seconds, self.plan = problem, seconds, plan
         self._console, self._update = console, update
         self._colours = Palette.of(tuple(problem.candidates)).placements
-        self._looks: list[Look] = []
+        self._states: list[CellState] = []
         self._last_move = ""
 
-    def show(self, look: Look) -> None:
+    def show(self, state: CellState) -> None:
         """Draw it anew."""
-        if self._looks:
-            self._note_move(self._looks[-1], look)
-        self._looks.append(look)
+        if self._states:
+            self._note_move(self._states[-1], state)
+        self._states.append(state)
         self._update(self.drawn())
 
-    def _note_move(self, before: Look, look: Look) -> None:
-        old, new = before.status.get("placement"), look.status.get("placement")
+    def _note_move(self, before: CellState, state: CellState) -> None:
+        old, new = before.status.get("placement"), state.status.get("placement")
         if old and new and old != new:
-            who = "the guard" if look.status.get("fallback") else "the controller"
-            self._last_move = f"last at {look.at_s:.0f} s by {who}: {old} → {new}"
+            who = "the guard" if state.status.get("fallback") else "the controller"
+            self._last_move = f"last at {state.at_s:.0f} s by {who}: {old} → {new}"
 
     def drawn(self) -> RenderableType:
         """Return all that is to be seen."""
-        look = self._looks[-1]
+        state = self._states[-1]
         width = min(self._console.width, MOST_COLUMNS)
         inner = width - 4
         columns = _Columns(inner - LABEL - VALUE, self.seconds)
         parts: tuple[RenderableType, ...] = (
-            self._head(look, inner),
+            self._head(state, inner),
             Text(),
-            *self._strips(look, columns),
+            *self._strips(state, columns),
             Text(),
-            self._tables(look),
+            self._tables(state),
             Text(),
-            *self._foot(look),
+            *self._foot(state),
         )
         title = f"{self.problem.name}, live"
         return Panel(Group(*parts), title=title, width=width, border_style=GREY, padding=(0, 1))
 
-    def _head(self, look: Look, width: int) -> Text:
-        clock = f"{min(look.at_s, self.seconds):.0f} of {self.seconds:.0f} s"
-        head = Text(look.disturbances or "nothing disturbs it", style="bold", no_wrap=True)
+    def _head(self, state: CellState, width: int) -> Text:
+        clock = f"{min(state.at_s, self.seconds):.0f} of {self.seconds:.0f} s"
+        head = Text(state.disturbances or "nothing disturbs it", style="bold", no_wrap=True)
         head.truncate(width - len(clock) - 2, overflow="ellipsis", pad=True)
         return head.append(f"  {clock}")
 
-    def _strips(self, look: Look, columns: _Columns) -> Iterator[Text]:
+    def _strips(self, state: CellState, columns: _Columns) -> Iterator[Text]:
         deadline_ms = self.problem.pipeline.deadline_ms
-        placement = look.status.get("placement") or "-"
-        yield self._line("played", self._planned(look, columns), "")
+        placement = state.status.get("placement") or "-"
+        yield self._line("played", self._planned(state, columns), "")
         yield self._line("placed", self._placed(columns), placement, self._colours.get(placement))
-        numbered = groupby(self._looks, lambda seen: seen.window.get("number"))
-        # Of each window, the look that saw it first.
-        windows = [(seen.at_s, seen.window) for _, looks in numbered for seen in islice(looks, 1)]
+        numbered = groupby(self._states, lambda seen: seen.window.get("number"))
+        # Of each window, the state that saw it first.
+        windows = [(seen.at_s, seen.window) for _, states in numbered for seen in islice(states, 1)]
         for name, key, scale, unit, most, limit in (
             ("L95", "l95_ms", 1, "ms", DEADLINES * deadline_ms, deadline_ms),
             ("V_D", "violation_rate", 100, "%", MOST_RATE, 0.05),
         ):
             worst = columns.worst((at_s, _float(window.get(key))) for at_s, window in windows)
-            value = _number(scale * _float(look.window.get(key)), unit)
+            value = _number(scale * _float(state.window.get(key)), unit)
             yield self._line(name, _sparkline(worst, columns.count, most, limit), value)
         if self.problem.live.observer is not None:
-            worst = columns.worst((seen.at_s, seen.error_mm) for seen in self._looks)
+            worst = columns.worst((seen.at_s, seen.error_mm) for seen in self._states)
             strip = _sparkline(worst, columns.count, MOST_MM, math.inf)
-            yield self._line("error", strip, _number(look.error_mm, "mm"))
+            yield self._line("error", strip, _number(state.error_mm, "mm"))
 
     @staticmethod
     def _line(label: str, strip: Text, value: str, style: str | None = None) -> Text:
@@ -257,7 +257,7 @@ class Screen:
         room = " " * max(0, 1 - len(value) + VALUE - 1)
         return line.append(room).append(value, style=f"bold {style}" if style else "bold")
 
-    def _planned(self, look: Look, columns: _Columns) -> Text:
+    def _planned(self, state: CellState, columns: _Columns) -> Text:
         """Write the names of the disturbances at their times, dim as long as they are to come."""
         letters = ["·"] * columns.count
         for item in self.plan:
@@ -265,25 +265,25 @@ class Screen:
             length = max(columns.column(min(item.end_s, self.seconds)) - first, 1)
             name = f" {item.kind} " if len(item.kind) + 2 <= length else f" {item.kind.split()[0]} "
             letters[first : first + length] = name[:length].center(length, "━")
-        text, now = Text(), columns.column(look.at_s) + 1
+        text, now = Text(), columns.column(state.at_s) + 1
         text.append("".join(letters[:now]), style="default")
         return text.append("".join(letters[now:]), style=GREY)
 
     def _placed(self, columns: _Columns) -> Text:
         text = Text()
-        for name, fallback in columns.placements(self._looks):
+        for name, fallback in columns.placements(self._states):
             text.append("▒" if fallback else "█", style=self._colours.get(name, "default"))
         text.append("·" * (columns.count - len(text)), style=GREY)
         return text
 
-    def _tables(self, look: Look) -> Table:
+    def _tables(self, state: CellState) -> Table:
         columns = Table.grid(padding=(0, 4))
-        columns.add_row(self._stages(look), self._costs(look), self._load(look))
+        columns.add_row(self._stages(state), self._costs(state), self._load(state))
         return columns
 
-    def _stages(self, look: Look) -> Table:
+    def _stages(self, state: CellState) -> Table:
         stages = Table.grid(padding=(0, 1))
-        placement = look.status.get("placement")
+        placement = state.status.get("placement")
         placed: Mapping[str, str] = self.problem.candidates.get(placement or "", {})
         colour = self._colours.get(placement or "", "default")
         for task in self.problem.pipeline.tasks.values():
@@ -292,12 +292,12 @@ class Screen:
             stages.add_row(Text(task.name, no_wrap=True), Text(node, style=style, no_wrap=True))
         return stages
 
-    def _costs(self, look: Look) -> Table:
+    def _costs(self, state: CellState) -> Table:
         """Write J of every candidate: measured, or estimated."""
         costs = Table.grid(padding=(0, 1))
-        placement, moving = look.status.get("placement"), look.status.get("moving_to")
+        placement, moving = state.status.get("placement"), state.status.get("moving_to")
         for name in self.problem.candidates:
-            value = (look.window.get("estimates") or {}).get(name)
+            value = (state.window.get("estimates") or {}).get(name)
             mark = "◀" if name == placement else "…" if name == moving else " "
             costs.add_row(
                 Text("J", style=GREY),
@@ -307,9 +307,9 @@ class Screen:
             )
         return costs
 
-    def _load(self, look: Look) -> Table:
+    def _load(self, state: CellState) -> Table:
         load = Table.grid(padding=(0, 1))
-        used = look.window.get("utilisation") or {}
+        used = state.window.get("utilisation") or {}
         for node in self.problem.fabric.nodes:
             share = used.get(node)
             filled = round(BAR * min(max(_float(share), 0.0), 1.0)) if share is not None else 0
@@ -318,16 +318,16 @@ class Screen:
             load.add_row(Text("CPU", style=GREY), Text(node, no_wrap=True), bar, percent)
         return load
 
-    def _foot(self, look: Look) -> Iterator[Text]:
-        status = look.status
+    def _foot(self, state: CellState) -> Iterator[Text]:
+        status = state.status
         moved, guarded = status.get("migrations", 0), status.get("guard_moves", 0)
         foot = Text(no_wrap=True, overflow="ellipsis")
         foot.append(f"{moved} migration{'' if moved == 1 else 's'}", style="bold")
         foot.append(f", {guarded} by the guard", style=f"bold {HELD}" if guarded else GREY)
         yield foot.append(f"   {self._last_move}", style=GREY)
         remark = Text(no_wrap=True, overflow="ellipsis")
-        if look.silent_s:
-            remark.append(f"no answer from the controller for {look.silent_s:.0f} s", "bold red")
+        if state.silent_s:
+            remark.append(f"no answer from the controller for {state.silent_s:.0f} s", "bold red")
         elif status.get("headline"):
             remark.append(status["headline"], "bold red")
         elif status.get("fallback"):
@@ -336,8 +336,8 @@ class Screen:
             remark.append(f"where the guard has put it{progress}", f"bold {HELD}")
         elif status.get("moving_to"):
             remark.append(f"moving to {status['moving_to']}", GREY)
-        elif look.window.get("reason"):
-            remark.append(f"last decision: {look.window['reason']}", GREY)
+        elif state.window.get("reason"):
+            remark.append(f"last decision: {state.window['reason']}", GREY)
         yield remark
 
 
@@ -353,8 +353,8 @@ def _sparkline(values: Sequence[float], columns: int, most: float, limit: float)
     return text
 
 
-def _error(look: Look) -> str:
-    return "" if math.isnan(look.error_mm) else f"  error {_number(look.error_mm, 'mm')}"
+def _error(state: CellState) -> str:
+    return "" if math.isnan(state.error_mm) else f"  error {_number(state.error_mm, 'mm')}"
 
 
 def _float(value: object) -> float:

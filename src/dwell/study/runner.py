@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from dwell.cellfile.work_folder import claimed
+from dwell.cellfile.work_folder import open_work_folder
 from dwell.errors import SimulationError
 from dwell.study.player import Example, PlayedItem, Player
 from dwell.study.results import PARAMETER, StudyRuns
@@ -149,7 +149,7 @@ def _play_in_folder(
         write_table(folder, f"{PARTS}/{item.name}", _frame(played))
         count([item])
 
-    with claimed(folder, STUDY, describe(study)):
+    with open_work_folder(folder, STUDY, describe(study)):
         known = finished(folder)
         count([item for item in items if item.name in known])
         missing = [item for item in items if item.name not in known]

@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from dwell.cellfile.work_folder import claimed, unwritable
+from dwell.cellfile.work_folder import open_work_folder, unwritable
 from dwell.errors import DwellError, LiveError
 from dwell.files import write_whole
 from dwell.model import Problem
@@ -122,7 +122,7 @@ def run_campaign(
     LiveError
         If the first attempts all end with an error.
     """
-    with claimed(folder, CAMPAIGN, campaign.describe()):
+    with open_work_folder(folder, CAMPAIGN, campaign.describe()):
         _keep_traces(campaign, folder)
         attempts = _Attempts(campaign, folder, partial(play, name=name), wait, quiet or Quiet())
         shutil.rmtree(folder / WORK, ignore_errors=True)
