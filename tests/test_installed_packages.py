@@ -21,7 +21,7 @@ from dwell.estimators.registry import names as estimator_names
 from dwell.policies import by_name
 from dwell.policies.registry import REGISTRY, names
 from dwell.study import compare
-from tests.policies.cell import problem
+from tests.cells.paper import problem
 
 ROOT = Path(__file__).parents[1]
 CELL = ROOT / "examples/canonical.yaml"

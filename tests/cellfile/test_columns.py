@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.cellfile.trace_cell import LINK, faults_of, trace_cell
+from tests.cells.with_traces import LINK, faults_of, trace_cell
 
 
 @pytest.mark.parametrize(

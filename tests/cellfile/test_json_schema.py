@@ -15,7 +15,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from tests.cellfile.faulty import DOCUMENT
 from tests.cellfile.test_cell import LEAST
-from tests.model.cells import problems
+from tests.cells.strategies import problems
 
 jsonschema = pytest.importorskip("jsonschema", reason="validates documents against the schema")
 

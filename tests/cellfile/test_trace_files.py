@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.cellfile.trace_cell import EXEC, LINK, faults_of, read_tables
+from tests.cells.with_traces import EXEC, LINK, faults_of, read_tables
 
 
 def test_only_columns_in_use_drop_rows(recorded: Path) -> None:

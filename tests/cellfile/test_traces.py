@@ -14,7 +14,7 @@ from dwell.cellfile import from_document, load, load_without_traces
 from dwell.errors import ProblemError, TraceError
 from dwell.model import Problem
 from dwell.model.document import fingerprint, to_document
-from tests.cellfile.trace_cell import EXEC, LINK, faults_of, read_tables, table_of, trace_cell
+from tests.cells.with_traces import EXEC, LINK, faults_of, read_tables, table_of, trace_cell
 
 REAL = Path(__file__).parents[2].parent / "shared" / "data"
 needs_real = pytest.mark.skipif(

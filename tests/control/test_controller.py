@@ -13,7 +13,7 @@ from dwell.control import ClosedWindow, Controller, Evidence
 from dwell.errors import DwellError, MetricError, ProblemError
 from dwell.estimators import Corrected, Learner, Scaling, Shadow, Support
 from dwell.model import Problem, QoS
-from tests.estimators.cell import MOVES, cell
+from tests.cells.deterministic import MOVES, cell
 
 SETTINGS = {"profile": 0.0, "shadow": 0.1, "scaling": 0.0, "corrected": 0.1}
 

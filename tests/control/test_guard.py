@@ -14,7 +14,7 @@ from dwell.control import Controller, Guard, Presence, Probation, parts_of
 from dwell.cost import hamming
 from dwell.errors import PolicyError, ProblemError
 from dwell.model import Decision, FrozenDict, QoS
-from tests.estimators.cell import cell
+from tests.cells.deterministic import cell
 
 P = 1000
 WHOLE = {"LOC": True, "HYB": True, "SO": True}

@@ -33,8 +33,8 @@ from dwell.model import (
     Task,
 )
 from dwell.model.fabric import Scheduler
+from tests.cells.deterministic import MOVES, cell, truth
 from tests.cells.generated import make_problem, random_problem, random_stamps
-from tests.estimators.cell import MOVES, cell, truth
 from tests.estimators.windows import Row, window
 
 SEEN = QoS(1.0, 0.0, {"R": 0.0, "E": 0.0})

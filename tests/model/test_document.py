@@ -31,7 +31,7 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.document import digest, to_document
-from tests.model.cells import problems
+from tests.cells.strategies import problems
 
 SLOW = [HealthCheck.too_slow, HealthCheck.data_too_large]
 

@@ -35,7 +35,7 @@ from dwell.model import (
     Task,
     Weights,
 )
-from tests.model.cells import problems
+from tests.cells.strategies import problems
 
 EXECUTION = Execution(Constant(1.0))
 EPISODES = Episodes("storm", Constant(30.0), Constant(10.0))

@@ -25,7 +25,7 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from tests.model.cells import processes
+from tests.cells.strategies import processes
 
 Floats = NDArray[np.float64]
 

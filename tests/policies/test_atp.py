@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Problem, QoS
 from dwell.policies import ATP, ATPThresholds, by_name, check_policy
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, problem, qos
 
 SLOW = 50.0  # milliseconds; the threshold is 40
 

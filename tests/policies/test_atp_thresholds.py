@@ -12,7 +12,7 @@ from dwell.errors import MetricError, PolicyError
 from dwell.model import Objective, Placement, QoS, Targets, Tier
 from dwell.policies import ATPThresholds
 from dwell.policies.atp_thresholds import find_pairs
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
 
 CALM, SLOW = qos(40.0, 1.0, 0.7, 0.7), qos(40.1)
 BUSY_ROBOT, BUSY_EDGE = qos(robot=0.71), qos(edge=0.71)

@@ -13,7 +13,7 @@ import pytest
 from dwell.model import Decision, Placement, Problem, QoS
 from dwell.policies import DTP, MinimalPolicy, Policy, by_name, check_policy
 from dwell.policies.registry import REGISTRY
-from tests.policies.cell import CANDIDATES, OBJECTIVE, place, problem
+from tests.cells.paper import CANDIDATES, OBJECTIVE, place, problem
 
 Estimates = Mapping[str, QoS]
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Caps, Decision, Objective, Placement, QoS, Targets, Weights
 from dwell.policies import Cusum, check_policy
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
 from tests.reference.algorithm_1 import price, worst
 
 #: J is L95 in milliseconds, moves are free, and nothing is forbidden.

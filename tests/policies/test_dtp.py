@@ -16,7 +16,7 @@ from dwell.cost import cost, excess
 from dwell.errors import DwellError, MetricError, PlacementError, PolicyError
 from dwell.model import Caps, Decision, Objective, Placement, QoS
 from dwell.policies import DTP, check_policy
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, place, problem, qos
 from tests.reference.algorithm_1 import algorithm_1
 
 NO_CAPS = replace(OBJECTIVE, caps=Caps())

@@ -8,7 +8,7 @@ import pytest
 
 from dwell.errors import MetricError, PolicyError
 from dwell.policies import LatencyFirst
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, problem, qos
 
 
 def latency_first(initial: str = "LOC") -> LatencyFirst:

@@ -4,7 +4,7 @@ import json
 import math
 
 from dwell.policies import by_name, parameters_of
-from tests.policies.cell import problem
+from tests.cells.paper import problem
 
 
 class Mine:

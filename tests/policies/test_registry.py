@@ -8,7 +8,7 @@ from dwell.errors import PolicyError
 from dwell.model import ControllerSettings
 from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Policy, Static, WorkFunction, by_name
 from dwell.policies.registry import REGISTRY
-from tests.policies.cell import CANDIDATES, OBJECTIVE, place, problem
+from tests.cells.paper import CANDIDATES, OBJECTIVE, place, problem
 
 SETTINGS = ControllerSettings(initial="HYB", min_dwell=7, min_improvement=0.25, escape=True)
 

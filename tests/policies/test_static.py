@@ -9,7 +9,7 @@ import pytest
 from dwell.errors import MetricError, PolicyError
 from dwell.model import QoS
 from dwell.policies import Static
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, problem, qos
 
 WORSE = estimates(qos(10.0), qos(119.0, 1.0), qos(10.0))
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from dwell.errors import MetricError, PolicyError
 from dwell.model import Caps, Objective, Placement, QoS, Targets, Weights
 from dwell.policies import WorkFunction
-from tests.policies.cell import CANDIDATES, OBJECTIVE, estimates, problem, qos
+from tests.cells.paper import CANDIDATES, OBJECTIVE, estimates, problem, qos
 from tests.reference.algorithm_1 import price, switching, worst
 
 NODES = tuple(OBJECTIVE.tiers)

@@ -10,7 +10,7 @@ import pytest
 import dwell
 from dwell.model import Gamma, Problem
 from dwell.testbed.calibrate import Calibrated, calibrate
-from tests.testbed.known_cell import (
+from tests.cells.known_cost import (
     ADDED_MS,
     BACKGROUND,
     BESIDE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dwell.testbed.calibrate import calibrate
-from tests.testbed.known_cell import (
+from tests.cells.known_cost import (
     CELL,
 )
 

@@ -14,7 +14,7 @@ from dwell.record import Run
 from dwell.testbed.calibrate import Calibrated, calibrate
 from dwell.testbed.measured import look_at
 from dwell.testbed.node_loads import TOGETHER, wakes
-from tests.testbed.known_cell import (
+from tests.cells.known_cost import (
     ADDED_MS,
     BACKGROUND,
     BESIDE,

@@ -11,7 +11,7 @@ import pytest
 import dwell
 from dwell.record import Run
 from dwell.testbed.calibrate import Calibrated, calibrate
-from tests.testbed.known_cell import (
+from tests.cells.known_cost import (
     MESSAGING_MS,
     STAGE_MS,
 )
