@@ -14,7 +14,7 @@ from dwell.model import Constant, Problem
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
 from dwell.testbed.calibrate import Calibrated, calibrate
-from tests.testbed.known_cell import (
+from tests.cells.known_cost import (
     BACKGROUND,
     CELL,
     observed,
@@ -68,6 +68,19 @@ def test_the_check_plays_runs_with_the_estimators_that_they_had(
     mine = [told["Oracle"].save(at / "Oracle"), folders[1]]
     said = calibrate(probing, mine, tmp_path / "out.yaml", say=lambda line: None).report["check"]
     assert [row["run"] for row in said] == [folders[1].name]
+
+
+def test_a_node_without_a_quota_is_given_no_finding_that_only_a_quota_has(
+    nominal: Path, folders: list[Path], tmp_path: Path
+) -> None:
+    assert "contention" in calibrate(
+        nominal, folders, tmp_path / "with.yaml", say=lambda line: None
+    ).cell.read_text(encoding="utf-8")
+    cell = tmp_path / "without.yaml"
+    cell.write_text(CELL.replace(", quota: {cpu: 0.8, period_ms: 4}", ""), encoding="utf-8")
+    written = calibrate(cell, folders, tmp_path / "out.yaml", say=lambda line: None).problem
+    assert written.fabric.nodes["E"].contention == 0.0
+    assert written.fabric.nodes["R1"].contention > 0.0
 
 
 def test_what_was_not_visited_stays(nominal: Path, folders: list[Path], tmp_path: Path) -> None:

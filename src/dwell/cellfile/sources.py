@@ -15,10 +15,18 @@ def digest_of(names: Iterable[str]) -> str:
     ----------
     names : iterable of str
         Files and folders below the package, as ``sim`` or ``cost.py``.
+
+    Raises
+    ------
+    FileNotFoundError
+        If one of them is not there.
     """
     digest = hashlib.sha256()
     for name in names:
-        for path, text in _sources(files("dwell").joinpath(name), name):
+        sources = list(_sources(files("dwell").joinpath(name), name))
+        if not sources:
+            raise FileNotFoundError(f"dwell has no sources {name}")
+        for path, text in sources:
             digest.update(path.encode())
             digest.update(text)
     return digest.hexdigest()[:16]

@@ -48,9 +48,7 @@ class Sink:
     ) -> None:
         self.place, self.task, self.actuator = place, task, actuator
         self._highest, self._expected = highest, expected
-        live, pipeline = place.problem.live, place.problem.pipeline
-        max_age_ms = 2 * pipeline.period_ms if live.max_age_ms is None else live.max_age_ms
-        self.max_age_ns = round(max_age_ms * 1e6)
+        self.max_age_ns = round(place.problem.max_age_ms * 1e6)
         self.newest = highest.load()
         self.offsets = place.offsets()
         #: What its node has taken, where something counts it.

@@ -258,6 +258,12 @@ class Problem(Displayed):
         return self.live.relay or self.controller_node
 
     @property
+    def max_age_ms(self) -> float:
+        """Age beyond which an actuator is given no command; by default two periods."""
+        given_ms = self.live.max_age_ms
+        return 2 * self.pipeline.period_ms if given_ms is None else given_ms
+
+    @property
     def stamper_node(self) -> str:
         """Node where cycles are released: that of the first source task in the initial placement.
 

@@ -112,7 +112,8 @@ def _disturbance(item: NodeDisturbance | LinkDisturbance) -> dict[str, str]:
     what = ["down"] if item.down else []
     if isinstance(item, NodeDisturbance):
         if item.stress_threads:
-            what.append(f"{item.stress_threads} busy threads")
+            threads = "thread" if item.stress_threads == 1 else "threads"
+            what.append(f"{item.stress_threads} busy {threads}")
         return {"where": item.node, "what": ", ".join(what)}
     if item.add_delay_ms is not None:
         what.append(f"delay {_process(item.add_delay_ms)}")

@@ -43,6 +43,8 @@ SEED = 20_260_101
 ASKED = 20_000
 #: Least execution time written, ms: one of nothing is no execution time.
 LEAST_MS = 1e-3
+#: Findings on a node that a cell states of nodes with a quota alone.
+ONLY_WITH_QUOTA = ("background_beside", "contention", "contention_stressed")
 #: Windows that the check simulates of every run at most.
 CHECK_WINDOWS = 300
 
@@ -352,7 +354,7 @@ def _put_in(
     for key, values in nodes.items():
         for node, value in values.items():
             entry = document["nodes"][node]
-            if key != "background_beside" or entry.get("quota"):
+            if key not in ONLY_WITH_QUOTA or entry.get("quota"):
                 entry[key] = value
     links = []
     for entry in document.get("links") or ():

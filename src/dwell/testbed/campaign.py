@@ -27,7 +27,7 @@ from dwell.testbed.trace_names import rename_traces
 
 PAPERS_SCENARIOS = ("baseline", "robot-cpu-stress", "edge-cpu-stress", "network-impairment")
 #: Parts of this package that a measurement depends on.
-SOURCES = (*("control", "cost.py", "demo", "estimators", "live", "model", "policies", "testbed"),)
+SOURCES = ("control", "cost.py", "estimators", "live", "model", "policies", "testbed")
 
 
 class Entrant(NamedTuple):

@@ -331,7 +331,7 @@ def _old(cell: Harness, observer: ActuatorObserver, fault: Fault, outcome: Outco
         return []
     stamped_ns = observer.judge.stamped_ns
     # The gate looks a little before the actuator is called, which may be scheduled out between.
-    limit_ms = cell.max_age_ms + cell.problem.pipeline.period_ms
+    limit_ms = cell.problem.max_age_ms + cell.problem.pipeline.period_ms
     return [
         f"cycle {seen.cycle} was actuated {age_ms:.0f} ms after it was stamped"
         for seen in cell.actuations.since(outcome.begin_ns)

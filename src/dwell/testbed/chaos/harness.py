@@ -83,11 +83,6 @@ class Harness(Started):
         """P."""
         return round(self.problem.pipeline.period_ms * 1e6)
 
-    @property
-    def max_age_ms(self) -> float:
-        """Age beyond which the gate lets no command through."""
-        return self.problem.live.max_age_ms or 2 * self.problem.pipeline.period_ms
-
     def start(self) -> None:
         """Start everything, and wait until the cell is at home."""
         try:

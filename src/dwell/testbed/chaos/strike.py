@@ -192,7 +192,7 @@ def _weigh(
     if hit_by(problem, fault) is not None or not _strikes_sink(fault):
         during = [one for one in seen if one.at_ns >= begin_ns - period_ns]
         outcome.late += unsafe(
-            during, cell.max_age_ms + problem.pipeline.period_ms + outcome.stall_ms
+            during, problem.max_age_ms + problem.pipeline.period_ms + outcome.stall_ms
         )
 
 
