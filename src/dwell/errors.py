@@ -77,7 +77,7 @@ class ProblemError(DwellError, ValueError):
     Parameters
     ----------
     faults : sequence of Fault, or str
-        What is wrong; a string is one fault without a path.
+        Faults; a string is one fault without a path.
     source : str, optional
         The file the problem was read from.
     """

@@ -84,7 +84,7 @@ def from_document(
     Parameters
     ----------
     document : mapping
-        What a YAML parser would make of a cell file.
+        Content of a cell file, as a YAML parser gives it.
     folder : str or path
         Where the traces that it names are.
     source : str, optional
@@ -140,7 +140,7 @@ def read_problem(
     document : object
         Plain values.
     faults : Faults
-        Those of the document so far, and the lines of its values.
+        Faults of the document so far, and the lines of its values.
     folder : Path, optional
         Where the traces that it names are; where None, they are named and not read.
     name : str

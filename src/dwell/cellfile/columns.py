@@ -29,7 +29,7 @@ class FileColumn(NamedTuple):
     values : float64 or object array, shape (rows,)
         Numbers, NaN where one is missing; or anything else.
     kind : str
-        What it holds, where these are no numbers: ``String``, ``Boolean``; empty for numbers.
+        Type of its values, where these are no numbers: ``String``, ``Boolean``; empty for numbers.
     """
 
     values: Values

@@ -38,7 +38,7 @@ class Form(Generic[E]):
     entry : type of Entry
         Its structure.
     what : str
-        What it is called in messages, as ``cell``.
+        Kind of document, for messages: ``cell``.
     key : str
         The key that holds the version of the format.
     version : int

@@ -228,7 +228,7 @@ class _Reading:
         otherwise : str
             Place of faults that several values cause together.
         where : str
-            What is added to their messages.
+            Text added to the messages.
         """
         try:
             return cell.changed(overrides)

@@ -37,7 +37,7 @@ class FolderMark(NamedTuple):
     version : int
         Version of the folder's layout.
     folders : tuple of str
-        Those inside that the work fills.
+        Folders inside that the work fills.
     """
 
     what: str

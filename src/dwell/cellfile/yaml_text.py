@@ -67,7 +67,7 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
     faults : Faults
         Takes what is wrong with the file as such, and the line of every value.
     what, begin : str
-        What kind of file it should be, and how such a file begins, for messages.
+        Kind of the file, and how such a file begins, for messages.
 
     Returns
     -------

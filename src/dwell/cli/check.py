@@ -232,7 +232,7 @@ def _fault(fault: Fault) -> dict[str, Any]:
 
 
 def _contents(problem: Problem, profile: Profile) -> dict[str, Any]:
-    """What the cell holds, as plain values."""
+    """Return the contents of the cell as plain values."""
     pipeline = problem.pipeline
     return {
         "name": problem.name,

@@ -1,4 +1,4 @@
-"""What a command's process ends with."""
+"""Exit codes of commands."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class CellState:
     answered_s : float
         Time of that answer.
     observed : mapping of str to float
-        What the cell's observer sees, by names with units; ``error_mm`` is drawn.
+        Values of the cell's observer, by names with units; ``error_mm`` is drawn.
     """
 
     at_s: float

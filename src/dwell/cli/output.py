@@ -1,4 +1,4 @@
-"""What commands write: tables, JSON, whole files, and progress on a terminal."""
+"""Output of commands: tables, JSON, whole files, and progress on a terminal."""
 
 from __future__ import annotations
 

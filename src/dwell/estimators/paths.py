@@ -119,7 +119,7 @@ def seen_windows(latency_ms: Floats, window_cycles: int, age_ms: Floats, censor_
     window_cycles : int
         W.
     age_ms : float64 array, shape (windows * W,)
-        What a lost cycle counts as: its age when the window closes.
+        Latency that a lost cycle counts with: its age when the window closes.
     censor_ms : float
         No latency counts for more.
     """

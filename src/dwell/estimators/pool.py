@@ -35,7 +35,7 @@ class Pool:
     places : float64 array, shape (m,)
         Quantile of every draw, in [0, 1), by which it is paired with those of other pools.
     normals : float64 array, shape (m,)
-        What widens every draw.
+        Standard normal numbers that widen the draws.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ class EstimatorEntry:
     path : str
         ``module:Class``; the class takes the problem.
     sentence : str
-        What it does, for the legend of a report; the estimator is its subject.
+        The estimator in a sentence, of which it is the subject, for the legend of a report.
     style : int
         Which marker and dashes a policy that believes it has in figures, from 0.
     shadows : bool
@@ -128,7 +128,7 @@ def name_in_run(meta: Mapping[str, Any]) -> str:
     Parameters
     ----------
     meta : mapping
-        What the run says of itself; ``estimator`` is a name, or the name of a class.
+        Metadata of the run; ``estimator`` is a name, or the name of a class.
 
     Raises
     ------

@@ -53,7 +53,7 @@ def spans_of(instants: Instants, sent_ns: Ints, limit_ns: int) -> Spans:
     sent_ns : int64 array, shape (n, flows)
         When the source of each message completed.
     limit_ns : int
-        What began before this, and has not ended, counts as lost.
+        A job or message that began before this, and has not ended, counts as lost.
     """
     return Spans(
         _between(instants.ready_ns, instants.end_ns, limit_ns),

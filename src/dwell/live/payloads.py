@@ -1,4 +1,4 @@
-"""How a stage's payload is written, and read again without trusting it.
+"""Payloads of stages: written, and read again without trusting them.
 
 A payload travels raw, beside its header, and the header says its kind: ``none``, ``bytes``,
 ``array:<dtype>:<shape>`` or ``struct:<name>``. An array is read where it arrived, without a copy.

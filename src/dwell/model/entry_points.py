@@ -34,7 +34,7 @@ def class_named(name: str, path: str | None, group: str, what: str, error: type[
     group : str
         Group of the entry points of other packages.
     what : str
-        What it is, for the message: ``policy``.
+        Kind of the class, for the message: ``policy``.
 
     Returns
     -------

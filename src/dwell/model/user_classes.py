@@ -47,7 +47,7 @@ def make_user_class(
     method : str
         Which the object must have.
     what : str
-        What it is, for messages: ``policy``.
+        Kind of the class, for messages: ``policy``.
 
     Raises
     ------

@@ -27,9 +27,9 @@ class MinimalPolicy(Protocol):
         Parameters
         ----------
         observed : QoS
-            What the last window showed under the incumbent.
+            Metrics of the last window, under the incumbent.
         estimates : mapping of str to QoS
-            What the same window would have shown, by candidate; the incumbent's is `observed`.
+            Estimated metrics of the same window, by candidate; the incumbent's are `observed`.
 
         Returns
         -------

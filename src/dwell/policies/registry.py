@@ -40,7 +40,7 @@ class PolicyEntry:
         Colour of its lines: ``#rrggbb``, the same on light and dark pages, or ``ink`` or
         ``muted``, which a page gives values to.
     sentence : str
-        What it does, for the legend of a report; empty where it is a variant of another policy.
+        The policy in a sentence, for the legend of a report; empty for a variant of another policy.
     variant_of : str
         The policy whose label, colour and sentence it shares; empty where it has its own.
     estimates : bool

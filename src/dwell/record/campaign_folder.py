@@ -21,7 +21,7 @@ CAMPAIGN = FolderMark("campaign", "campaign.json", 1, (RUNS, FAILED, TRACES))
 
 
 class CampaignFolder(NamedTuple):
-    """What is in a campaign's folder.
+    """Content of a campaign's folder.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def is_campaign(folder: Path) -> bool:
 
 
 def read_campaign(folder: Path) -> CampaignFolder:
-    """Return what is in a campaign's folder, also while it goes on.
+    """Read a campaign's folder, also while the campaign goes on.
 
     Raises
     ------

@@ -202,7 +202,7 @@ def read_journal(
     Returns
     -------
     meta : dict
-        What the writer said of the run, and under ``recovered`` what was lost.
+        Metadata that the writer gave the run, and under ``recovered`` what was lost.
     tables : dict of str to DataFrame
 
     Raises
@@ -267,7 +267,7 @@ class Journal:
     cut_bytes : int
         Length of the torn end that was cut off.
     meta : dict
-        What is said of the run, now and by those who wrote it before.
+        Metadata of the run, of this writer and of those before it.
 
     Raises
     ------

@@ -68,7 +68,7 @@ class Column:
     kind : str
         A type of Polars', or what its names are names of.
     sentence : str
-        What it says.
+        Meaning of the column.
     unit : str
         Unit of a number; empty for a count, a share and a bare number.
     null : str
@@ -92,7 +92,7 @@ class TableSchema:
     Parameters
     ----------
     sentence : str
-        What a row of it is.
+        Meaning of a row.
     columns : tuple of tuple of Column
         In their order; one for each node and candidate goes through the candidates of a node first.
     numbered : bool
@@ -314,7 +314,7 @@ def column_types(table: str, problem: Problem, features: Collection[Feature] = (
     problem : Problem
         Its nodes, tasks and candidates.
     features : collection of {"live", "shadows", "support"}
-        Those of the run.
+        Features of the run.
     """
     return {name: kind for name, _, kind in _columns(table, problem, features)}
 
@@ -371,7 +371,7 @@ def frame_of(
     values : mapping of str to sequence, array or Series
         By column; all of one length.
     features : collection of {"live", "shadows", "support"}
-        Those of the run.
+        Features of the run.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How objects show themselves: their answer as text, and as HTML of a notebook.
+"""Short representations of results: their answer as text, and as HTML of a notebook.
 
 The answer is the first section of the page that a report of them is. Pictures need the extra
 `report`; without it a notebook shows the tables.

@@ -81,7 +81,7 @@ def layer(
     Parameters
     ----------
     encoding : mapping of str to Spec
-        What it has of its own: what a group of layers shares is the group's.
+        Encoding of this layer alone; what layers share stands in their group.
     rows : str
         Name of its data, where these are not the chart's.
     where : sequence of str
@@ -105,7 +105,7 @@ def styled(styles: Mapping[str, Style], width: float = 0.0) -> dict[str, Spec]:
     styles : mapping of str to Style
         By the names that the data have in the column ``policy``.
     width : float
-        Of their legend, pixels; none where it is 0.
+        Width of their legend, pixels; no legend where it is 0.
     """
     each = SYMBOL_PX + LETTER_PX * max(map(len, styles), default=0)
     shown = {"columns": max(1, int(width / each)), "symbolSize": 60} if width else None
@@ -214,7 +214,7 @@ def stacked(
     parts : mapping of str to str
         Colours, in the order of the bars.
     heading : str
-        Of the axis, with its unit.
+        Heading of the axis, with its unit.
     """
     encoding = {
         "x": quantity("value", heading, stack="zero", axis={"tickCount": 4}),
@@ -272,7 +272,7 @@ def cumulative(
     frame : DataFrame
         ``scenario``, ``policy``, ``value``, ``share`` at or below it.
     headings : (str, str)
-        Of the axes: values, shares.
+        Headings of the axes: values, shares.
     """
     across = quantity("value", headings[0], axis={"tickCount": 4})
     up = quantity("share", headings[1], axis={"format": "~%", "tickCount": 4})
@@ -321,7 +321,7 @@ def curves(
         ``scenario``, ``policy``, ``at`` (the parameter's values, texts or numbers), ``mean``,
         ``low``, ``high`` in the measure's shown unit.
     heading : str
-        Of the parameter.
+        Heading of the parameter.
     """
     numeric = frame["at"].dtype.is_numeric()
     values = frame["at"].unique(maintain_order=True).to_list()

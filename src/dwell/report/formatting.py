@@ -1,4 +1,4 @@
-"""How numbers and names are written: the same in pages, figures and on the terminal."""
+"""Formats of numbers and names: the same in pages, figures and on the terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "
 
 
 class Measure(NamedTuple):
-    """How a column is written.
+    """Format of a column.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a cell, its scenarios and its contenders are: the tables that a report ends with."""
+"""Tables of a cell, its scenarios and its contenders, with which a report ends."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class Fact(NamedTuple):
     error : str
         Its interval, or what else belongs to it.
     word : str
-        Of a verdict, where there is one.
+        Word of a verdict, where there is one.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Section:
     note : str
         Fixed text under the heading.
     anchor : str
-        What links in the page name.
+        Name for links within the page.
     folded : bool
         Whether it is opened by a click.
     """
@@ -78,16 +78,16 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """What a report shows, the answer first.
+    """A report, the answer first.
 
     Parameters
     ----------
     subtitle : str
-        What it is a report of.
+        Subject of the report.
     policies : mapping of str to str
-        Those that can be chosen, by how they are written: their colour.
+        Colours of the policies that can be chosen, by how they are written.
     seeds : sequence of int
-        Those that can be chosen.
+        Seeds that can be chosen.
     """
 
     title: str

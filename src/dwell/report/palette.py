@@ -81,11 +81,11 @@ class Contended(NamedTuple):
     family : str
         The policy: ``dtp`` of ``dtp+corrected``.
     variant : str
-        Of it: ``tuned`` of ``dtp-tuned+corrected``.
+        Variant of the policy: ``tuned`` of ``dtp-tuned+corrected``.
     belief : str
         Its estimator: ``corrected`` of ``dtp+corrected``, or of ``dtp (corrected)``.
     rest : str
-        What else tells it from others: ``LOC or SO`` of ``dtp+corrected LOC or SO``.
+        Rest of the name: ``LOC or SO`` of ``dtp+corrected LOC or SO``.
     """
 
     family: str
@@ -113,7 +113,7 @@ def contended(name: str) -> Contended | None:
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """How a policy is drawn."""
+    """Style of a policy in figures."""
 
     colour: str
     marker: str
@@ -141,7 +141,7 @@ class Palette:
         policies : iterable of str
             With what they believe in brackets, where that tells them apart.
         estimator : str
-            What the cell says that policies believe. Where any of them says so itself, the others
+            Estimator that the cell gives its policies. Where any of them says so itself, the others
             are drawn as who believes this: ``dtp`` is then another line than ``dtp+corrected``.
         """
         placements = {name: HUES[i % len(HUES)] for i, name in enumerate(candidates)}

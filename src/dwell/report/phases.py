@@ -72,7 +72,7 @@ def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed
     Parameters
     ----------
     scenario : iterable of Disturbance
-        Those that come in episodes are left out: when they came was drawn.
+        Disturbances; those in episodes are left out, as their times were drawn.
     fabric : Fabric
         Whose nodes say their tiers.
     """
@@ -149,11 +149,11 @@ class PhaseRow(NamedTuple):
     Parameters
     ----------
     violation_rate, l95_ms : float
-        Of their final latencies; infinite L95 where more than 5 % never finished.
+        By final latencies; L95 is infinite where more than 5 % never finished.
     lost : int
         Cycles that never finished.
     shares : mapping of str to float
-        Of the cycles, by placement; the largest first.
+        Shares of the cycles, by placement; the largest first.
     migrations, guard_moves : int
         By when the first cycle on the new placement was released.
     rms_mm, rms_px : float

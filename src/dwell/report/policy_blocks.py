@@ -326,7 +326,7 @@ def scaled(frame: pl.DataFrame, measure: Measure) -> pl.DataFrame:
     Parameters
     ----------
     frame : DataFrame
-        Of `dwell.study.over_seeds`.
+        Table that `dwell.study.over_seeds` returns.
     """
     import polars as pl
 

@@ -18,7 +18,7 @@ from dwell.study.drawn_disturbances import disturbances_of
 
 
 class RunHeader(NamedTuple):
-    """What a run is the record of.
+    """Header of a run.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class RunHeader(NamedTuple):
         What was done to nodes and links: as it was played, where the run says so, and as its
         scenario has it elsewhere.
     recovered : mapping of str to object
-        What was lost of a live run's journal.
+        Losses of a live run's journal.
     """
 
     problem: Problem

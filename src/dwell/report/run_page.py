@@ -76,7 +76,7 @@ def run_page(run: Run, *, sections: int | None = None) -> Page:
 
 
 class _RunPage:
-    """What the parts of a run's page are made from."""
+    """Parts of a run's page, made from the run."""
 
     def __init__(self, run: Run, header: RunHeader, counted: Counted, sections: int | None) -> None:
         self.run = run

@@ -68,13 +68,13 @@ class Cell(NamedTuple):
     Parameters
     ----------
     error : str
-        What is known of a number's error.
+        Error of the number, as text.
     kind : str
         ``num``, or the kind of a `Text`; of a word what it means.
     sort : float or str
         By which rows are sorted.
     colour : str
-        Of the mark before a name.
+        Colour of the mark before a name.
     ring : bool
         Whether that mark is a ring: of what moves.
     """

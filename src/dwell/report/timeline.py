@@ -85,7 +85,7 @@ def run_timeline(
     palette : Palette
         Colours of the candidates.
     disturbed : iterable of Disturbed
-        What happened meanwhile. What went on beyond the run is cut.
+        Disturbances, cut at the ends of the run.
     links : mapping of int to str, optional
         Where windows lead to, by their numbers.
     """

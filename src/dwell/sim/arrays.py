@@ -83,7 +83,7 @@ def lay_out(
     log_jobs : bool
         Whether every job's instants are kept.
     shadows : Realisation, optional
-        What the shadow jobs of a single cell meet (see `draw_shadows`); it gets a shadow then.
+        Draws for the shadow jobs of a single cell (see `draw_shadows`); it gets a shadow then.
     """
     return _Layout(cells, shared, log_jobs, shadows).arrays()
 

@@ -80,7 +80,7 @@ def drawn_intervals(
     Parameters
     ----------
     unit_ns : float
-        What their values count.
+        Unit of their values.
     rngs : pair of Generator
         Random streams of the times off, and of the times on.
     begin_ns, horizon_ns : int

@@ -68,7 +68,7 @@ class NodeChanges(Sequence[NodeChange]):
     Attributes
     ----------
     nodes : tuple of str
-        What the column `node` counts.
+        Nodes, in the order that the column `node` counts.
     table : int64 array, shape (changes, 4)
         Columns at_ns, node, threads, down.
     """
@@ -106,7 +106,7 @@ class LinkSegments(Sequence[LinkSegment]):
     Attributes
     ----------
     links : tuple of str
-        What the column `link` counts.
+        Links, in the order that the column `link` counts.
     table : int64 array, shape (segments, 4)
         Columns at_ns, link, down, and the layers as bits.
     table_f : float64 array, shape (segments, 2)

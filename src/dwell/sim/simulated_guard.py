@@ -46,7 +46,7 @@ class SimulatedGuard:
     problem : Problem
         With fallbacks.
     tables : Tables
-        What is about to be played; the guard is armed in it.
+        Tables of the simulation about to be played; the guard is armed in them.
     """
 
     def __init__(self, problem: Problem, realisation: Realisation, tables: k.Tables) -> None:

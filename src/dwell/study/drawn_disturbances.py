@@ -1,4 +1,4 @@
-"""What was done to the nodes and links of a run, and when: episodes as they were drawn."""
+"""Disturbances of a run by node, link and time: episodes as they were drawn."""
 
 from __future__ import annotations
 

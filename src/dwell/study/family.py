@@ -45,7 +45,7 @@ class Family:
     Parameters
     ----------
     question : str
-        What is asked, for instance ``is DTP cheaper than each static placement?``
+        The question in words, for instance ``is DTP cheaper than each static placement?``
     metric : str
         Column that is compared.
     comparisons : mapping of str to PairedDifference or PairedMedian

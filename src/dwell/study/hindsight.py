@@ -37,7 +37,7 @@ Floats: TypeAlias = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class _Alone:
-    """What a candidate alone showed.
+    """Windows of a candidate played alone.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the jobs of runs took on each node, measured and predicted, and messages on each link."""
+"""Times of jobs on each node and of messages on each link, measured and predicted."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def job_times(
     Parameters
     ----------
     measured, predicted : sequence of DataFrame
-        What `finished_jobs` gives of the runs that kept their jobs, and of simulations of them.
+        Tables of `finished_jobs`: of the runs that kept their jobs, and of their simulations.
 
     Returns
     -------

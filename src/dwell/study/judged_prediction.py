@@ -47,7 +47,7 @@ class Judged:
     verdict : {"met", "explained", "open", "missed", ""}
         Empty where nothing is asked.
     baseline : float
-        What the sum-of-means predictor says; NaN where it says nothing.
+        Prediction of the sum of means; NaN where it makes none.
     note : str
         Remark that belongs to the verdict.
     """

@@ -1,4 +1,4 @@
-"""What a campaign has measured: its runs as a comparison, and what its jobs and messages took.
+"""A measured campaign: its runs as a comparison, and the times of its jobs and messages.
 
 A repetition takes the place of a seed: one run gives one number, and the runs of one scenario and
 repetition are a pair. Windows that were measured under pressure are left out, with their cycles.

@@ -42,7 +42,7 @@ MADE_OF = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredRun:
-    """What a run is a run of, which of it counts, and so what is to be simulated for it.
+    """A measured run: its problem, the windows that count, and the simulations made for it.
 
     Parameters
     ----------
@@ -329,7 +329,7 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
-    """What counts of a simulation, and its jobs where they were asked for."""
+    """The part of a simulation that counts, and its jobs where they were asked for."""
 
     piece: Piece
     jobs: pl.DataFrame | None

@@ -45,7 +45,7 @@ class Example:
 
 @dataclass(frozen=True, slots=True)
 class PlayedItem:
-    """What came of an item.
+    """Result of an item.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What the paper predicts for its cell, and whether runs agree (its table of scenarios).
+"""Predictions of the paper for its cell (its table of scenarios), and whether runs agree.
 
 The predictions are qualitative: words. To hold them against runs, each is read as a condition on
 numbers, which is stated beside it, and the answer is one of four: it agrees, it agrees in part, it
@@ -80,7 +80,7 @@ class Prediction(NamedTuple):
 
     @property
     def reading(self) -> str:
-        """What the words on DTP are read as."""
+        """Reading of the paper's words on DTP."""
         names = " or ".join(self.dominant)
         return f"{names} leads, with at least {self.share * 100:.0f} % of the windows"
 
@@ -218,7 +218,7 @@ PAPER: tuple[Prediction, ...] = (
 
 
 class Judgement(NamedTuple):
-    """What DTP did in a scenario, beside what the paper predicts.
+    """Behaviour of DTP in a scenario, beside the paper's prediction.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -
         Runs at a single point of the candidates LOC, SO and HYB, in some of the paper's
         scenarios.
     policies : sequence of str
-        Those that the predictions about DTP are held against.
+        Policies that the predictions about DTP are held against.
 
     Returns
     -------

@@ -40,17 +40,17 @@ POINTS = 4000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """What counts of one run: no warm-up, and no window that is excluded.
+    """The part of a run that counts: without warm-up and excluded windows.
 
     Parameters
     ----------
     windows : DataFrame
         As in the run.
     cycles : DataFrame
-        What is needed of the run's, and ``place``, the row of their window in `windows`. Cycles
-        between two windows belong to the one before them.
+        Cycles with the columns needed, and ``place``, the row of their window in `windows`.
+        Cycles between two windows belong to the one before them.
     migrations : int
-        Those of the policy, after the warm-up.
+        Migrations by the policy, after the warm-up.
     """
 
     windows: pl.DataFrame
@@ -177,7 +177,7 @@ class QosSample:
 
     @property
     def units(self) -> int:
-        """How many units there are."""
+        """Number of units."""
         return sum(self.lengths)
 
     @property

@@ -1,4 +1,4 @@
-"""What the actuator got: misses in a row, the age of its information, and what a loop makes of it.
+"""Quality of the actuation: misses in a row, the age of its information, tracking errors.
 
 A cycle *actuates* at its completion, late or not; a lost one never does. What it knows dates from
 its release. A cycle that completes after a newer one is discarded at the actuator, so that its

@@ -1,4 +1,4 @@
-"""What a realisation could have cost: every candidate alone, and the clairvoyant's sequences.
+"""References of a realisation in hindsight: every candidate alone, and the clairvoyant's sequences.
 
 The clairvoyant knows what every candidate, simulated alone, costs in every window of the same
 realisation. It plans the cheapest sequence of them, once with the dwell of Algorithm 1 and once
@@ -83,12 +83,12 @@ class References:
 
     @property
     def cost(self) -> float:
-        """What that costs: the reference for regret."""
+        """Least cost: the reference for regret."""
         return self.costs[self.name]
 
     @property
     def run(self) -> Run:
-        """Its run."""
+        """Run that costs least."""
         return self.statics.get(self.name) or self.runs[self.name]
 
     @property
@@ -98,7 +98,7 @@ class References:
 
     @property
     def best_static_cost(self) -> float:
-        """What it costs."""
+        """Cost of the best static placement."""
         return self.costs[self.best_static]
 
 

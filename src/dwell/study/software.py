@@ -1,4 +1,4 @@
-"""What the numbers of a study depend on beside the study itself."""
+"""Versions of the software that the numbers of a study depend on."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Contender:
     policy : policy or str
         An object with ``decide``, a policy's name, or a candidate's.
     estimator : Estimator or str, optional
-        What the cell says where None.
+        The cell's where None.
     settings : mapping of str to object
         Values of the cell below ``controller`` and ``objective``, by their paths. They change what
         the controller does and how it weighs, and nothing that happens to it; its runs are judged
@@ -102,7 +102,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """What is done, and kept, as a whole: one realisation, played by every contender.
+    """Unit of work: one realisation, played by every contender, and kept as a whole.
 
     Parameters
     ----------
@@ -116,13 +116,13 @@ class Item:
 
     @property
     def name(self) -> str:
-        """What tells it from the other items of its study."""
+        """Name among the items of its study."""
         return f"{self.points[0]:05d}-{self.scenario}-{self.seed}"
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What is to be simulated: every point, scenario, contender and seed.
+    """Plan of a study: every point, scenario, contender and seed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What one run comes to: the row of numbers that statistics over seeds are made of.
+"""Summary of a run: the row of numbers that statistics over seeds are made of.
 
 Only what follows the warm-up counts: the windows not flagged as such, the decisions at their
 closes, and every cycle from the first of those windows to the end of the last. (After a migration
@@ -51,7 +51,7 @@ STRETCHES = {20: 1, 100: 5}
 
 
 class Counted(NamedTuple):
-    """What of a run statistics are made of: no warm-up, no incomplete window."""
+    """The part of a run for statistics: no warm-up, no incomplete window."""
 
     windows: pl.DataFrame
     decisions: pl.DataFrame

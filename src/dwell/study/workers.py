@@ -87,7 +87,7 @@ def spread(
 
 
 class _Worker:
-    """What a worker process was sent when it began; its types end at the pickle."""
+    """Settings that a worker process was started with; their types end at the pickle."""
 
     task: Callable[..., object]
 

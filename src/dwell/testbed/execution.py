@@ -57,7 +57,7 @@ class Play(Protocol):
 
 
 class State(NamedTuple):
-    """How far a campaign is.
+    """Progress of a campaign.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ class Quiet:
 
 
 class Idle(NamedTuple):
-    """How the machine was when a run began.
+    """State of the machine when a run began.
 
     Parameters
     ----------

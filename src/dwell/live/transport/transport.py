@@ -1,4 +1,4 @@
-"""What every transport does, whatever carries the messages.
+"""The protocol of transports, whatever carries the messages.
 
 A key is chunks with ``/`` between them; in an expression that subscribers match keys with, a chunk
 ``*`` stands for any one chunk and ``**`` for any number of them. That is the part of Zenoh's key
