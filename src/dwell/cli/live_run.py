@@ -67,13 +67,13 @@ def run_live(
         If the cell has tasks without a stage, does not come up, or the folder holds something else.
     """
     problem = dwell.load(file)
-    _require_stages(problem, file)
     if policy is not None or estimator is not None:
         names = (policy or problem.controller.policy, estimator)
         problem = problem.under("+".join(name for name in names if name is not None))
     scenario = scenario or _first_that_disturbs(problem)
     seconds = seconds or _length_s(problem.scenario(scenario))
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
+    _require_stages(problem, file)
     out = out or Path("live-out", problem.name)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
