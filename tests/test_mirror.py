@@ -10,17 +10,11 @@ PACKAGE = TESTS.parent / "src" / "dwell"
 #: Modules without a test file of their name, by package: nothing runs them but what is tested
 #: through the module that uses them, or they only declare. The list may only become shorter.
 WITHOUT = {
-    "kernels": """
-        advance cycles layout links nodes
-    """,
     "live": """
         node role_process
     """,
-    "model": """
-        instants
-    """,
     "sim": """
-        arrays tables
+        arrays
     """,
     "testbed/chaos": """
         harness

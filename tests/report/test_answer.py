@@ -11,9 +11,7 @@ import polars as pl
 import pytest
 
 import dwell
-from dwell.model import (
-    Problem,
-)
+from dwell.model import Problem
 
 ROOT = Path(__file__).parents[2]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -20,8 +19,6 @@ from hypothesis import strategies as st
 import dwell
 from dwell.control import shadow_stamps
 from dwell.estimators import Evidence
-from dwell.kernels.advance import advance
-from dwell.kernels.layout import Tables
 from dwell.model import (
     AR1,
     Constant,
@@ -520,11 +517,6 @@ def test_a_run_with_shadows_is_determined_by_its_seed() -> None:
     assert other.jobs is not None
     assert one.jobs["shadow"].any()
     assert not one.jobs.equals(other.jobs)
-
-
-def test_arguments_of_the_kernel_are_the_fields_of_its_tables() -> None:
-    function: Any = getattr(advance, "py_func", advance)
-    assert tuple(inspect.signature(function).parameters) == Tables._fields
 
 
 # ----------------------------------------------------------------------------------- evidence

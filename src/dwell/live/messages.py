@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeAlias, TypeVar, cast
 import msgspec
 
 from dwell.errors import LiveError
+from dwell.model.instants import NEVER_NS
 
 #: Longer headers and control messages are refused before anything of them is read.
 MAX_HEADER_BYTES = 16_384
@@ -20,7 +21,7 @@ MAX_CONTROL_BYTES = 262_144
 SIGNATURE_BYTES = 64
 
 Name: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=120)]
-Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=NEVER_NS)]
 #: Number of an order that is believed to have been carried out: a quarter of the range is left for
 #: those that follow, whatever one message says.
 Passed: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=3 << 60)]
@@ -28,8 +29,8 @@ Passed: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=3 << 60)]
 MaybeName: TypeAlias = Annotated[str, msgspec.Meta(max_length=120)]
 Hops: TypeAlias = "Annotated[tuple[Hop, ...], msgspec.Meta(max_length=64)]"
 #: CPU time; -1 where it is not known.
-Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)]
-Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-(1 << 62), lt=1 << 62)]
+Spent: TypeAlias = Annotated[int, msgspec.Meta(ge=-1, lt=NEVER_NS)]
+Instant: TypeAlias = Annotated[int, msgspec.Meta(ge=-NEVER_NS, lt=NEVER_NS)]
 Forks: TypeAlias = Annotated[tuple[tuple[Name, Name], ...], msgspec.Meta(max_length=16)]
 Words: TypeAlias = Annotated[str, msgspec.Meta(max_length=2_000)]
 
@@ -114,7 +115,7 @@ class Hop(_Array, frozen=True):
     started_ns: Instant
     ended_ns: Instant
     inputs: Annotated[tuple[tuple[Name, Instant], ...], msgspec.Meta(max_length=64)] = ()
-    state_age: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 62)] = -1
+    state_age: Annotated[int, msgspec.Meta(ge=-1, lt=NEVER_NS)] = -1
     cpu_ns: Spent = -1
     others_ns: Spent = -1
     outside_ns: Spent = -1

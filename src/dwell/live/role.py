@@ -31,6 +31,7 @@ from dwell.live.transport.transport import Arrival, Transport
 from dwell.live.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import fingerprint
+from dwell.model.instants import NEVER_NS
 
 #: What PTP and chrony on one network keep to.
 SYSTEM_BOUND_NS = 1_000_000
@@ -312,12 +313,12 @@ class Pulse:
         self._digest = fingerprint(place.problem)
         self._nodes = frozenset(place.problem.fabric.nodes)
         self._known = {role.who: role.node for role in roles(place.problem)}
-        self._next_ns = self._sent_ns = -(1 << 62)
+        self._next_ns = self._sent_ns = -NEVER_NS
         #: Who is not heard because of its cell file or version: why, and when it beat last.
         self.strangers: dict[str, tuple[str, int]] = {}
         self._rivals: dict[str, int] = {}
         self._complained = 0
-        self._repeat_until_ns = -(1 << 62)
+        self._repeat_until_ns = -NEVER_NS
         keys = place.keys
         self._key = keys.beat(place.node, place.who)
         self._returned = keys.detour(self._key)

@@ -2,5 +2,5 @@
 
 from __future__ import annotations
 
-#: Later than every instant, longer than every latency; sums of two still fit 64 bits.
+#: Later than every instant, longer than every latency; the sum with any of them fits 64 bits.
 NEVER_NS = 1 << 62

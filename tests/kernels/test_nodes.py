@@ -1,0 +1,296 @@
+"""Nodes: quotas and their ticks, turns, wakes, backgrounds and contention, in whole runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.model import (
+    Constant,
+    Execution,
+    Node,
+    NodeDisturbance,
+    Quota,
+    Task,
+)
+from dwell.record import Run
+from dwell.sim import Phase
+from tests.cells.generated import MS, make_problem
+
+
+@pytest.mark.parametrize(("exec_ms", "latency_ms"), [(3.0, 3.0), (5.0, 5.0), (8.0, 13.0)])
+def test_a_quota_stops_a_job_whose_bucket_is_empty(exec_ms: float, latency_ms: float) -> None:
+    # 5 ms of one core in every 10 ms; releases fall on the begins of periods.
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(0.5, 10.0))],
+        [Task("work", {"R": Execution(Constant(exec_ms))})],
+        period_ms=20.0,
+        window_cycles=10,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    assert set(run.cycles["latency_ns"].to_list()) == {round(latency_ms * MS)}
+
+
+def test_a_core_keeps_some_of_what_it_has_drawn() -> None:
+    # As above, but 1 ms outlasts the period: from the second job on 6 ms are there at its begin.
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(0.5, 10.0, slack_ms=1.0))],
+        [Task("work", {"R": Execution(Constant(8.0))})],
+        period_ms=20.0,
+        window_cycles=10,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    latency_ms = [ns / MS for ns in run.cycles["latency_ns"]]
+    assert latency_ms == [13.0, *[12.0] * 19]
+
+
+def test_a_quota_is_noticed_at_ticks_and_its_overrun_paid_back() -> None:
+    # 2 ms in every 4; periods begin with the releases, and 3 ms after a tick.
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(0.5, 4.0, tick_ms=4.0))],
+        [Task("work", {"R": Execution(Constant(6.0))})],
+        period_ms=40.0,
+        window_cycles=10,
+    )
+    real = replace(
+        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": Phase(0, 3 * MS)}
+    )
+    run = dwell.simulate_realisation(problem, real, policy="LOC")
+    # It runs from 0 to 5: 1 of 2 ms are left at the first tick, and 1 too many of 4 are used at the
+    # second. The refill at 8 pays that debt, and in the ms that it leaves the job ends.
+    assert set(run.cycles["latency_ns"].to_list()) == {9 * MS}
+
+
+def test_threads_take_turns_from_tick_to_tick() -> None:
+    stress = NodeDisturbance(node="R", at_s=0.0, stress_threads=1)
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=Quota(1.0, 4.0, tick_ms=4.0))],
+        [Task("work", {"R": Execution(Constant(6.0))})],
+        period_ms=40.0,
+        window_cycles=10,
+        scenario=[stress],
+    )
+    real = replace(
+        dwell.draw(problem, scenario="disturbed", seed=1, windows=1), phases={"R": Phase(0, 1 * MS)}
+    )
+    run = dwell.simulate_realisation(problem, real, policy="LOC", jobs=True)
+    assert run.jobs is not None
+    # The other thread has the core until the tick at 3, and from 7 to 11.
+    assert set((run.jobs["start_ns"] - run.jobs["ready_ns"]).to_list()) == {3 * MS}
+    assert set(run.cycles["latency_ns"].to_list()) == {13 * MS}
+
+
+def test_phases_are_drawn_where_ticks_are() -> None:
+    def drawn(tick_ms: float, seed: int) -> Mapping[str, Phase]:
+        node = Node("R", "robot", 1, quota=Quota(0.5, 10.0, tick_ms=tick_ms))
+        problem = make_problem([node], [Task("work", {"R": Execution(Constant(1.0))})])
+        return dwell.draw(problem, scenario="disturbed", seed=seed, windows=1).phases
+
+    assert drawn(0.0, 1) == {}
+    assert drawn(4.0, 1) == drawn(4.0, 1) != drawn(4.0, 2)
+    period_ago, tick_ago, wakes = zip(*(drawn(4.0, seed)["R"] for seed in range(50)), strict=True)
+    assert len(set(wakes)) == 50
+    assert 0 <= min(period_ago) < 2 * MS < 8 * MS < max(period_ago) < 10 * MS
+    assert 0 <= min(tick_ago) < MS < 3 * MS < max(tick_ago) < 4 * MS
+
+
+def woken(hz: float, *disturbances: NodeDisturbance, quota: Quota, exec_ms: float) -> Run:
+    """A job every 40 ms on a node where something else wakes so often."""
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=quota, background_hz=hz)],
+        [Task("work", {"R": Execution(Constant(exec_ms))})],
+        period_ms=40.0,
+        window_cycles=25,
+        scenario=[*disturbances],
+    )
+    real = dwell.draw(problem, scenario="disturbed", seed=1, windows=20)
+    phase = real.phases["R"]._replace(period_ago_ns=0, tick_ago_ns=3 * MS)
+    return dwell.simulate_realisation(problem, replace(real, phases={"R": phase}), policy="LOC")
+
+
+def latencies_ms(run: Run) -> np.ndarray[Any, Any]:
+    return run.cycles["latency_ns"].to_numpy() / MS
+
+
+def test_what_wakes_has_the_kernel_look_at_the_quota() -> None:
+    # Beside the ticks, which alone make it 9 ms (above): looked at all the time it is used up after
+    # 2 ms of every 4, and what is overrun by then is paid in the next period.
+    run = woken(100_000.0, quota=Quota(0.5, 4.0, tick_ms=4.0), exec_ms=6.0)
+    assert latencies_ms(run).mean() == pytest.approx(10.0, abs=0.03)
+    # It runs on to the tick at 5, unless something wakes between 2, when 2 are used up, and 4.
+    rare = latencies_ms(woken(100.0, quota=Quota(0.5, 4.0, tick_ms=4.0), exec_ms=6.0))
+    assert 0.6 < np.mean(rare == 9.0) < 0.95
+
+
+def test_what_wakes_has_the_kernel_pick_anew_who_runs() -> None:
+    # Beside one foreign thread, on a whole core: 13 ms where threads take turns from tick to tick.
+    stress = NodeDisturbance("R", stress_threads=1)
+    quota = Quota(1.0, 4.0, tick_ms=4.0)
+    run = woken(100_000.0, stress, quota=quota, exec_ms=6.0)
+    assert latencies_ms(run) == pytest.approx(12.0, abs=0.2)
+    # As often as here, turns are two gaps long in the mean, and never longer than to the next tick.
+    often = latencies_ms(woken(1_000.0, stress, quota=quota, exec_ms=6.0))
+    assert often.mean() == pytest.approx(12.0, rel=0.03)
+    assert often.std() > 0.3
+
+
+@pytest.mark.parametrize(("hz", "used"), [(0.0, 0.86), (300.0, 0.955), (1_000.0, 0.99)])
+def test_the_more_often_something_wakes_the_less_of_a_quota_is_lost(hz: float, used: float) -> None:
+    # Measured with a busy thread, 0.8 of a core in 3 ms, beside one that sleeps and wakes (its time
+    # and its going to sleep, at which the kernel looks too, are not in the model).
+    node = Node("R", "robot", 1, quota=Quota(0.8, 3.0, slack_ms=1.0, tick_ms=4.0), background_hz=hz)
+    problem = make_problem(
+        [node],
+        [Task("work", {"R": Execution(Constant(0.1))})],
+        period_ms=100.0,
+        window_cycles=20,
+        scenario=[NodeDisturbance("R", stress_threads=1)],
+    )
+    found = [
+        dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=seed, windows=2).windows[
+            "u_R"
+        ][1]
+        for seed in range(30)
+    ]
+    assert np.mean(found) == pytest.approx(used, abs=0.025)
+
+
+@pytest.mark.parametrize(
+    ("quota", "exec_ms", "latency_ms", "used"),
+    [
+        # 4 of the 5 ms in every period are left to the job.
+        (Quota(0.5, 10.0), 3.0, 3.0, 0.5),
+        (Quota(0.5, 10.0), 8.0, 14.0, 1.0),
+        # 0.9 of the core are left to it: busy while it runs, and for a tenth of the rest.
+        (None, 4.5, 5.0, 0.325),
+    ],
+)
+def test_the_background_takes_of_the_quota_or_of_the_cores(
+    quota: Quota | None, exec_ms: float, latency_ms: float, used: float
+) -> None:
+    problem = make_problem(
+        [Node("R", "robot", 1, quota=quota, background=0.1)],
+        [Task("work", {"R": Execution(Constant(exec_ms))})],
+        period_ms=20.0,
+        window_cycles=10,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    assert set(run.cycles["latency_ns"].to_list()) == {round(latency_ms * MS)}
+    assert run.windows["u_R"].to_list() == pytest.approx([used] * 2)
+
+
+def test_what_waits_while_jobs_run_takes_less_of_their_quota() -> None:
+    # 4.5 of the 5 ms in every period are left to the job, 4 while there are foreign threads: these
+    # have half of them. The job takes 1.25 times as long then.
+    node = Node(
+        *("R1", "robot", 1),
+        quota=Quota(0.5, 10.0),
+        background=0.1,
+        background_beside=0.05,
+        interference=1.25,
+    )
+    problem = make_problem(
+        [node],
+        [Task("work", {"R1": Execution(Constant(8.0))})],
+        period_ms=100.0,
+        window_cycles=5,
+        scenario=[NodeDisturbance("R1", stress_threads=1)],
+    )
+    calm = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=1, windows=2)
+    assert set(calm.cycles["latency_ns"].to_list()) == {round(13.5 * MS)}
+    assert calm.windows["u_R1"].to_list() == pytest.approx([0.36] * 2)
+    stressed = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=2)
+    # 1.6 ms of its 8 in every period.
+    assert stressed.cycles["latency_ns"][1] == 44 * MS
+    assert stressed.windows["u_R1"].to_list() == pytest.approx([1.0] * 2, abs=0.02)
+
+
+def test_what_no_quota_counts_makes_the_core_slower_and_the_quota_last() -> None:
+    # Others have half of the core's time: the job has used up its 2.5 ms of every 10 after 5, and
+    # after three such periods it takes another millisecond for the last half of one.
+    node = Node("R1", "robot", 1, quota=Quota(0.25, 10.0), contention=0.5)
+    problem = make_problem(
+        [node],
+        [Task("work", {"R1": Execution(Constant(8.0))})],
+        period_ms=100.0,
+        window_cycles=5,
+    )
+    run = dwell.simulate(problem, policy="LOC", seed=1, windows=2)
+    assert set(run.cycles["latency_ns"].to_list()) == {31 * MS}
+    assert run.windows["u_R1"].to_list() == pytest.approx([8.0 / 25.0] * 2)
+    ticking = replace(node, quota=Quota(0.25, 10.0, slack_ms=1.0, tick_ms=4.0))
+    fabric = replace(problem.fabric, nodes={"R1": ticking})
+    run = dwell.simulate(replace(problem, fabric=fabric), policy="LOC", seed=1, windows=20)
+    assert run.windows["u_R1"].mean() == pytest.approx(8.0 / 25.0, rel=0.01)
+    # What ticks notice late is made up for later; faster than its pace the job never is.
+    assert min(run.cycles["latency_ns"].to_list()) >= 16 * MS
+
+
+def test_a_period_that_begins_with_stress_and_a_job_is_a_stressed_one() -> None:
+    # All three at 30 ms. Without stress a period has 5 ms, with it 2.5, of which the job has half.
+    problem = make_problem(
+        [Node("R1", "robot", 1, quota=Quota(0.5, 10.0), background=0.25, background_beside=0.0)],
+        [Task("work", {"R1": Execution(Constant(4.0))}, offset_ms=30.0)],
+        period_ms=100.0,
+        window_cycles=5,
+        scenario=[NodeDisturbance("R1", at_s=0.03, stress_threads=1)],
+    )
+    run = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=1)
+    assert run.cycles["latency_ns"][0] == 60.5 * MS
+
+
+def test_foreign_threads_of_a_node_on_the_same_cpu_take_more_of_it() -> None:
+    # R2 has all of its core, and in the second of four windows, while R1 is stressed, a quarter.
+    quota = Quota(0.4, 20.0)
+    problem = make_problem(
+        [
+            Node("R1", "robot", 1),
+            Node("R2", "robot", 1, quota=quota, contention_stressed={"R1": 0.75}),
+        ],
+        [Task("work", {"R2": Execution(Constant(10.0))})],
+        period_ms=100.0,
+        window_cycles=5,
+        scenario=[NodeDisturbance("R1", at_s=0.5, for_s=0.5, stress_threads=1)],
+    )
+    run = dwell.simulate(problem, scenario="disturbed", policy="LOC", seed=1, windows=4)
+    # Calm: 8 ms, 12 of waiting, 2. Stressed: 5 ms in every period, less than its quota.
+    assert run.cycles["latency_ns"].to_list() == [22 * MS] * 5 + [40 * MS] * 5 + [22 * MS] * 10
+    # It is the same work, whatever it took of the core's time.
+    assert run.windows["u_R2"].to_list() == pytest.approx([0.25] * 4)
+
+
+def test_threads_that_hand_a_job_on_wait_for_their_turns() -> None:
+    # One core, nothing used up: a foreign thread, ticks every 4 ms.
+    def played(before_ms: float, after_ms: float) -> tuple[list[float], list[float]]:
+        execution = Execution(Constant(4.0), before_ms=before_ms, after_ms=after_ms)
+        problem = make_problem(
+            [Node("R1", "robot", 1, quota=Quota(1.0, 1000.0, 0.0, 4.0))],
+            [Task("work", {"R1": execution})],
+            period_ms=101.0,
+            window_cycles=40,
+            scenario=[NodeDisturbance("R1", stress_threads=1)],
+        )
+        run = dwell.simulate(
+            problem, scenario="disturbed", policy="LOC", seed=3, windows=1, jobs=True
+        )
+        waits_ns = run.jobs["start_ns"] - run.jobs["ready_ns"]
+        latency_ns = run.cycles["latency_ns"].to_list()
+        return [ns / MS for ns in latency_ns], [ns / MS for ns in waits_ns.to_list()]
+
+    one, first_waits = played(0.0, 0.0)
+    three, waits = played(1.0, 1.0)
+    # One thread waits for the end of the foreign one's turn, at a tick.
+    assert min(one) > 4.9
+    assert first_waits.count(0.0) <= 2
+    # Of three the first takes the turn at once where it has lasted 1.4 ms.
+    assert waits.count(0.0) >= 18
+    # The worker lets the foreign one go first, which has waited: to the first tick after 1.4 ms.
+    at_once = [ms for ms, wait in zip(three, waits, strict=True) if wait == 0.0]
+    assert min(at_once) >= 4.0 + 1.4
+    # The last goes first: nobody has had another turn.
+    assert max(at_once) < 4.0 + 1.4 + 4.0

@@ -1,0 +1,114 @@
+"""Tables of a run: what they promise, on the example cells under every policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import polars as pl
+import pytest
+
+import dwell
+from dwell.errors import RunError
+from dwell.model import Problem
+from tests.cells.generated import MS
+from tests.cells.two_nodes import Script
+
+
+def runs_of(cells: Mapping[str, Problem]) -> list[tuple[Problem, dwell.Run]]:
+    """Return a run of every cell and scenario under two policies."""
+    return [
+        (problem, dwell.simulate(problem, scenario=scenario, policy=policy, seed=3, windows=15))
+        for problem in cells.values()
+        for scenario in problem.scenarios
+        for policy in ("dtp", "latency-first")
+    ]
+
+
+def test_every_cycle_is_done_lost_or_in_flight(cells: Mapping[str, Problem]) -> None:
+    for problem, run in runs_of(cells):
+        cycles = run.cycles
+        # Orders take time: the cycles of a last window that is not complete are never released.
+        count = run.windows["first_cycle"][-1] + problem.window_cycles
+        assert 14 * problem.window_cycles <= count <= 15 * problem.window_cycles
+        assert cycles["cycle"].to_list() == list(range(count))
+        assert (cycles["release_ns"].diff().drop_nulls() > 0).all()
+        done = cycles["outcome"] == "done"
+        assert (cycles["latency_ns"].is_not_null() == done).all()
+        assert cycles.filter(~done)["missed"].all()
+        deadline_ns = round(problem.pipeline.deadline_ms * MS)
+        assert cycles.filter(pl.col("latency_ns") > deadline_ns)["missed"].all()
+        # Nothing hangs: what is in flight was released near the end.
+        flying = cycles.filter(pl.col("outcome") == "in_flight")["cycle"]
+        assert (flying >= count - 2 * problem.window_cycles).all()
+
+
+def test_latency_is_compute_queue_and_network(cells: Mapping[str, Problem]) -> None:
+    for _, run in runs_of(cells):
+        parts = run.cycles.select("compute_ns", "queue_ns", "network_ns")
+        done = run.cycles.filter(pl.col("outcome") == "done")
+        assert (
+            done["compute_ns"] + done["queue_ns"] + done["network_ns"] == done["latency_ns"]
+        ).all()
+        assert (parts.min_horizontal().drop_nulls() >= 0).all()
+        lost = run.cycles.filter(pl.col("outcome") != "done")
+        nulls = lost.select("latency_ns", "compute_ns", "queue_ns", "network_ns").null_count()
+        assert set(nulls.row(0)) == {lost.height}
+
+
+def test_windows_say_what_their_cycles_say(cells: Mapping[str, Problem]) -> None:
+    for problem, run in runs_of(cells):
+        width = problem.window_cycles
+        for row in run.windows.iter_rows(named=True):
+            mine = run.cycles[row["first_cycle"] : row["first_cycle"] + width]
+            assert mine.height == width
+            assert row["placement"] == mine["placement"][0]
+            assert row["mixed"] == (mine["placement"].n_unique() > 1)
+            assert row["violation_rate"] == mine["missed"].mean()
+            latencies = sorted(
+                math.inf if value is None else value / MS for value in mine["latency_ns"].to_list()
+            )
+            assert row["l95_ms"] == latencies[math.ceil(0.95 * width) - 1]
+            assert row["warmup"] == (row["window"] < problem.warmup_windows)
+            for node in problem.fabric.nodes:
+                assert 0 <= row[f"u_{node}"] <= 1
+
+
+def test_windows_follow_one_another(cells: Mapping[str, Problem]) -> None:
+    for problem, run in runs_of(cells):
+        moved = run.decisions.filter(pl.col("migrated"))["window"].to_list()
+        gaps = run.windows["first_cycle"].diff().to_list()[1:]
+        for window, gap in enumerate(gaps):
+            if window in moved:
+                assert gap >= problem.window_cycles
+            else:
+                assert gap == problem.window_cycles
+
+
+def test_decisions_say_what_was_stamped(cells: Mapping[str, Problem]) -> None:
+    for _, run in runs_of(cells):
+        placed = dict(run.windows.select("window", pl.col("placement").cast(str)).rows())
+        for row in run.decisions.iter_rows(named=True):
+            assert row["incumbent"] == placed[row["window"]]
+            assert row["migrated"] == (row["placement"] != row["incumbent"])
+            if row["window"] + 1 in placed:
+                assert placed[row["window"] + 1] == row["placement"]
+
+
+def test_costs_are_finite_whatever_is_lost(cells: Mapping[str, Problem]) -> None:
+    for _, run in runs_of(cells):
+        assert run.windows["cost"].drop_nulls().is_finite().all()
+        assert run.windows["seen_l95_ms"].drop_nulls().is_finite().all()
+
+
+def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:
+    run = dwell.simulate(canonical, policy=Script("SO", "LOC", "HYB"), seed=1, windows=6, jobs=True)
+    placed = run.cycles.select("cycle", pl.col("placement").cast(str))
+    jobs = run.jobs.with_columns(pl.col("task", "node").cast(str)).join(placed, on="cycle")
+    for task, node, candidate in jobs.select("task", "node", "placement").unique().iter_rows():
+        assert canonical.candidates[candidate][task] == node
+    finished = jobs.filter(pl.col("end_ns").is_not_null() & pl.col("start_ns").is_not_null())
+    assert (finished["ready_ns"] <= finished["start_ns"]).all()
+    assert (finished["start_ns"] <= finished["end_ns"]).all()
+    with pytest.raises(RunError):
+        _ = dwell.simulate(canonical, seed=1, windows=1).jobs
