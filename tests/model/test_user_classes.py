@@ -14,6 +14,7 @@ import pytest
 import dwell
 from dwell.cellfile import load_without_traces
 from dwell.control import Controller
+from dwell.errors import PolicyError
 from tests.cli.small_cell import SMALL, call, read_json
 
 POLICY = """\
@@ -178,6 +179,17 @@ def test_two_folders_have_modules_of_one_name(cell: Path, tmp_path: Path) -> Non
         run = dwell.simulate(problem, policy="own.choice:Last", seed=1, windows=4)
         placed.append(run.windows["placement"].to_list()[-1])
     assert placed == ["OFF", "LOC", "OFF"]
+
+
+def test_a_folder_without_a_module_does_not_get_the_one_of_another(
+    cell: Path, tmp_path: Path
+) -> None:
+    dwell.simulate(dwell.load(cell), policy="own.choice:Last", seed=1, windows=4)
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    shutil.copy(cell, bare)
+    with pytest.raises(PolicyError, match="there is no module 'own'"):
+        dwell.simulate(dwell.load(bare / cell.name), policy="own.choice:Last", seed=1, windows=4)
 
 
 def test_a_study_over_processes_knows_a_changed_module(cell: Path) -> None:

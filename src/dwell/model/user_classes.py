@@ -11,7 +11,7 @@ import re
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -118,7 +118,7 @@ def import_user_module(
     try:
         if folder is not None and beside:
             return _import_beside(name, folder)
-        return importlib.import_module(name)
+        return _import_installed(name)
     except (Exception, SystemExit) as fault:
         missing = fault.name if isinstance(fault, ModuleNotFoundError) else None
         if missing is not None and f"{name}.".startswith(f"{missing}."):
@@ -136,6 +136,20 @@ def _import_beside(name: str, folder: str) -> ModuleType:
         return _beside[folder, name]
 
 
+def _import_installed(name: str) -> ModuleType:
+    """Import an installed module, not one of its name that stands beside another cell file."""
+    package = name.partition(".")[0]
+    with _importing:
+        beside = {
+            known: module
+            for known, module in sys.modules.items()
+            if known.partition(".")[0] == package
+            and any(_is_in(module, folder) for folder, _ in _beside)
+        }
+        with _hidden(beside):
+            return importlib.import_module(name)
+
+
 @contextmanager
 def _first_on_path(folder: str) -> Iterator[None]:
     """Look for modules in a folder first; modules of the same names from elsewhere come back."""
@@ -145,16 +159,25 @@ def _first_on_path(folder: str) -> Iterator[None]:
         for name, module in sys.modules.items()
         if name.partition(".")[0] in names and not _is_in(module, folder)
     }
-    for name in elsewhere:
+    with _hidden(elsewhere):
+        sys.path.insert(0, folder)
+        importlib.invalidate_caches()
+        try:
+            yield
+        finally:
+            if folder in sys.path:
+                sys.path.remove(folder)
+
+
+@contextmanager
+def _hidden(modules: Mapping[str, ModuleType]) -> Iterator[None]:
+    """Have modules count as never imported, for a while."""
+    for name in modules:
         del sys.modules[name]
-    sys.path.insert(0, folder)
-    importlib.invalidate_caches()
     try:
         yield
     finally:
-        if folder in sys.path:
-            sys.path.remove(folder)
-        sys.modules.update(elsewhere)
+        sys.modules.update(modules)
 
 
 def _modules_in(folder: str) -> set[str]:
@@ -163,8 +186,9 @@ def _modules_in(folder: str) -> set[str]:
 
 
 def _is_in(module: ModuleType, folder: str) -> bool:
-    file = getattr(module, "__file__", None)
-    return isinstance(file, str) and file.startswith(f"{folder}/")
+    # A package without __init__.py has no file, but places.
+    places = [getattr(module, "__file__", None), *getattr(module, "__path__", ())]
+    return any(isinstance(one, str) and one.startswith(f"{folder}/") for one in places)
 
 
 def _told(fault: BaseException) -> str:
