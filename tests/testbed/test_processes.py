@@ -90,13 +90,15 @@ def test_none_is_left_when_the_process_that_started_them_is_killed(tmp_path: Pat
     cell, out = write_cell(tmp_path), tmp_path / "out"
     words = [sys.executable, "-c", OWNER, str(cell), str(out)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, process_group=0) as owner:
-        assert owner.stdout is not None
-        agent = int(owner.stdout.readline())
-        marks = [out / "R1" / f"{who}.pid" for who in ("stamper@R1", "sensing@R1")]
-        wait_until(lambda: all(mark.exists() for mark in marks))
-        pids = [agent, *(json.loads(mark.read_text())["pid"] for mark in marks)]
-        assert all(psutil.pid_exists(pid) for pid in pids)
-        owner.send_signal(signal.SIGKILL)
+        try:
+            assert owner.stdout is not None
+            agent = int(owner.stdout.readline())
+            marks = [out / "R1" / f"{who}.pid" for who in ("stamper@R1", "sensing@R1")]
+            wait_until(lambda: all(mark.exists() for mark in marks))
+            pids = [agent, *(json.loads(mark.read_text())["pid"] for mark in marks)]
+            assert all(psutil.pid_exists(pid) for pid in pids)
+        finally:
+            owner.send_signal(signal.SIGKILL)
     wait_until(lambda: not any(psutil.pid_exists(pid) for pid in pids))
 
 
