@@ -39,3 +39,7 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
         app(arguments, prog_name="dwell", obj=platform)
     except KeyboardInterrupt:
         sys.exit(ExitCode.INTERRUPTED)
+    finally:
+        # CPython notes an interrupt that passes through `exec` of a text, as in Numba, and ends
+        # `python -m` by SIGINT for it, handled or not. The next `exec` takes the note back.
+        exec("")  # noqa: S102
