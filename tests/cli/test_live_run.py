@@ -228,13 +228,18 @@ class Looking:
         ({"without": ["camera"]}, "nothing to run for camera"),
         ({"live": {"observer": "looking"}}, "live.observer: 'looking' is not allowed"),
         ({"scenario": "storm"}, "storm"),
-        ({}, "tasks.camera.run (stages:Camera): there is no module 'stages'"),
+        (
+            {"run": "nowhere:Camera"},
+            "tasks.camera.run (nowhere:Camera): there is no module 'nowhere'",
+        ),
     ],
 )
 def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
     document = to_document(dwell.load(CELL.parents[1] / "live" / "cell.yaml"))
     for task in change.get("without", ()):
         del document["tasks"][task]["run"]
+    if "run" in change:
+        document["tasks"]["camera"]["run"] = change["run"]
     document["live"] = {**document.get("live", {}), **change.get("live", {})}
     cell = tmp_path / "cell.yaml"
     cell.write_text(yaml.safe_dump(document))
