@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from dwell.calibration.target import find_callable, importable_from
+from dwell.calibration.target import find_callable
 from dwell.errors import ProfileError
+from dwell.model.user_classes import importable_from
 
 MODULE = """\
 import functools
@@ -51,7 +52,7 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     (package / "failing.py").write_text("\n\nraise RuntimeError('no camera')\n")
     (package / "leaving.py").write_text("raise SystemExit(3)\n")
     (package / "wrong.py").write_text("def f(:\n")
-    with importable_from(tmp_path):
+    with importable_from(str(tmp_path)):
         yield tmp_path
     for name in [name for name in sys.modules if name.startswith("a_package")]:
         del sys.modules[name]
@@ -116,6 +117,6 @@ def test_where_modules_are_looked_for_is_said(
 
 def test_the_path_is_given_back(tmp_path: Path) -> None:
     before = list(sys.path)
-    with importable_from(tmp_path):
+    with importable_from(str(tmp_path)):
         assert sys.path == [str(tmp_path.resolve()), *before]
     assert sys.path == before

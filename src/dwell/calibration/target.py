@@ -5,26 +5,11 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 from dwell.calibration.error_origin import describe_raised
 from dwell.errors import ProfileError
-
-
-@contextmanager
-def importable_from(folder: Path) -> Iterator[None]:
-    """Look for modules in `folder` first, as ``python -m`` does in the current one."""
-    place = str(folder.resolve())
-    sys.path.insert(0, place)
-    importlib.invalidate_caches()
-    try:
-        yield
-    finally:
-        if place in sys.path:
-            sys.path.remove(place)
 
 
 def find_callable(name: str, option: str) -> Callable[..., object]:

@@ -178,10 +178,11 @@ def _measured(
     node: str, sources: Mapping[str, str], factories: Mapping[str, str], settings: Settings
 ) -> list[Measurement]:
     from dwell.calibration.measure import measure_task, undisturbed_collector
-    from dwell.calibration.target import find_callable, importable_from
+    from dwell.calibration.target import find_callable
+    from dwell.model.user_classes import importable_from
 
     measured = []
-    with importable_from(Path.cwd()), undisturbed_collector():
+    with importable_from(str(Path.cwd())), undisturbed_collector():
         calls = {task: find_callable(name, f"--task {task}") for task, name in sources.items()}
         inputs: dict[str, Callable[[int], object]] = {
             task: find_callable(name, "--inputs") for task, name in factories.items()

@@ -159,14 +159,20 @@ def _first_on_path(folder: str) -> Iterator[None]:
         for name, module in sys.modules.items()
         if name.partition(".")[0] in names and not _is_in(module, folder)
     }
-    with _hidden(elsewhere):
-        sys.path.insert(0, folder)
-        importlib.invalidate_caches()
-        try:
-            yield
-        finally:
-            if folder in sys.path:
-                sys.path.remove(folder)
+    with _hidden(elsewhere), importable_from(folder):
+        yield
+
+
+@contextmanager
+def importable_from(folder: str) -> Iterator[None]:
+    """Look for modules in a folder first, as ``python -m`` does in the current one."""
+    sys.path.insert(0, folder)
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if folder in sys.path:
+            sys.path.remove(folder)
 
 
 @contextmanager
