@@ -229,8 +229,11 @@ def excess(qos: QoS, objective: Objective) -> float:
     Returns
     -------
     float
-        Maximum of ``value / cap - 1`` over L95 and the utilisation of every node in `qos` (see
-        `busiest`); above 0 if and only if a cap is exceeded, -1 where there are no caps.
+        Maximum of ``value / cap - 1`` over L95 (uncut: a lost one exceeds every cap) and the
+        utilisation of every node in `qos` (see `busiest`); above 0 if and only if a cap is
+        exceeded, -1 where there are no caps.
     """
     caps = objective.caps
-    return max(qos.l95_ms / caps.latency_ms, busiest(qos) / caps.utilisation) - 1.0
+    # No latency, a lost one either, is over a cap that is not there.
+    latency = qos.uncut_l95_ms / caps.latency_ms if caps.latency_ms < math.inf else 0.0
+    return max(latency, busiest(qos) / caps.utilisation) - 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from dwell.estimators import Profile
 from dwell.estimators.paths import order_statistic
 from dwell.model import (
     AR1,
+    Caps,
     Constant,
     Execution,
     Exponential,
@@ -319,20 +321,36 @@ def test_a_lost_message_is_a_latency_at_the_bound() -> None:
     problem = across(Link("R1", "E", Constant(1.0), loss=0.1), deadline_ms=20.0)
     profile = Profile(problem, samples=100_000)
     assert profile.l95_ms == {"LOC": 2.0, "SO": 200.0}
+    assert profile.uncut_l95_ms == {"LOC": 2.0, "SO": math.inf}
     assert profile.violation_rate["LOC"] == 0.0
     assert profile.violation_rate["SO"] == pytest.approx(0.1, abs=0.005)
     rare = across(Link("R1", "E", Constant(1.0), loss=0.02), deadline_ms=20.0)
     assert Profile(rare, samples=100_000).l95_ms["SO"] == 3.0
 
 
-def test_the_bound_is_the_larger_of_ten_deadlines_and_a_window() -> None:
+@pytest.mark.parametrize("window_cycles", [1, 3, 400])
+@pytest.mark.parametrize(
+    ("deadline_ms", "cap_ms", "bound"),
+    [(20.0, math.inf, 200.0), (60.0, math.inf, 240.0), (60.0, 300.0, 300.0), (60.0, 9.0, 240.0)],
+)
+def test_the_bound_is_four_deadlines_two_periods_or_the_cap(
+    window_cycles: int, deadline_ms: float, cap_ms: float, bound: float
+) -> None:
     link = Link("R1", "E", Constant(1.0), loss=0.5)
-    for window_cycles, bound in [(1, 200.0), (2, 200.0), (3, 300.0)]:
-        problem = across(link, deadline_ms=20.0, window_cycles=window_cycles)
-        assert Profile(problem, samples=100).l95_ms["SO"] == bound
-        assert problem.censor_ms == bound
-    slow = across(Link("R1", "E", Constant(500.0)), deadline_ms=20.0)
-    assert Profile(slow, samples=100).l95_ms["SO"] == 200.0
+    problem = across(link, deadline_ms=deadline_ms, window_cycles=window_cycles)
+    problem = replace(problem, objective=replace(problem.objective, caps=Caps(latency_ms=cap_ms)))
+    assert problem.censor_ms == bound
+    assert Profile(problem, samples=100).l95_ms["SO"] == bound
+
+
+def test_what_is_cut_is_known_uncut() -> None:
+    slow = across(Link("R1", "E", Constant(500.0)), deadline_ms=60.0)
+    profile = Profile(slow, samples=100)
+    assert (profile.l95_ms["SO"], profile.uncut_l95_ms["SO"]) == (240.0, 502.0)
+    observed = QoS(1.0, 0.0, {"R1": 0.0, "E": 0.0})
+    estimates = profile.estimate(observed=observed, incumbent="LOC", own={"R1": 0.0, "E": 0.0})
+    assert (estimates["SO"].l95_ms, estimates["SO"].uncut_l95_ms) == (240.0, 502.0)
+    assert estimates["LOC"].cut_from_ms is None
 
 
 def test_retransmission_by_hand() -> None:

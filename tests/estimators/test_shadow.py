@@ -225,7 +225,8 @@ def test_newer_samples_weigh_more() -> None:
 
 
 def test_lost_shadows_count_as_ages_and_as_missed() -> None:
-    shadow = Shadow(cell())
+    problem = cell()
+    shadow = Shadow(problem)
     # Every fifth of 20 is lost; the oldest loss is 50 windows of 40 ms old.
     lost = (0, 10, 20, 30)
     rows = {i: GONE if i in lost else off(40.0 * i, 20.0) for i in range(0, 40, 2)}
@@ -233,7 +234,7 @@ def test_lost_shadows_count_as_ages_and_as_missed() -> None:
     shown = estimate(shadow)["OFF"]
     assert shown.violation_rate == 0.2
     # The 19th of 20: the second oldest loss.
-    assert shown.l95_ms == 40.0 * 40
+    assert (shown.l95_ms, shown.uncut_l95_ms) == (problem.censor_ms, math.inf)
     assert shadow.support()["OFF"].samples == 20
 
 
@@ -334,6 +335,7 @@ def test_the_estimate_is_censored() -> None:
     shadow.learn(one_window(dict.fromkeys(range(40), GONE)))
     shown = estimate(shadow)["OFF"]
     assert (shown.l95_ms, shown.violation_rate) == (problem.censor_ms, 1.0)
+    assert shown.uncut_l95_ms == math.inf
 
 
 def test_a_start_forgets_and_another_problem_has_its_own_profile() -> None:

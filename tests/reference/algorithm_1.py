@@ -49,7 +49,9 @@ def worst(q: QoS, objective: Objective) -> float:
     """Largest value / cap - 1; a node that is full to 0.995 counts as full."""
     used = [max(u, 1.0) if u >= 0.995 else u for u in q.utilisation.values()]
     shares = [u / objective.caps.utilisation for u in used]
-    return max([q.l95_ms / objective.caps.latency_ms, *shares]) - 1
+    l95_ms = q.l95_ms if q.cut_from_ms is None else q.cut_from_ms
+    latency = 0 if objective.caps.latency_ms == math.inf else l95_ms / objective.caps.latency_ms
+    return max([latency, *shares]) - 1
 
 
 def algorithm_1(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -167,13 +168,18 @@ def _full_links(problem: Problem) -> Iterator[Fault]:
 def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield candidates that are over the latency cap before anything disturbs them."""
     cap_ms = problem.objective.caps.latency_ms
-    for name, l95_ms in profile.l95_ms.items():
-        if cap_ms is not None and l95_ms > cap_ms:
+    for name, l95_ms in profile.uncut_l95_ms.items():
+        if l95_ms > cap_ms:
             yield Fault(
                 f"candidates.{name}",
-                f"L95 is {l95_ms:.1f} ms undisturbed, over the cap of {cap_ms:g} ms: it is never "
-                "eligible while another one is",
+                f"L95 is {_shown_ms(l95_ms)} ms undisturbed, over the cap of {cap_ms:g} ms: it is "
+                "never eligible while another one is",
             )
+
+
+def _shown_ms(l95_ms: float) -> str:
+    """An L95 with one digit; infinite where more messages are lost than it leaves out."""
+    return f"{l95_ms:.1f}" if math.isfinite(l95_ms) else "∞"
 
 
 def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
@@ -246,7 +252,7 @@ def _contents(problem: Problem, profile: Profile) -> dict[str, Any]:
         "candidates": {
             name: {
                 "placement": dict(placement),
-                "l95_ms": profile.l95_ms[name],
+                "l95_ms": profile.uncut_l95_ms[name],
                 "violation_rate": profile.violation_rate[name],
                 "own_work": dict(profile.own[name]),
             }
@@ -266,7 +272,7 @@ def _summary(problem: Problem, profile: Profile) -> str:
     rows = [
         [
             name,
-            f"{profile.l95_ms[name]:.1f}",
+            _shown_ms(profile.uncut_l95_ms[name]),
             f"{profile.violation_rate[name] * 100:.1f}",
             *(f"{profile.own[name][node] * 100:.0f}" for node in nodes),
         ]

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import missed_cycles, seen_l95_ns, utilisation
+from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.cost import SATURATED, censored, excess, hamming, price, tier_nodes
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
 from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
@@ -145,7 +145,6 @@ class Controller:
         self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
-        self._censor_ns = round(problem.censor_ms * 1e6)
         #: By which caps candidates are eligible: the policy's own, where it has any.
         self.objective: Objective = getattr(self.policy, "objective", None) or problem.objective
         self._has_caps = self.objective.caps != Caps()
@@ -231,15 +230,16 @@ class Controller:
         """
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
-        l95_ms = int(seen_l95_ns(window.latency_ns, age_ns, self._censor_ns)) / 1e6
+        l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self.problem.censor_ms)
         used, own, shadow = self.utilisation(window)
         if self._learner is not None and window.evidence is not None:
             self._learner.learn(window.evidence())
         return self.decide(
             QoS(
-                l95_ms,
+                float(l95_ms),
                 missed / len(age_ns),
                 FrozenDict(zip(self.nodes, used.tolist(), strict=True)),
+                float(uncut_ms),
             ),
             # Neither the cell's jobs nor its shadow jobs are foreign.
             dict(zip(self.nodes, (own + shadow).tolist(), strict=True)),
@@ -518,10 +518,8 @@ def static_columns(
     missed = missed_cycles(window.latency_ns, age_ns, controller._deadline_ns)
     share = controller.utilisation(window)
     used, own = share[:, 0], share[:, 1]
-    seen: dict[str, Floats] = {
-        "l95_ms": seen_l95_ns(window.latency_ns, age_ns, controller._censor_ns) / 1e6,
-        "violation_rate": missed / age_ns.shape[-1],
-    }
+    seen_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, problem.censor_ms)
+    seen: dict[str, Floats] = {"l95_ms": seen_ms, "violation_rate": missed / age_ns.shape[-1]}
     by_node = {node: used[:, i] for i, node in enumerate(controller.nodes)}
     seen["cost"] = _priced(problem, seen["l95_ms"], seen["violation_rate"], by_node, 0.0)
     # No other candidate is ever active, so that none is known to leave a full node less than full.
@@ -540,8 +538,10 @@ def static_columns(
     }
     for candidate, placement in problem.candidates.items():
         l95_ms, violation_rate, busy = seen["l95_ms"], seen["violation_rate"], by_node
+        capped_ms = uncut_ms
         if candidate != name:
             l95_ms = np.full(count, profile.l95_ms[candidate])
+            capped_ms = np.full(count, profile.uncut_l95_ms[candidate])
             violation_rate = np.full(count, profile.violation_rate[candidate])
             work = profile.own[candidate]
             busy = {
@@ -549,7 +549,7 @@ def static_columns(
                 for i, node in enumerate(controller.nodes)
             }
         switching = hamming(placement, problem.candidates[name])
-        over = _excess(controller.objective.caps, l95_ms, busy)
+        over = _excess(controller.objective.caps, capped_ms, busy)
         j = _priced(problem, l95_ms, violation_rate, busy, switching) if priced else null
         estimated = {
             "j": j,
@@ -568,7 +568,8 @@ def _excess(caps: Caps, l95_ms: Floats, by_node: Mapping[str, Floats]) -> Floats
     """`dwell.cost.excess` of many windows."""
     largest: Floats = np.maximum.reduce(list(by_node.values()))
     largest = np.where(largest < SATURATED, largest, np.maximum(largest, 1.0))
-    excess: Floats = np.maximum(l95_ms / caps.latency_ms, largest / caps.utilisation) - 1.0
+    latency = l95_ms / caps.latency_ms if caps.latency_ms < np.inf else 0.0
+    excess: Floats = np.maximum(latency, largest / caps.utilisation) - 1.0
     return excess
 
 

@@ -43,26 +43,30 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
     return missed
 
 
-def seen_l95_ns(latency_ns: Ints, age_ns: Ints, censor_ns: int) -> Ints:
+def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Floats, Floats]:
     """L95 as it could be known when the window closed: an unfinished cycle counts with its age.
 
     Parameters
     ----------
     latency_ns, age_ns : int64 array, shape (..., W)
         As in `missed_cycles`.
-    censor_ns : int
-        No latency counts for more than this.
+    censor_ms : float
+        `Problem.censor_ms`.
 
     Returns
     -------
-    int64 array, shape (...)
+    l95_ms, uncut_ms : float64 array, shape (...)
+        At most `censor_ms`, as J is made of it; and as caps are compared with it, infinite where
+        the L95 is that of an unfinished cycle, which is lost or later than nearly all others.
     """
-    seen = np.minimum(latency_ns, age_ns)
+    # The last bit tells unfinished cycles apart; of equal values theirs come last.
+    seen = 2 * np.minimum(latency_ns, age_ns) + (latency_ns > age_ns)
     rank = l95_rank(seen.shape[-1])
     seen.partition(rank - 1, axis=-1)
+    l95 = seen[..., rank - 1]
     # Censoring is monotone, so censoring the order statistic is censoring every latency.
-    l95: Ints = np.minimum(seen[..., rank - 1], censor_ns)
-    return l95
+    cut_ns = np.minimum(l95 // 2, round(censor_ms * 1e6))
+    return cut_ns / 1e6, np.where(l95 % 2, np.inf, l95 // 2 / 1e6)
 
 
 def final_l95_ms(latency_ns: Ints) -> Floats:

@@ -236,9 +236,9 @@ class Corrected:
             [0.0 if pool is None else pool.drawn for pool in route.messages],
         )
         late = latency_ms > problem.pipeline.deadline_ms + ROUNDING_MS
-        l95_ms = seen_windows(latency_ms, self._row, self._age_ms, problem.censor_ms)
+        l95_ms, uncut_ms = seen_windows(latency_ms, self._row, self._age_ms, problem.censor_ms)
         missed = int(np.count_nonzero(late)) / len(latency_ms)
-        return QoS(l95_ms, missed, known.utilisation)
+        return QoS(l95_ms, missed, known.utilisation, uncut_ms)
 
     def _widening(self, pool: Pool) -> float:
         """Deviation of the logarithm of a pool's times, from the windows since it was measured."""

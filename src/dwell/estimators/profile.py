@@ -64,6 +64,8 @@ class Profile:
     ----------
     l95_ms : mapping of str to float
         Estimated L95 of every candidate, milliseconds; never more than ``problem.censor_ms``.
+    uncut_l95_ms : mapping of str to float
+        The same without that bound; infinite where it is lost.
     violation_rate : mapping of str to float
         Estimated V_D of every candidate.
     own : mapping of str to mapping of str to float
@@ -80,19 +82,21 @@ class Profile:
         require(seed >= 0, "seed", seed, "a whole number of at least 0")
         self._samples, self._seed = samples, seed
         cycles = SampleCycles(problem, samples, seed)
-        l95_ms, violation_rate, own = {}, {}, {}
+        uncut_l95_ms, violation_rate, own = {}, {}, {}
         for name, placement in problem.candidates.items():
             latency_ms = cycles.latency_ms(placement)
-            l95_ms[name] = order_statistic(latency_ms)
+            uncut_l95_ms[name] = order_statistic(latency_ms)
             late = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
             violation_rate[name] = int(late) / samples
             own[name] = FrozenDict(cycles.own_work(placement))
+        l95_ms = {name: min(uncut, problem.censor_ms) for name, uncut in uncut_l95_ms.items()}
         self.l95_ms: Mapping[str, float] = FrozenDict(l95_ms)
+        self.uncut_l95_ms: Mapping[str, float] = FrozenDict(uncut_l95_ms)
         self.violation_rate: Mapping[str, float] = FrozenDict(violation_rate)
         self.own: Mapping[str, Mapping[str, float]] = FrozenDict(own)
         self._nodes = tuple(problem.fabric.nodes)
         self._table = tuple(
-            (name, l95_ms[name], violation_rate[name], tuple(own[name].items()))
+            (name, l95_ms[name], uncut_l95_ms[name], violation_rate[name], tuple(own[name].items()))
             for name in problem.candidates
         )
         self.start(problem)
@@ -132,14 +136,14 @@ class Profile:
                 f"it must hold each of {', '.join(self._nodes)}"
             ) from None
         estimates = {}
-        for name, l95_ms, violation_rate, work in self._table:
+        for name, l95_ms, uncut_ms, violation_rate, work in self._table:
             utilisation = {}
             for node, share in work:
                 busy = foreign[node] + share
                 utilisation[node] = busy if busy < 1.0 else 1.0
             for node, shown in full.items():
                 utilisation[node] = shown.get(name, 1.0)
-            estimates[name] = QoS(l95_ms, violation_rate, FrozenDict(utilisation))
+            estimates[name] = QoS(l95_ms, violation_rate, FrozenDict(utilisation), uncut_ms)
         return estimates
 
 
@@ -156,7 +160,7 @@ class SampleCycles:
         self._message: dict[tuple[Flow, str], Floats] = {}
 
     def latency_ms(self, placement: Placement) -> Floats:
-        """Latency of every sample cycle, censored; shape (samples,), milliseconds."""
+        """Latency of every sample cycle; infinite where it is lost; shape (samples,), ms."""
         pipeline = self.problem.pipeline
         latency = longest_path(
             self._steps,
@@ -164,7 +168,7 @@ class SampleCycles:
             [self.sent(flow, placement) for flow in pipeline.flows],
         )
         # To whole nanoseconds, as everything is timed: 0.1 + 0.2 must not miss a deadline of 0.3.
-        return np.minimum(np.round(latency, 6), self.problem.censor_ms)
+        return np.round(latency, 6)
 
     def own_work(self, placement: Placement) -> dict[str, float]:
         """Share of each node's cores that one job of every task placed there takes a period."""

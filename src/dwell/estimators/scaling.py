@@ -138,8 +138,9 @@ class Scaling:
         # To whole nanoseconds, as everything is timed.
         latency_ms = np.round(longest_path(self._steps, executed, sent), 6)
         missed = int(np.count_nonzero(latency_ms > pipeline.deadline_ms))
-        l95_ms = min(order_statistic(latency_ms), self.problem.censor_ms)
-        return QoS(l95_ms, missed / len(latency_ms), known.utilisation)
+        l95_ms = order_statistic(latency_ms)
+        bound_ms = self.problem.censor_ms
+        return QoS(min(l95_ms, bound_ms), missed / len(latency_ms), known.utilisation, l95_ms)
 
     def _executed(
         self, task: str, taken_ms: Floats, active: Placement, placement: Placement

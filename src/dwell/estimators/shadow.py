@@ -12,6 +12,7 @@ candidate whose samples weigh less than `ENOUGH` is estimated by the profile.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TypeAlias
 
@@ -30,6 +31,7 @@ from dwell.model.qos import QoS
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
+Truths: TypeAlias = NDArray[np.bool_]
 
 #: Weight of the samples that an estimate needs. Their largest is then about the 91st percentile; a
 #: fraction of 0.05 reaches it in the third window of 100 cycles, at a half-life of two.
@@ -44,13 +46,13 @@ NS_PER_MS = 1e6
 
 
 class _Samples:
-    """Latencies of a candidate: what each counts as, whether it missed, and its weight."""
+    """Latencies of a candidate: what each counts as, whether it missed, or was unfinished."""
 
-    __slots__ = ("age", "missed", "seen_ms", "weight")
+    __slots__ = ("age", "missed", "seen_ms", "unfinished", "weight")
 
     def __init__(self) -> None:
         self.seen_ms = self.weight = np.empty(0)
-        self.missed = np.empty(0, np.bool_)
+        self.missed = self.unfinished = np.empty(0, np.bool_)
         self.age = 0
 
     def decay(self, factor: float) -> None:
@@ -60,15 +62,17 @@ class _Samples:
         first = int(np.searchsorted(weight, FORGOTTEN, side="right"))
         self.weight = weight[first:]
         self.seen_ms, self.missed = self.seen_ms[first:], self.missed[first:]
+        self.unfinished = self.unfinished[first:]
         self.age += 1
 
-    def add(self, seen_ms: Floats, missed: NDArray[np.bool_]) -> None:
+    def add(self, seen_ms: Floats, missed: Truths, unfinished: Truths) -> None:
         """Add the samples of a window; the oldest beyond `LARGEST` are dropped."""
         step = -(-len(seen_ms) // LARGEST)
-        seen_ms, missed = seen_ms[::step], missed[::step]
+        seen_ms, missed, unfinished = seen_ms[::step], missed[::step], unfinished[::step]
         ones = np.ones(len(seen_ms))
         self.seen_ms = np.concatenate((self.seen_ms, seen_ms))[-LARGEST:]
         self.missed = np.concatenate((self.missed, missed))[-LARGEST:]
+        self.unfinished = np.concatenate((self.unfinished, unfinished))[-LARGEST:]
         self.weight = np.concatenate((self.weight, ones))[-LARGEST:]
         self.age = 0
 
@@ -153,7 +157,7 @@ class Shadow:
         missed = latency_ns > np.minimum(age_ns, self._deadline_ns)
         seen_ms = np.minimum(latency_ns, age_ns) / NS_PER_MS
         for samples in self._named[index]:
-            samples.add(seen_ms, missed)
+            samples.add(seen_ms, missed, latency_ns > age_ns)
 
     def _apart(self, active: int, other: int) -> frozenset[str]:
         """Tasks that shadows of cycles under one candidate through another have for themselves."""
@@ -217,13 +221,16 @@ class Shadow:
         total = float(samples.weight.sum())
         if total < ENOUGH:
             return known
-        order = np.argsort(samples.seen_ms)
+        # Of equal latencies those of unfinished cycles come last.
+        order = np.lexsort((samples.unfinished, samples.seen_ms))
         reached = np.cumsum(samples.weight[order])
         # Sums of weights that are equal in theory differ by their rounding.
         rank = int(np.searchsorted(reached, 0.95 * total * (1 - 1e-12)))
-        l95_ms = min(float(samples.seen_ms[order[rank]]), self.problem.censor_ms)
+        seen_ms = float(samples.seen_ms[order[rank]])
+        l95_ms = min(seen_ms, self.problem.censor_ms)
+        uncut_ms = math.inf if samples.unfinished[order[rank]] else seen_ms
         missed = float(samples.weight[samples.missed].sum()) / total
-        return QoS(l95_ms, min(missed, 1.0), known.utilisation)
+        return QoS(l95_ms, min(missed, 1.0), known.utilisation, uncut_ms)
 
 
 def _latest(instants_ns: Ints) -> Ints:

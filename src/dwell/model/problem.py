@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -241,9 +242,13 @@ class Problem(Displayed):
 
     @property
     def censor_ms(self) -> float:
-        """Latency that stands for any longer one in J, so that J is finite: max(10 D, W P)."""
-        pipeline = self.pipeline
-        return max(10 * pipeline.deadline_ms, self.window_cycles * pipeline.period_ms)
+        """Latency that stands for any longer one in J: max(4 D, 2 P), and no less than L_max.
+
+        docs/concepts.md says why.
+        """
+        pipeline, cap_ms = self.pipeline, self.objective.caps.latency_ms
+        bound_ms = max(4 * pipeline.deadline_ms, 2 * pipeline.period_ms)
+        return max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
 
     @property
     def controller_node(self) -> str:

@@ -28,16 +28,20 @@ class QoS:
         Share of the window's cycles that missed the deadline, in [0, 1].
     utilisation : mapping of str to float
         Busy share of each node's cores; finite, at least 0.
+    cut_from_ms : float, optional
+        L95 that `l95_ms` stands for in J where it is larger than that; infinite where it is lost.
+        Caps are compared with it.
 
     Raises
     ------
     MetricError
-        If a value is missing, NaN, infinite, or out of its range.
+        If a value is missing, NaN, infinite (but `cut_from_ms`), or out of its range.
     """
 
     l95_ms: float
     violation_rate: float
     utilisation: Mapping[str, float]
+    cut_from_ms: float | None = None
 
     def __post_init__(self) -> None:
         # Comparisons with NaN are false, so each test is written to pass only for a good value.
@@ -50,8 +54,21 @@ class QoS:
                 raise MetricError(
                     f"utilisation of {node} is {value!r}; it must be finite and at least 0"
                 )
+        if self.cut_from_ms is not None:
+            if not self.cut_from_ms >= self.l95_ms:
+                raise MetricError(
+                    f"cut_from_ms is {self.cut_from_ms!r}; it must be at least l95_ms, "
+                    f"{self.l95_ms!r}"
+                )
+            if self.cut_from_ms == self.l95_ms:
+                object.__setattr__(self, "cut_from_ms", None)
         if type(self.utilisation) is not FrozenDict:
             object.__setattr__(self, "utilisation", FrozenDict(self.utilisation))
+
+    @property
+    def uncut_l95_ms(self) -> float:
+        """L95 as caps are compared with it, milliseconds; infinite where it is lost."""
+        return self.l95_ms if self.cut_from_ms is None else self.cut_from_ms
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ class Pricing:
         within = []
         for name in self.candidates:
             qos = estimates[name]
-            if qos.l95_ms <= latency_ms and busiest(qos) <= utilisation:
+            if qos.uncut_l95_ms <= latency_ms and busiest(qos) <= utilisation:
                 within.append(name)
         if within:
             return within, True

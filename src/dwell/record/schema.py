@@ -209,7 +209,10 @@ DECISIONS = (
     ),
     Column("eligible_{candidate}", "Boolean", "Whether it is within the caps.", null=GUARD),
     Column(
-        "excess_{candidate}", "Float64", "Its largest value / cap − 1.", null=f"{GUARD}, or no caps"
+        "excess_{candidate}",
+        "Float64",
+        "Its largest value / cap − 1; ∞ where its L95 is lost, and has a cap.",
+        null=f"{GUARD}, or no caps",
     ),
     Column(
         "est_samples_{candidate}", "Float64", "Samples behind its estimate.", null=GUARD, of=SUPPORT

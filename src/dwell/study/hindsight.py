@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import missed_cycles, seen_l95_ns
+from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.errors import SimulationError
 from dwell.estimators import Evidence
 from dwell.model import FrozenDict, Problem, QoS
@@ -90,7 +90,7 @@ class Hindsight:
                 "and elsewhere `Hindsight(statics)` does"
             )
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
-        self._censor_ns = round(problem.censor_ms * 1e6)
+        self._censor_ms = problem.censor_ms
         self._candidates = tuple(problem.candidates)
 
     def learn(self, evidence: Evidence) -> None:
@@ -110,7 +110,7 @@ class Hindsight:
         first = int(np.searchsorted(alone.release_ns, release_ns[0]))
         latency_ns = alone.latency_ns[first : first + len(release_ns)]
         age_ns = close_ns - release_ns
-        l95_ms = int(seen_l95_ns(latency_ns, age_ns, self._censor_ns)) / 1e6
+        l95_ms, uncut_ms = seen_l95_ms(latency_ns, age_ns, self._censor_ms)
         missed = int(missed_cycles(latency_ns, age_ns, self._deadline_ns))
         span_ns = float(close_ns - release_ns[0])
         at_ns = np.array([release_ns[0], close_ns])
@@ -118,7 +118,7 @@ class Hindsight:
             node: min(float(np.diff(np.interp(at_ns, alone.open_ns, busy_ns))[0]) / span_ns, 1.0)
             for node, busy_ns in alone.busy_ns.items()
         }
-        return QoS(l95_ms, missed / len(release_ns), FrozenDict(used))
+        return QoS(float(l95_ms), missed / len(release_ns), FrozenDict(used), float(uncut_ms))
 
 
 def _alone(run: Run) -> _Alone:

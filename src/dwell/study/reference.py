@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import seen_l95_ns
+from dwell.control.windows import seen_l95_ms
 from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
@@ -266,7 +266,7 @@ def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Float
     grace_ns = round(problem.controller.close_grace_ms * 1e6)
     close_ns = realisation.release_ns[first + problem.window_cycles] + grace_ns
     age_ns = close_ns[:, None] - realisation.release_ns[rows]
-    l95_ms = seen_l95_ns(latency_ns, age_ns, round(problem.censor_ms * 1e6)) / 1e6
+    l95_ms, _ = seen_l95_ms(latency_ns, age_ns, problem.censor_ms)
     rate = windows["violation_rate"].to_numpy()
     return price(l95_ms, rate, *tier_use(windows, problem), 0.0, problem.objective)
 
