@@ -134,11 +134,10 @@ def test_one_value_has_no_interval() -> None:
     assert share_limits([0.5]) == (0.0, 1.0)
 
 
-def test_a_share_stays_between_0_and_1() -> None:
-    # Three values have no bootstrap; what they did not show has at most 1 - tail^(1/3).
+def test_shares_alone_are_limited_by_what_every_distribution_allows() -> None:
     unseen = 1 - 0.025 ** (1 / 3)
-    high = 0.3 * (1 - unseen) + unseen
-    assert share_interval([0.0, 0.0, 0.3]) == pytest.approx((0.1, 0.0, high))
+    found = share_interval([0.1, 0.2, 0.3])
+    assert found == pytest.approx((0.2, 0.1 * (1 - unseen), 0.3 * (1 - unseen) + unseen))
     assert share_interval([1.0, 1.0, 0.9]).high == 1.0
 
 
@@ -147,16 +146,27 @@ def test_limits_are_one_sided() -> None:
     limits = (0.1 * (1 - unseen), 0.3 * (1 - unseen) + unseen)
     assert share_limits([0.1, 0.2, 0.3]) == pytest.approx(limits)
     values = np.linspace(0.01, 0.05, 20)
-    assert share_limits(values) == studentised_limits(values, 0.05)
-    _, low, high = share_interval(values)
-    assert low < share_limits(values)[0] < 0.03 < share_limits(values)[1] < high
+    _, low, high = share_interval(values, windows=4000)
+    at_least, at_most = share_limits(values, windows=4000)
+    assert low < at_least < 0.03 < at_most < high
+    assert (low, high) == studentised_limits(values, 0.025)
+    assert at_least == studentised_limits(values, 0.05)[0]
 
 
-def test_a_hair_of_misses_is_not_better_than_none() -> None:
-    # Student's t would limit a single run with 0.01 % of misses at 0.014 %.
-    limit = share_limits([0.0] * 19 + [1e-4])[1]
-    assert limit == pytest.approx(rule_of_three(20), abs=1e-4)
-    assert limit > rule_of_three(20)
+def test_what_no_window_showed_limits_what_the_runs_agree_in() -> None:
+    unseen = 1 - 0.025 ** (1 / 400)
+    for rate in (0.0, 0.0002, 0.4, 1.0):
+        found = share_interval([rate] * 10, windows=400)
+        ends = (rate * (1 - unseen), rate * (1 - unseen) + unseen)
+        assert found == pytest.approx((rate, *ends))
+
+
+def test_students_limit_is_taken_where_the_bootstrap_has_none() -> None:
+    # Nine of ten runs without a miss: a third of the resamples have none either.
+    values = [0.0] * 9 + [0.1]
+    assert studentised_limits(values, 0.025)[1] == math.inf
+    half = float(stats.t.ppf(0.975, 9)) * 0.01
+    assert share_interval(values, windows=100_000).high == pytest.approx(0.01 + half)
 
 
 def test_limits_of_skewed_rates_keep_their_promise() -> None:
@@ -164,7 +174,7 @@ def test_limits_of_skewed_rates_keep_their_promise() -> None:
     shape, runs, samples = 0.5, 20, 300
     rates = np.random.default_rng(11).beta(shape, 20, size=(samples, runs))
     mean = shape / (shape + 20)
-    kept = sum(share_limits(row)[1] >= mean for row in rates)
+    kept = sum(share_limits(row, windows=100_000)[1] >= mean for row in rates)
     quantile = stats.t.ppf(0.95, runs - 1)
     errors = rates.std(axis=1, ddof=1) / math.sqrt(runs)
     student = int((rates.mean(axis=1) + quantile * errors >= mean).sum())
@@ -174,36 +184,68 @@ def test_limits_of_skewed_rates_keep_their_promise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "verdict"),
+    ("values", "windows", "verdict"),
     [
-        ([0.0] * 58, "not shown"),
-        ([0.0] * 59, "under"),
-        ([1.0] * 4, "over"),
-        ([0.03], "not shown"),
-        ([0.01, 0.02, 0.03] * 7, "under"),
-        ([0.04, 0.05, 0.06] * 7, "not shown"),
-        ([0.06, 0.07, 0.08] * 7, "over"),
+        ([0.0] * 10, None, "not shown"),
+        ([0.0] * 5 + [0.0002] * 5, None, "not shown"),
+        ([0.0] * 58, None, "not shown"),
+        ([0.0] * 59, None, "under"),
+        ([1.0] * 4, None, "over"),
+        ([0.0] * 10, 400, "under"),
+        ([0.0] * 5 + [0.0002] * 5, 400, "under"),
+        ([0.0] * 2, 50, "not shown"),
+        ([0.0] * 2, 60, "under"),
+        ([0.03], 4000, "not shown"),
+        ([0.01, 0.02, 0.03] * 7, 4000, "under"),
+        ([0.04, 0.05, 0.06] * 7, 4000, "not shown"),
+        ([0.06, 0.07, 0.08] * 7, 4000, "over"),
     ],
 )
-def test_under_is_said_where_the_limit_says_so(values: Sequence[float], verdict: str) -> None:
-    assert under(values) == verdict
+def test_under_is_said_where_the_limit_says_so(
+    values: Sequence[float], windows: int | None, verdict: str
+) -> None:
+    assert under(values, windows=windows) == verdict
 
 
 def test_another_limit_may_be_asked_for() -> None:
     values = [0.01, 0.02, 0.03] * 7
-    assert under(values, 0.02) == "not shown"
-    assert under(values, 0.01) == "over"
+    assert under(values, 0.02, windows=4000) == "not shown"
+    assert under(values, 0.01, windows=4000) == "over"
     assert under([0.0] * 20, 0.14) == "under"
 
 
-@pytest.mark.parametrize("runs", [1, 5, 20, 59])
+RATES = st.lists(st.floats(0, 0.12) | st.sampled_from([0.0, 0.04, 1.0]), min_size=1, max_size=24)
+
+
+@given(RATES, st.none() | st.integers(1, 60), st.data())
+def test_fewer_misses_never_take_the_word_away(
+    values: list[float], windows: int | None, data: st.DataObject
+) -> None:
+    each = windows or 0
+    limit = data.draw(st.sampled_from([0.03, 0.05, 0.1]))
+    lower = [data.draw(st.sampled_from([0.0, 0.5, 1.0])) * value for value in values]
+    longer = [*values, 0.0]
+    before = share_limits(values, windows=each * len(values) or None)
+    for fewer in (lower, longer):
+        after = share_limits(fewer, windows=each * len(fewer) or None)
+        assert after[1] <= before[1] + 1e-12
+        if under(values, limit, windows=each * len(values) or None) == "under":
+            word = under(fewer, limit, windows=each * len(fewer) or None)
+            assert word == "under" or after[1] == pytest.approx(limit, abs=1e-12)
+
+
+def test_the_limit_is_above_the_bootstraps_where_few_runs_agree() -> None:
+    values = [0.030, 0.032, 0.034, 0.036, 0.038]
+    at_most = share_limits(values, windows=100_000)[1]
+    assert studentised_limits(values, 0.05)[1] < at_most < 1.2 * max(values)
+
+
+@pytest.mark.parametrize("runs", [2, 5, 20, 59])
 def test_no_miss_at_all_is_limited_by_the_rule_of_three(runs: int) -> None:
     limit = rule_of_three(runs)
     assert (1 - limit) ** runs == pytest.approx(0.05)
     assert limit <= 3 / runs
-    assert share_interval([0.0] * runs) == (0.0, 0.0, limit)
     assert share_limits([0.0] * runs) == (0.0, limit)
-    assert share_interval([1.0] * runs) == (1.0, 1.0 - limit, 1.0)
     assert share_limits([1.0] * runs) == (1.0 - limit, 1.0)
 
 
@@ -231,14 +273,13 @@ def test_few_values_leave_a_median_without_interval(count: int) -> None:
     assert not interval.known
 
 
-@given(st.lists(st.floats(0, 1), min_size=2, max_size=30))
-def test_limits_lie_inside_the_interval(values: Sequence[float]) -> None:
-    value, low, high = share_interval(values)
-    at_least, at_most = share_limits(values)
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=30), st.none() | st.integers(30, 10_000))
+def test_intervals_of_shares_hold_the_mean(values: Sequence[float], windows: int | None) -> None:
+    value, low, high = share_interval(values, windows=windows)
+    at_least, at_most = share_limits(values, windows=windows)
     assert 0 <= low <= value + 1e-12
     assert value - 1e-12 <= high <= 1
-    assert low - 1e-12 <= at_least
-    assert at_most <= high + 1e-12
+    assert low - 1e-12 <= at_least <= at_most <= 1
 
 
 # --------------------------------------------------------------------- differences of shares
@@ -248,15 +289,16 @@ SOME = [0.031, 0.033, 0.034, 0.031, 0.035, 0.037, 0.032, 0.033, 0.031, 0.034, 0.
 
 
 def test_a_difference_is_known_no_better_than_its_parts() -> None:
-    value, low, high = share_difference_interval(ALL, SOME)
-    assert value == pytest.approx(1 - np.mean(SOME))
-    # What 12 runs could not show of the first part is open of the difference, too.
-    least = share_interval(ALL).low
-    alone = mean_interval(1 - np.array(SOME))
-    assert low == pytest.approx(alone.low - (1 - least))
-    assert high == pytest.approx(alone.high)
-    mirrored = share_difference_interval(SOME, ALL)
-    assert (mirrored.low, mirrored.high) == pytest.approx((-high, -low))
+    for windows in (None, 400):
+        value, low, high = share_difference_interval(ALL, SOME, windows=windows)
+        assert value == pytest.approx(1 - np.mean(SOME))
+        # What the first part did not show is open of the difference, too.
+        least = share_interval(ALL, windows=windows).low
+        alone = mean_interval(1 - np.array(SOME))
+        assert low == pytest.approx(alone.low - (1 - least))
+        assert high == pytest.approx(alone.high)
+        mirrored = share_difference_interval(SOME, ALL, windows=windows)
+        assert (mirrored.low, mirrored.high) == pytest.approx((-high, -low))
 
 
 def test_a_part_without_a_miss_opens_the_other_side() -> None:
@@ -267,11 +309,13 @@ def test_a_part_without_a_miss_opens_the_other_side() -> None:
 
 
 def test_shares_that_were_always_all_or_none_may_differ_in_a_run_to_come() -> None:
-    p = rule_of_three(12)
-    assert share_difference_interval(SOME, SOME) == (0.0, 0.0, 0.0)
-    for mine in (ALL, NONE):
-        assert share_difference_interval(mine, mine)[1:] == pytest.approx((-p, p))
-    assert share_difference_interval(ALL, NONE)[1:] == pytest.approx((1 - 2 * p, 1.0))
+    for windows in (None, 400):
+        p = 1 - 0.025 ** (1 / (windows or 12))
+        for mine in (ALL, NONE, SOME):
+            found = share_difference_interval(mine, mine, windows=windows)
+            assert found == pytest.approx((0.0, -p, p)) or mine != SOME
+        found = share_difference_interval(ALL, NONE, windows=windows)
+        assert found == pytest.approx((1.0, 1 - 2 * p, 1.0))
 
 
 def test_one_pair_has_no_interval() -> None:

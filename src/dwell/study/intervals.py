@@ -1,11 +1,12 @@
 """Intervals over seeds.
 
-The unit is the seed: one run gives one number, runs of different seeds are independent, and the
-windows and cycles inside a run are not. Three kinds of number need three kinds of interval:
+The unit is the seed: one run gives one number, and runs of different seeds are independent. Three
+kinds of number need three kinds of interval:
 
 * a mean: the studentised bootstrap (see `studentised_limits`);
-* a mean of shares: the same, or what every distribution on [0, 1] allows, whichever is narrower.
-  Where every run shows 0 (or every run 1) there is only the second (see `rule_of_three`);
+* a mean of shares: what the runs showed, by the same, and what they did not show, by the number of
+  their windows (see `share_interval`); without that number, by what every distribution on [0, 1]
+  allows (see `rule_of_three`);
 * a median, where infinity can occur: order statistics, by the binomial distribution. It assumes
   nothing about the shape, and it never interpolates.
 
@@ -85,29 +86,40 @@ def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:
     return Interval(mean, min(low, mean), max(high, mean))
 
 
-def share_interval(values: Values) -> Interval:
+def share_interval(values: Values, *, windows: int | None = None) -> Interval:
     """Mean of shares with its two-sided interval, inside [0, 1].
+
+    Runs spread, and that is in the studentised bootstrap. What no run showed is not, and is limited
+    by the windows: a kind of window that comes with probability p is in none of N with (1 - p)^N,
+    which is the tail at p = 1 - tail^(1/N), about 3/N; at worst all of its cycles miss. So the
+    upper limit is no less than (1 - p) · mean + p, the lower one no more than (1 - p) · mean. The
+    assumption is that a kind of window that may come at all comes in windows of any run
+    independently; of a kind that fills one run in ten and no window of the others N says nothing.
 
     Parameters
     ----------
     values : sequence of float
         One a seed, in [0, 1], at least one.
+    windows : int, optional
+        N, windows behind the values, all runs together. Where None, the limits are those that every
+        distribution on [0, 1] allows: with confidence 1 - tail a further run lies above the largest
+        of n with a probability of at most p = 1 - tail^(1/n) (Wilks 1941, DOI
+        10.1214/aoms/1177731788), and then it shows at most 1; below the smallest likewise.
 
     Returns
     -------
     Interval
-        By the studentised bootstrap or without any assumption, whichever is narrower; by
-        `rule_of_three` where all are 0, or all are 1. NaN at the ends for a single value.
+        NaN at the ends for a single value.
     """
     sample = np.asarray(values, np.float64)
     mean = float(sample.mean())
-    if len(sample) == 1 and 0.0 < mean < 1.0:
+    if len(sample) == 1:
         return Interval(mean, math.nan, math.nan)
-    return Interval(mean, *_share_limits(sample, (1 - CONFIDENCE) / 2))
+    return Interval(mean, *_share_limits(sample, (1 - CONFIDENCE) / 2, windows))
 
 
 def share_difference_interval(
-    first: Values, second: Values, *, seed: int = RESAMPLING_SEED
+    first: Values, second: Values, *, windows: int | None = None, seed: int = RESAMPLING_SEED
 ) -> Interval:
     """Mean of the first shares less the second, over pairs, with its two-sided interval.
 
@@ -119,6 +131,8 @@ def share_difference_interval(
     ----------
     first, second : sequence of float
         One a seed, in the same order, in [0, 1], at least one.
+    windows : int, optional
+        Windows behind each of them (see `share_interval`).
 
     Returns
     -------
@@ -126,67 +140,85 @@ def share_difference_interval(
         By the studentised bootstrap of the differences, each end farther away by what is open of
         the parts there (the distance from a part's mean to its limit of `share_interval`, on a side
         on which the bootstrap has none); or what every distribution on [-1, 1] allows, whichever is
-        narrower. NaN at the ends for a single pair.
+        narrower. Where all differences are the same: they, and what no window showed. NaN at the
+        ends for a single pair.
     """
     one, other = np.asarray(first, np.float64), np.asarray(second, np.float64)
     differences = one - other
     count, mean = len(differences), float(differences.mean())
     if count < 2:
         return Interval(mean, math.nan, math.nan)
+    tail = (1 - CONFIDENCE) / 2
     if _same(differences):
-        p = rule_of_three(count)
-        low = high = mean
-        least, most = mean * (1 - p) - p, mean * (1 - p) + p
+        p = _unseen(count if windows is None else windows, tail)
+        low, high = least, most = mean * (1 - p) - p, mean * (1 - p) + p
     else:
-        tail = (1 - CONFIDENCE) / 2
         p = _unseen(count, tail)
         low, high = studentised_limits(differences, tail, seed=seed)
+        if windows is not None:
+            low, high = _by_student(differences, tail, low, high)
         least = float(differences.min()) * (1 - p) - p
         most = float(differences.max()) * (1 - p) + p
-    below, above = _open_sides(one)
-    other_below, other_above = _open_sides(other)
+    below, above = _open_sides(one, windows)
+    other_below, other_above = _open_sides(other, windows)
     low = max(low - below - other_above, least, -1.0)
     high = min(high + above + other_below, most, 1.0)
     return Interval(mean, min(low, mean), max(high, mean))
 
 
-def share_limits(values: Values) -> tuple[float, float]:
+def share_limits(values: Values, *, windows: int | None = None) -> tuple[float, float]:
     """One-sided limits of a mean of shares: it is above the first, it is below the second.
 
-    Each is right with the confidence of `CONFIDENCE` on its own.
+    Each is right with the confidence of `CONFIDENCE` on its own. The lower one is that of
+    `share_interval`, one-sided. The upper one never rises where a value falls, or where a run of 0
+    is added, as a limit by the spread of the values does: it is that of `_limit_by_weights`, and no
+    less than what no window showed (see `share_interval`).
 
     Parameters
     ----------
     values : sequence of float
         One a seed, in [0, 1], at least one.
+    windows : int, optional
+        Windows behind the values, all runs together. Where None, what every distribution on [0, 1]
+        allows: nothing but the number of runs is known.
 
     Returns
     -------
     at_least, at_most : float
         0 and 1 for a single value, which limits nothing.
     """
-    return _share_limits(np.asarray(values, np.float64), 1 - CONFIDENCE)
+    sample, tail = np.asarray(values, np.float64), 1 - CONFIDENCE
+    if len(sample) == 1:
+        return 0.0, 1.0
+    at_least, at_most = _share_limits(sample, tail, windows)
+    if windows is None:
+        return at_least, at_most
+    unseen = _unseen(windows, tail)
+    shown = _limit_by_weights(tuple(sample.tolist()), tail)
+    return at_least, max(shown, float(sample.mean()) * (1 - unseen) + unseen)
 
 
-def under(values: Values, limit: float = 0.05) -> Verdict:
+def under(values: Values, limit: float = 0.05, *, windows: int | None = None) -> Verdict:
     """Whether a mean of shares is shown to be under a limit, by its one-sided limits.
 
-    The unit is the seed and not the cycle. Misses come in bursts, from a disturbance or a bad hour
-    of a trace, so that 10,000 cycles of one run may hold one independent event; counting them as
-    10,000 would limit a cell without a miss at 0.03 %, where nothing but the number of runs is
-    known: 20 runs without a miss limit it at 13.9 %, and 59 are the fewest that show "under 5 %".
+    The unit is the seed, and within it the window, not the cycle. Misses come in bursts, from a
+    disturbance or a bad hour of a trace: 10,000 cycles of one run may hold one independent event.
+    Fewer misses in any run, or one more run without any, never take the word "under" away.
 
     Parameters
     ----------
     values : sequence of float
         One a seed (of a trace: one a run), in [0, 1], at least one.
+    windows : int, optional
+        Windows behind the values, all runs together. Without it 59 runs that all show 0 are the
+        fewest that are "under" 5 %.
 
     Returns
     -------
     {"under", "over", "not shown"}
         Under: the upper limit of `share_limits` is below `limit`. Over: the lower one is above it.
     """
-    at_least, at_most = share_limits(values)
+    at_least, at_most = share_limits(values, windows=windows)
     return "under" if at_most < limit else "over" if at_least > limit else "not shown"
 
 
@@ -307,34 +339,48 @@ def _tangent(angle: float) -> float:
     return math.copysign(math.inf, angle) if abs(angle) >= math.pi / 2 else math.tan(angle)
 
 
-def _share_limits(sample: Floats, tail: float) -> tuple[float, float]:
-    """Limits of a mean of shares, each wrong with probability `tail`.
+def _share_limits(sample: Floats, tail: float, windows: int | None) -> tuple[float, float]:
+    """Limits of a mean of shares, each wrong with probability `tail` (see `share_interval`)."""
+    if windows is None:
+        p = _unseen(len(sample), tail)
+        return float(sample.min()) * (1 - p), float(sample.max()) * (1 - p) + p
+    p, mean = _unseen(windows, tail), float(sample.mean())
+    low, high = _by_student(sample, tail, *studentised_limits(sample, tail))
+    return max(min(low, mean * (1 - p)), 0.0), min(max(high, mean * (1 - p) + p), 1.0)
 
-    With confidence 1 - `tail`, a further run lies above the largest of n with a probability of at
-    most p = 1 - tail^(1/n) (Wilks 1941, DOI 10.1214/aoms/1177731788), and then it shows at most 1:
-    the mean is at most (1 - p) · largest + p. That is `rule_of_three` where the largest is 0.
+
+@lru_cache(maxsize=4096)
+def _limit_by_weights(values: tuple[float, ...], tail: float) -> float:
+    """Upper limit of a mean of shares that does not rise where one of them falls.
+
+    Means over the values and one more, each with random weights (of a flat Dirichlet distribution:
+    the Bayesian bootstrap, Rubin 1981, DOI 10.1214/aos/1176345338): the limit is what 1 - `tail` of
+    them do not exceed. The one more is the end of the range that n values show, (1 + 1/n) times the
+    largest. Were it the end of all that may come, this would be Gaffke's limit, which no
+    distribution is known to break. Any draw gives the k-th largest value the same weight before it
+    is divided by their sum, so that no draw rises where a value falls, or where a 0 is added.
     """
-    if not sample.any():
-        return 0.0, rule_of_three(len(sample))
-    if (sample == 1.0).all():
-        return 1.0 - rule_of_three(len(sample)), 1.0
-    if len(sample) == 1:
-        return 0.0, 1.0
-    low, high = studentised_limits(sample, tail)
-    if low == high:
+    count = len(values)
+    descending = np.sort(np.array(values))[::-1]
+    end = min((1 + 1 / count) * descending[0], 1.0)
+    rng = np.random.default_rng(RESAMPLING_SEED)
+    weights = rng.exponential(size=(count + 1, RESAMPLES))
+    means = (np.append(end, descending) @ weights) / weights.sum(axis=0)
+    rank = RESAMPLES - round((RESAMPLES + 1) * tail)
+    return float(np.partition(means, rank)[rank])
+
+
+def _by_student(sample: Floats, tail: float, low: float, high: float) -> tuple[float, float]:
+    """Limits of a mean with Student's in place of those that the bootstrap has not."""
+    if not (math.isinf(low) or math.isinf(high)):
         return low, high
-    p = _unseen(len(sample), tail)
-    least, most = float(sample.min()), float(sample.max())
-    mean = float(sample.mean())
-    return (
-        min(max(low, least * (1 - p)), mean),
-        max(min(high, most * (1 - p) + p), mean),
-    )
+    mean, half = float(sample.mean()), _half_width(sample, tail)
+    return mean - half if math.isinf(low) else low, mean + half if math.isinf(high) else high
 
 
-def _open_sides(sample: Floats) -> tuple[float, float]:
+def _open_sides(sample: Floats, windows: int | None) -> tuple[float, float]:
     """How far below and above its mean shares may lie where the bootstrap has no limit; else 0."""
-    mean, low, high = share_interval(sample)
+    mean, low, high = share_interval(sample, windows=windows)
     if _same(sample):
         return mean - low, high - mean
     least, most = studentised_limits(sample, (1 - CONFIDENCE) / 2)
