@@ -474,6 +474,31 @@ def test_a_window_closes_a_grace_after_the_first_cycle_beyond_it() -> None:
     assert hand.close() == [5, 6, 7, 8, 9]
 
 
+@pytest.mark.parametrize("window_cycles", [1, W])
+def test_a_window_of_early_frames_closes_when_its_last_deadline_has_passed(
+    window_cycles: int,
+) -> None:
+    hand = Hand(small(window_cycles=window_cycles))
+    # Frames come 15 ms after each other, and so D = 40 ms is over two frames after the next one.
+    gap_ns = 15 * MS
+    cycles = range(4 * window_cycles)
+    for cycle in cycles:
+        hand.release([cycle], at_ns=cycle * gap_ns)
+        hand.done(cycle, ms=40, at_ns=cycle * gap_ns)
+    closes = []
+    for window in range(3):
+        last_ns = ((window + 1) * window_cycles - 1) * gap_ns
+        assert hand.windows.due_ns(0) == last_ns + 40 * MS
+        closed = hand.windows.close()
+        closes.append(closed.close_ns)
+        assert closed.close_ns == last_ns + 40 * MS
+        hand.controller.close(closed)
+    hand.record()
+    assert closes == sorted(closes)
+    assert set(hand.column("windows", "violation_rate")) == {0.0}
+    assert set(hand.column("windows", "seen_violation_rate")) == {0.0}
+
+
 def test_after_a_migration_the_window_starts_with_the_first_cycle_of_the_new_placement() -> None:
     hand = Hand()
     hand.release(range(W + 2))
@@ -533,10 +558,9 @@ def test_a_close_is_not_later_than_a_grace_after_the_stamp_was_heard() -> None:
 def test_what_happened_after_the_close_is_no_evidence_and_no_success() -> None:
     hand = Hand()
     hand.release(range(W))
-    # The camera was early: the window closes 30 ms after its last release.
-    close_ns = (W - 1) * P + 30 * MS
-    hand.release([W], at_ns=close_ns)
-    for cycle, ms in ((3, 35), (4, 35)):
+    # The camera was early: the window closes with its last deadline, 40 ms after its last release.
+    hand.release([W], at_ns=(W - 1) * P + 30 * MS)
+    for cycle, ms in ((3, 35), (4, 45)):
         end_ns = cycle * P + ms * MS
         hop = Hop(
             "act0", "A", end_ns - 9 * MS, end_ns - 8 * MS, end_ns, (("see", end_ns - 9 * MS),)
@@ -548,10 +572,10 @@ def test_what_happened_after_the_close_is_no_evidence_and_no_success() -> None:
     assert window.evidence is not None
     known = window.evidence().cycles
     assert known.end_ns[3:, 1].tolist() == [3 * P + 35 * MS, UNKNOWN]
-    assert known.ready_ns[4, 1] == 4 * P + 26 * MS
+    assert known.ready_ns[4, 1] == 4 * P + 36 * MS
     hand.controller.close(window)
     hand.record()
-    assert hand.column("cycles", "latency_ns")[3:] == [35 * MS, 35 * MS]
+    assert hand.column("cycles", "latency_ns")[3:] == [35 * MS, 45 * MS]
     assert hand.column("cycles", "missed")[3:] == [False, True]
     rates = ("violation_rate", "seen_violation_rate")
     assert [hand.column("windows", name) for name in rates] == [[0.8], [0.8]]

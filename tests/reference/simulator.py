@@ -672,7 +672,7 @@ class Simulation:
         self.reals = [real] if shadows is None else [real, shadows]
         self.release = [int(ns) for ns in real.release_ns]
         self.number = real.cycles
-        self.end = self.release[-1] + nanoseconds(self.settings.close_grace_ms)
+        self.end = self.close_of(self.number)
         self.index = {task: i for i, task in enumerate(self.pipeline.tasks)}
         self.sources = [task for task in self.pipeline.tasks if not self.pipeline.inputs(task)]
         self.sinks = [task for task in self.pipeline.tasks if not self.pipeline.outputs(task)]
@@ -877,9 +877,8 @@ class Simulation:
         if boundary > self.number:
             self.over = True
             return
-        close = self.release[boundary] + nanoseconds(self.settings.close_grace_ms)
         self.at(
-            close,
+            self.close_of(boundary),
             CLOSE,
             boundary,
             -1,
@@ -888,6 +887,15 @@ class Simulation:
             # A window that the guard has cut short does not close.
             valid=lambda: self.first == first,
         )
+
+    def close_of(self, boundary: int) -> int:
+        """Close of the window that ends before a cycle: no deadline of its cycles comes later."""
+        # Reading: a deadline between two nanoseconds has passed after the first of them.
+        deadline = math.floor(Fraction(repr(self.pipeline.deadline_ms)) * 10**6)
+        first = max(0, boundary - self.problem.window_cycles)
+        deadlines = [release + deadline for release in self.release[first:boundary]]
+        grace = nanoseconds(self.settings.close_grace_ms)
+        return max(self.release[boundary] + grace, *deadlines)
 
     def close_window(self) -> None:
         boundary = self.first + self.problem.window_cycles

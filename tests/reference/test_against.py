@@ -59,6 +59,7 @@ from tests.reference.simulator import (
     WindowResult,
     attempt_uniform,
     control,
+    nanoseconds,
     simulate,
 )
 
@@ -161,6 +162,18 @@ def make_case(
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     share = rng.choice([0.0, 0.1, 0.3, 1.0]) / len(problem.candidates) if orders else 0.0
     return Case(problem, real, names, share)
+
+
+def jittered(case: Case, rng: Random, *, whole_ms: bool) -> Case:
+    """Delay the releases of a case, up to some periods, each by another time."""
+    pipeline, real = case.problem.pipeline, case.real
+    longest_ms = pipeline.period_ms * rng.choice([0.3, 1.0, 2.5])
+    late_ms = [rng.uniform(0, longest_ms) for _ in real.release_ns]
+    late_ns = np.rint(np.round(late_ms) * MS if whole_ms else np.array(late_ms) * MS)
+    release_ns = np.maximum.accumulate(real.release_ns + late_ns.astype(np.int64))
+    deadline_ms = rng.choice([pipeline.deadline_ms, pipeline.period_ms])
+    problem = replace(case.problem, pipeline=replace(pipeline, deadline_ms=deadline_ms))
+    return replace(case, problem=problem, real=replace(real, release_ns=release_ns))
 
 
 def make_guarded(
@@ -306,6 +319,13 @@ def window_differences(case: Case, windows: pl.DataFrame, result: Result) -> Ite
         first, last = expected.first_cycle, expected.first_cycle + case.problem.window_cycles
         if row["first_cycle"] != first:
             yield f"{where}: first_cycle {row['first_cycle']}, expected {first}"
+        # Every deadline has passed at the close, so that nothing else is missed.
+        deadline_ns = nanoseconds(case.problem.pipeline.deadline_ms)
+        latencies = [cycle.latency_ns for cycle in result.cycles[first:last]]
+        missed = sum(ns is None or ns > deadline_ns for ns in latencies) / len(latencies)
+        for column in ("violation_rate", "seen_violation_rate"):
+            if row[column] not in (missed, None):
+                yield f"{where}: {column} {row[column]}, expected {missed}"
         sent = sum(other is not None for _, other in result.stamps[first:last])
         if row.get("shadow_cycles", 0) != sent:
             yield f"{where}: shadow_cycles {row['shadow_cycles']}, expected {sent}"
@@ -520,6 +540,7 @@ def compare(
     orders: bool = False,
     stamped: bool = False,
     guarded: bool = False,
+    jitter: bool = False,
 ) -> None:
     excluded = 0
     failures: list[str] = []
@@ -527,13 +548,15 @@ def compare(
     for seed in range(examples):
         make = make_guarded if guarded else make_case
         case = make(seed, schedulers, whole_ms=whole_ms, orders=orders)
+        if jitter:
+            case = jittered(case, Random(seed), whole_ms=whole_ms)
         found = (
             examine_stamped(seed, case, tolerance_ns) if stamped else examine(case, tolerance_ns)
         )
         if found is None:
             excluded += 1
         elif found:
-            how = f"whole_ms={whole_ms}, orders={orders}"
+            how = f"whole_ms={whole_ms}, orders={orders}, jitter={jitter}"
             failures.append(f"{make.__name__}({seed}, {schedulers}, {how}): {found[:3]}")
     assert not failures, f"{len(failures)} of {examples} differ:\n" + "\n".join(failures[:10])
     assert excluded <= MOST_EXCLUDED * examples
@@ -580,6 +603,17 @@ def test_orders_equal_to_the_microsecond_with_processor_sharing() -> None:
     compare(EVERY, FAIR_TOLERANCE_NS, orders=True)
 
 
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
+def test_release_jitter_equal_to_the_nanosecond_without_processor_sharing(whole_ms: bool) -> None:
+    compare(("fifo", "priority"), whole_ms=whole_ms, jitter=True)
+    compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, jitter=True)
+
+
+def test_release_jitter_equal_to_the_microsecond_with_processor_sharing() -> None:
+    compare(EVERY, FAIR_TOLERANCE_NS, jitter=True)
+    compare(EVERY, FAIR_TOLERANCE_NS, orders=True, jitter=True)
+
+
 @pytest.fixture
 def _early_health(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let few cycles make health."""
@@ -587,9 +621,12 @@ def _early_health(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_early_health")
+@pytest.mark.parametrize("jitter", [False, True], ids=["periodic", "jitter"])
 @pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole-ms"])
-def test_the_guard_equal_to_the_nanosecond_without_processor_sharing(whole_ms: bool) -> None:
-    compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, guarded=True)
+def test_the_guard_equal_to_the_nanosecond_without_processor_sharing(
+    whole_ms: bool, jitter: bool
+) -> None:
+    compare(("fifo", "priority"), whole_ms=whole_ms, orders=True, guarded=True, jitter=jitter)
 
 
 @pytest.mark.usefixtures("_early_health")
@@ -603,6 +640,8 @@ def test_cycles_are_stamped_as_decided() -> None:
         controller = case.problem.controller_node
         if any(change.down and change.node == controller for change in case.real.node_changes):
             continue
+        if case.problem.pipeline.release_jitter_ms != Constant(0.0):
+            continue  # an order comes after cycles that were released before the last deadline
         expected = [name for name in case.names for _ in range(case.problem.window_cycles)]
         assert play(case).cycles["placement"].to_list() == expected
 

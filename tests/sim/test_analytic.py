@@ -26,6 +26,7 @@ from dwell.model import (
     Problem,
     Process,
     Task,
+    Uniform,
 )
 from dwell.sim.realisation import NodeChange, Realisation
 from tests.cells.generated import MS, make_problem, make_realisation
@@ -102,6 +103,31 @@ def test_utilisation_is_the_offered_load() -> None:
     problem = one_server(Exponential(7.0), 10.0)
     run = dwell.simulate(problem, scenario="baseline", policy="LOC", seed=2, windows=WINDOWS)
     assert_mean(run.windows["u_R"].to_numpy(), 0.7)
+
+
+@pytest.mark.parametrize("window_cycles", [1, 10])
+def test_release_jitter_makes_no_misses(window_cycles: int) -> None:
+    task = Task("a", {"R": Execution(Constant(20.0), workers=4)})
+    problem = make_problem(
+        [Node("R", "robot", cores=4)],
+        [task],
+        period_ms=33,
+        deadline_ms=30,
+        release_jitter_ms=Uniform(0.0, 30.0),
+        window_cycles=window_cycles,
+    )
+    real = dwell.draw(problem, scenario="baseline", seed=1, windows=1000 // window_cycles)
+    played = [
+        dwell.simulate_realisation(problem, real, policy="LOC", by_window=by_window)
+        for by_window in (False, True)
+    ]
+    for run in played:
+        assert set(run.cycles["latency_ns"]) == {20 * MS}
+        assert not run.cycles["missed"].any()
+        assert run.windows["seen_violation_rate"].max() == run.windows["violation_rate"].max() == 0
+        assert run.windows["seen_l95_ms"].max() == 20.0
+        assert run.windows.equals(played[0].windows)
+        assert run.cycles.equals(played[0].cycles)
 
 
 def test_m_m_1_sojourn_is_exponential() -> None:

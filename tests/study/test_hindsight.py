@@ -9,7 +9,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from dwell.errors import SimulationError
-from dwell.model import NodeDisturbance, Problem
+from dwell.model import NodeDisturbance, Problem, Uniform
 from dwell.policies import DTP
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
@@ -44,6 +44,16 @@ def test_a_window_of_every_candidate_is_seen_as_its_controller_saw_it() -> None:
     for name, price in moved.items():
         expected = alone[name].windows["cost"][0] + price
         assert first[f"j_{name}"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_windows_that_overlap_are_seen_as_their_controller_saw_them() -> None:
+    jitter = Uniform(0.0, PROBLEM.pipeline.period_ms)
+    pipeline = replace(PROBLEM.pipeline, release_jitter_ms=jitter)
+    run, alone = played(replace(PROBLEM, pipeline=pipeline), "LOC")
+    for name in ("SO", "HYB"):
+        told = [f"est_{column}_{name}" for column in ("l95_ms", "violation_rate", "u_R1", "u_E")]
+        seen = ["seen_l95_ms", "seen_violation_rate", "u_R1", "u_E"]
+        assert run.decisions.select(told).rows() == alone[name].windows.select(seen).rows()
 
 
 @pytest.mark.parametrize("lead", [0, 3])

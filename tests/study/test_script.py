@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from dwell.errors import PolicyError
-from dwell.model import NodeDisturbance, Problem
+from dwell.model import NodeDisturbance, Problem, Uniform
 from dwell.record import Run
 from dwell.sim import draw, simulate_realisation
 from dwell.study.script import Script
@@ -20,7 +20,7 @@ WINDOWS = 24
 OUTAGES = ((0.99, 0.9), (4.0, 0.5), (6.2, math.inf))
 
 
-def make_cell(*, outages: bool, **settings: float) -> Problem:
+def make_cell(*, outages: bool, jitter_ms: float = 0.0, **settings: float) -> Problem:
     problem = make_problem()
     down = tuple(
         NodeDisturbance("E", at_s=at_s, for_s=for_s, down=True)
@@ -28,6 +28,7 @@ def make_cell(*, outages: bool, **settings: float) -> Problem:
     )
     return replace(
         problem,
+        pipeline=replace(problem.pipeline, release_jitter_ms=Uniform(0.0, jitter_ms)),
         scenarios={"outages": down},
         controller=replace(problem.controller, **settings),  # type: ignore[arg-type]
     )
@@ -50,6 +51,8 @@ TURNS = [("LOC", "SO", "HYB")[k % 3] for k in range(WINDOWS)]
         {"order_lead_cycles": 5},
         {"close_grace_ms": 70.0},
         {"order_delay_ms": 100.0, "order_lead_cycles": 1, "close_grace_ms": 15.0},
+        {"jitter_ms": 70.0},
+        {"jitter_ms": 20.0, "order_delay_ms": 40.0, "close_grace_ms": 15.0},
     ],
 )
 @pytest.mark.parametrize("outages", [False, True])

@@ -627,7 +627,8 @@ class ControllerEntry(Entry):
         "Cycles between a window's close and its order's first; default 0."
     )
     close_grace_ms: TimeMs | None = optional(
-        "Time that a window stays open for stragglers, ms; default 0."
+        "Time that a window stays open for stragglers after the release of the first cycle beyond "
+        "it, ms; default 0. No window closes before the last deadline of its cycles."
     )
 
 

@@ -3,7 +3,7 @@
 from dwell.control.controller import ClosedWindow, Controller, DecisionLog, static_columns
 from dwell.control.guard import Guard, Presence, Probation, parts_of, rest_cycles
 from dwell.control.shadows import shadow_stamps
-from dwell.control.windows import final_l95_ms
+from dwell.control.windows import final_l95_ms, window_close_ns
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.policies import MinimalPolicy
 
@@ -23,4 +23,5 @@ __all__ = [
     "rest_cycles",
     "shadow_stamps",
     "static_columns",
+    "window_close_ns",
 ]

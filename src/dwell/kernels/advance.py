@@ -51,7 +51,6 @@ from dwell.kernels.layout import (
     FIRST,
     FLOW_0,
     FOREIGN,
-    GRACE_NS,
     GROW_EVENTS,
     GROW_RING,
     GUARD,
@@ -216,7 +215,7 @@ def _announce(s: Tables) -> int:
         boundary = s.cells[cell, CLOSE_CYCLE]
         if s.cells[cell, CLOSE_PENDING] == 0 and boundary <= s.cells[cell, N_CYCLES]:
             s.cells[cell, CLOSE_PENDING] = 1
-            t = s.release_ns[cell, boundary] + s.cells[cell, GRACE_NS]
+            t = s.close_ns[cell, boundary - 1]
             key = (CLOSE << KIND_SHIFT) | (cell << CELL_SHIFT) | (boundary << CYCLE_SHIFT)
             push_event(s.clock, s.event_t, s.event_key, t, key)
         n += s.cells[cell, CLOSE_PENDING]
@@ -393,7 +392,7 @@ def _opens(s: Tables, cell: int, cycle: int) -> int:
         if cycle == s.cells[cell, WINDOW_FIRST]:
             window = s.cells[cell, WINDOW]
     elif beyond % s.cells[cell, WINDOW_CYCLES] == 0:
-        # The window before has a grace and has not closed yet.
+        # The window before has not closed yet.
         window = s.cells[cell, WINDOW] + 1 + beyond // s.cells[cell, WINDOW_CYCLES]
     return window
 
@@ -549,6 +548,7 @@ def advance(
     paces: Ints,
     paces_f: Floats,
     release_ns: Ints,
+    close_ns: Ints,
     exec_ns: Ints,
     delay_ns: Ints,
     extra_ns: Ints,
@@ -616,6 +616,7 @@ def advance(
         fixed_columns(paces, N_PACE),
         paces_f,
         release_ns,
+        close_ns,
         exec_ns,
         delay_ns,
         extra_ns,

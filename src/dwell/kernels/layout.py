@@ -84,7 +84,6 @@ FAIR, FIFO, PRIORITY, TURNS = range(4)
     CLOSE_CYCLE,
     CLOSE_PENDING,
     WINDOW_CYCLES,
-    GRACE_NS,
     N_CANDIDATES,
     PAIR_0,
     SHADOW,
@@ -95,7 +94,7 @@ FAIR, FIFO, PRIORITY, TURNS = range(4)
     WAITED,
     MOVED,
     N_CELL,
-) = range(22)
+) = range(21)
 
 # Where a link has no timeout of its own, state that was lost is sent again after Linux's least
 # TCP retransmission timeout.
@@ -252,6 +251,7 @@ class Tables(NamedTuple):
     paces: Ints  # (paces, N_PACE)
     paces_f: Floats  # (paces,) PACE of the server meanwhile
     release_ns: Ints  # (cells, N + 1)
+    close_ns: Ints  # (cells, N), close of the window that a cycle is the last of
     exec_ns: Ints  # (sites, N)
     delay_ns: Ints  # (hops, N)
     extra_ns: Ints  # (layers, N)

@@ -2,9 +2,9 @@
 
 Everything is put on the stamper's clock (see `offsets`), counted from the first release of the run.
 A window is W consecutive cycles by release and closes `close_grace_ms` after the release of the
-first cycle beyond them. Where the term or the placement changes before W cycles are there, or while
-an order is under way, the next window starts at the first cycle stamped anew; the cycles before it
-are lead, and belong to no window.
+first cycle beyond them, or D after that of the last of them where this is later. Where the term or
+the placement changes before W cycles are there, or while an order is under way, the next window
+starts at the first cycle stamped anew; the cycles before it are lead, and belong to no window.
 
 Messages are lost, late, and come twice. A cycle is known by its stamp or by its completion; one of
 which neither was heard, between two that are known, is taken to have been released between them,
@@ -21,7 +21,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import ClosedWindow, Controller
+from dwell.control import ClosedWindow, Controller, window_close_ns
 from dwell.errors import LiveError
 from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
@@ -80,7 +80,6 @@ class LiveWindows:
         self._size = problem.window_cycles
         self._period_ns = round(problem.pipeline.period_ms * 1e6)
         self._proven_ns = int(PROVEN_SHARE * round(problem.pipeline.deadline_ms * 1e6))
-        self._grace_ns = round(problem.controller.close_grace_ms * 1e6)
         self._longest = 8 * self._size + KEPT_CYCLES
         #: What is recorded.
         self.record = RunRows(
@@ -313,7 +312,12 @@ class LiveWindows:
         )
         if bound_ns >= UNBOUNDED_NS:
             released_ns = beyond.stamped_ns
-        return min(released_ns, beyond.stamped_ns) + self._grace_ns
+        return min(released_ns, beyond.stamped_ns) + self._close_ns(start) - beyond.at_ns
+
+    def _close_ns(self, start: int) -> int:
+        """Close of the window that starts at a place in the line, since the origin."""
+        last, beyond = self._line[start + self._size - 1 : start + self._size + 1]
+        return int(window_close_ns(self.problem, last.at_ns, beyond.at_ns))
 
     def close(self, *, unix_ns: int | None = None) -> ClosedWindow:
         """Close the window that is due.
@@ -334,7 +338,7 @@ class LiveWindows:
         self._drop(start)
         self._ordered = False
         cycles = self._line[: self._size]
-        close_ns = self._line[self._size].at_ns + self._grace_ns
+        close_ns = self._close_ns(0)
         for cycle in cycles:
             self._ledger.settle(cycle)
             cycle.window, cycle.close_ns = self._next_window, close_ns

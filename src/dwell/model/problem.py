@@ -73,7 +73,8 @@ class ControllerSettings:
     order_lead_cycles : int
         Cycles between the close of a window and the first one its order may stamp.
     close_grace_ms : float
-        Time a window stays open after the release of the first cycle beyond it.
+        Time a window stays open after the release of the first cycle beyond it; it stays open until
+        the last deadline of its cycles, too.
     """
 
     on: str | None = None

@@ -122,7 +122,11 @@ CYCLES = (
     Column("release_ns", "Int64", "Its release, since the beginning of the run.", "ns"),
     Column("placement", "candidate", "The candidate that it was stamped with."),
     Column("latency_ns", "Int64", "Release to completion of the last sink.", "ns", LOST),
-    Column("missed", "Boolean", "Later than D, or unfinished when its window closed."),
+    Column(
+        "missed",
+        "Boolean",
+        "Later than D, or unfinished when its window closed, which is no earlier.",
+    ),
     Column("outcome", "outcome", "What became of it."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
     Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dwell.control import window_close_ns
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
@@ -109,6 +110,7 @@ class _Layout:
         self.server_row: dict[tuple[str, str | None], int] = {}
         self.server_workers: list[int] = []
         self.cell_rows: list[list[int]] = []
+        self.close_ns: list[k.Ints] = []
         self.tasks: list[list[int]] = []
         self.flows: list[list[int]] = []
         self.out_flows: list[int] = []
@@ -216,10 +218,11 @@ class _Layout:
         row[k.N_SINKS] = sum(not pipeline.outputs(name) for name in names)
         row[k.N_CYCLES] = real.cycles
         row[k.CLOSE_CYCLE] = row[k.WINDOW_CYCLES] = problem.window_cycles
-        row[k.GRACE_NS] = round(problem.controller.close_grace_ms * 1e6)
         row[k.N_CANDIDATES], row[k.PAIR_0] = len(problem.candidates), len(self.shadow_parts)
         row[k.SHADOW] = row[k.PARENT] = -1
         self.cell_rows.append(row)
+        release_ns = real.release_ns
+        self.close_ns.append(window_close_ns(problem, release_ns[:-1], release_ns[1:]))
         flows = ordered_flows(pipeline)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         for flow in flows:
@@ -266,6 +269,7 @@ class _Layout:
         # Its windows never close.
         shadow[k.CLOSE_CYCLE] = real.cycles + 1
         self.cell_rows.append(shadow)
+        self.close_ns.append(self.close_ns[0])
         self.reals.append(real)
         hop_0 = len(self.hops)
         self._add_hops(problem, real, {name: i for i, name in enumerate(problem.fabric.links)})
@@ -391,11 +395,7 @@ class _Layout:
             for layer, row in rows.items():
                 layer_rows[hop, layer] = row
         clock = np.zeros(k.N_CLOCK, np.int64)
-        clock[k.END] = max(
-            int(real.release_ns[-1]) + row[k.GRACE_NS]
-            for real, row in zip(reals, self.cell_rows, strict=True)
-        )
-
+        clock[k.END] = max(int(close_ns[-1]) for close_ns in self.close_ns)
         stamps = np.zeros((cells, cycles), np.int16)
         stamps[[row[k.PARENT] >= 0 for row in self.cell_rows]] = -1
         tables = k.Tables(
@@ -418,6 +418,7 @@ class _Layout:
             paces=_table(self.paces, k.N_PACE),
             paces_f=np.array(self.paces_f, np.float64),
             release_ns=_stack([real.release_ns[None] for real in reals], cycles + 1),
+            close_ns=_stack([close_ns[None] for close_ns in self.close_ns], cycles),
             exec_ns=_stack([real.exec_ns for real in reals], cycles),
             delay_ns=_stack([real.delay_ns for real in reals], cycles),
             extra_ns=_stack([real.extra_ns for real in reals], cycles),

@@ -253,7 +253,7 @@ class _Stamper:
         settings = problem.controller
         self.lead = settings.order_lead_cycles
         self.delay_ns = round(settings.order_delay_ms * 1e6)
-        self.grace_ns = round(settings.close_grace_ms * 1e6)
+        self.close_ns = arrays.tables.close_ns[0]
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
@@ -280,10 +280,9 @@ class _Stamper:
 
     def _reach(self, boundary: int) -> int:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
-        if self.grace_ns == 0 or boundary > self.cycles:
+        if boundary > self.cycles or self.close_ns[boundary - 1] <= self.release_ns[boundary]:
             return boundary
-        close_ns = self.release_ns[min(boundary, self.cycles)] + self.grace_ns
-        return int(np.searchsorted(self.release_ns, close_ns, side="right"))
+        return int(np.searchsorted(self.release_ns, self.close_ns[boundary - 1], side="right"))
 
     def close_window(self) -> None:
         """Hand the window that has just closed to the controller and carry out its order."""
@@ -291,7 +290,7 @@ class _Stamper:
         index = len(self.first)
         first = self.next_first
         boundary = first + self.window_cycles
-        close_ns = int(self.release_ns[boundary]) + self.grace_ns
+        close_ns = int(self.close_ns[boundary - 1])
         self.first.append(first)
         order = self.placement
         if self._host_down(close_ns):

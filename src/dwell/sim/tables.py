@@ -77,9 +77,8 @@ class PlayedRealisation:
     @property
     def close_ns(self) -> Ints:
         """Instant of every close, shape (windows,)."""
-        boundary = self.first + self.problem.window_cycles
-        grace_ns = round(self.problem.controller.close_grace_ms * 1e6)
-        close: Ints = self.realisation.release_ns[boundary] + grace_ns
+        last = self.first + self.problem.window_cycles - 1
+        close: Ints = self.arrays.tables.close_ns[0, last]
         return close
 
     def closed_windows(self) -> ClosedWindow:

@@ -9,8 +9,8 @@ It is not the best of all estimators for a rule that looks at one window: it bri
 that window along, which an estimate over several windows does not. So a real one may do better.
 
 The metrics are exact, except utilisation where windows do not begin with those of the static runs
-(after a migration whose order took time): then it is that of the windows that overlap, by how much
-they do.
+(after a migration whose order took time, or came after the next release): then it is that of the
+windows that overlap, by how much they do.
 """
 
 from __future__ import annotations
@@ -42,6 +42,10 @@ class _Alone:
     Parameters
     ----------
     release_ns, latency_ns : int64 array, shape (cycles,)
+    first : int64 array, shape (windows,)
+        First cycle of every window.
+    used : dict of str to float64 array, shape (windows,)
+        Utilisation of each node in every window.
     open_ns : int64 array, shape (windows + 1,)
         Begin of every window, and the end of the last.
     busy_ns : dict of str to float64 array, shape (windows + 1,)
@@ -50,8 +54,21 @@ class _Alone:
 
     release_ns: Ints
     latency_ns: Ints
+    first: Ints
+    used: dict[str, Floats]
     open_ns: Ints
     busy_ns: dict[str, Floats]
+
+    def utilisation(self, first: int, open_ns: int, close_ns: int) -> dict[str, float]:
+        """Utilisation of each node in the window of a first cycle, between two instants."""
+        window = int(np.searchsorted(self.first, first))
+        if window < len(self.first) and self.first[window] == first:
+            return {node: float(used[window]) for node, used in self.used.items()}
+        at_ns, span_ns = np.array([open_ns, close_ns]), float(close_ns - open_ns)
+        return {
+            node: min(float(np.diff(np.interp(at_ns, self.open_ns, busy_ns))[0]) / span_ns, 1.0)
+            for node, busy_ns in self.busy_ns.items()
+        }
 
 
 class Hindsight:
@@ -112,12 +129,7 @@ class Hindsight:
         age_ns = close_ns - release_ns
         l95_ms, uncut_ms = seen_l95_ms(latency_ns, age_ns, self._censor_ms)
         missed = int(missed_cycles(latency_ns, age_ns, self._deadline_ns))
-        span_ns = float(close_ns - release_ns[0])
-        at_ns = np.array([release_ns[0], close_ns])
-        used = {
-            node: min(float(np.diff(np.interp(at_ns, alone.open_ns, busy_ns))[0]) / span_ns, 1.0)
-            for node, busy_ns in alone.busy_ns.items()
-        }
+        used = alone.utilisation(first, int(release_ns[0]), close_ns)
         return QoS(float(l95_ms), missed / len(release_ns), FrozenDict(used), float(uncut_ms))
 
 
@@ -133,9 +145,9 @@ def _alone(run: Run) -> _Alone:
     open_ns = np.append(opened, last)
     span_ns = np.diff(open_ns)
     names = [name.removeprefix("u_") for name in windows.columns if name.startswith("u_")]
+    used = {name: windows[f"u_{name}"].to_numpy() for name in names}
     busy_ns = {
-        name: np.concatenate(([0.0], np.cumsum(windows[f"u_{name}"].to_numpy() * span_ns)))
-        for name in names
+        name: np.concatenate(([0.0], np.cumsum(shares * span_ns))) for name, shares in used.items()
     }
     latency_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
-    return _Alone(release_ns, latency_ns, open_ns, busy_ns)
+    return _Alone(release_ns, latency_ns, first, used, open_ns, busy_ns)

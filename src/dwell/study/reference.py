@@ -13,7 +13,8 @@ Whoever knows the future sends orders in time, and has a moved task ready when i
 sequences move at the boundary of the windows they were planned for, without ``order_delay_ms``,
 ``order_lead_cycles`` or a cold start. (Orders that are given late shift all later windows by the
 cycles that they take, and after some tens of migrations the plan is about other cycles than those
-it is applied to.) Where ``close_grace_ms`` is set, a migration still comes that much late.
+it is applied to.) Where ``close_grace_ms`` is set, or releases jitter, windows close after the
+release of the first cycle beyond them, and a migration still comes that much late.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import seen_l95_ms
+from dwell.control.windows import seen_l95_ms, window_close_ns
 from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
@@ -263,9 +264,9 @@ def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Float
     first = windows["first_cycle"].to_numpy()
     rows = first[:, None] + np.arange(problem.window_cycles)
     latency_ns = run.cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()[rows]
-    grace_ns = round(problem.controller.close_grace_ms * 1e6)
-    close_ns = realisation.release_ns[first + problem.window_cycles] + grace_ns
-    age_ns = close_ns[:, None] - realisation.release_ns[rows]
+    release_ns = realisation.release_ns
+    close_ns = window_close_ns(problem, release_ns[rows[:, -1]], release_ns[rows[:, -1] + 1])
+    age_ns = close_ns[:, None] - release_ns[rows]
     l95_ms, _ = seen_l95_ms(latency_ns, age_ns, problem.censor_ms)
     rate = windows["violation_rate"].to_numpy()
     return price(l95_ms, rate, *tier_use(windows, problem), 0.0, problem.objective)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.control import window_close_ns
 from dwell.errors import PolicyError
 from dwell.model import Problem, QoS
 
@@ -85,12 +86,11 @@ def _seen_closes(script: Script, problem: Problem, realisation: Realisation) -> 
     if not down.any():
         return range(realisation.windows)
     settings, release_ns = problem.controller, realisation.release_ns
-    grace_ns = round(settings.close_grace_ms * 1e6)
     delay_ns = round(settings.order_delay_ms * 1e6)
     seen = []
     placement, window, boundary = script.initial, 0, problem.window_cycles
     while boundary <= realisation.cycles:
-        close_ns = release_ns[boundary] + grace_ns
+        close_ns = int(window_close_ns(problem, release_ns[boundary - 1], release_ns[boundary]))
         change = np.searchsorted(at_ns, close_ns, side="right") - 1
         if change < 0 or not down[change]:
             seen.append(window)
