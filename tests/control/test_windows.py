@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import dwell
 from dwell.control import final_l95_ms, window_close_ns
@@ -62,6 +63,13 @@ def test_a_cycle_misses_when_it_is_late_or_not_there_yet() -> None:
     )
 
 
+def seen(
+    latency_ns: NDArray[np.int64], age_ns: NDArray[np.int64], censor_ms: float
+) -> tuple[float, float]:
+    l95_ms, uncut_ms = seen_l95_ms(latency_ns, age_ns, censor_ms)
+    return float(l95_ms), float(uncut_ms)
+
+
 @given(st.lists(st.integers(0, 10**9), min_size=1, max_size=60), st.data())
 def test_l95_is_the_order_statistic_of_what_could_be_known(
     latencies: list[int], data: st.DataObject
@@ -69,21 +77,21 @@ def test_l95_is_the_order_statistic_of_what_could_be_known(
     size = len(latencies)
     ages = data.draw(st.lists(st.integers(0, 10**9), min_size=size, max_size=size))
     # An unfinished cycle comes after a finished one that shows the same.
-    seen = sorted((min(pair), pair[0] > pair[1]) for pair in zip(latencies, ages, strict=True))
-    l95, unfinished = seen[math.ceil(0.95 * size - 1e-9) - 1]
-    found = seen_l95_ms(np.array(latencies), np.array(ages), 500.0)
+    shown = sorted((min(pair), pair[0] > pair[1]) for pair in zip(latencies, ages, strict=True))
+    l95, unfinished = shown[math.ceil(0.95 * size - 1e-9) - 1]
+    found = seen(np.array(latencies), np.array(ages), 500.0)
     assert found == (min(l95 / MS, 500.0), math.inf if unfinished else l95 / MS)
 
 
 def test_an_l95_that_no_completion_showed_is_known_as_an_age_alone() -> None:
     latency, age = np.full(20, 8 * MS), np.full(20, 100 * MS)
     latency[:2] = NEVER_NS
-    assert seen_l95_ms(latency, age, 60.0) == (60.0, math.inf)
+    assert seen(latency, age, 60.0) == (60.0, math.inf)
     latency[1] = 90 * MS
-    assert seen_l95_ms(latency, age, 60.0) == (60.0, 90.0)
+    assert seen(latency, age, 60.0) == (60.0, 90.0)
     # Two cycles released just before the close are unfinished, and younger than others' latencies.
     latency[:], age[-2:] = 60 * MS, 20 * MS
-    assert seen_l95_ms(latency, age, 100.0) == (60.0, 60.0)
+    assert seen(latency, age, 100.0) == (60.0, 60.0)
 
 
 def test_final_l95_is_infinite_where_more_than_5_percent_never_completed() -> None:
