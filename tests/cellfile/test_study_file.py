@@ -140,6 +140,42 @@ parameters:
     assert starts == [1, 2]
 
 
+def test_paths_that_are_zipped_go_together_and_the_rest_is_a_grid(folder: Path) -> None:
+    study = read(
+        folder,
+        f"""\
+{LEAST}
+parameters:
+  objective.targets.latency_ms: [20, 30, 30]
+  controller.min_dwell: [1, 2]
+  period_ms: [40, 50, 60]
+zip: [[period_ms, objective.targets.latency_ms]]
+labels: {{period_ms: P = D (ms)}}
+""",
+    )
+    # The first path of a group stands before what goes with it.
+    assert [tuple(point.values) for point in study.points] == [
+        ("period_ms", "objective.targets.latency_ms", "controller.min_dwell")
+    ] * 6
+    assert [tuple(point.values.values()) for point in study.points] == [
+        (period_ms, target_ms, dwell)
+        for period_ms, target_ms in ((40, 20), (50, 30), (60, 30))
+        for dwell in (1, 2)
+    ]
+    assert [point.problem.pipeline.period_ms for point in study.points] == [40, 40, 50, 50, 60, 60]
+    assert study.points[2].problem.objective.targets.latency_ms == 30
+    assert study.labels == {"period_ms": "P = D (ms)"}
+
+
+def test_only_what_is_no_group_multiplies_the_number_of_points(folder: Path) -> None:
+    many = ", ".join(map(str, range(1, 201)))
+    parameters = f"{{window_cycles: [{many}], controller.min_dwell: [{many}]}}"
+    more = f"parameters: {parameters}\nzip: [[window_cycles, controller.min_dwell]]\n"
+    assert len(read(folder, f"{LEAST}{more}").points) == 200
+    more = more.replace("zip: [[window_cycles, controller.min_dwell]]", "")
+    assert "40000 points are more than 10000" in faults(folder, f"{LEAST}{more}")["parameters"]
+
+
 def test_traces_are_read_once_for_all_points(folder: Path) -> None:
     data = folder / "data"
     data.mkdir()
@@ -273,6 +309,68 @@ def test_what_is_wrong_is_told_where_it_is(
     assert found[path].startswith(message)
 
 
+THREE = "parameters: {period_ms: [40, 50], deadline_ms: [40, 30], window_cycles: [5, 6, 7]}"
+
+
+@pytest.mark.parametrize(
+    ("more", "path", "message"),
+    [
+        (
+            "zip: [[period_ms, window_cycles]]",
+            "zip[0]",
+            "values differ in number: period_ms has 2, window_cycles has 3; give as many of each",
+        ),
+        (
+            "zip: [[period_ms, deadlin_ms]]",
+            "zip[0][1]",
+            "'deadlin_ms' is none of the parameters; did you mean 'deadline_ms'?",
+        ),
+        (
+            "zip: [[period_ms, deadline_ms], [window_cycles, period_ms]]",
+            "zip[1][1]",
+            "period_ms is in zip[0], too; name it once",
+        ),
+        (
+            "zip: [[period_ms, period_ms]]",
+            "zip[0][1]",
+            "period_ms is in zip[0], too; name it once",
+        ),
+        ("zip: [[period_ms]]", "zip[0]", "a group of 1 path; name at least two that go together"),
+        ("zip: [[]]", "zip[0]", "a group of 0 paths; name at least two that go together"),
+        ("zip: [period_ms]", "zip[0]", "'period_ms' is not allowed; it must be a li"),
+        ("zip: period_ms", "zip", "'period_ms' is not allowed; it must be a list"),
+        ("zip: [[period_ms, 5]]", "zip[0][1]", "5 is not allowed; it must be a text"),
+        (
+            "labels: {perid_ms: P}",
+            "labels.perid_ms",
+            "'perid_ms' is none of the parameters; did you mean 'period_ms'?",
+        ),
+        ("labels: {period_ms: ''}", "labels.period_ms", "'' is not allowed; it must be a text"),
+        ("labels: {period_ms: 5}", "labels.period_ms", "5 is not allowed; it must be a text"),
+        ("labels: P", "labels", "'P' is not allowed; it must be a mapping"),
+    ],
+)
+def test_a_group_or_a_label_that_is_wrong_is_told_with_its_line(
+    folder: Path, more: str, path: str, message: str
+) -> None:
+    with pytest.raises(ProblemError) as caught:
+        read(folder, f"{LEAST}{THREE}\n{more}\n")
+    (found,) = caught.value.faults
+    assert (found.path, found.line) == (path, 5)
+    assert found.message.startswith(message)
+
+
+def test_the_first_path_of_a_group_tells_its_points_apart(folder: Path) -> None:
+    more = "parameters: {period_ms: [40, 40], window_cycles: [5, 6]}\n"
+    found = faults(folder, f"{LEAST}{more}zip: [[period_ms, window_cycles]]\n")
+    assert found == {"parameters.period_ms": "a value is given twice; give each once"}
+
+
+def test_groups_without_parameters_are_refused(folder: Path) -> None:
+    found = faults(folder, f"{LEAST}zip: [[period_ms, deadline_ms]]\n")
+    assert found["zip[0][0]"] == "'period_ms' is none of the parameters; none is declared"
+
+
 @pytest.mark.parametrize(
     ("policies", "path", "message"),
     [
@@ -374,7 +472,11 @@ KEYS = ("dwell-study", "name", "traces", "scenarios", "windows", "seeds", "refer
 @settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-@given(st.dictionaries(st.sampled_from((*KEYS, "parameters", "odd")), ODDER, max_size=4))
+@given(
+    st.dictionaries(
+        st.sampled_from((*KEYS, "parameters", "zip", "labels", "odd")), ODDER, max_size=4
+    )
+)
 def test_whatever_stands_there_ends_in_a_study_or_in_faults(
     folder: Path, odd: dict[str, object]
 ) -> None:

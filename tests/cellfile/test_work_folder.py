@@ -21,6 +21,16 @@ def test_the_same_work_goes_on_in_its_folder(tmp_path: Path) -> None:
     assert json.loads((folder / "study.json").read_text())["seeds"] == [1, 2]
 
 
+def test_notes_may_change_and_the_work_goes_on(tmp_path: Path) -> None:
+    file = tmp_path / "out" / "study.json"
+    for notes in ({"labels": {"a": "A"}}, {"labels": {"a": "B"}}, None):
+        with open_work_folder(tmp_path / "out", STUDY, {"seeds": [1]}, notes):
+            known = json.loads(file.read_text())
+        assert known.get("labels") == (notes or {}).get("labels")
+    with open_work_folder(tmp_path / "new", STUDY, {"seeds": [1]}):
+        assert file.read_bytes() == (tmp_path / "new" / "study.json").read_bytes()
+
+
 def test_other_work_is_told_what_differs_and_touches_nothing(tmp_path: Path) -> None:
     with open_work_folder(tmp_path / "out", STUDY, {"seeds": [1], "cell": {"period_ms": 40}}):
         pass

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import polars as pl
 import pytest
 
 from dwell.errors import DwellError, MetricError, PolicyError, SimulationError
 from dwell.study import Comparison, run_study
 from dwell.study.intervals import mean_interval, share_limits
+from dwell.study.results import PARAMETER
 from tests.study.test_comparison import POLICIES, small
 from tests.study.test_study import grid, make_study
 
@@ -37,6 +40,25 @@ def test_differences_are_those_of_pairs(comparison: Comparison) -> None:
         "baseline", "LOC", "l95_ms"
     )
     assert found == mean_interval(gaps)
+
+
+@pytest.mark.parametrize(
+    ("values", "axes"),
+    [
+        ({"a": [1, 1, 2, 2], "b": [3, 4, 3, 4]}, [("a",), ("b",)]),
+        ({"a": [1, 2], "b": [5, 5]}, [("a", "b")]),
+        ({"a": [5, 5], "b": [1, 2]}, [("b", "a")]),
+        ({"a": [1, 1, 2, 2], "b": ["x", "x", "y", "y"], "c": [1, 2, 1, 2]}, [("a", "b"), ("c",)]),
+        ({"a": [7], "b": [8]}, [("a", "b")]),
+        ({}, []),
+    ],
+)
+def test_parameters_whose_values_go_together_are_one_axis(
+    comparison: Comparison, values: dict[str, list[object]], axes: list[tuple[str, ...]]
+) -> None:
+    runs = pl.DataFrame({PARAMETER + name: each for name, each in values.items()})
+    expected = tuple(tuple(PARAMETER + name for name in axis) for axis in axes)
+    assert replace(comparison, runs=runs).axes == expected
 
 
 def test_one_seed_gives_no_interval() -> None:

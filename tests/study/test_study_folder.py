@@ -20,7 +20,7 @@ import polars as pl
 import pytest
 
 from dwell.errors import RunError, SimulationError
-from dwell.study import Contender, Study, load_study, run_study
+from dwell.study import Contender, Point, Study, load_study, open_study, run_study
 from tests.study.test_study import make_study
 
 ROOT = Path(__file__).parents[2]
@@ -174,6 +174,28 @@ def test_a_folder_holds_what_memory_would(small: Path) -> None:
     result = run_study(make_study(), processes=1)
     for name in TABLES:
         assert getattr(result, name).equals(pl.read_parquet(small / f"{name}.parquet"))
+
+
+def test_labels_may_be_given_later_and_are_read_again(small: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(small, out)
+    assert open_study(out).labels == {}
+    points = tuple(Point({"period_ms": 1}, point.problem) for point in make_study().points)
+    with pytest.raises(SimulationError, match="'perid_ms' is none of the parameters; did you mean"):
+        replace(make_study(), points=points, labels={"perid_ms": "P"})
+
+
+def test_a_study_of_parameters_keeps_their_labels(whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole / "whole", out)
+    known = parts_in(out)
+    path = "objective.weights.switching"
+    labelled = replace(load_study(whole / "study.yaml"), labels={path: "ω_S"})
+    run_study(labelled, folder=out, processes=1)
+    assert parts_in(out) == known
+    assert open_study(out).labels == {path: "ω_S"}
+    assert open_study(out).shown_parameter(f"parameter.{path}") == "ω_S"
+    assert_same_files(out, whole / "whole")
 
 
 # ------------------------------------------------------------------------------ other studies

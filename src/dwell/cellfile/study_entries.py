@@ -131,6 +131,12 @@ class StudyEntry(Entry):
     parameters: Annotated[dict[str, object], _Read(_parameters)] | None = optional(
         "Values by their path in the cell; every combination is a point."
     )
+    zip: list[list[str]] | None = optional(
+        "Groups of parameters whose values go together, the first with the first; default: none."
+    )
+    labels: dict[str, Annotated[str, Field(min_length=1)]] | None = optional(
+        "Names of parameters in figures and tables, by their paths; default: the paths."
+    )
 
 
 def _own_scenario(steps: tuple[Step, ...]) -> bool:

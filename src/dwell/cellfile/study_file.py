@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike, fspath
 from pathlib import Path
@@ -62,6 +62,7 @@ class DeclaredStudy:
 
     name: str
     points: tuple[DeclaredPoint, ...]
+    labels: Mapping[str, str]
     scenarios: tuple[str, ...]
     policies: tuple[DeclaredPolicy, ...]
     seeds: tuple[int, ...]
@@ -157,13 +158,15 @@ class _Reading:
         name = entry.name or self.path.stem
         self._check_name("name", name)
         grid = self._grid()
+        axes = self._axes(grid)
+        labels = self._labels()
         policies = self._policies()
         cell = self._cell()
         if cell is None:
             return None
         cell = self._with_scenarios(cell)
         scenarios = self._scenarios(cell.problem)
-        points = self._points(cell, grid)
+        points = self._points(cell, grid, axes)
         policies = [self._with_estimator(policy, cell.problem) for policy in policies]
         for policy in policies:
             self._check_names(policy, cell.problem)
@@ -173,6 +176,7 @@ class _Reading:
         return DeclaredStudy(
             name=name,
             points=tuple(DeclaredPoint(values, cell.problem) for values, cell in points),
+            labels=labels,
             scenarios=scenarios,
             policies=tuple(policies),
             seeds=SEEDS if entry.seeds is None else entry.seeds,
@@ -277,6 +281,8 @@ class _Reading:
     def _grid(self) -> dict[str, list[Any]]:
         """Return the values of every parameter whose structure is right."""
         grid: dict[str, list[Any]] = {}
+        # What goes with another parameter may take a value again.
+        following = {path for group in self.entry.zip or () for path in group[1:]}
         for path, values in (self.entry.parameters or {}).items():
             place = f"parameters.{path}"
             if not isinstance(values, list) or not values:
@@ -284,32 +290,79 @@ class _Reading:
                 self.faults.add(place, f"{has}; it must be a list of at least one value")
             elif self.faults.touches(place):
                 pass
-            elif len(set(_shown(values))) < len(values):
+            elif path not in following and len(set(_shown(values))) < len(values):
                 self.faults.add(place, "a value is given twice; give each once")
             else:
                 grid[path] = values
-        count = math.prod(len(values) for values in grid.values())
-        if count > MAX_POINTS:
-            self.faults.add("parameters", f"{count} points are more than {MAX_POINTS}; give fewer")
-            return {}
         return grid
 
+    def _axes(self, grid: Mapping[str, list[Any]]) -> list[tuple[str, ...]]:
+        """Return the paths of every axis of the grid: those of a group, or one alone.
+
+        Of more points than there may be, no axis.
+        """
+        axes: dict[str, tuple[str, ...]] = {path: (path,) for path in grid}
+        for place, group in self._groups():
+            counts = {path: len(grid[path]) for path in group if path in grid}
+            if len(set(counts.values())) > 1:
+                has = ", ".join(f"{path} has {count}" for path, count in counts.items())
+                self.faults.add(place, f"values differ in number: {has}; give as many of each")
+            else:
+                axes |= dict.fromkeys(counts, tuple(counts))
+        each = list(dict.fromkeys(axes.values()))
+        count = math.prod(len(grid[first]) for first, *_ in each)
+        if count > MAX_POINTS:
+            self.faults.add("parameters", f"{count} points are more than {MAX_POINTS}; give fewer")
+            return []
+        return each
+
+    def _groups(self) -> Iterator[tuple[str, list[str]]]:
+        """Yield the place and the paths of every group that is right as such."""
+        known: dict[str, str] = {}
+        for i, group in enumerate(self.entry.zip or ()):
+            place = f"zip[{i}]"
+            if len(group) < 2:
+                has = "1 path" if group else "0 paths"
+                self.faults.add(place, f"a group of {has}; name at least two that go together")
+            for j, path in enumerate(group):
+                if path in known:
+                    message = f"{path} is in {known[path]}, too; name it once"
+                    self.faults.add(f"{place}[{j}]", message)
+                else:
+                    known[path] = place
+                    self._check_parameter(f"{place}[{j}]", path)
+            if not self.faults.touches(place):
+                yield place, group
+
+    def _check_parameter(self, place: str, path: str) -> None:
+        known = self.entry.parameters or {}
+        if path not in known and not self.faults.at("parameters"):
+            self.faults.add(place, f"{path!r} is none of the parameters; {nearest(path, known)}")
+
+    def _labels(self) -> dict[str, str]:
+        """Return the names of parameters by their paths."""
+        labels = self.entry.labels or {}
+        for path in labels:
+            self._check_parameter(f"labels.{path}", path)
+        return labels
+
     def _points(
-        self, cell: _Cell, grid: Mapping[str, list[Any]]
+        self, cell: _Cell, grid: Mapping[str, list[Any]], axes: Sequence[tuple[str, ...]]
     ) -> list[tuple[dict[str, Value], _Cell]]:
-        """Return every combination of values, and the cell with them."""
+        """Return every combination of the values of axes, and the cell with them."""
         steps = {path: self._steps("parameters", path, cell) for path in grid}
         self._check_apart("parameters", steps)
         places = {path: known for path, known in steps.items() if known is not None}
         shown = {path: _shown(values) for path, values in grid.items()}
+        right = [tuple(path for path in axis if path in places) for axis in axes]
+        right = [axis for axis in right if axis]
         points = []
-        for picked in itertools.product(*(range(len(grid[path])) for path in places)):
-            at = list(zip(places.items(), picked, strict=True))
+        for picked in itertools.product(*(range(len(grid[first])) for first, *_ in right)):
+            at = [(path, i) for axis, i in zip(right, picked, strict=True) for path in axis]
             overrides = [
-                _Override(f"parameters.{path}[{i}]", known, grid[path][i])
-                for (path, known), i in at
+                _Override(f"parameters.{path}[{i}]", places[path], grid[path][i]) for path, i in at
             ]
-            values = {path: shown[path][i] for (path, _), i in at}
+            values = {path: shown[path][i] for path, i in at}
             listed = ", ".join(f"{path} = {value}" for path, value in values.items())
             changed = self._changed(cell, overrides, "parameters", f" (at {listed})")
             if changed is not None:

@@ -47,13 +47,17 @@ class FolderMark(NamedTuple):
 
 
 @contextmanager
-def open_work_folder(folder: Path, mark: FolderMark, description: Description) -> Iterator[None]:
+def open_work_folder(
+    folder: Path, mark: FolderMark, description: Description, notes: Description | None = None
+) -> Iterator[None]:
     """Open a folder for this process alone, and make it where there is none.
 
     Parameters
     ----------
     description : mapping
         JSON-able: all that the results depend on.
+    notes : mapping, optional
+        JSON-able: stands beside the description, and is replaced where it has changed.
 
     Raises
     ------
@@ -72,7 +76,7 @@ def open_work_folder(folder: Path, mark: FolderMark, description: Description) -
         raise unwritable(folder, error) from None
     try:
         _lock(folder, handle, mark.what)
-        _take(folder, mark, description)
+        _take(folder, mark, description, notes or {})
         for place in (folder, *(folder / inner for inner in mark.folders)):
             for draft in place.glob(".*.draft"):
                 draft.unlink(missing_ok=True)
@@ -101,12 +105,12 @@ def _require_kind(folder: Path, mark: FolderMark) -> None:
         raise RunError(f"{folder} exists and is no {mark.what}; choose another folder")
 
 
-def _take(folder: Path, mark: FolderMark, description: Description) -> None:
+def _take(folder: Path, mark: FolderMark, description: Description, notes: Description) -> None:
     """Write whose folder it is, or refuse it where it is another's."""
     path = folder / mark.file
     text = json.dumps({f"dwell-{mark.what}-folder": mark.version, **description}, allow_nan=False)
-    whole = json.loads(text)
-    whole["digest"] = hashlib.sha256(text.encode()).hexdigest()
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    whole = {**json.loads(text), "digest": digest, **notes}
     if path.is_file():
         try:
             known = json.loads(path.read_text(encoding="utf-8"))
@@ -114,9 +118,10 @@ def _take(folder: Path, mark: FolderMark, description: Description) -> None:
             raise RunError(f"{path}: cannot be read ({error})") from None
         if not isinstance(known, dict):
             raise RunError(f"{path} describes no {mark.what}; choose another folder")
-        if known.get("digest") != whole["digest"]:
+        if known.get("digest") != digest:
             raise RunError(_difference(folder, mark.what, known, whole))
-        return
+        if known == whole:
+            return
     try:
         text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)
         write_whole(path, f"{text}\n")

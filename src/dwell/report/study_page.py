@@ -10,7 +10,7 @@ from dwell.report.charts import NO_LIMIT, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
 from dwell.report.method import ranges
-from dwell.report.page import Block, Page, Section, page_html
+from dwell.report.page import Block, Definitions, Page, Section, page_html
 from dwell.report.policy_blocks import COST, L95, RATE, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
 from dwell.study import StudyRuns, over_seeds
@@ -44,8 +44,9 @@ def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
 
 def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
-        for place, parameter in enumerate(study.parameters):
-            shown = parameter.partition(".")[2]
+        for place, (parameter, *others) in enumerate(study.axes):
+            shown = study.shown_parameter(parameter)
+            together = {"together with it": ", ".join(map(study.shown_parameter, others))}
             figures: list[Block] = []
             tables: list[Block] = []
             for measure in _measures(study):
@@ -54,7 +55,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
                 tables.append(_pivot(means, blocks, parameter, measure, place))
             yield Section(
                 f"By {shown}",
-                [figures[0], tables[0]],
+                [*([Definitions(together)] if others else []), figures[0], tables[0]],
                 note="Means over the other parameters and seeds; intervals are over seeds, of "
                 "their means.",
             )
@@ -97,7 +98,7 @@ def _curve(
     import polars as pl
 
     limits = {RATE.column: THE_AIM, L95.column: blocks.deadline}
-    shown = parameter.partition(".")[2]
+    shown = blocks.found.shown_parameter(parameter)
     table = scaled(means, measure)
     at = table[parameter]
     rows = table.with_columns(at=at if at.dtype.is_numeric() else at.cast(pl.String))
@@ -122,7 +123,7 @@ def _pivot(
     columns = [measure._replace(column=value, name=value, unit="") for value in values]
     return Table(
         f"pivot-{measure.column}-{place}",
-        f"{measure.heading} by {parameter.partition('.')[2]}",
+        f"{measure.heading} by {blocks.found.shown_parameter(parameter)}",
         [Text("policy", "policy", "policy"), *columns],
         list(rows.values()),
         Text("scenario", "", "scenario"),
@@ -140,7 +141,7 @@ def _points(study: StudyRuns, blocks: PolicyBlocks) -> Table:
         "Every point",
         [
             Text("policy", "policy", "policy"),
-            *(Text(name, name.partition(".")[2]) for name in study.parameters),
+            *(Text(name, study.shown_parameter(name)) for name in study.parameters),
             *measures,
         ],
         table.to_dicts(),

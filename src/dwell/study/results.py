@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from dwell.display import Displayed
 from dwell.errors import PolicyError, SimulationError
-from dwell.model import Problem
+from dwell.model import FrozenDict, Problem
 from dwell.model.semantics import nearest
 from dwell.study.intervals import Floats, Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
@@ -49,6 +49,8 @@ class StudyRuns(Displayed):
         lost.
     versions : mapping of str to str
         Versions of the software that made the runs, by package.
+    labels : mapping of str to str
+        Names of parameters in figures and tables, by their paths.
     """
 
     name: str
@@ -61,6 +63,7 @@ class StudyRuns(Displayed):
     costs: pl.DataFrame
     latencies: pl.DataFrame
     versions: Mapping[str, str]
+    labels: Mapping[str, str] = field(default_factory=FrozenDict)
 
     def __repr__(self) -> str:
         return (
@@ -73,6 +76,29 @@ class StudyRuns(Displayed):
     def parameters(self) -> tuple[str, ...]:
         """Columns that hold the values of parameters."""
         return tuple(name for name in self.runs.columns if name.startswith(PARAMETER))
+
+    @property
+    def axes(self) -> tuple[tuple[str, ...], ...]:
+        """Columns of parameters whose values go together; the first has a value for each.
+
+        What has one value throughout goes with the first of the others.
+        """
+        values = self.runs.select(self.parameters).unique()
+        varying = [name for name in self.parameters if values[name].n_unique() > 1]
+        axes: dict[str, list[str]] = {}
+        for column in [*varying, *(name for name in self.parameters if name not in varying)]:
+            for first, others in axes.items():
+                if values.select(first, column).n_unique() == values[first].n_unique():
+                    others.append(column)
+                    break
+            else:
+                axes[column] = []
+        return tuple((first, *others) for first, others in axes.items())
+
+    def shown_parameter(self, column: str) -> str:
+        """Return what a parameter's column is called in figures and tables."""
+        path = column.removeprefix(PARAMETER)
+        return self.labels.get(path, path)
 
     @property
     def statics(self) -> tuple[str, ...]:

@@ -96,6 +96,7 @@ def run_study(
         windows=study.windows,
         **tables,
         versions=versions(),
+        labels=study.labels,
         study=study,
         folder=folder,
     )
@@ -149,7 +150,8 @@ def _play_in_folder(
         write_table(folder, f"{PARTS}/{item.name}", _frame(played))
         count([item])
 
-    with open_work_folder(folder, STUDY, describe(study)):
+    notes = {"labels": dict(study.labels)} if study.labels else {}
+    with open_work_folder(folder, STUDY, describe(study), notes):
         known = finished(folder)
         count([item for item in items if item.name in known])
         missing = [item for item in items if item.name not in known]

@@ -15,6 +15,7 @@ from dwell.cellfile.study_paths import with_settings
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.document import to_document
+from dwell.model.semantics import nearest
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
 
 if TYPE_CHECKING:
@@ -132,6 +133,8 @@ class Study:
         Length of every run, the warm-up included.
     references : bool
         Whether the references in hindsight play as well.
+    labels : mapping of str to str
+        Names of parameters in figures and tables, by their paths; a path where there is none.
 
     Raises
     ------
@@ -148,8 +151,10 @@ class Study:
     seeds: tuple[int, ...]
     windows: int
     references: bool = False
+    labels: Mapping[str, str] = field(default_factory=FrozenDict)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "labels", FrozenDict(self.labels))
         names = tuple(contender.name for contender in self.contenders)
         _require_each_once("points", [dict(point.values) for point in self.points])
         _require_each_once("scenarios", self.scenarios)
@@ -157,6 +162,10 @@ class Study:
         _require_each_once("seeds", self.seeds)
         for point in self.points:
             self._check(point)
+        for path in self.labels:
+            if path not in self.parameters:
+                hint = nearest(path, self.parameters)
+                raise SimulationError(f"labels: {path!r} is none of the parameters; {hint}")
         reserved = [name for name in names if self.references and name in REFERENCES]
         if reserved:
             raise SimulationError(f"{reserved[0]!r} is a reference's name; choose another")
@@ -274,4 +283,5 @@ def load_study(path: str | PathLike[str]) -> Study:
         seeds=declared.seeds,
         windows=declared.windows,
         references=declared.references,
+        labels=declared.labels,
     )

@@ -88,7 +88,8 @@ def open_study(folder: str | Path) -> StudyRuns:
         scenarios, policies = (tuple(map(str, known[name])) for name in ("scenarios", "policies"))
         seeds = tuple(map(int, known["seeds"]))
         windows = int(known["windows"])
-    except (OSError, ValueError, KeyError, TypeError, DwellError) as error:
+        labels = {str(path): str(label) for path, label in known.get("labels", {}).items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, DwellError) as error:
         raise RunError(f"{path}: cannot be read ({error!r})") from None
     tables = {}
     for name in TABLES:
@@ -109,6 +110,7 @@ def open_study(folder: str | Path) -> StudyRuns:
         windows=windows,
         **tables,
         versions=software,
+        labels=labels,
     )
 
 
