@@ -440,7 +440,7 @@ def test_a_fault_of_the_cell_is_told_with_its_own_line(folder: Path) -> None:
         ("dwell-study: 1\ncell: 5\npolicies: {}", "cell: 5 is not allowed; it must be a text"),
         ("dwell-study: 1\ncell: cell.yaml\npolicies: {}", "policies: the mapping is empty"),
         ("dwell-study: 1\ncell: none.yaml", "none.yaml: no such file; check the path"),
-        ("dwell-study: 1\ncell: study.yaml", "study.yaml:1: dwell: missing"),
+        ("dwell-study: 1\ncell: study.yaml", "study.yaml:1: dwell-study: this is a study, not"),
     ],
 )
 def test_what_is_no_study_is_refused(folder: Path, text: str, message: str) -> None:

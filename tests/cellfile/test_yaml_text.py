@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.cellfile.document_faults import Faults, dotted
-from dwell.cellfile.yaml_text import read_yaml
+from dwell.cellfile.yaml_text import read_value, read_yaml
 from dwell.errors import Fault
 
 
@@ -136,3 +136,23 @@ def test_the_line_of_a_path_is_that_of_what_is_around_it(tmp_path: Path) -> None
     read_yaml(str(path), faults)
     lines = {where: faults.line(where) for where in ("a.b[1].d", "a.b[1].x.y", "a.b", "a.z", "q")}
     assert lines == {"a.b[1].d": 4, "a.b[1].x.y": 4, "a.b": 2, "a.z": 1, "q": 1}
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "message"),
+    [
+        ("4e1", 40.0, ""),
+        ("{a: [on, ~]}", {"a": ["on", None]}, ""),
+        ("", None, ""),
+        ("{a: 1", None, "not a YAML document: while parsing a flow mapping"),
+        ("{a: 1, a: 2}", {"a": 1}, "a: the key 'a' is given again (first in line 1); keep one"),
+    ],
+)
+def test_a_text_that_is_one_value_has_its_faults_at_one_place(
+    text: str, value: object, message: str
+) -> None:
+    faults = Faults()
+    assert read_value(text, faults, "here") == value
+    found = faults.error().faults
+    assert [fault.path for fault in found] == (["here"] if message else [])
+    assert all(fault.message.startswith(message) for fault in found)

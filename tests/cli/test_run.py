@@ -8,6 +8,7 @@ import pytest
 
 import dwell
 from dwell.errors import RunError
+from dwell.model import Constant
 from dwell.record import Run
 from tests.cli.small_cell import SMALL, assert_refused, call, read_json
 
@@ -95,6 +96,73 @@ def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
     assert_refused(more, "kept holds another run")
     assert call(*words, "--seed", "2", "--force").exit_code == 0
     assert dwell.open_run("kept").meta["seed"] == 2
+
+
+def test_values_of_the_cell_are_set_for_one_run(cell: Path) -> None:
+    call("run", cell, "--windows", "5")
+    settings = ("--set", "period_ms=40", "--set", "tasks.plan.on.R.exec_ms=15.5")
+    more = ("--set", "objective.caps={latency_ms: 40}", "--set", "links[0].loss=1e-1")
+    result = call("run", cell, "--windows", "5", *settings, *more)
+    assert result.exit_code == 0, result.output
+    folders = sorted(path.name for path in Path("runs").iterdir())
+    assert folders == [
+        "small-baseline-dtp-1",
+        "small-baseline-dtp-1-period_ms=40-tasks.plan.on.R.exec_ms=15.5"
+        "-objective.caps=_latency_ms__40_-links_0_.loss=1e-1",
+    ]
+    problem = dwell.open_run(Path("runs", folders[1])).problem
+    assert problem.pipeline.period_ms == 40
+    assert problem.pipeline.tasks["plan"].on["R"].exec_ms == Constant(15.5)
+    assert problem.objective.caps.latency_ms == 40
+    assert problem.fabric.links["E->R"].loss == 0.1
+    assert dwell.open_run(Path("runs", folders[0])).problem == dwell.load(cell)
+
+
+def test_a_long_list_of_values_still_names_a_folder(cell: Path) -> None:
+    words = [f"nodes.E.cores={'0' * 300}{cores}" for cores in (1, 2)]
+    for word in words:
+        assert call("run", cell, "--windows", "2", "--set", word).exit_code == 0
+    assert len(list(Path("runs").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["period_ms"], ["--set period_ms: there is no `=`; write it as PATH=VALUE"]),
+        (["=5"], ["--set : not a path"]),
+        (["perid_ms=5"], ["--set perid_ms: unknown key 'perid_ms'; did you mean 'period_ms'?"]),
+        (["tasks.plann.input=all"], ["the cell's tasks have no 'plann'; did you mean 'plan'?"]),
+        (["links[3].loss=0"], ["--set links[3].loss: there is no links[3]; links has 1 items"]),
+        (["period_ms=x"], ["--set period_ms: 'x' is not allowed"]),
+        (["period_ms=-1"], ["--set period_ms: -1 is not allowed"]),
+        (["period_ms="], ["--set period_ms: nothing is given"]),
+        (["nodes.E={tier: edge"], ["--set nodes.E: not a YAML document"]),
+        (["nodes.E.cores=1", "nodes.E.cores=2"], ["--set nodes.E.cores: is given twice"]),
+        (
+            ["objective.caps={latency_ms: 5}", "objective.caps.latency_ms=6"],
+            ["--set objective.caps.latency_ms: is a part of objective.caps; give one of them"],
+        ),
+        (["period_ms=0", "seed", "links[1].loss=0"], ["--set seed: there", "--set links[1].loss:"]),
+        (
+            ["window_cycles=0", "nodes.E.cores=0"],
+            ["--set window_cycles: 0", "--set nodes.E.cores:"],
+        ),
+        (["deadline_ms=30"], ["--set deadline_ms: "]),
+        (["controller.policy=dpt"], ["--set controller.policy: "]),
+        (["links=[]", "nodes.E.cores=2"], ["--set: ", "(with links=[], nodes.E.cores=2)"]),
+    ],
+)
+def test_a_setting_that_is_wrong_is_named(cell: Path, settings: list[str], said: list[str]) -> None:
+    result = call("run", cell, *(word for one in settings for word in ("--set", one)))
+    assert_refused(result, f"{cell}: ", *said)
+    assert not Path("runs").exists()
+
+
+def test_a_fault_of_the_cell_itself_is_its_own(cell: Path) -> None:
+    cell.write_text(SMALL.replace("tier: edge", "tier: egde"), encoding="utf-8")
+    result = call("run", cell, "--set", "period_ms=x")
+    assert_refused(result, "small.yaml:7: nodes.E.tier: 'egde' is not allowed")
+    assert "--set" not in result.stderr
 
 
 def test_a_study_given_to_run_is_called_one(cell: Path) -> None:

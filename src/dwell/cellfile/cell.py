@@ -57,17 +57,29 @@ def load_without_traces(path: str | PathLike[str]) -> Problem:
 
 
 def _load(source: str, folder: Path | None) -> Problem:
+    document, faults = read_document(source)
+    home = str(Path(source).resolve().parent)
+    return read_problem(document, faults, folder, Path(source).stem or "cell", home=home)
+
+
+def read_document(source: str) -> tuple[object, Faults]:
+    """Return the plain values of a cell file, and what is wrong with them as such.
+
+    Raises
+    ------
+    ProblemError
+        If it is no cell file, or none that could be read on.
+    """
     from dwell.cellfile.yaml_text import read_yaml
 
     faults = Faults(source)
-    text = read_yaml(source, faults)
+    document = read_yaml(source, faults)
     if faults.at(""):
         raise faults.error()  # the file as such; there is nothing to read on
-    if isinstance(text, dict) and "dwell-study" in text and "dwell" not in text:
+    if isinstance(document, dict) and "dwell-study" in document and "dwell" not in document:
         faults.add("dwell-study", "this is a study, not a cell; run it by `dwell study FILE`")
         raise faults.error()
-    home = str(Path(source).resolve().parent)
-    return read_problem(text, faults, folder, Path(source).stem or "cell", home=home)
+    return document, faults
 
 
 def from_document(

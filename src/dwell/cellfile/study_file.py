@@ -9,16 +9,16 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from dwell.cellfile.cell import read_problem
-from dwell.cellfile.document_faults import Faults, Step, dotted
+from dwell.cellfile.document_faults import Faults, Step
+from dwell.cellfile.overrides import OpenCell, Override, check_apart, open_cell
 from dwell.cellfile.rendering import as_read
-from dwell.cellfile.study_paths import SETTINGS, put, steps_of
+from dwell.cellfile.study_paths import SETTINGS, steps_of
 from dwell.errors import ProblemError
 from dwell.estimators.registry import names as estimator_names
 from dwell.model import Problem
@@ -28,7 +28,6 @@ from dwell.policies.registry import names as policy_names
 
 if TYPE_CHECKING:
     from dwell.cellfile.study_entries import StudyEntry
-    from dwell.cellfile.traces import Tables
 
 WINDOWS = 300
 SEEDS = tuple(range(1, 21))
@@ -105,45 +104,6 @@ def read_study(path: str | PathLike[str], *, references: Collection[str] = ()) -
 
 
 @dataclass(frozen=True, slots=True)
-class _Override:
-    """A value that the study puts into the cell."""
-
-    place: str
-    steps: tuple[Step, ...]
-    value: object
-
-    @property
-    def path(self) -> str:
-        """Dotted path of the value in the cell."""
-        return dotted(self.steps)
-
-
-@dataclass(frozen=True, slots=True)
-class _Cell:
-    """A cell with other values in it: its document, and what it has been read into."""
-
-    document: Any
-    problem: Problem
-    folder: Path
-    traces: dict[object, Tables] = field(repr=False)
-
-    def changed(self, overrides: Iterable[_Override]) -> _Cell:
-        """Return the cell with values put into it.
-
-        Raises
-        ------
-        ProblemError
-            With every fault found.
-        """
-        document = self.document
-        for one in overrides:
-            document = put(document, one.steps, one.value)
-        name, home = self.problem.name, self.problem.folder
-        problem = read_problem(document, Faults(), self.folder, name, self.traces, home=home)
-        return _Cell(document, problem, self.folder, self.traces)
-
-
-@dataclass(frozen=True, slots=True)
 class _Reading:
     """One study file on its way from its entry to what it declares."""
 
@@ -188,7 +148,7 @@ class _Reading:
         if message := bad_name(name):
             self.faults.add(path, message)
 
-    def _check_windows(self, windows: int, points: Sequence[tuple[object, _Cell]]) -> None:
+    def _check_windows(self, windows: int, points: Sequence[tuple[object, OpenCell]]) -> None:
         warmup = max((cell.problem.warmup_windows for _, cell in points), default=0)
         if windows <= warmup:
             bound = f"more than the {warmup} windows of warm-up"
@@ -196,65 +156,27 @@ class _Reading:
 
     # ------------------------------------------------------------------------------ cell
 
-    def _cell(self) -> _Cell | None:
+    def _cell(self) -> OpenCell | None:
         """Read the cell as it is in its file."""
-        from dwell.cellfile.yaml_text import read_yaml
-
         if not self.entry.cell:
             if not self.faults.at("cell"):
                 self.faults.add("cell", "the text is empty; name the cell's file")
             return None
-        file = self.path.parent / self.entry.cell
         given = self.entry.traces
-        folder = file.parent if given is None else self.path.parent / given
-        faults = Faults(str(file))
-        document = read_yaml(str(file), faults)
-        traces: dict[object, Tables] = {}
+        traces = None if given is None else self.path.parent / given
         try:
-            if faults.at(""):
-                raise faults.error()
-            home = str(file.resolve().parent)
-            name = file.stem or "cell"
-            problem = read_problem(document, faults, folder, name, traces, home=home)
+            return open_cell(self.path.parent / self.entry.cell, traces)
         except ProblemError as error:
             for line in str(error).splitlines():
                 self.faults.add("cell", line)
             return None
-        return _Cell(document, problem, folder, traces)
-
-    def _changed(
-        self, cell: _Cell, overrides: Sequence[_Override], otherwise: str, where: str = ""
-    ) -> _Cell | None:
-        """Put values into the cell, or record what is wrong with them where they are given.
-
-        Parameters
-        ----------
-        otherwise : str
-            Place of faults that several values cause together.
-        where : str
-            Text added to the messages.
-        """
-        try:
-            return cell.changed(overrides)
-        except ProblemError as error:
-            for fault in error.faults:
-                beneath = Faults()
-                beneath.add(fault.path, "")
-                mine = [one for one in overrides if beneath.touches(one.path)]
-                exact = bool(mine) and mine[0].path == fault.path
-                message = fault.message if exact else str(fault)
-                if mine:
-                    self.faults.add(mine[0].place, message)
-                else:
-                    self.faults.add(otherwise, message + where)
-            return None
 
     # ------------------------------------------------------------------------- scenarios
 
-    def _with_scenarios(self, cell: _Cell) -> _Cell:
+    def _with_scenarios(self, cell: OpenCell) -> OpenCell:
         """Put the study's own scenarios into the cell; a fault leaves them all out."""
         own = [
-            _Override(f"scenarios.{name}", ("scenarios", name), items)
+            Override(f"scenarios.{name}", ("scenarios", name), items)
             for name, items in (self.entry.scenarios or {}).items()
             if items is not None
         ]
@@ -347,11 +269,11 @@ class _Reading:
         return labels
 
     def _points(
-        self, cell: _Cell, grid: Mapping[str, list[Any]], axes: Sequence[tuple[str, ...]]
-    ) -> list[tuple[dict[str, Value], _Cell]]:
+        self, cell: OpenCell, grid: Mapping[str, list[Any]], axes: Sequence[tuple[str, ...]]
+    ) -> list[tuple[dict[str, Value], OpenCell]]:
         """Return every combination of the values of axes, and the cell with them."""
         steps = {path: self._steps("parameters", path, cell) for path in grid}
-        self._check_apart("parameters", steps)
+        check_apart({f"parameters.{path}": found for path, found in steps.items()}, self.faults)
         places = {path: known for path, known in steps.items() if known is not None}
         shown = {path: _shown(values) for path, values in grid.items()}
         right = [tuple(path for path in axis if path in places) for axis in axes]
@@ -360,26 +282,19 @@ class _Reading:
         for picked in itertools.product(*(range(len(grid[first])) for first, *_ in right)):
             at = [(path, i) for axis, i in zip(right, picked, strict=True) for path in axis]
             overrides = [
-                _Override(f"parameters.{path}[{i}]", places[path], grid[path][i]) for path, i in at
+                Override(f"parameters.{path}[{i}]", places[path], grid[path][i]) for path, i in at
             ]
             values = {path: shown[path][i] for path, i in at}
             listed = ", ".join(f"{path} = {value}" for path, value in values.items())
-            changed = self._changed(cell, overrides, "parameters", f" (at {listed})")
+            changed = cell.attempt(overrides, self.faults, "parameters", f" (at {listed})")
             if changed is not None:
                 points.append((values, changed))
         return points
 
-    def _steps(self, place: str, path: str, cell: _Cell) -> tuple[Step, ...] | None:
+    def _steps(self, place: str, path: str, cell: OpenCell) -> tuple[Step, ...] | None:
         """Split a path into steps; None beside a fault."""
         unread = path.startswith("scenarios.") and self.faults.touches("scenarios")
         return None if unread else self.faults.attempt(place, steps_of, path, cell.document)
-
-    def _check_apart(self, place: str, steps: Mapping[str, tuple[Step, ...] | None]) -> None:
-        """Refuse a path that leads into what another one gives."""
-        known = {path: found for path, found in steps.items() if found is not None}
-        for (path, inner), (other, outer) in itertools.permutations(known.items(), 2):
-            if inner[: len(outer)] == outer:
-                self.faults.add(f"{place}.{path}", f"is a part of {other}; give one of them")
 
     # -------------------------------------------------------------------------- policies
 
@@ -455,22 +370,22 @@ class _Reading:
             shown = f"unknown estimator {policy.estimator!r}; {hint}"
             self.faults.add(f"{path}.estimator", shown)
 
-    def _check_settings(self, policy: DeclaredPolicy, points: Sequence[_Cell]) -> None:
+    def _check_settings(self, policy: DeclaredPolicy, points: Sequence[OpenCell]) -> None:
         """Check that the settings of a policy are right at every point."""
         path = f"policies.{policy.name}"
         for cell in points:
             steps = {key: self._steps(path, key, cell) for key in policy.settings}
-            self._check_apart(path, steps)
+            check_apart({f"{path}.{key}": found for key, found in steps.items()}, self.faults)
             overrides = [
-                _Override(f"{path}.{key}", found, policy.settings[key])
+                Override(f"{path}.{key}", found, policy.settings[key])
                 for key, found in steps.items()
                 if found is not None
             ]
             if policy.estimator is not None and _is_estimator(policy.estimator):
                 place = f"{path}.estimator"
-                overrides.append(_Override(place, ("controller", "estimator"), policy.estimator))
+                overrides.append(Override(place, ("controller", "estimator"), policy.estimator))
             if overrides:
-                self._changed(cell, overrides, path)
+                cell.attempt(overrides, self.faults, path)
 
 
 def _is_estimator(name: str) -> bool:

@@ -77,8 +77,35 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
     text = _read_text(path, faults, what)
     if text is None:
         return None
+    known = len(faults)
+    root = _composed(text, faults)
+    if root is None:
+        if len(faults) == known:
+            faults.add("", f"the file is empty; a {what} file begins with `{begin}`")
+        return None
+    return _Builder(faults).build(root, ())
+
+
+def read_value(text: str, faults: Faults, path: str) -> object:
+    """Read a text that is one value, as an option has it; what is wrong with it is a fault there.
+
+    Returns
+    -------
+    object
+        None where the text is empty, or at fault.
+    """
+    inner = Faults()
+    root = _composed(text, inner)
+    value = None if root is None else _Builder(inner).build(root, ())
+    for fault in inner.error().faults:
+        faults.add(path, str(fault))
+    return value
+
+
+def _composed(text: str, faults: Faults) -> yaml.Node | None:
+    """Return the node of a text; None where it is empty, or beside a fault."""
     try:
-        root = yaml.compose(text, Loader=_Loader)
+        root: yaml.Node | None = yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problem = " ".join(filter(None, (error.context, error.problem)))
@@ -94,10 +121,7 @@ def read_yaml(path: str, faults: Faults, what: str = "cell", begin: str = "dwell
     except (ValueError, OverflowError) as error:  # the parser's own, on an escape like \UFFFFFFFF
         faults.add("", f"not a YAML document: {error}")
         return None
-    if root is None:
-        faults.add("", f"the file is empty; a {what} file begins with `{begin}`")
-        return None
-    return _Builder(faults).build(root, ())
+    return root
 
 
 def _read_text(path: str, faults: Faults, what: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from dwell.model import Problem
     from dwell.study.summary import Row
 
+#: Bytes of a run's default name at most; file systems take 255.
+LONGEST_NAME = 200
+
 
 def run(
     cell: CellArgument,
@@ -45,10 +49,20 @@ def run(
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Where to save the run; runs/CELL-SCENARIO-POLICY-SEED if not given.",
+            help="Where to save the run; runs/CELL-SCENARIO-POLICY-SEED, and what --set says, if "
+            "not given.",
         ),
     ] = None,
     traces: Traces = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="PATH=VALUE",
+            help="Another value of the cell, as period_ms=40 or links[0].delay_ms=5; YAML. May be "
+            "repeated.",
+        ),
+    ] = None,
     jobs: Annotated[bool, typer.Option("--jobs", help="Keep every job's instants.")] = False,
     guard: Annotated[
         bool, typer.Option("--guard", help="Let the robots' guard move to a fallback by itself.")
@@ -62,10 +76,11 @@ def run(
 
     300 windows, if neither --windows nor --seconds is given.
     """
+    from dwell.cellfile.overrides import load_with
     from dwell.cli.first_answer import prepare
 
     require_one_length(windows, seconds)
-    problem = dwell.load(cell, traces=traces)
+    problem = load_with(cell, settings, traces) if settings else dwell.load(cell, traces=traces)
     if seconds is not None:
         windows = windows_of(seconds, problem)
     windows = windows or 300
@@ -76,10 +91,9 @@ def run(
     from dwell.study.summary import summarise
 
     policy = policy or problem.controller.policy
-    name = f"{problem.name}-{scenario}-{policy}-{seed}"
-    folder = out or Path("runs", file_name(name, more="+"))
+    folder = out or _default_folder(problem.name, scenario, policy, str(seed), *(settings or ()))
     require_free(folder)
-    settings: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         "scenario": scenario,
         "policy": policy,
         "estimator": estimator,
@@ -88,10 +102,10 @@ def run(
         "guard": guard,
     }
     if not force:
-        _require_same(folder, describe(problem, **settings))
+        _require_same(folder, describe(problem, **arguments))
     remark = f" ({how})" if how else ""
     with working(f"simulating {windows} windows{remark}"):
-        result = dwell.simulate(problem, **settings, jobs=jobs)
+        result = dwell.simulate(problem, **arguments, jobs=jobs)
         try:
             result.save(folder)
         except RunError as error:
@@ -107,6 +121,15 @@ def run(
     else:
         typer.echo(_summary(problem, labels, windows, measured))
         typer.echo(f"\nsaved to {folder}")
+
+
+def _default_folder(*parts: str) -> Path:
+    """Return where a run is saved: its parts are told by their digest where they are long."""
+    name = file_name("-".join(parts), more="+=")
+    if len(name.encode()) > LONGEST_NAME:
+        digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+        name = f"{name.encode()[: LONGEST_NAME - 13].decode(errors='ignore')}-{digest}"
+    return Path("runs", name)
 
 
 def _require_same(folder: Path, settings: Mapping[str, Any]) -> None:
