@@ -161,12 +161,15 @@ def test_what_no_window_showed_limits_what_the_runs_agree_in() -> None:
         assert found == pytest.approx((rate, *ends))
 
 
-def test_students_limit_is_taken_where_the_bootstrap_has_none() -> None:
+def test_a_side_without_a_bootstrap_has_a_limit_still() -> None:
     # Nine of ten runs without a miss: a third of the resamples have none either.
     values = [0.0] * 9 + [0.1]
     assert studentised_limits(values, 0.025)[1] == math.inf
+    found = share_interval(values, windows=100_000)
     half = float(stats.t.ppf(0.975, 9)) * 0.01
-    assert share_interval(values, windows=100_000).high == pytest.approx(0.01 + half)
+    assert 0.01 + half < found.high < 0.1
+    mirrored = share_interval([1 - value for value in values], windows=100_000)
+    assert (mirrored.low, mirrored.high) == pytest.approx((1 - found.high, 1 - found.low))
 
 
 def test_limits_of_skewed_rates_keep_their_promise() -> None:

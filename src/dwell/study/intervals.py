@@ -345,7 +345,11 @@ def _share_limits(sample: Floats, tail: float, windows: int | None) -> tuple[flo
         p = _unseen(len(sample), tail)
         return float(sample.min()) * (1 - p), float(sample.max()) * (1 - p) + p
     p, mean = _unseen(windows, tail), float(sample.mean())
-    low, high = _by_student(sample, tail, *studentised_limits(sample, tail))
+    low, high = studentised_limits(sample, tail)
+    if math.isinf(low):
+        low = 1.0 - _limit_by_weights(tuple((1.0 - sample).tolist()), tail)
+    if math.isinf(high):
+        high = _limit_by_weights(tuple(sample.tolist()), tail)
     return max(min(low, mean * (1 - p)), 0.0), min(max(high, mean * (1 - p) + p), 1.0)
 
 
