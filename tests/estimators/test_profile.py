@@ -272,7 +272,9 @@ def test_adding_a_task_shifts_nobody_elses_draws() -> None:
         (Node("R1", "robot", 4), 4, None, 10.0, 10 * 4 / 400),
         (Node("R1", "robot", 4), 8, None, 20.0, 10 * 8 / 400),
         (Node("R1", "robot", 1), 3, None, 30.0, 10 * 3 / 100),
-        (Node("R1", "robot", 4, "fifo"), 8, None, 10.0, 10 * 4 / 400),
+        (Node("R1", "robot", 4, "fifo"), 8, None, 20.0, 10 * 8 / 400),
+        (Node("R1", "robot", 4, "priority", background=1.0), 2, None, 13.333333, 10 * 2 / 300),
+        (Node("R1", "robot", 4, "priority", background=1.0), 8, None, 26.666667, 10 * 8 / 300),
         (Node("R1", "robot", 4, accelerators={"gpu": 1}), 8, "gpu", 10.0, 0.0),
     ],
 )

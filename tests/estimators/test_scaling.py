@@ -194,10 +194,9 @@ def make_task(name: str, nodes: list[Node], source: bool, rng: Random) -> Task:
 
 
 def stretch(problem: Problem, task: str, node_name: str) -> float:
-    """Times as long that a job takes where it has more threads than a fair node has cores."""
+    """Times as long that a job takes where it has more threads than its node has cores."""
     node, execution = problem.fabric.nodes[node_name], problem.pipeline.tasks[task].on[node_name]
-    shares = node.scheduler == "fair" and execution.accelerator is None
-    return max(1.0, execution.threads / node.cores) if shares else 1.0
+    return max(1.0, execution.threads / node.cores) if execution.accelerator is None else 1.0
 
 
 def delays_ns(real: Realisation, hop: int) -> Ints:

@@ -27,6 +27,7 @@ nodes = st.builds(
         ("fifo", 1, 3, 1.75),
         ("priority", 4, 4, 2.0),
         ("fifo", 1, 0, 1.0),
+        ("fifo", 8, 4, 2.0),
     ],
 )
 def test_by_hand(scheduler: str, threads: int, foreign: float, factor: float) -> None:

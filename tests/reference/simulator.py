@@ -551,6 +551,13 @@ class NodeState:
             return min(Fraction(1), left / max(1, self.threads + s))
         return left / (c + s)
 
+    def part(self, job: Job) -> Fraction:
+        """Part of its speed at which a job runs on the cores that it holds."""
+        # The speed of a fair node is that of its threads, however many a job has.
+        if self.node.scheduler == "fair":
+            return Fraction(1)
+        return min(Fraction(1), Fraction(self.node.cores, job.execution.threads))
+
     @property
     def behind(self) -> Fraction:
         """Cores that the background has."""
@@ -566,11 +573,9 @@ class NodeState:
         speed, rate = self.speed, self.rate
         for job in self.running:
             before = max(job.left, Fraction(0))
-            job.left -= speed * elapsed
+            job.left -= speed * self.part(job) * elapsed
             received = before - max(job.left, Fraction(0))
-            # A fair node shares its cores among threads, however many a job has.
-            threads = job.execution.threads if self.node.scheduler == "fair" else job.cores
-            self.work[job.cell] += threads * received
+            self.work[job.cell] += job.execution.threads * received
         for jobs in self.served.values():
             for job in jobs:
                 job.left -= elapsed * (job.cores > 0)
@@ -624,7 +629,7 @@ class NodeState:
             return now
         if job.cores == 0:
             return None
-        speed = self.speed if job.execution.accelerator is None else Fraction(1)
+        speed = self.speed * self.part(job) if job.execution.accelerator is None else Fraction(1)
         if speed == 0:
             return None
         return now + math.ceil(job.left / speed)

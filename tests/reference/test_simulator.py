@@ -139,8 +139,8 @@ def test_fifo_under_stress_runs_at_its_share_of_each_core() -> None:
 def test_fifo_job_wider_than_the_node_holds_all_of_it() -> None:
     node = Node("R", "robot", cores=2, scheduler="fifo")
     result = run([node], [task("A", 5, threads=9), task("B", 1)])
-    assert times(result, "A") == (0, 0, 5)
-    assert times(result, "B") == (0, 5, 6)
+    assert times(result, "A") == (0, 0, 22.5)
+    assert times(result, "B") == (0, 22.5, 23.5)
 
 
 def test_fifo_starts_in_the_order_of_readiness_not_of_the_worker() -> None:

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -268,6 +269,28 @@ def test_stress_that_begins_and_ends_slows_for_as_long() -> None:
     # 3 until 3; then 4 ms at 1/4 give 1; 6 are left.
     changes = [NodeChange(3 * MS, "R", 3, False), NodeChange(7 * MS, "R", 0, False)]
     assert ends_ms(Node("R", "robot"), [job("A", 10)], changes) == [13]
+
+
+@pytest.mark.parametrize("scheduler", ["fair", "fifo", "priority"])
+@pytest.mark.parametrize(("threads", "cores", "ends"), [(4, 1, 80), (5, 3, 100 / 3), (2, 4, 20)])
+def test_a_job_wider_than_its_node_is_as_much_work_under_each_scheduler(
+    scheduler: Literal["fair", "fifo", "priority"], threads: int, cores: int, ends: float
+) -> None:
+    node = Node("R", "robot", cores=cores, scheduler=scheduler)
+    problem = make_problem([node], [job("A", 20, threads=threads)])
+    real = make_realisation(problem, windows=2)
+    run = dwell.simulate_realisation(problem, real, policy="LOC")
+    assert run.cycles["latency_ns"].to_list() == [math.ceil(ends * MS)] * 2
+    assert run.windows["u_R"].to_list() == pytest.approx([threads * 20 / (cores * 100)] * 2)
+
+
+def test_a_wide_job_is_slowed_by_stress_and_loses_nothing_when_it_is_preempted() -> None:
+    # wide has 4 threads on 2 cores: 12 ms alone. It runs 0-4, waits for high until 7, and at half
+    # from 9 on: 4 and 2 are done, 6 are left.
+    changes = [NodeChange(9 * MS, "R", 2, False)]
+    tasks = [job("wide", 6, threads=4), job("high", 3, offset=4, priority=1)]
+    node = Node("R", "robot", cores=2, scheduler="priority")
+    assert ends_ms(node, tasks, changes) == [21, 7]
 
 
 def test_fifo_under_stress() -> None:

@@ -405,7 +405,8 @@ class ExecutionEntry(Entry):
         description="Time that one job needs when nothing disturbs it, with all its threads, ms."
     )
     threads: Annotated[int, Number(bounds.THREADS)] | None = optional(
-        "Cores that one job can use at once; default 1."
+        "Cores that one job can use at once; default 1. On a node with fewer it takes so many "
+        "times as long."
     )
     workers: Workers | None = optional(
         "Jobs of this task that may run there at a time; default: the task's."

@@ -260,11 +260,11 @@ def mean_ms(pipeline: Pipeline, task: Task, execution: Execution) -> float:
 def _stretch(execution: Execution, node: Node) -> float:
     """Factor by which a CPU job takes longer where the node has fewer cores than it has threads.
 
-    Only a `fair` node shares its cores among threads; the others give the job the whole node.
-    What the background takes of the cores comes on top.
+    What the background takes of the cores comes on top. A `fair` node has others use the cores that
+    a job leaves first; elsewhere it slows every job.
     """
     if node.scheduler != "fair":
-        return node.cores / node.spare
+        return max(execution.threads, node.cores) / node.spare
     return max(1.0, execution.threads / node.spare)
 
 

@@ -15,7 +15,7 @@ What is bounded
     bound holds, cycle by cycle on the same realisation, where
 
     * ratios are true: exec there <= ratio * exec here in every cycle (a task with more threads than
-      a `fair` node has cores takes threads / cores times as long there, which counts);
+      a node has cores takes threads / cores times as long there, which counts);
     * declared bounds hold: no message takes longer on a link that its flow does not use now,
       repeated attempts included, nor is one lost there;
     * a link that its flow does use is no worse for the message at the instant at which the

@@ -151,6 +151,7 @@ from dwell.kernels.nodes import (
     restress,
     set_speed,
     tick,
+    time_alone,
 )
 
 # More inputs than any task has: a join that can never be complete.
@@ -174,9 +175,9 @@ def _progress(s: Tables, server: int, at: int) -> tuple[int, float]:
             return FOREIGN, 0.0
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
     job = key_row(s.ring, s.stride, key)
-    site = s.jobs[job, SITE]
+    site = index(s.jobs[job, SITE])
     left = max(left, 0.0) + s.jobs[job, REST]
-    return key, s.sites[site, NEED] * (s.exec_ns[site, cycle] - left)
+    return key, s.sites[site, NEED] * (time_alone(s, site, s.exec_ns[site, cycle]) - left)
 
 
 @phase

@@ -39,7 +39,6 @@ from dwell.kernels.layout import (
     N_READY,
     N_SINKS,
     N_TASKS,
-    NEED,
     NETWORK,
     NEXT,
     NODE,
@@ -66,6 +65,7 @@ from dwell.kernels.layout import (
     TAKEN,
     TARGET,
     TASK_0,
+    THREADS,
     UNKNOWN,
     WAITING,
     Tables,
@@ -210,7 +210,7 @@ def complete(
     """The job of a server that finishes first has finished; its outputs are the caller's."""
     leave(s, server, site, now)
     if s.servers[server, IS_CPU] != 0:
-        work = s.sites[site, NEED] * float(s.exec_ns[site, cycle])
+        work = s.sites[site, THREADS] * float(s.exec_ns[site, cycle])
         s.own[cell, index(s.sites[site, NODE])] += work
     s.jobs[row, COMPUTE] += now - s.jobs[row, STARTED]
     _log(s, cell, cycle, row, local, DONE, now)

@@ -110,6 +110,8 @@ N_IN, N_OUT, OUT_0, OFFSET_NS, N_TASK = range(5)
 SOURCE, TARGET, N_FLOW = range(3)
 
 # sites
+# NEED is what a job uses of its server: the cores that it holds, the threads that share them where
+# the server is fair, or a place. THREADS is how many threads its work is done by.
 (
     SITE_CELL,
     SITE_TASK,
@@ -121,6 +123,7 @@ SOURCE, TARGET, N_FLOW = range(3)
     TAIL,
     WAITING,
     NEED,
+    THREADS,
     READY_AT,
     START_NS,
     DEPTH,
@@ -128,7 +131,7 @@ SOURCE, TARGET, N_FLOW = range(3)
     BEFORE_NS,
     AFTER_NS,
     N_SITE,
-) = range(17)
+) = range(18)
 
 # A foreign thread among those that wait for their turn, where jobs have their keys.
 FOREIGN = _number(-1)

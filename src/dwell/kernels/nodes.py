@@ -2,8 +2,9 @@
 
 All running jobs of a server advance at one common speed, so a virtual clock that advances at that
 speed turns processor sharing into a heap: a job that starts at virtual time v with c nanoseconds of
-work ends at virtual time v + c, whoever comes or goes meanwhile. The virtual clock is set back to 0
-whenever the server runs empty, which keeps its rounding error below a picosecond in practice.
+work ends at virtual time v + c, whoever comes or goes meanwhile. A job that holds fewer cores than
+it has threads has so much more work. The virtual clock is set back to 0 whenever the server runs
+empty, which keeps its rounding error below a picosecond in practice.
 
 Where a quota is noticed at ticks, threads take turns instead. All but the one that has the turn are
 in the heap of those that wait, foreign threads too, by the core time that each has received.
@@ -81,6 +82,7 @@ from dwell.kernels.layout import (
     STARTED,
     STRESS,
     STRESSED_NS,
+    THREADS,
     THROTTLED,
     TICK_AGO,
     TICK_NS,
@@ -117,6 +119,13 @@ def key_row(ring: int, stride: int, key: int) -> int:
     cell = (key >> CELL_SHIFT) & CELL_MASK
     cycle = (key >> CYCLE_SHIFT) & CYCLE_MASK
     return job_row(ring, stride, cell, cycle, key & ITEM_MASK)
+
+
+@phase
+def time_alone(s: Tables, site: int, work: int) -> float:
+    """How long a job of some execution time takes with the cores that it holds, undisturbed."""
+    need, threads = s.sites[site, NEED], s.sites[site, THREADS]
+    return float(work) if need == threads else float(work) * threads / need
 
 
 @phase
@@ -552,6 +561,7 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
         _line_up(s, server, site, row, key, first, _average(s, server))
         return
     s.jobs[row, REST] = 0
+    left = time_alone(s, site, work)
     n = s.servers[server, N_WAIT]
     need = s.sites[site, NEED]
     # Where nobody else can want the cores now, the job needs no queue.
@@ -562,20 +572,20 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
         refill(s, server, now)
     if scheduler == FAIR or fits:
         tick(s, server, now)
-        _start(s, server, site, key, row, float(work), now)
+        _start(s, server, site, key, row, left, now)
         if scheduler == FAIR:
             set_speed(s, server)
         if s.servers[server, DIRTY] != 0:
             return
         lone = s.servers[server, N_RUN] == 1 and s.servers[server, QUOTA_NS] == 0
-        if lone and s.servers_f[server, SPEED] == 1.0:
+        if lone and s.servers_f[server, SPEED] == 1.0 and left == work:
             _announce(s, server, now + work, key)
         else:
             schedule(s, server, now)
         return
     mark(s, server)
     rank = 0 if scheduler == FIFO else s.sites[site, RANK]
-    _queue_up(s, server, rank, s.jobs[row, READY], key, float(work))
+    _queue_up(s, server, rank, s.jobs[row, READY], key, left)
 
 
 @phase

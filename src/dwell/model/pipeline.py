@@ -33,7 +33,8 @@ class Execution:
     exec_ms : Process
         Time one job needs there when nothing disturbs it, milliseconds.
     threads : int
-        Cores the job can use at once; `exec_ms` is the time with all of them.
+        Cores the job can use at once; `exec_ms` is the time with all of them, and on a node with
+        fewer it takes so many times as long.
     workers : int
         Jobs of this task that may run there at the same time.
     accelerator : str, optional

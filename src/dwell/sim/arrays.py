@@ -309,9 +309,9 @@ class _Layout:
             row[k.DEPTH], row[k.RANK] = task.depth, -task.priority
             row[k.SERVER], row[k.NODE] = server, self.node_row[node]
             row[k.WORKERS] = row[k.IDLE] = execution.workers
-            if execution.accelerator is not None:
-                row[k.NEED] = 1
-            else:
+            row[k.NEED] = row[k.THREADS] = 1
+            if execution.accelerator is None:
+                row[k.THREADS] = execution.threads
                 row[k.NEED] = execution.threads if fair else min(execution.threads, cores)
             row[k.START_NS] = round(task.start_ms * 1e6)
             row[k.BEFORE_NS] = round(execution.before_ms * 1e6)
