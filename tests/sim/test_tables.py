@@ -10,8 +10,9 @@ import pytest
 
 import dwell
 from dwell.errors import RunError
-from dwell.model import Problem
-from tests.cells.generated import MS
+from dwell.model import Constant, Execution, Node, Problem, Task
+from dwell.sim.realisation import NodeChange
+from tests.cells.generated import MS, make_problem, make_realisation
 from tests.cells.two_nodes import Script
 
 
@@ -99,6 +100,28 @@ def test_costs_are_finite_whatever_is_lost(cells: Mapping[str, Problem]) -> None
     for _, run in runs_of(cells):
         assert run.windows["cost"].drop_nulls().is_finite().all()
         assert run.windows["seen_l95_ms"].drop_nulls().is_finite().all()
+
+
+def test_a_job_ends_when_it_completes_or_is_lost() -> None:
+    # One worker takes 25 ms a job; one more may wait. R is down from 30 to 45 ms.
+    node = Node("R", "robot", scheduler="fifo")
+    task = Task("A", {"R": Execution(Constant(25.0))}, depth=1)
+    problem = make_problem([node], [task], period_ms=10)
+    down = [NodeChange(30 * MS, "R", 0, True), NodeChange(45 * MS, "R", 0, False)]
+    real = make_realisation(problem, windows=6, node_changes=down)
+    jobs = dwell.simulate_realisation(problem, real, policy="LOC", jobs=True).jobs
+    assert jobs is not None
+    at_ms = jobs.sort("cycle").select(
+        pl.col("ready_ns", "start_ns", "end_ns") // MS, pl.col("outcome").cast(pl.String)
+    )
+    assert at_ms.rows() == [
+        (0, 0, 25, "done"),
+        (10, None, 20, "replaced"),
+        (20, 25, 30, "node_down"),
+        (30, None, 30, "node_down"),
+        (40, None, 40, "node_down"),
+        (50, 50, None, "in_flight"),
+    ]
 
 
 def test_jobs_are_where_their_cycles_were_placed(canonical: Problem) -> None:

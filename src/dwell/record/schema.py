@@ -243,8 +243,14 @@ JOBS = (
     Column("task", "task", "Its task."),
     Column("node", "node", "Where it ran."),
     Column("ready_ns", "Int64", "When it became ready, as `release_ns`.", "ns"),
-    Column("start_ns", "Int64", "When it started.", "ns", "it did not, or was replaced"),
-    Column("end_ns", "Int64", "When it ended.", "ns", "it did not, or was replaced"),
+    Column("start_ns", "Int64", "When it started.", "ns", "it did not"),
+    Column(
+        "end_ns",
+        "Int64",
+        "When it completed, or was lost.",
+        "ns",
+        "neither by the end of the run, or it was replaced in a live one",
+    ),
     Column("outcome", "outcome", "What became of it."),
     Column("shadow", "Boolean", "Whether it is a shadow's.", of=("live", "shadows")),
     Column(

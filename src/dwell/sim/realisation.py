@@ -162,7 +162,8 @@ class Realisation:
     windows : int
         Windows of W cycles the run has; N = windows * W.
     release_ns : int64 array, shape (N + 1,)
-        Release instant of every cycle, ascending; the last entry closes the last window.
+        Release instant of every cycle, ascending; the last entry is that of the first cycle beyond
+        the last window.
     sites : tuple of (task, node)
         Rows of `exec_ns`.
     exec_ns : int64 array, shape (sites, N)

@@ -50,7 +50,7 @@ def jobs_of(run: Run, scenario: str, policy: str, number: int) -> pl.DataFrame:
         jobs = jobs.filter(~pl.col("shadow"))
     columns = ["cycle", "task", "node", "ready_ns", "start_ns", "end_ns"]
     columns += ["cpu_ns"] if "cpu_ns" in jobs.columns else []
-    return jobs.filter(pl.col("end_ns").is_not_null()).select(
+    return jobs.filter(pl.col("outcome").cast(pl.String) == "done").select(
         *(pl.col(name).cast(pl.String) if name in ("task", "node") else name for name in columns),
         scenario=pl.lit(scenario),
         policy=pl.lit(policy),
