@@ -86,7 +86,13 @@ def test_unknown_processes_are_refused() -> None:
     with pytest.raises(LiveError, match="knows no Odd; it knows constant, uniform"):
         to_json({"delay_ms": Odd()})
     with pytest.raises(ProblemError, match="loss"):
-        changed(Conditions(), {"loss": 1.0})
+        changed(Conditions(), {"loss": 1.001})
+
+
+def test_of_a_loss_of_1_every_message_is_lost() -> None:
+    draws = Draws((1, 0))
+    draws.apply({"loss": 1.0})
+    assert all(draws.lose() for _ in range(10_000))
 
 
 def test_a_stream_goes_on_while_its_share_changes() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from dwell.errors import LiveError
 from dwell.model import Constant
-from dwell.testbed.conditions import Conditions
+from dwell.testbed.conditions import MOST_ATTEMPTS, Conditions
 from dwell.testbed.link import TunLink
 from tests.testbed.test_packets import ip, udp
 
@@ -125,6 +125,21 @@ def test_lost_messages_are_held_back_by_whole_timeouts(ends: Ends) -> None:
     assert passed.vanished == 0
     # Of a geometric number of timeouts the mean is one, with half of the messages not held at all.
     assert 1.5 < passed.delay_mean_ms < 6.0
+
+
+def test_what_is_always_lost_vanishes_and_what_is_nearly_always_is_held_a_bounded_time(
+    ends: Ends,
+) -> None:
+    """The process goes on: it answers, and forwards again when the loss has ended."""
+    with ends.link(Conditions(loss=1.0), retransmit_ms={("R1", "E"): 3.0}, seed=3) as link:
+        ends.send(*(udp(port) for port in range(1, 11)))
+        while link.read(reset=False)["R1", "E"].vanished < 10:
+            time.sleep(0.001)
+        link.set("R1", "E", loss=1 - 1e-12)
+        ends.send(udp(11))
+        assert ends.arrive(1) == [udp(11)]
+        passed = link.read()["R1", "E"]
+        assert passed.delay_mean_ms == pytest.approx(MOST_ATTEMPTS * 3.0)
 
 
 def test_it_ends_with_a_node_that_is_gone(ends: Ends) -> None:

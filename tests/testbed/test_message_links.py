@@ -14,7 +14,7 @@ import dwell
 from dwell.errors import LiveError
 from dwell.model import Constant, Execution, Flow, Link, Node, Normal, Task
 from dwell.testbed.conditions import transmission_ns
-from dwell.testbed.message_links import HELD, LinkEnds, LinkFile
+from dwell.testbed.message_links import HELD, LOST, LinkEnds, LinkFile
 from tests.cells.generated import make_problem
 
 NODES = "R1", "E", "R2"
@@ -140,6 +140,18 @@ def test_losses_and_cuts(file: LinkFile) -> None:
     assert way.begin(10, 0) == HELD
     file.set("R1", "E", cut=None)
     assert way.begin(10, 5) == 5
+
+
+def test_of_a_loss_of_1_all_is_lost_or_waits_where_it_would_be_sent_again(tmp_path: Path) -> None:
+    links = [Link("R1", "E", Constant(0.0)), Link("E", "R1", Constant(0.0), retransmit_ms=40.0)]
+    with LinkFile(tmp_path / "links", NODES, links, seed=1) as file:
+        there, back = ends(file).to["E"], ends(file, "perception@E").to["R1"]
+        file.set("R1", "E", loss=1.0)
+        file.set("E", "R1", loss=1.0)
+        assert {there.begin(10, n) for n in range(100)} == {LOST}
+        assert {back.begin(10, n) for n in range(100)} == {HELD}
+        file.set("E", "R1", loss=0.0)
+        assert back.begin(10, 7) == 7
 
 
 def test_a_link_that_retransmits_loses_nothing_and_keeps_order_where_it_is_to(

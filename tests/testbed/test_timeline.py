@@ -39,6 +39,7 @@ MIXED: list[dict[str, Any]] = [
     {"node": "R2", "down": True, "at_s": 6, "for_s": 3},
 ]
 SECONDS = 30.0
+LINK = from_document(document()).fabric.links["R1->E"]
 
 
 def cell(*items: dict[str, Any], **more: Any) -> Problem:
@@ -189,11 +190,11 @@ def test_an_outage_is_played_where_it_can_be() -> None:
     assert conditions_of(found, "E->R1") == []
 
 
-def test_a_link_that_would_lose_everything_is_refused() -> None:
-    with pytest.raises(ProblemError, match="loss"):
-        planned({"link": "R1->E", "loss": 1.0})
-
-
 def test_an_unknown_scenario_is_an_error() -> None:
     with pytest.raises(ProblemError, match="unknown scenario 'nome'"):
         timeline_of(cell({"node": "E", "stress_threads": 1}), "nome", seed=1, seconds=1)
+
+
+def test_a_loss_of_1_is_played_beside_the_own_of_its_link() -> None:
+    links = conditions_of(planned({"link": "R1->E", "loss": 1, "at_s": 3, "for_s": 4}), "R1->E")
+    assert [conditions.loss for conditions in links] == [1, usual_conditions(LINK).loss]

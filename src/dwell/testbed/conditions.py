@@ -33,6 +33,8 @@ NAMES = {kind: name for name, kind in NAMED.items()}
 # Drawn at a time: a draw of one costs a hundred times as much a value.
 BLOCK = 256
 NS_PER_MS = 1e6
+#: Attempts at a message on a link that retransmits.
+MOST_ATTEMPTS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ class Conditions:
     rate_mbps : float
         Serialisation rate that all connections share, Mbit/s; infinite where nothing queues.
     loss : float
-        Probability that a message of data is lost, in [0, 1).
+        Probability that a message of data is lost, in [0, 1].
     cut : {"drop", "hold"}, optional
         Nothing begins its way while it is cut. Data is lost (`drop`, as on a link of the simulator
         that drops), or waits until it is whole again (`hold`, as on one that retransmits). What
@@ -71,7 +73,7 @@ class Conditions:
         good = len(self.shares) == len(self.add_delays_ms) and all(0 <= s <= 1 for s in self.shares)
         bounds.require(good, "shares", self.shares, "one from 0 to 1 for each of add_delays_ms")
         bounds.RATE_MBPS.check("rate_mbps", self.rate_mbps)
-        bounds.LOSS.check("loss", self.loss)
+        bounds.ADDED_LOSS.check("loss", self.loss)
         known = self.cut is None or self.cut in CUTS
         bounds.require(known, "cut", self.cut, f"one of {', '.join(CUTS)}, or none")
 

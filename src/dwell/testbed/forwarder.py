@@ -22,7 +22,13 @@ from typing import TypedDict, cast
 
 from dwell.errors import DwellError
 from dwell.testbed.child import Json, Parent
-from dwell.testbed.conditions import Draws, Scheduling, changed, transmission_ns
+from dwell.testbed.conditions import (
+    MOST_ATTEMPTS,
+    Draws,
+    Scheduling,
+    changed,
+    transmission_ns,
+)
 from dwell.testbed.event_loop import Loop
 from dwell.testbed.packets import kind_of
 
@@ -182,7 +188,9 @@ class _Direction:
         if kind is None:
             counts.ignored += 1
             return
-        if conditions.cut is not None or self._waiting_bytes > WAITING_BYTES:
+        # Where every attempt is lost, the sender's own repetitions are what waits for better times.
+        stopped = conditions.cut is not None or (kind.data and conditions.loss == 1)
+        if stopped or self._waiting_bytes > WAITING_BYTES:
             counts.vanished += 1
             return
         took_ns = transmission_ns(len(packet), conditions.rate_mbps)
@@ -208,7 +216,7 @@ class _Direction:
     def _held_back(self) -> int:
         """Draw how long a burst is held back until an attempt to send it is not lost, ns."""
         held_ns = 0
-        while self._retransmit_ns and self.draws.lose():
+        while held_ns < MOST_ATTEMPTS * self._retransmit_ns and self.draws.lose():
             held_ns += self._retransmit_ns
         self.counts.held += held_ns > 0
         return held_ns

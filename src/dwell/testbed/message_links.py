@@ -29,7 +29,15 @@ from typing import Self
 from dwell.errors import LiveError, ProblemError
 from dwell.files import write_whole
 from dwell.model import Link
-from dwell.testbed.conditions import Conditions, Draws, changed, fields_of, to_json, transmission_ns
+from dwell.testbed.conditions import (
+    MOST_ATTEMPTS,
+    Conditions,
+    Draws,
+    changed,
+    fields_of,
+    to_json,
+    transmission_ns,
+)
 from dwell.testbed.mapped_file import HEAD, make_file, open_file
 
 _KIND = "links"
@@ -39,10 +47,8 @@ _WAY = struct.Struct("<3q")
 #: What waits longer for its turn is lost.
 LONGEST_WAIT_S = 10.0
 #: Instead of the arrival of a message that is lost, and of one that the sender has to hold: the
-#: direction is cut, and loses nothing.
+#: direction lets nothing pass, and loses nothing.
 LOST, HELD = -1, -2
-#: Attempts at a message on a link that retransmits.
-MOST_ATTEMPTS = 20
 
 
 class LinkFile:
@@ -167,8 +173,9 @@ class Way:
         """
         with self._lock:
             self._refresh()
-            cut = self._draws.conditions.cut
-            if cut is not None:
+            cut, loss = self._draws.conditions.cut, self._draws.conditions.loss
+            # Attempts that are all lost are none: the message waits as while the link is down.
+            if cut is not None or loss == 1:
                 return HELD if cut == "hold" or self._retransmit_ms is not None else LOST
             sent_ns = self._transmitted(size_bytes, now_ns)
             if sent_ns - now_ns > LONGEST_WAIT_S * 1e9:
