@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from dwell.errors import TraceError
 from tests.cells.with_traces import EXEC, LINK, faults_of, read_tables
 
 
@@ -48,15 +49,36 @@ def test_negative_and_missing_values_are_counted_and_shown(recorded: Path) -> No
     assert set(faults) == {f"{LINK}.column", f"{EXEC}.column"}
     assert faults[f"{LINK}.column"].startswith("1 negative of 7 rows (first: row 2, -2);")
     assert faults[f"{EXEC}.column"].startswith("1 missing or NaN of 7 rows (first: row 6);")
-    for message in faults.values():
-        assert "on_negative: drop" in message
-        assert "`clip`" in message
 
 
-def test_what_is_missing_cannot_be_clipped(recorded: Path) -> None:
-    faults = faults_of(recorded, "t.parquet", on_negative="clip")
-    assert set(faults) == {f"{EXEC}.column"}
-    assert "0 cannot stand for that" in faults[f"{EXEC}.column"]
+@pytest.mark.parametrize("mode", ["error", "clip"])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, -1.0, 2e9])
+@pytest.mark.parametrize("beside", [5.0, np.nan])
+def test_a_remedy_that_is_offered_works(
+    mode: str, wrong: float, beside: float, tmp_path: Path
+) -> None:
+    """Whatever is wrong in one column, and in another one of the file."""
+    frame = pl.DataFrame({"up": [wrong, 1.0, 2.0], "work": [3.0, 4.0, beside]})
+    frame.write_parquet(tmp_path / "t.parquet")
+    remedies = {"drop": "`on_negative: drop`", "clip": "`on_negative: clip`"}
+    works = {}
+    for remedy in remedies:
+        try:
+            read_tables(tmp_path, "t.parquet", on_negative=remedy)
+            works[remedy] = True
+        except TraceError:
+            works[remedy] = False
+    if works.get(mode):
+        return
+    for message in faults_of(tmp_path, "t.parquet", on_negative=mode).values():
+        assert {name: text in message for name, text in remedies.items()} == works
+
+
+def test_where_no_row_could_stay_none_is_offered_to_be_dropped(tmp_path: Path) -> None:
+    pl.DataFrame({"up": [np.inf, 1.0], "work": [1.0, np.nan]}).write_parquet(tmp_path / "t.parquet")
+    for message in faults_of(tmp_path, "t.parquet").values():
+        assert "on_negative" not in message
+        assert "record it again" in message
 
 
 def test_infinite_and_huge_values_are_refused(tmp_path: Path) -> None:

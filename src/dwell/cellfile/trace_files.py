@@ -12,7 +12,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.cellfile.columns import SUFFIXES, FileColumn, UnreadableError, column_names, read_columns
+from dwell.cellfile.columns import (
+    POINTS,
+    SUFFIXES,
+    FileColumn,
+    UnreadableError,
+    column_names,
+    read_columns,
+)
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.entries import TraceEntry
 from dwell.cellfile.traces import Source
@@ -30,6 +37,7 @@ RELATIVE = (
     "file names are relative to the cell file's folder, or to the one given as `traces` "
     "(`--traces FOLDER`)"
 )
+RECORD_AGAIN = "no row could stay; record it again, or name another column"
 
 
 @dataclass(slots=True)
@@ -140,7 +148,8 @@ class Reading:
         for path, key, name in self._named():
             if frame[name].kind:
                 message = f"column {name!r} holds {frame[name].kind}; it must hold numbers"
-                self._fail(key, f"{message}: name another, or record it again", path)
+                remedy = f"{POINTS}, leave out what is missing, or name another column"
+                self._fail(key, f"{message}: {remedy}", path)
         return not self.failed
 
     def _starts(self, frame: Frame) -> NDArray[np.int64]:
@@ -168,42 +177,28 @@ class Reading:
 
     def _judge(self, values: dict[str, Floats], time: Floats | None) -> tuple[Mask, int]:
         """Return which rows stay, and how many were clipped; what may not be is a fault."""
-        rows = len(next(iter(values.values())))
-        keep, clip = np.ones(rows, np.bool_), np.zeros(rows, np.bool_)
-        mode = self.source.on_negative
-        for path, entry in self.uses:
-            column = values[entry.column]
-            negative = column < 0
-            bad = ~(column <= VALUE.high)  # and so is NaN
-            if mode == "clip":
-                clip |= negative
-            else:
-                bad |= negative
-            if mode == "drop":
-                keep &= ~bad
-            elif bad.any():
-                self._fail("column", self._complaint(column, bad, mode), path)
+        used = [(path, "column", values[entry.column]) for path, entry in self.uses]
+        # Of a column and of instants: what is negative, and what no number can stand for.
+        negative = [column < 0 for *_, column in used]
+        lost = [~(column <= VALUE.high) for *_, column in used]  # and so is NaN
         if time is not None:
-            lost = ~np.isfinite(time)
-            if mode == "drop":
-                keep &= ~lost
-            elif lost.any():
-                self._fail("time", self._complaint(time, lost, "clip"))
-        return keep, int(np.count_nonzero(clip))
-
-    def _complaint(self, column: Floats, bad: Mask, mode: str) -> str:
-        kinds = {
-            "negative": bad & (column < 0),
-            "missing or NaN": bad & np.isnan(column),
-            "above 1e9": bad & (column > VALUE.high),
+            used.append((self.uses[0][0], "time", time))
+            negative.append(np.zeros(len(time), np.bool_))
+            lost.append(~np.isfinite(time))
+        mode, clip = self.source.on_negative, np.any(negative, axis=0)
+        left = ~(clip | np.any(lost, axis=0))
+        if mode == "drop":
+            return left, 0
+        remedies = {
+            "set `on_negative: drop` to leave such rows out of all columns": left.any(),
+            "`on_negative: clip` to make negative ones 0": not np.any(lost) and mode == "error",
         }
-        counts = {kind: int(np.count_nonzero(rows)) for kind, rows in kinds.items()}
-        has = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-        row = int(np.flatnonzero(bad)[0])
-        value = "" if np.isnan(column[row]) else f", {column[row]:g}"
-        drop = "set `on_negative: drop` to leave such rows out of all columns"
-        clip = "0 cannot stand for that" if mode == "clip" else "or `clip` to make negative ones 0"
-        return f"{has} of {len(column)} rows (first: row {row + 1}{value}); {drop}, {clip}"
+        remedy = ", or ".join(text for text, works in remedies.items() if works)
+        for (path, key, column), below, gone in zip(used, negative, lost, strict=True):
+            bad = gone | below if mode == "error" else gone
+            if bad.any():
+                self._fail(key, f"{_complaint(column, bad)}; {remedy or RECORD_AGAIN}", path)
+        return np.ones(len(left), np.bool_), int(np.count_nonzero(clip)) if mode == "clip" else 0
 
     def _instants(self, time: Floats, starts: NDArray[np.int64], rows: NDArray[np.int64]) -> Floats:
         """Return each row's instant since its group's first; they must not go back."""
@@ -229,6 +224,20 @@ class Reading:
                     "that does, or remove the key to go on with this one",
                     path,
                 )
+
+
+def _complaint(column: Floats, bad: Mask) -> str:
+    """Return how many rows of a column are bad, in which ways, and the first of them."""
+    kinds = {
+        "negative": bad & (column < 0),
+        "missing or NaN": bad & np.isnan(column),
+        "above 1e9": bad & (column > VALUE.high),
+    }
+    counts = {kind: int(np.count_nonzero(rows)) for kind, rows in kinds.items()}
+    has = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    row = int(np.flatnonzero(bad)[0])
+    value = "" if np.isnan(column[row]) else f", {column[row]:g}"
+    return f"{has} of {len(column)} rows (first: row {row + 1}{value})"
 
 
 def _floats(column: FileColumn) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+import re
 from dataclasses import dataclass
 
 from dwell.errors import Fault, ProblemError
@@ -26,6 +27,14 @@ def shown(value: object) -> str:
         return f"a whole number of about {int(value.bit_length() * math.log10(2)) + 1} digits"
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
+
+
+def counted(count: float, noun: str) -> str:
+    """Return how many there are of a thing: ``1 window``, ``2 windows``, ``2 policies``."""
+    if count == 1:
+        return f"1 {noun}"
+    stem, ending = (noun[:-1], "ies") if re.search("[^aeiou]y$", noun) else (noun, "s")
+    return f"{shown(count)} {stem}{'es' if noun.endswith('s') else ending}"
 
 
 @dataclass(frozen=True, slots=True)
