@@ -52,6 +52,11 @@ def test_check_prints_every_fault_with_its_line(cell: Path) -> None:
             ("candidates.LOC: its own work takes 155% of the cores of R",),
         ),
         (
+            "tier: edge, cores: 4}",
+            "tier: edge, cores: 4, quota: {cpu: 0.08, period_ms: 100}}",
+            ("takes 125% of the quota (cpu 0.08) of E", "raise nodes.E.quota.cpu"),
+        ),
+        (
             "candidates:",
             "objective: {caps: {latency_ms: 5}}\ncandidates:",
             ("candidates.LOC: L95 is 9.0 ms undisturbed, over the cap of 5 ms",),

@@ -16,7 +16,7 @@ from dwell.errors import Fault, PolicyError, ProblemError
 
 if TYPE_CHECKING:
     from dwell.estimators import Profile
-    from dwell.model import Problem
+    from dwell.model import Node, Problem
 
 #: Draws of a process that a percentile is taken of, and their seed.
 DRAWS, SEED = 10_000, 1
@@ -113,11 +113,20 @@ def _overloads(problem: Problem, profile: Profile) -> Iterator[Fault]:
     for name, shares in profile.own.items():
         for node, share in shares.items():
             if share > 1:
+                limit, remedy = _limit(problem.fabric.nodes[node])
                 yield Fault(
                     f"candidates.{name}",
-                    f"its own work takes {share:.0%} of the cores of {node}: it can never keep "
-                    "pace; place less there, or give the node more cores",
+                    f"its own work takes {share:.0%} of {limit} of {node}: it can never keep pace; "
+                    f"place less there, or {remedy}",
                 )
+
+
+def _limit(node: Node) -> tuple[str, str]:
+    """Return what bounds the work of a node, and how it could do more."""
+    quota = node.quota
+    if quota is None or quota.cpu >= node.cores:
+        return "the cores", "give the node more cores"
+    return f"the quota (cpu {quota.cpu:g})", f"raise nodes.{node.name}.quota.cpu"
 
 
 def _slow_stages(problem: Problem, profile: Profile) -> Iterator[Fault]:
