@@ -2,7 +2,15 @@ from __future__ import annotations
 
 import pytest
 
-from dwell.model.semantics import CellParts, find_faults, nearest, nearest_of, too_many_shadows
+from dwell.model import Constant, Execution, Link, Task
+from dwell.model.semantics import (
+    CellParts,
+    bad_name,
+    find_faults,
+    nearest,
+    nearest_of,
+    too_many_shadows,
+)
 
 
 @pytest.mark.parametrize(
@@ -35,3 +43,47 @@ def test_what_could_not_be_read_is_known_by_its_name_and_asked_nothing_more() ->
     parts.candidates = {"LOC": {"sensing": "Edge"}, "SO": {"sensin": "E"}}
     (fault,) = find_faults(parts)
     assert str(fault) == "candidates.SO.sensin: unknown task 'sensin'; did you mean 'sensing'?"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("cafe\u0301", ("U+0301 (COMBINING ACUTE ACCENT)", "as one character")),
+        ("\u0915\u094d", ("U+094D (DEVANAGARI SIGN VIRAMA)", "use letters")),
+        ("a\u200bb", ("U+200B (ZERO WIDTH SPACE)", "use letters")),
+        ("a/b", ("U+002F (SOLIDUS)", "use letters")),
+        ("a\x07", ("U+0007", "use letters")),
+        ("a  b", ("single spaces",)),
+        ("-a", ("first",)),
+        ("a" * 65, ("at most 64 characters",)),
+    ],
+)
+def test_a_name_at_fault_says_which_character_it_is(name: str, words: tuple[str, ...]) -> None:
+    for word in words:
+        assert word in bad_name(name)
+
+
+@pytest.mark.parametrize(
+    "name", ["caf\u00e9", "R 1", "_a.b+c:d-e", "\u0420\u043e\u0431\u043e\u0442", "9"]
+)
+def test_letters_of_any_script_make_a_name(name: str) -> None:
+    assert bad_name(name) == ""
+
+
+def test_a_name_that_only_looks_declared_is_not_said_to_be_unknown() -> None:
+    links = [("links[0]", Link("R", "e\u0301", Constant(1.0)))]
+    faults = find_faults(
+        CellParts(nodes={"R": None, "\u00e9": None}, tasks={"a": None}, links=links)
+    )
+    (fault,) = [fault for fault in faults if fault.path == "links[0].to"]
+    assert "U+0301" in fault.message
+
+
+def test_a_node_that_a_task_misspells_makes_no_fault_of_a_placement() -> None:
+    once = Execution(Constant(1.0))
+    parts = CellParts(
+        nodes={"R": None, "E": None},
+        tasks={"a": Task("a", {"R": once, "Edge": once})},
+        candidates={"SO": {"a": "E"}},
+    )
+    assert [fault.path for fault in find_faults(parts)] == ["tasks.a.on.Edge"]

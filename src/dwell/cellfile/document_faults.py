@@ -39,6 +39,8 @@ class Faults:
         # A mapping keeps their order and finds one again, however many an alias multiplies.
         self._faults: dict[Fault, type[ProblemError]] = {}
         self._paths: set[str] = set()
+        # By kind and value: 1 and true are one key of a mapping, and two names.
+        self._unquoted: dict[tuple[type, object], str] = {}
 
     def add(
         self,
@@ -51,6 +53,23 @@ class Faults:
         """Record a fault at a path; its line is looked up where it is not given."""
         fault = Fault(path, message, self.line(path) if line is None else line)
         self._faults.setdefault(fault, kind)
+        self._paths.add(path)
+
+    def take_as_text(self, path: str, key: object, text: str, line: int | None = None) -> str:
+        """Record that a key is no text, once for all places with its value; return its text."""
+        if self.unquoted(key) is None:
+            self._unquoted[type(key), key] = text
+            message = f"the key {text} is not a text; put it in quotes, here and wherever it stands"
+            self.add(path, message, line=line)
+        return text
+
+    def unquoted(self, value: object) -> str | None:
+        """Return the text of a key that is no text and has this value, where there is one."""
+        plain = value is None or isinstance(value, bool | int | float)
+        return self._unquoted.get((type(value), value)) if plain else None
+
+    def excuse(self, path: str) -> None:
+        """Count a path as one at fault, of which a fault elsewhere has said all."""
         self._paths.add(path)
 
     def attempt(

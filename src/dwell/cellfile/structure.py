@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Generic, Literal, TypeVar, Union, get_args, get_origin
 
@@ -22,9 +22,11 @@ from dwell.cellfile.entries import CellEntry, Entry
 from dwell.cellfile.rendering import as_read
 from dwell.model import bounds
 from dwell.model.document import VERSION
-from dwell.model.semantics import nearest
+from dwell.model.semantics import closest, nearest
 
 MAX_DEPTH = 40
+# How like a required key an unknown one has to be to stand for it: `teir` for `tier`.
+MISSPELT = 0.7
 
 E = TypeVar("E", bound=Entry)
 
@@ -116,6 +118,8 @@ def read_structure(document: object, faults: Faults, form: Form[E]) -> E:
         except ValidationError as error:
             details = error.errors(include_url=False, include_context=False)
         # Reported first, all of them: blanking one may take others away.
+        for missing in _misspelt(details, form):
+            faults.excuse(dotted(missing))
         for detail in details:
             path = dotted(detail["loc"])
             if not known(path):
@@ -147,9 +151,11 @@ def _plain_mapping(
     """Return a deep copy in dicts and lists, which can be blanked; what is no document is None."""
     values: dict[str, object] = {}
     for key, item in document.items():
-        path = (*steps, str(key))
-        if isinstance(key, str) and not _is_torn(key):
-            values[key] = _plain(item, path, faults, form)
+        path, name = (*steps, str(key)), key
+        if isinstance(key, bool | int | float | None):
+            name = faults.take_as_text(dotted(path), key, str(key))
+        if isinstance(name, str) and not _is_torn(name):
+            values[name] = _plain(item, path, faults, form)
         else:
             faults.add(dotted(path), f"the key {as_read(key)} is not a text")
     return values
@@ -167,10 +173,21 @@ def _plain(value: object, steps: tuple[Step, ...], faults: Faults, form: Form[E]
     if isinstance(value, str) and _is_torn(value):
         faults.add(path, f"{as_read(value)} holds half of a character; remove it")
         return None
+    name = faults.unquoted(value)
+    if name is not None and _declaration(steps, form)[0] is str:
+        return name
     if value is None and not form.may_be_empty(steps) and not faults.at(path):
-        what = f"the key {steps[-1]!r}" if isinstance(steps[-1], str) else "the item"
-        faults.add(path, f"nothing is given; give a value, or remove {what}")
+        faults.add(path, f"nothing is given; {_filling(steps, form)}")
     return value
+
+
+def _filling(steps: tuple[Step, ...], form: Form[E]) -> str:
+    """Return a remedy for a key or an item without a value."""
+    declared = _declaration(steps, form)[1]
+    if declared is not None and declared.is_required():
+        return f"give a value: {_lower(declared.description)}"
+    what = f"the key {steps[-1]!r}" if isinstance(steps[-1], str) else "the item"
+    return f"give a value, or remove {what}"
 
 
 def _is_torn(text: str) -> bool:
@@ -207,6 +224,17 @@ def _has(container: object, step: Step) -> bool:
     if isinstance(container, dict):
         return step in container
     return isinstance(container, list) and isinstance(step, int) and step < len(container)
+
+
+def _misspelt(details: Sequence[ErrorDetails], form: Form[E]) -> Iterator[tuple[Step, ...]]:
+    """Yield the places of keys that are missing because an unknown one stands for them."""
+    missing = {detail["loc"] for detail in details if detail["type"] == "missing"}
+    for detail in details:
+        *parent, key = detail["loc"]
+        if detail["type"] == "extra_forbidden":
+            meant = closest(str(key), _keys(_declaration(parent, form)[0]), MISSPELT)
+            if (*parent, meant) in missing:
+                yield (*parent, meant)
 
 
 def _message(detail: ErrorDetails, form: Form[E]) -> str:

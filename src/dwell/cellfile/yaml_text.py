@@ -192,9 +192,10 @@ class _Builder:
             path = dotted((*steps, key_node.value))
             key = self._scalar(key_node, path)
             if not isinstance(key, str):
-                message = f"the key {key_node.value} is not a text; put it in quotes"
-                self.faults.add(path, message, line=line)
-            elif key in values:
+                if self.faults.at(path):
+                    continue
+                key = self.faults.take_as_text(path, key, key_node.value, line)
+            if key in values:
                 message = f"the key {key!r} is given again (first in line {first[key]}); keep one"
                 self.faults.add(path, message, line=line)
             else:

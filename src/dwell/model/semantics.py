@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
+NAME_SIGN = re.compile(r"[\w.+:\- ]")
 LONGEST_NAME = 64
 # How far shares may sum up beyond 1 by rounding.
 SHARE_TOLERANCE = 1e-9
@@ -65,12 +67,23 @@ class CellParts:
     live: LiveSettings | None = None
 
 
+def closest(word: str, known: Iterable[str], likeness: float = 0.6) -> str:
+    """Return the known name that is most like a word; empty where none is like it enough.
+
+    Parameters
+    ----------
+    likeness : float
+        Least ratio of `difflib.SequenceMatcher`, from 0 to 1.
+    """
+    return next(iter(difflib.get_close_matches(word, list(known), n=1, cutoff=likeness)), "")
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return a remedy for an unknown name: the nearest known one, or the list of them."""
     names = list(known)
-    match = difflib.get_close_matches(word, names, n=1, cutoff=0.6)
+    match = closest(word, names)
     if match:
-        return f"did you mean {match[0]!r}?"
+        return f"did you mean {match!r}?"
     return f"known: {', '.join(names)}" if names else "none is declared"
 
 
@@ -100,7 +113,9 @@ def find_faults(parts: CellParts) -> list[Fault]:
 def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[Fault]:
     names = list(known)
     if word not in names:
-        yield Fault(path, f"unknown {what} {word!r}; {nearest(word, names)}")
+        # Decomposed, a name looks like the one that is declared.
+        twin = unicodedata.normalize("NFC", word) in names and bad_name(word)
+        yield Fault(path, twin or f"unknown {what} {word!r}; {nearest(word, names)}")
 
 
 def _names(parts: CellParts) -> Iterator[Fault]:
@@ -121,10 +136,18 @@ def bad_name(name: str) -> str:
     """Return what is wrong with a name, or nothing."""
     if NAME.fullmatch(name) is not None and len(name) <= LONGEST_NAME:
         return ""
-    return (
-        f"{name!r} is not a name; use letters, digits, _ - . + : and single spaces, "
+    rule = (
+        "use letters, digits, _ - . + : and single spaces, "
         f"a letter, a digit or _ first, at most {LONGEST_NAME} characters"
     )
+    sign = next((sign for sign in name if not NAME_SIGN.fullmatch(sign)), None)
+    if sign is None:
+        return f"{name!r} is not a name; {rule}"
+    called = unicodedata.name(sign, "a character without a name")
+    composed = unicodedata.normalize("NFC", name)
+    if NAME.fullmatch(composed) is not None:
+        rule = "write the letter and its accent as one character (Unicode's form NFC)"
+    return f"{name!r} is not a name, for it holds U+{ord(sign):04X} ({called}); {rule}"
 
 
 def _nodes(parts: CellParts) -> Iterator[Fault]:
@@ -249,6 +272,8 @@ def _placed(parts: CellParts, path: str, moves: Mapping[str, str]) -> Iterator[F
         feasible = ", ".join(task.on)
         if node not in parts.nodes:
             yield from _unknown(here, "node", node, parts.nodes)
+        elif not all(name in parts.nodes for name in task.on):
+            continue  # a node of the task's is misspelt, and may be this one
         elif task.anchored:
             yield Fault(here, f"{task_name} is anchored to {feasible}; it cannot move to {node}")
         else:
