@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,81 @@ def test_what_never_ends_is_null_in_json(cell: Path) -> None:
     cell.write_text(SMALL.replace("delay_ms: 1}", "delay_ms: 1, loss: 0.9}"), encoding="utf-8")
     found = read_json(call("run", cell, "--policy", "OFF", "--windows", "5", "--json"))
     assert found["summary"]["p95_ms"] is None
+
+
+ROWS = [1 + 7 * (row * 37 % 101) / 101 for row in range(2_000)]
+
+
+def write_with_traces(folder: Path, files: str) -> Path:
+    """Write a cell that replays two files, one by row and one by time, and the files."""
+    (folder / "data").mkdir(parents=True)
+    lines = [f"{20 * row},{value}\n" for row, value in enumerate(ROWS)]
+    for name in ("work.csv", "delay.csv"):
+        (folder / "data" / name).write_text("sent_ms,ms\n" + "".join(lines), encoding="utf-8")
+    work = f"{{trace: {{file: {files}/work.csv, column: ms}}}}"
+    delay = f"{{trace: {{file: {files}/delay.csv, column: ms, by: time, wrap: true}}}}"
+    text = SMALL.replace("{exec_ms: 8}", f"{{exec_ms: {work}}}").replace(
+        "delay_ms: 1}", f"delay_ms: {delay}}}"
+    )
+    cell = folder / "small.yaml"
+    cell.write_text(text, encoding="utf-8")
+    return cell
+
+
+def test_a_run_is_the_same_wherever_the_files_of_its_cell_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "elsewhere" / "second"
+    here = write_with_traces(first, "data")
+    shutil.copytree(first, second)
+    bare = tmp_path / "alone" / "small.yaml"
+    bare.parent.mkdir()
+    shutil.copy(here, bare)
+    runs = []
+    commands: list[tuple[Path, tuple[str | Path, ...]]] = [
+        (tmp_path, (here,)),
+        (first, ("small.yaml",)),
+        (second, ("small.yaml",)),
+        (tmp_path, ("elsewhere/../elsewhere/second/small.yaml",)),
+        (tmp_path, (bare, "--traces", first)),
+        (second, (bare, "--traces", ".")),
+    ]
+    for number, (current, words) in enumerate(commands):
+        monkeypatch.chdir(current)
+        out = tmp_path / f"run-{number}"
+        read_json(call("run", *words, "--windows", "40", "--jobs", "--out", out, "--json"))
+        runs.append(dwell.open_run(out))
+    for run in runs[1:]:
+        assert_same(run, runs[0])
+
+
+def test_a_run_is_the_same_where_a_cell_names_its_traces_absolutely(tmp_path: Path) -> None:
+    runs = []
+    for name in ("first", "second"):
+        cell = write_with_traces(tmp_path / name, str(tmp_path / name / "data"))
+        found = read_json(
+            call("run", cell, "--windows", "40", "--out", tmp_path / f"of-{name}", "--json")
+        )
+        runs.append(dwell.open_run(found["run"]))
+    assert_same(*runs)
+
+
+def assert_same(run: Run, other: Run) -> None:
+    for table in ("cycles", "windows", "decisions"):
+        assert getattr(run, table).equals(getattr(other, table))
+
+
+def test_run_as_json_says_where_traces_begin(tmp_path: Path) -> None:
+    cell = write_with_traces(tmp_path, "data")
+    arguments = ("run", cell, "--policy", "LOC", "--windows", "40", "--jobs")
+    found = read_json(call(*arguments, "--out", tmp_path / "run", "--json"))
+    starts = {start["file"]: start for start in found["traces"]}
+    assert starts.keys() == {"data/work.csv", "data/delay.csv"}
+    assert starts["data/work.csv"]["columns"] == ["ms"]
+    row = starts["data/work.csv"]["row"]
+    jobs = dwell.open_run(found["run"]).jobs.filter(task="plan").sort("cycle")
+    took_ms = ((jobs["end_ns"] - jobs["start_ns"]) / 1e6).to_list()
+    assert took_ms[:3] == pytest.approx(ROWS[row - 1 : row + 2])
 
 
 @pytest.mark.parametrize(

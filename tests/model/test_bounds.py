@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import ProblemError
-from dwell.model.bounds import Bound, shown
+from dwell.model.bounds import Bound, counted, shown
 
 
 @pytest.mark.parametrize(
@@ -52,6 +52,12 @@ def test_what_is_refused_is_named() -> None:
     with pytest.raises(ProblemError) as caught:
         Bound(0, 10).check("a.b", 11)
     assert str(caught.value) == "a.b: 11 is not allowed; it must be a number from 0 to 10"
+
+
+def test_one_thing_is_not_many() -> None:
+    counts = [(1, "window"), (2, "policy"), (0, "process"), (1, "policy"), (2.5, "key")]
+    texts = ["1 window", "2 policies", "0 processes", "1 policy", "2.5 keys"]
+    assert [counted(*count) for count in counts] == texts
 
 
 def test_no_value_is_too_long_to_show() -> None:

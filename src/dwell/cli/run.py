@@ -28,6 +28,7 @@ from dwell.cli.options import (
 )
 from dwell.cli.output import file_name, print_json, working
 from dwell.errors import RunError
+from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.model import Problem
@@ -104,8 +105,11 @@ def run(
     if not force:
         _require_same(folder, describe(problem, **arguments))
     remark = f" ({how})" if how else ""
-    with working(f"simulating {windows} windows{remark}"):
-        result = dwell.simulate(problem, **arguments, jobs=jobs)
+    with working(f"simulating {counted(windows, 'window')}{remark}"):
+        realisation = dwell.draw(problem, scenario=scenario, seed=seed, windows=windows)
+        result = dwell.simulate_realisation(
+            problem, realisation, policy=policy, estimator=estimator, jobs=jobs, guard=guard
+        )
         try:
             result.save(folder)
         except RunError as error:
@@ -117,7 +121,8 @@ def run(
         measured = summarise(result, problem, labels).row
     if as_json:
         head: dict[str, Any] = {"cell": problem.name, **labels, "run": folder}
-        print_json({**head, "summary": measured})
+        starts = [start._asdict() for start in realisation.trace_starts]
+        print_json({**head, "traces": starts, "summary": measured})
     else:
         typer.echo(_summary(problem, labels, windows, measured))
         typer.echo(f"\nsaved to {folder}")

@@ -233,7 +233,7 @@ class SampleCycles:
             return process.marginal(self._stream(name), self.samples)
         table = process.table
         if table.file not in self._rows:
-            rng = self._stream(f"trace/{table.file}")
+            rng = self._stream(f"trace/{table.stream}")
             self._rows[table.file] = rng.integers(table.rows, size=self.samples)
         # Two tables of one file may differ in rows (one drops some): the draw is folded then.
         values: Floats = process.values[self._rows[table.file] % table.rows]

@@ -284,6 +284,15 @@ class TraceTable:
         """Number of rows."""
         return len(next(iter(self.columns.values())))
 
+    @property
+    def stream(self) -> str:
+        """Name of the streams that rows of it are drawn from: the file as written.
+
+        Of an absolute path only the last part counts, so that no run changes with the place of its
+        files.
+        """
+        return self.file.rpartition("/")[2] if self.file.startswith("/") else self.file
+
     def replay(self, rng: np.random.Generator, release_ms: Floats) -> NDArray[np.int64]:
         """Rows that cycles released at `release_ms` take, from a random start.
 

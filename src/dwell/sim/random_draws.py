@@ -30,7 +30,7 @@ from dwell.model import (
 )
 from dwell.model.scenario import RAMP_STEPS
 from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
-from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
+from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -152,7 +152,7 @@ class _Draw:
         self.seed, self.windows = seed, windows
         self.shadow = shadow
         self.cycles = windows * problem.window_cycles
-        self.rows: dict[int, Ints] = {}
+        self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
 
     def realisation(self) -> Realisation:
@@ -175,6 +175,7 @@ class _Draw:
             node_changes=self._node_changes(),
             link_segments=self._link_segments(),
             phases=self._phases(),
+            trace_starts=tuple(self._trace_starts()),
         )
 
     def changes(self) -> tuple[NodeChanges, LinkSegments]:
@@ -219,13 +220,16 @@ class _Draw:
         return ordered
 
     def _table_rows(self, table: TraceTable) -> Ints:
-        rows = self.rows.get(id(table))
-        if rows is None:
-            rng = self._rng(f"trace/{table.file}/{table.by}/{table.group}")
+        if id(table) not in self.rows:
+            rng = self._rng(f"trace/{table.stream}/{table.by}/{table.group}")
             # The last release only closes the last window; no cycle needs a row for it.
-            rows = table.replay(rng, self.release_ns[:-1] / NS_PER_MS)
-            self.rows[id(table)] = rows
-        return rows
+            self.rows[id(table)] = table, table.replay(rng, self.release_ns[:-1] / NS_PER_MS)
+        return self.rows[id(table)][1]
+
+    def _trace_starts(self) -> Iterator[TraceStart]:
+        """Yield where each trace that has been replayed began."""
+        for table, rows in self.rows.values():
+            yield TraceStart(table.file, tuple(table.columns), int(rows[0]) + 1)
 
     def _fill(self, out: Ints, process: Process, name: str, scale: Floats | None = None) -> None:
         """Fill `out` with a path of the process in nanoseconds, block by block."""

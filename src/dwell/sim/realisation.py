@@ -62,6 +62,24 @@ class Phase(NamedTuple):
     wakes: int = 0
 
 
+class TraceStart(NamedTuple):
+    """Where the replay of a trace begins.
+
+    Parameters
+    ----------
+    file : str
+        As written in the cell file.
+    columns : tuple of str
+        The columns of it that are replayed from there, together.
+    row : int
+        Row of the first cycle, from 1; rows that ``on_negative: drop`` leaves out do not count.
+    """
+
+    file: str
+    columns: tuple[str, ...]
+    row: int
+
+
 class NodeChanges(Sequence[NodeChange]):
     """The changes of all nodes, ascending in time: rows of arrays that read as `NodeChange`.
 
@@ -184,6 +202,8 @@ class Realisation:
         Per link ascending in time; kept as `LinkSegments`.
     phases : mapping of str to Phase
         Phases of the nodes whose kernel checks quotas at ticks; a node left out has phase 0.
+    trace_starts : tuple of TraceStart
+        Where each replayed trace began.
     """
 
     scenario: str
@@ -200,6 +220,7 @@ class Realisation:
     node_changes: Sequence[NodeChange]
     link_segments: Sequence[LinkSegment]
     phases: Mapping[str, Phase] = field(default_factory=dict)
+    trace_starts: tuple[TraceStart, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))
