@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import numpy as np
 import polars as pl
 import pytest
 
 import dwell
-from dwell.report.figure import Figure, svg
+from dwell.report.figure import Figure, printed_svg, svg
 from dwell.report.palette import Palette
 from dwell.report.phases import Disturbed
-from dwell.report.timeline import MOST_MARKS, begins_by_number, run_timeline
+from dwell.report.timeline import MOST_BINS, MOST_MARKS, begins_by_number, run_timeline
 from tests.cells.small import make_problem
 
 PROBLEM = make_problem()
@@ -60,26 +62,68 @@ def test_what_goes_on_beyond_the_run_is_shaded_to_its_end(run: dwell.Run) -> Non
     assert STRESS.what in svg(figure)
 
 
-def test_of_too_many_windows_the_worst_of_several_is_a_mark(run: dwell.Run) -> None:
-    windows = pl.concat([run.windows] * 25).with_columns(
-        window=pl.int_range(0, 1500, dtype=pl.Int64),
-        first_cycle=pl.int_range(0, 1500, dtype=pl.Int64) * PROBLEM.window_cycles,
+def long_run(run: dwell.Run, windows: int) -> dwell.Run:
+    """Return a run of so many windows, those of a shorter one again and again."""
+    tables = pl.concat([run.windows] * math.ceil(windows / run.windows.height)).head(windows)
+    numbers = pl.int_range(0, windows, dtype=pl.Int64)
+    repeated = tables.with_columns(window=numbers, first_cycle=numbers * PROBLEM.window_cycles)
+    return dwell.Run(
+        run.meta, {"cycles": run.cycles, "windows": repeated, "decisions": run.decisions}
     )
-    tables = {"cycles": run.cycles, "windows": windows, "decisions": run.decisions}
-    marks = timeline(dwell.Run(run.meta, tables)).frames["windows"]
-    assert 0 < marks.height <= MOST_MARKS
-    assert marks["v_d"].max() == pytest.approx(100 * run.windows["violation_rate"].to_numpy().max())
+
+
+@pytest.mark.parametrize(
+    ("field", "column", "factor"),
+    [("v_d", "violation_rate", 100), ("l95", "seen_l95_ms", 1), ("j", "cost", 1)],
+)
+def test_a_mark_of_several_windows_shows_their_quantiles(
+    field: str, column: str, factor: int, run: dwell.Run
+) -> None:
+    whole = long_run(run, 1_501)
+    marks = timeline(whole).frames["windows"]
+    assert 100 <= marks.height <= MOST_BINS
+    assert marks["windows"].sum() == 1_501
+    assert field not in marks.columns
+    values, ends = whole.windows[column].to_numpy() * factor, np.cumsum(marks["windows"])
+    for number, part in enumerate(np.split(values, ends[:-1])):
+        shares = [np.quantile(part, share) for share in (0, 0.25, 0.5, 0.75, 1)]
+        found = marks.row(number, named=True)
+        names = [f"{field}_{end}" for end in ("min", "q1", "median", "q3", "max")]
+        assert [found[name] for name in names] == pytest.approx(shares)
+
+
+def test_use_and_estimates_of_several_windows_are_no_maxima(run: dwell.Run) -> None:
+    whole = long_run(run, 1_501)
+    used = timeline(whole).frames["nodes"]
+    for node in PROBLEM.fabric.nodes:
+        mine, every = used.filter(node=node), whole.windows[f"u_{node}"].cast(pl.Float64) * 100
+        assert mine["used_min"].min() == pytest.approx(every.min())
+        assert mine["used_max"].max() == pytest.approx(every.max())
+        assert (mine["used_q1"] <= mine["used_median"]).all()
+        assert (mine["used_median"] <= mine["used_q3"]).all()
+
+
+def test_a_figure_says_how_many_windows_a_mark_is(run: dwell.Run) -> None:
+    figure = timeline(long_run(run, 1_501), caption="More.")
+    for text in (svg(figure), printed_svg(figure)):
+        assert "a mark: median, quartiles, extremes of 13 windows" in text
+    assert "quartiles" in figure.caption
+    assert "windows" not in svg(timeline(run))
+    assert timeline(run, caption="More.").caption.startswith("A mark is a window")
 
 
 def test_a_mark_of_several_windows_has_the_placement_that_most_had_or_the_first(
     run: dwell.Run,
 ) -> None:
-    count = 2 * MOST_MARKS
-    windows = pl.concat([run.windows.head(1)] * count).with_columns(
-        window=pl.int_range(0, count, dtype=pl.Int64),
-        first_cycle=pl.int_range(0, count, dtype=pl.Int64) * PROBLEM.window_cycles,
-        placement=pl.Series(["SO", "LOC"] * MOST_MARKS),
+    count = 1_200
+    windows = long_run(run, count).windows.with_columns(
+        placement=pl.Series((["SO"] * 5 + ["LOC"] * 5) * (count // 10)),
     )
     tables = {"cycles": run.cycles, "windows": windows, "decisions": run.decisions}
     marks = timeline(dwell.Run(run.meta, tables)).frames["windows"]
-    assert marks["placement"].to_list() == ["SO"] * MOST_MARKS
+    assert marks["placement"].to_list() == ["SO"] * MOST_BINS
+
+
+def test_up_to_six_hundred_windows_each_has_a_mark(run: dwell.Run) -> None:
+    assert timeline(long_run(run, MOST_MARKS)).frames["windows"].height == MOST_MARKS
+    assert timeline(long_run(run, MOST_MARKS + 1)).frames["windows"].height <= MOST_BINS

@@ -88,9 +88,9 @@ def _sections(
         yield Section(
             f"{shown_policy(shown)} through time",
             timelines,
-            note=f"Runs of seed {comparison.seeds[0]}. Marks are windows, thin lines J of the "
-            "other placements as estimated, upright lines migrations. Shaded: warm-up and "
-            "disturbances.",
+            note=f"Runs of seed {comparison.seeds[0]}. Marks are windows, or as many of them as "
+            "the axis says; thin lines J of the other placements as estimated, upright lines "
+            "migrations. Shaded: warm-up and disturbances.",
         )
         yield Section("What was estimated, and what was measured", [_beliefs(comparison, blocks)])
     yield Section("More numbers", [blocks.more()])

@@ -170,10 +170,9 @@ class _RunPage:
             tracking=self.header.tracking,
             links=links,
             caption=(
-                "A mark is a window, in the colour of the placement that was active. Thin lines: "
-                "J of the other placements as the policy estimated it. Dashed: the aim of 5 %, and "
-                "the deadline. Upright lines: migrations; in colour, the guard's. Shaded: warm-up "
-                "and disturbances. U: all of a node's load, foreign work included."
+                "Thin lines: J of the other placements as the policy estimated it. Dashed: the aim "
+                "of 5 %, and the deadline. Upright lines: migrations; in colour, the guard's. "
+                "Shaded: warm-up and disturbances. U: all of a node's load, foreign work included."
                 f"{' Marks of the worst windows lead to their cycles.' if links else ''}"
             ),
         )

@@ -20,8 +20,16 @@ if TYPE_CHECKING:
     from dwell.report.phases import Disturbed
     from dwell.report.run_header import Tracking
 
-#: Marks of a panel at most; of longer runs several windows are one mark.
-MOST_MARKS = 600
+#: Marks of a panel at most, each a window; of longer runs there are fewer, each of several windows.
+MOST_MARKS, MOST_BINS = 600, 120
+#: What a mark of several windows shows: ends of the names of its columns, and the quantiles.
+QUANTILES = {"median": 0.5, "min": 0.0, "q1": 0.25, "q3": 0.75, "max": 1.0}
+A_WINDOW = "A mark is a window, in the colour of the placement that was active. "
+A_BIN = (
+    "A mark is several windows, as many as the axis says: a point at their median, a bar between "
+    "their quartiles, a line between their extremes, in the colour of the placement that most of "
+    "them had; of U, a line and bands. "
+)
 PANEL_PX, USE_PX = 86, 56
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 #: Scales that every panel has for itself.
@@ -39,16 +47,6 @@ SHADES = layer(
     },
     rows="spans",
     color=SHADE,
-)
-MIGRATIONS = layer(
-    "rule",
-    {
-        "color": {"condition": {"test": "datum.reason === 'guard'", "value": BAD}, "value": INK},
-        "opacity": {"value": 0.35},
-        "tooltip": [name_of("move", title="moved"), *names("reason"), AT],
-    },
-    rows="moves",
-    strokeWidth=0.7,
 )
 
 
@@ -88,12 +86,15 @@ def run_timeline(
         Disturbances, cut at the ends of the run.
     links : mapping of int to str, optional
         Where windows lead to, by their numbers.
+    caption : str
+        Stands behind what a mark is; where it is empty, nothing says that a mark is a window.
     """
     import polars as pl
 
     length_s = float(np.median(np.diff(begin_s))) if len(begin_s) > 1 else 1.0
     end_s = float(begin_s[-1]) + length_s
     candidates = tuple(palette.placements)
+    each = 1 if windows.height <= MOST_MARKS else math.ceil(windows.height / MOST_BINS)
     frame = pl.DataFrame(
         {
             "window": windows["window"],
@@ -103,7 +104,6 @@ def run_timeline(
             "l95": windows["seen_l95_ms"],
             "j": windows["cost"],
             "link": [(links or {}).get(number) for number in windows["window"].to_list()],
-            **{f"u {node}": windows[f"u_{node}"].cast(pl.Float64) * 100 for node in nodes},
         },
         strict=False,
     ).with_columns(link=pl.col("link").cast(pl.String))
@@ -111,34 +111,31 @@ def run_timeline(
         errors = [tracking.rms(begin, begin + length_s)[0] for begin in begin_s.tolist()]
         frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
     frames = {
-        "windows": _binned(frame),
-        "estimates": _estimates(windows, decisions, begin_s + length_s, candidates),
+        "windows": _binned(frame, each),
+        "estimates": _estimates(windows, decisions, begin_s + length_s, candidates, each),
         "moves": _moves(windows, decisions, begin_s, length_s),
         "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
+        "nodes": _used(windows, begin_s + length_s / 2, nodes, each),
     }
-    long = frames["windows"].unpivot(
-        [f"u {node}" for node in nodes],
-        index=["time", "window"],
-        variable_name="node",
-        value_name="used",
-    )
-    frames["nodes"] = long.with_columns(node=pl.col("node").str.slice(2))
-    frames["windows"] = frames["windows"].drop([f"u {node}" for node in nodes])
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
     colours = {name: colour for name, colour in palette.placements.items() if name in used}
     panels: list[tuple[int, list[Spec]]] = [
-        (PANEL_PX, [*aim, _marks("v_d", "V_D (%)", colours)]),
-        (PANEL_PX, [*due, _marks("l95", L95, colours, log=wide)]),
-        (PANEL_PX, [_others(palette), _marks("j", "J", colours)]),
-        (USE_PX, [_use(nodes)]),
+        (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
+        (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
+        (PANEL_PX, [_others(palette), *_marks("j", "J", colours, each)]),
+        (USE_PX, _use(nodes, each)),
     ]
     if tracking is not None:
-        panels.append((PANEL_PX, [_marks("error", "tracking error (mm)", colours)]))
+        panels.append((PANEL_PX, [*_marks("error", "tracking error (mm)", colours, each)]))
 
     time: Spec = {"type": "quantitative", "scale": {"domain": [0, end_s], "nice": False}}
-    axes = [*[None] * (len(panels) - 1), {"title": "time (s)", "grid": False, "tickCount": 10}]
+    # On paper there is no caption.
+    across = "time (s)"
+    if each > 1:
+        across += f"; a mark: median, quartiles, extremes of {each} windows"
+    axes = [*[None] * (len(panels) - 1), {"title": across, "grid": False, "tickCount": 10}]
 
     def draw(width: float) -> Spec:
         drawn = [
@@ -146,7 +143,7 @@ def run_timeline(
                 "width": width - 90,
                 "height": height,
                 "encoding": {"x": {"field": "time", **time, "axis": axis}},
-                "layer": [SHADES, *layers, MIGRATIONS],
+                "layer": [SHADES, *layers, _migrations(frames["moves"].height)],
             }
             for (height, layers), axis in zip(panels, axes, strict=True)
         ]
@@ -156,33 +153,57 @@ def run_timeline(
             "resolve": {"scale": {"x": "shared", **dict.fromkeys(OWN, "independent")}},
         }
 
-    return Figure(slug, title, frames, draw, caption)
+    mark = A_BIN if each > 1 else A_WINDOW if caption else ""
+    return Figure(slug, title, frames, draw, f"{mark}{caption}".strip())
 
 
 # -------------------------------------------------------------------------------------- data
 
 
-def _binned(frame: pl.DataFrame) -> pl.DataFrame:
-    """Return one row a mark: of several windows the worst, where there are too many."""
+def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFrame:
+    """Return a row a mark: windows, or `each` of them with the quantiles of every measure.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        A row a window, or one for each window and value of `by`.
+    """
     import polars as pl
 
-    each = math.ceil(frame.height / MOST_MARKS)
-    if each <= 1:
+    if each == 1:
         return frame
     numbers = [name for name, kind in frame.schema.items() if kind.is_float() and name != "time"]
-    rows = frame.with_row_index("row").with_columns(bin=pl.col("row") // each)
-    return (
-        rows.group_by("bin", maintain_order=True)
-        .agg(
-            pl.col("window").first(),
-            pl.col("time").mean(),
-            pl.col("placement").mode(maintain_order=True).first(),
-            *(pl.col(name).max() for name in numbers),
-            pl.col("link").drop_nulls().first(),
-        )
-        .drop("bin")
-        .select(frame.columns)
+    firsts = [pl.col("window").first(), pl.len().alias("windows"), pl.col("time").mean()]
+    if "placement" in frame.columns and "placement" not in by:
+        firsts.append(pl.col("placement").mode(maintain_order=True).first())
+    if "link" in frame.columns:
+        firsts.append(pl.col("link").drop_nulls().first())
+    quantiles = [
+        pl.col(name).quantile(share, "linear").alias(f"{name}_{end}")
+        for name in numbers
+        for end, share in QUANTILES.items()
+    ]
+    bins = frame.with_columns(bin=(pl.col("window").rank("dense") - 1) // each)
+    return bins.group_by("bin", *by, maintain_order=True).agg(*firsts, *quantiles).drop("bin")
+
+
+def _used(
+    windows: pl.DataFrame, middle_s: NDArray[np.float64], nodes: Sequence[str], each: int
+) -> pl.DataFrame:
+    """Return the utilisation of every node, a row a node and mark."""
+    import polars as pl
+
+    frame = pl.DataFrame(
+        {
+            "window": windows["window"],
+            "time": middle_s,
+            **{node: windows[f"u_{node}"].cast(pl.Float64) * 100 for node in nodes},
+        }
     )
+    long = frame.unpivot(
+        list(nodes), index=["time", "window"], variable_name="node", value_name="used"
+    )
+    return _binned(long, each, ["node"])
 
 
 def _estimates(
@@ -190,17 +211,20 @@ def _estimates(
     decisions: pl.DataFrame,
     close_s: NDArray[np.float64],
     candidates: Sequence[str],
+    each: int,
 ) -> pl.DataFrame:
-    """Return J of the candidates that were not active, as estimated at the close of windows."""
+    """Return J of the candidates that were not active, as estimated at the close of windows.
+
+    Of several windows in a mark, the median.
+    """
     import polars as pl
 
     closes = pl.DataFrame({"window": windows["window"], "time": close_s})
     priced = decisions.filter(pl.col("reason").cast(pl.String) != "guard").join(
         closes, on="window", how="inner"
     )
-    each = math.ceil(priced.height / MOST_MARKS) or 1
     parts = [
-        priced.gather_every(each).select(
+        priced.select(
             "time",
             pl.lit(name).alias("placement"),
             pl.when(pl.col("incumbent").cast(pl.String) != name)
@@ -211,7 +235,12 @@ def _estimates(
         if f"j_{name}" in priced.columns
     ]
     schema = {"time": pl.Float64, "placement": pl.String, "j": pl.Float64}
-    return pl.concat(parts) if parts else pl.DataFrame(schema=schema)
+    found = pl.concat(parts) if parts else pl.DataFrame(schema=schema)
+    if each == 1:
+        return found
+    bins = found.with_columns(bin=(pl.col("time").rank("dense") - 1) // each)
+    means = bins.group_by("bin", "placement", maintain_order=True)
+    return means.agg(pl.col("time").mean(), pl.col("j").median()).select(list(schema))
 
 
 def _moves(
@@ -278,22 +307,57 @@ def _named_spans(width: float, time: Spec) -> Spec:
     return {"width": width, "height": {"step": 15}, **bars}
 
 
-def _marks(field: str, title: str, colours: Mapping[str, str], *, log: bool = False) -> Spec:
-    scale: Spec = {"type": "log", "nice": False} if log else {"zero": field == "v_d"}
-    legend = {"symbolSize": 60} if field == "v_d" else None
+def _migrations(count: int) -> Spec:
+    """Return upright lines at migrations, the fainter the more there are."""
     encoding = {
-        "y": quantity(field, title, scale=scale, axis={"tickCount": 4}),
-        "color": coloured("placement", colours, legend=legend),
+        "color": {"condition": {"test": "datum.reason === 'guard'", "value": BAD}, "value": INK},
+        "opacity": {"value": min(0.35, 35 / max(count, 1))},
+        "tooltip": [name_of("move", title="moved"), *names("reason"), AT],
+    }
+    return layer("rule", encoding, rows="moves", strokeWidth=0.7)
+
+
+def _marks(
+    field: str, title: str, colours: Mapping[str, str], each: int, *, log: bool = False
+) -> list[Spec]:
+    """Return the marks of a panel: a window each, or `each` windows."""
+    scale: Spec = {"type": "log", "nice": False} if log else {"zero": field == "v_d"}
+    legend = {"symbolSize": 60, "symbolOpacity": 0.9} if field == "v_d" else None
+    shown = field if each == 1 else f"{field}_median"
+    colour = coloured("placement", colours, legend=legend)
+    about = [quantity("window", "window"), AT, *names("placement")]
+    if each == 1:
+        about.append(quantity(field, title))
+    else:
+        about.append(quantity("windows", "windows"))
+        about += [quantity(f"{field}_{end}", f"{title}, {end}") for end in QUANTILES]
+    point = {
+        "y": quantity(shown, title, scale=scale, axis={"tickCount": 4}),
+        "color": colour,
         # What leads nowhere would lead away from the page.
         "href": {"condition": {"test": "datum.link !== null", "field": "link"}},
-        "tooltip": [
-            quantity("window", "window"),
-            AT,
-            *names("placement"),
-            quantity(field, title),
-        ],
+        "tooltip": about,
     }
-    return layer("point", encoding, rows="windows", filled=True, size=18, opacity=0.9)
+    # On paper many stand side by side.
+    size = 18 if each == 1 else 8
+    marks = [layer("point", point, rows="windows", filled=True, size=size, opacity=0.9)]
+    if each == 1:
+        return marks
+    bars = [
+        layer(
+            "rule",
+            {
+                "y": quantity(f"{field}_{low}", title, scale=scale, axis={"tickCount": 4}),
+                "y2": {"field": f"{field}_{high}"},
+                "color": colour,
+            },
+            rows="windows",
+            strokeWidth=wide,
+            opacity=opacity,
+        )
+        for low, high, wide, opacity in (("min", "max", 0.6, 0.5), ("q1", "q3", 2.4, 0.5))
+    ]
+    return [*bars, *marks]
 
 
 def _others(palette: Palette) -> Spec:
@@ -304,13 +368,32 @@ def _others(palette: Palette) -> Spec:
     return layer("line", encoding, rows="estimates", strokeWidth=1, opacity=0.75)
 
 
-def _use(nodes: Sequence[str]) -> Spec:
+def _use(nodes: Sequence[str], each: int) -> list[Spec]:
+    """Return a line a node; of several windows in a mark, with bands of quartiles and extremes."""
     shades = {node: (INK, MUTED)[place % 2] for place, node in enumerate(nodes)}
     dashes = [DASHES[place % len(DASHES)] for place in range(len(nodes))]
     axis, scale = {"values": [0, 50, 100]}, {"domain": [0, 104]}
-    encoding = {
-        "y": quantity("used", "U (%)", scale=scale, axis=axis),
-        "color": coloured("node", shades),
+
+    def up(end: str) -> Spec:
+        return quantity(f"used{end}", "U (%)", scale=scale, axis=axis)
+
+    legend = {"symbolType": "stroke", "symbolOpacity": 1}
+    colour = coloured("node", shades, **({} if each == 1 else {"legend": legend}))
+    line = {
+        "y": up("" if each == 1 else "_median"),
+        "color": colour,
         "strokeDash": name_of("node", scale={"domain": list(nodes), "range": dashes}),
     }
-    return layer("line", encoding, rows="nodes", strokeWidth=1.1)
+    lines = layer("line", line, rows="nodes", strokeWidth=1.1)
+    if each == 1:
+        return [lines]
+    bands = [
+        layer(
+            "area",
+            {"y": up(low), "y2": {"field": f"used{high}"}, "color": colour},
+            rows="nodes",
+            opacity=opacity,
+        )
+        for low, high, opacity in (("_min", "_max", 0.12), ("_q1", "_q3", 0.25))
+    ]
+    return [*bands, lines]
