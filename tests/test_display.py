@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -16,7 +17,7 @@ import pytest
 
 import dwell
 from dwell.control import ClosedWindow, Controller, Guard, Presence, Probation
-from dwell.display import Displayed
+from dwell.display import Displayed, milliseconds
 from dwell.estimators import Evidence, Instants
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import (
@@ -225,3 +226,23 @@ def test_without_what_draws_there_are_tables(
     Reader().feed(html)
     assert "<svg" not in html
     assert "<table>" in html or "V_D" in html
+
+
+@pytest.mark.parametrize(
+    ("value", "decimals", "text"),
+    [
+        (12.3456, 2, "12.35"),
+        (0.5, 2, "0.50"),
+        (0.0123, 2, "0.012"),
+        (0.0042, 1, "0.0042"),
+        (0.0000014, 1, "0.000001"),
+        (1e-9, 2, "0.00"),
+        (0.0, 2, "0.00"),
+        (1234.5, 1, "1234.5"),
+        (math.inf, 2, "∞"),
+    ],
+)
+def test_of_a_time_two_digits_count_down_to_a_nanosecond(
+    value: float, decimals: int, text: str
+) -> None:
+    assert milliseconds(value, decimals) == text

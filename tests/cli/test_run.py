@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -37,6 +38,19 @@ def test_run_saves_and_sums_up(cell: Path) -> None:
     assert run.windows.height == 12
     assert run.meta["scenario"] == "stress"
     assert not run.has_jobs
+
+
+def test_of_a_cell_of_microseconds_times_are_not_written_as_nothing(cell: Path) -> None:
+    small = SMALL.replace("period_ms: 20", "period_ms: 0.05").replace(
+        "delay_ms: 1}", "delay_ms: 0}"
+    )
+    for exec_ms in ("1", "8", "2"):
+        small = small.replace(f"{{exec_ms: {exec_ms}}}", f"{{exec_ms: 0.00{exec_ms}}}")
+    cell.write_text(small, encoding="utf-8")
+    shown = call("run", cell, "--windows", "12").stdout
+    assert re.findall(r"\b0\.0+ ms", shown) == []
+    assert "0.0090 ms" in shown
+    assert "0.0090" in call("check", cell).stdout
 
 
 def test_run_as_json_says_what_the_tables_say(cell: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dwell.errors import ProblemError
 from dwell.model import Constant, Execution, Flow, Pipeline, Task
@@ -62,3 +65,29 @@ def test_what_runs_elsewhere_and_all_behind_it_is_not_shared(moved: str, apart: 
     active = dict.fromkeys("abcd", "R")
     other = {**active, **dict.fromkeys(moved, "E")}
     assert DIAMOND.diverging(active, other) == frozenset(apart)
+
+
+@pytest.mark.parametrize(
+    ("flows", "shown"),
+    [
+        ([("a", "b"), ("b", "c"), ("c", "d")], "a → b → c → d"),
+        ([("a", "b"), ("a", "c"), ("b", "d"), ("c", "d")], "a → b → d; a → c → d"),
+        ([("a", "c"), ("b", "c"), ("c", "d")], "a → c → d; b → c"),
+        ([("a", "d"), ("b", "c")], "a → d; b → c"),
+        ([], "a; b; c; d"),
+    ],
+)
+def test_a_pipeline_is_shown_by_its_flows(flows: list[tuple[str, str]], shown: str) -> None:
+    assert str(pipeline(*flows)) == shown
+    assert shown.replace("→", "->") in repr(pipeline(*flows))
+
+
+@given(st.sets(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=15))
+def test_of_the_chains_every_step_is_a_flow_and_every_flow_a_step(
+    pairs: set[tuple[int, int]],
+) -> None:
+    flows = {("abcdefg"[low], "abcdefg"[high]) for low, high in pairs if low < high}
+    chains = pipeline(*sorted(flows), tasks="abcdefg").chains()
+    steps = [step for chain in chains for step in itertools.pairwise(chain)]
+    assert sorted(steps) == sorted(flows)
+    assert {name for chain in chains for name in chain} == set("abcdefg")

@@ -21,6 +21,7 @@ from dwell.cli.options import (
     seconds_of_runs,
 )
 from dwell.cli.output import file_name, print_json, say, working, write_report
+from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.model import Problem
@@ -138,10 +139,10 @@ def _run(campaign: Campaign, folder: Path, play: Play, name: str, minutes: float
                 tell=say,
             )
     except KeyboardInterrupt:
-        done = len(list(folder.glob("runs/*/run.json")))
+        done, planned = len(list(folder.glob("runs/*/run.json"))), len(campaign.plan())
         typer.echo(
-            f"interrupted: {done} of {len(campaign.plan())} runs are done and stay in {folder}; "
-            "the same command goes on from there",
+            f"interrupted: {done} of {counted(planned, 'run')} are done and stay in {folder}; the "
+            "same command goes on from there",
             err=True,
         )
         raise typer.Exit(ExitCode.INTERRUPTED) from None
@@ -190,7 +191,7 @@ def _print(
     if state is not None and state.given_up:
         typer.echo(f"given up: {', '.join(state.given_up)}", err=True)
     if state is not None and state.left:
-        typer.echo(f"{state.left} runs are left; the same command goes on", err=True)
+        typer.echo(f"{counted(state.left, 'run')} left; the same command goes on", err=True)
 
 
 def _document(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -12,7 +11,9 @@ import dwell
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.options import CellArgument, Insecure, Json, Keys, Traces
 from dwell.cli.output import aligned, print_json
+from dwell.display import milliseconds
 from dwell.errors import Fault, PolicyError, ProblemError
+from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.estimators import Profile
@@ -181,14 +182,9 @@ def _over_caps(problem: Problem, profile: Profile) -> Iterator[Fault]:
         if l95_ms > cap_ms:
             yield Fault(
                 f"candidates.{name}",
-                f"L95 is {_shown_ms(l95_ms)} ms undisturbed, over the cap of {cap_ms:g} ms: it is "
-                "never eligible while another one is",
+                f"L95 is {milliseconds(l95_ms)} ms undisturbed, over the cap of {cap_ms:g} ms: it "
+                "is never eligible while another one is",
             )
-
-
-def _shown_ms(l95_ms: float) -> str:
-    """An L95 with one digit; infinite where more messages are lost than it leaves out."""
-    return f"{l95_ms:.1f}" if math.isfinite(l95_ms) else "∞"
 
 
 def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
@@ -208,8 +204,8 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
             yield Fault(
                 "controller.guard_cycles",
                 f"{settings.guard_cycles} is tight for {name}: L95 and the way back to the source "
-                f"take {needed_ms:.1f} ms of (guard_cycles - 1) periods = {bound_ms:.1f} ms, so "
-                "that the guard fires without a fault; raise it",
+                f"take {milliseconds(needed_ms)} ms of (guard_cycles - 1) periods = "
+                f"{milliseconds(bound_ms)} ms, so that the guard fires without a fault; raise it",
             )
 
 
@@ -281,7 +277,7 @@ def _summary(problem: Problem, profile: Profile) -> str:
     rows = [
         [
             name,
-            _shown_ms(profile.uncut_l95_ms[name]),
+            milliseconds(profile.uncut_l95_ms[name]),
             f"{profile.violation_rate[name] * 100:.1f}",
             *(f"{profile.own[name][node] * 100:.0f}" for node in nodes),
         ]
@@ -290,9 +286,10 @@ def _summary(problem: Problem, profile: Profile) -> str:
     return "\n".join(
         (
             f"{problem.name}: no faults",
-            f"{len(pipeline.tasks)} tasks, {len(nodes)} nodes, {len(problem.fabric.links)} links; "
+            f"{counted(len(pipeline.tasks), 'task')}, {counted(len(nodes), 'node')}, "
+            f"{counted(len(problem.fabric.links), 'link')}; "
             f"P {pipeline.period_ms:.4g} ms, D {pipeline.deadline_ms:.4g} ms, "
-            f"W {problem.window_cycles} cycles",
+            f"W {counted(problem.window_cycles, 'cycle')}",
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",
             "",

@@ -17,6 +17,7 @@ from dwell.live.security import Security, exposed
 from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
 from dwell.live.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
+from dwell.model.bounds import counted
 
 PACKAGES = {"zenoh": "eclipse-zenoh", "msgspec": "msgspec", "psutil": "psutil"}
 
@@ -163,7 +164,7 @@ def _summary(problem: Problem, wiring: Wiring, node: str) -> str:
     return "\n".join(
         (
             f"{problem.name}: {node} has all that it needs",
-            f"{len(here)} processes; TCP ports {host.port} to {last} of {host.address}",
+            f"{counted(len(here), 'process')}; TCP ports {host.port} to {last} of {host.address}",
             "",
             aligned(rows[0], rows[1:]),
         )

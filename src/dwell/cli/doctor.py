@@ -26,6 +26,7 @@ from dwell.calibration.machine_conditions import MachineCounters, processor
 from dwell.cli.output import print_json
 from dwell.errors import DISTRIBUTION, OPTIONAL, LiveError, TrustError, installing
 from dwell.model import Host, Problem
+from dwell.model.bounds import counted
 from dwell.testbed import doctor as testbed_doctor
 from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.doctor import Finding
@@ -182,7 +183,7 @@ def _cache(*, clear: bool) -> Iterator[Finding]:
         try:
             for file in outdated:
                 file.unlink(missing_ok=True)
-            found = f"{len(outdated)} files, {bytes_ / 1e6:.1f} MB, {whose}"
+            found = f"{counted(len(outdated), 'file')}, {bytes_ / 1e6:.1f} MB, {whose}"
             yield Finding("compiled before", True, found)
         except OSError as error:
             found = f"{error.filename}: {error.strerror}"

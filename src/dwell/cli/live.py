@@ -27,6 +27,7 @@ from dwell.cli.options import (
     Seed,
 )
 from dwell.cli.output import json_text, print_json, say
+from dwell.display import milliseconds
 
 if TYPE_CHECKING:
     from dwell.live.operator_client import OperatorClient
@@ -386,7 +387,7 @@ def status_lines(status: dict[str, Any]) -> list[str]:
         used = ", ".join(f"{node} {share:.0%}" for node, share in window["utilisation"].items())
         lines.append(
             f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: L95 "
-            f"{window['l95_ms']:.1f} ms, V_D {window['violation_rate']:.1%}, J "
+            f"{milliseconds(window['l95_ms'])} ms, V_D {window['violation_rate']:.1%}, J "
             f"{window['cost']:.3f}, {window['reason']}; utilisation {used}"
         )
     lines += [f"  {who:24} differs    {why}" for who, why in sorted(status["strangers"].items())]

@@ -18,10 +18,11 @@ from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
 from dwell.errors import LiveError, missing_package
 from dwell.model import Problem, Scenario
+from dwell.model.bounds import counted
 from dwell.model.user_classes import import_user_module
 from dwell.record import Run, open_run, seal_run
 from dwell.report import run_html
-from dwell.report.formatting import listed, percent, write_number
+from dwell.report.formatting import listed, percent, write_ms
 from dwell.report.phases import Disturbed, PhaseRow, disturbed, phase_rows
 from dwell.report.run_header import RunHeader
 from dwell.testbed.cell_observer import CellObserver, load_observer
@@ -244,8 +245,8 @@ def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bo
         )
         return
     typer.echo(
-        f"{len(cycles)} cycles, {100 * rate:.1f} % missed, {lost} without a command; "
-        f"{migrations} migrations by the controller, {len(guard)} by the guard\n"
+        f"{counted(len(cycles), 'cycle')}, {100 * rate:.1f} % missed, {lost} without a command; "
+        f"{counted(migrations, 'migration')} by the controller, {len(guard)} by the guard\n"
     )
     if phases:
         typer.echo(f"{_table(phases)}\n")
@@ -263,7 +264,7 @@ def _table(phases: Sequence[PhaseRow]) -> str:
             f"{row.begin_s:.0f} s",
             f"{row.end_s:.0f} s",
             f"{100 * row.violation_rate:.1f} %",
-            f"{write_number(row.l95_ms)} ms",
+            write_ms(row.l95_ms),
             str(row.lost),
             str(row.migrations),
             str(row.guard_moves),

@@ -27,6 +27,7 @@ from dwell.cli.options import (
     windows_of,
 )
 from dwell.cli.output import file_name, print_json, working
+from dwell.display import milliseconds
 from dwell.errors import RunError
 from dwell.model.bounds import counted
 
@@ -155,7 +156,7 @@ def _summary(
     warmup = problem.warmup_windows
     title = (
         f"{problem.name}, {labels['scenario']}, {labels['policy']}, seed {labels['seed']}: "
-        f"{windows} windows of {problem.window_cycles} cycles"
+        f"{counted(windows, 'window')} of {counted(problem.window_cycles, 'cycle')}"
     )
     if row is None:
         return f"{title}, none after the {warmup} of warm-up: nothing to sum up; ask for more"
@@ -163,7 +164,7 @@ def _summary(
     used = (f"{node} {row[f'node_{node}']:.0%}" for node in problem.fabric.nodes)
     lines = (
         ("missed deadlines (V_D)", f"{float(row['violation_rate']) * 100:.2f} %"),
-        ("L95, mean of windows", f"{row['l95_ms']:.2f} ms"),
+        ("L95, mean of windows", f"{milliseconds(float(str(row['l95_ms'])), 2)} ms"),
         ("median latency", _latency(row["p50_ms"])),
         ("95th percentile of all cycles", _latency(row["p95_ms"])),
         ("cost J, mean of windows", f"{row['cost']:.3f}"),
@@ -185,7 +186,11 @@ def _summary(
 def _latency(value: object) -> str:
     """``12.34 ms``; infinite where too many cycles never finished."""
     latency_ms = float(str(value))
-    return f"{latency_ms:.2f} ms" if math.isfinite(latency_ms) else "∞: too many never finished"
+    return (
+        f"{milliseconds(latency_ms, 2)} ms"
+        if math.isfinite(latency_ms)
+        else "∞: too many never finished"
+    )
 
 
 def _unfinished(row: Row) -> Iterator[tuple[str, str]]:
@@ -200,8 +205,8 @@ def _control(row: Row) -> Iterator[tuple[str, str]]:
 
     most = ", ".join(f"{row[f'misses_in_{stretch}']} in {stretch}" for stretch in STRETCHES)
     yield "most misses", f"{most} consecutive cycles"
-    ages = (row[f"aoi_{name}_ms"] for name in ("mean", "p95", "peak"))
-    yield "age at the actuator", "mean {:.2f}, p95 {:.2f}, peak {:.2f} ms".format(*ages)
+    ages = (milliseconds(float(str(row[f"aoi_{name}_ms"])), 2) for name in ("mean", "p95", "peak"))
+    yield "age at the actuator", "mean {}, p95 {}, peak {} ms".format(*ages)
     if "tracking_rms_mm" in row:
         rms, iae = row["tracking_rms_mm"], row["tracking_iae_mm"]
         yield "tracking error", f"RMS {rms:.2f} mm, mean absolute (IAE / time) {iae:.2f} mm"

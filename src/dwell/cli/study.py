@@ -20,6 +20,7 @@ from dwell.cli.options import (
     windows_of,
 )
 from dwell.cli.output import Progress, aligned, file_name, print_json, progress, working
+from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.report.formatting import Measure
@@ -119,8 +120,8 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
             yield count
     except KeyboardInterrupt:
         typer.echo(
-            f"interrupted: {done} of {study.runs} runs are finished and stay in {folder}; the same "
-            "command goes on from there",
+            f"interrupted: {done} of {counted(study.runs, 'run')} are finished and stay in "
+            f"{folder}; the same command goes on from there",
             err=True,
         )
         raise typer.Exit(ExitCode.INTERRUPTED) from None

@@ -34,7 +34,7 @@ def counted(count: float, noun: str) -> str:
     if count == 1:
         return f"1 {noun}"
     stem, ending = (noun[:-1], "ies") if re.search("[^aeiou]y$", noun) else (noun, "s")
-    return f"{shown(count)} {stem}{'es' if noun.endswith('s') else ending}"
+    return f"{count} {stem}{'es' if noun.endswith('s') else ending}"
 
 
 @dataclass(frozen=True, slots=True)

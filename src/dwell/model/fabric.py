@@ -23,6 +23,7 @@ from dwell.model.bounds import (
     QUOTA_TICK_MS,
     RATE_MBPS,
     RETRANSMIT_MS,
+    counted,
     require,
 )
 from dwell.model.frozen import FrozenDict, require_names, shortened
@@ -263,8 +264,10 @@ class Fabric:
         object.__setattr__(self, "links", FrozenDict(self.links))
 
     def __repr__(self) -> str:
-        nodes = [f"{one.name} ({one.tier}, {one.cores} cores)" for one in self.nodes.values()]
-        return f"<Fabric: {shortened(nodes)}; {len(self.links)} links>"
+        nodes = [
+            f"{one.name} ({one.tier}, {counted(one.cores, 'core')})" for one in self.nodes.values()
+        ]
+        return f"<Fabric: {shortened(nodes)}; {counted(len(self.links), 'link')}>"
 
     def tier(self, tier: Tier) -> tuple[str, ...]:
         """Names of a tier's nodes, in the file's order."""

@@ -162,10 +162,15 @@ class Pipeline:
         object.__setattr__(self, "scales", FrozenDict(self.scales))
 
     def __repr__(self) -> str:
+        chains = [shortened(chain, " -> ") for chain in self.chains()]
         return (
-            f"<Pipeline: {shortened(self.topological(), ' -> ')}; period {self.period_ms:g} ms, "
+            f"<Pipeline: {shortened(chains, '; ')}; period {self.period_ms:g} ms, "
             f"deadline {self.deadline_ms:g} ms>"
         )
+
+    def __str__(self) -> str:
+        """Return its flows as chains: ``a → b → d; c → b``."""
+        return "; ".join(" → ".join(chain) for chain in self.chains())
 
     def inputs(self, task: str) -> tuple[Flow, ...]:
         """Flows into a task."""
@@ -197,3 +202,16 @@ class Pipeline:
                 if waiting[flow.target] == 0:
                     order.append(flow.target)
         return tuple(order)
+
+    def chains(self) -> tuple[tuple[str, ...], ...]:
+        """Paths that have every flow once among their steps, and every task at least once."""
+        left = {name: [flow.target for flow in self.outputs(name)] for name in self.tasks}
+        found: list[tuple[str, ...]] = []
+        for name in self.topological():
+            alone = not self.inputs(name) and not self.outputs(name)
+            while left[name] or alone:
+                chain, alone = [name], False
+                while left[chain[-1]]:
+                    chain.append(left[chain[-1]].pop(0))
+                found.append(tuple(chain))
+        return tuple(found)

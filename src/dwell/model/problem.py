@@ -19,6 +19,7 @@ from dwell.model.bounds import (
     TIME_MS,
     WARMUP_WINDOWS,
     WINDOW_CYCLES,
+    counted,
     require,
 )
 from dwell.model.fabric import Fabric
@@ -166,15 +167,16 @@ class Problem(Displayed):
     def __repr__(self) -> str:
         """Return a summary of its parts; `dwell.model.document` has all of it."""
         pipeline, controller = self.pipeline, self.controller
-        counted = {"scenario": self.scenarios, "candidate": self.candidates}
-        names = [f"{what}s: {shortened(these)}" for what, these in counted.items()]
+        parts = {"scenarios": self.scenarios, "candidates": self.candidates}
+        names = [f"{what}: {shortened(these)}" for what, these in parts.items()]
         return "\n  ".join(
             (
                 f"<Problem {self.name!r}",
                 f"{pipeline!r}",
                 f"{self.fabric!r}",
                 *names,
-                f"windows of {self.window_cycles} cycles, {self.warmup_windows} of warm-up",
+                f"windows of {counted(self.window_cycles, 'cycle')}, "
+                f"{self.warmup_windows} of warm-up",
                 f"controller on {self.controller_node}: {controller.policy}, "
                 f"{controller.estimator}, begins with {self.initial}>",
             )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, runtime_checkable
 
 from dwell.errors import Fault, TraceError
-from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, Bound, require
+from dwell.model.bounds import CV, GAMMA_CV, MEAN, REAL, RHO, VALUE, Bound, counted, require
 from dwell.model.frozen import shortened
 
 if TYPE_CHECKING:
@@ -277,7 +277,7 @@ class TraceTable:
 
     def __repr__(self) -> str:
         columns = shortened(self.columns)
-        return f"<TraceTable {self.file!r}: {self.rows} rows of {columns}; by {self.by}>"
+        return f"<TraceTable {self.file!r}: {counted(self.rows, 'row')} of {columns}; by {self.by}>"
 
     @property
     def rows(self) -> int:
@@ -323,7 +323,7 @@ class TraceTable:
         before = np.cumsum(slack)
         if before[-1] == 0:
             longest = int((ends - self.starts).max())
-            raise self._too_short(f"{longest} rows", f"{cycles} cycles")
+            raise self._too_short(counted(longest, "row"), counted(cycles, "cycle"))
         pick = int(rng.integers(before[-1]))
         group = int(np.searchsorted(before, pick, side="right"))
         first = int(self.starts[group]) + pick - int(before[group] - slack[group])

@@ -15,8 +15,9 @@ from functools import cache
 from html import escape
 
 from dwell.model import Problem
+from dwell.model.bounds import counted
 from dwell.report.figure import svg
-from dwell.report.formatting import write_number
+from dwell.report.formatting import write_ms
 from dwell.report.method import placements_table
 from dwell.report.page import TEMPLATES, Block, Fact, Page, Section
 from dwell.report.table import Table, table_text
@@ -82,9 +83,9 @@ def _answer(shown: object) -> Page:
 def _cell(problem: Problem) -> Page:
     pipeline, controller = problem.pipeline, problem.controller
     facts = [
-        Fact("period", f"{write_number(pipeline.period_ms)} ms"),
-        Fact("deadline", f"{write_number(pipeline.deadline_ms)} ms"),
-        Fact("window", f"{problem.window_cycles} cycles"),
+        Fact("period", write_ms(pipeline.period_ms)),
+        Fact("deadline", write_ms(pipeline.deadline_ms)),
+        Fact("window", counted(problem.window_cycles, "cycle")),
         Fact("policy", controller.policy, f"on {problem.controller_node}"),
         Fact("scenarios", f"{len(problem.scenarios)}"),
     ]
@@ -94,8 +95,7 @@ def _cell(problem: Problem) -> Page:
     except ModuleNotFoundError:
         # Figures are data frames, which a robot's installation has none of.
         blocks = [placements_table(problem)]
-    steps = " → ".join(pipeline.topological())
-    return Page(f"Cell {problem.name}", steps, [Section("", blocks)], facts)
+    return Page(f"Cell {problem.name}", str(pipeline), [Section("", blocks)], facts)
 
 
 def _drawn(page: Page) -> Iterator[str]:

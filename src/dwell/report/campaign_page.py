@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, cumulative
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, percent, shown_contender, write_number
@@ -36,7 +37,8 @@ def campaign_page(measured: MeasuredCampaign) -> Page:
     blocks = PolicyBlocks(comparison)
     return Page(
         title=f"Campaign on {comparison.problem.name}",
-        subtitle=f"{len(comparison.scenarios)} scenarios, {len(comparison.policies)} policies, "
+        subtitle=f"{counted(len(comparison.scenarios), 'scenario')}, "
+        f"{counted(len(comparison.policies), 'policy')}, "
         f"runs of {write_number(measured.seconds, 0)} s on "
         f"{WHERE.get(measured.where, 'real hosts')}; a repetition takes the place of a seed",
         facts=list(_facts(measured)),

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from dwell.model.bounds import counted
 from dwell.report.charts import curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure, shown_policy, shown_scenario
-from dwell.report.method import ranges
+from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
 from dwell.report.palette import Palette
 from dwell.report.phases import disturbed
@@ -61,8 +62,9 @@ def comparison_page(
     cells = ", ".join(one.problem.name for one in comparisons)
     return Page(
         title=f"Placement policies compared on {cells}",
-        subtitle=f"{runs} simulated runs: {len(first.scenarios)} scenarios, {len(first.policies)} "
-        f"policies, seeds {ranges(first.seeds)}, {first.windows} windows",
+        subtitle=f"{counted(runs, 'simulated run')}: {counted(len(first.scenarios), 'scenario')}, "
+        f"{counted(len(first.policies), 'policy')}, {numbered(first.seeds)}, "
+        f"{counted(first.windows, 'window')}",
         sections=parts,
         policies=policies,
         seeds=first.seeds,
@@ -95,7 +97,7 @@ def _sections(
         yield Section("What was estimated, and what was measured", [_beliefs(comparison, blocks)])
     yield Section("More numbers", [blocks.more()])
     method = blocks.method(
-        runs=f"{comparison.windows} windows, seeds {ranges(comparison.seeds)}; every policy "
+        runs=f"{counted(comparison.windows, 'window')}, {numbered(comparison.seeds)}; every policy "
         "plays the same realisation of a scenario and seed",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own; "
         "of medians, by order statistics",

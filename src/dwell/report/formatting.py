@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
+from dwell.display import decimals_for
 from dwell.report.palette import FAMILIES, contended
 from dwell.study import Interval
 
@@ -49,6 +50,16 @@ class Measure(NamedTuple):
         """``L95 (ms)``."""
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
+    def for_size(self, *values: float) -> Measure:
+        """Return the measure with decimals for numbers of this size.
+
+        Times have more where they would be written as nothing.
+        """
+        size = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+        if self.unit not in ("ms", "s") or size >= 10.0**-self.decimals:
+            return self
+        return self._replace(decimals=decimals_for(size, self.decimals))
+
 
 class Written(NamedTuple):
     """A number and what is known of its error, each as text."""
@@ -74,6 +85,11 @@ def write_number(value: float, decimals: int = 1, *, signed: bool = False) -> st
     return plus + _fixed(value, _places(value, decimals))
 
 
+def write_ms(value: float) -> str:
+    """Write a time in milliseconds, with its unit, as `write_number` does: ``12.3 ms``."""
+    return f"{write_number(value, decimals_for(value, 1))} ms"
+
+
 def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = False) -> Written:
     """Write a number over seeds with its 95 % interval.
 
@@ -88,6 +104,7 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
         finite: for tables that are short of room and say so.
     """
     value, low, high = (end * measure.factor for end in interval)
+    measure = measure.for_size(value, low, high)
     text = write_number(value, measure.decimals, signed=measure.signed) if value else "0"
     if not interval.known or low == high:
         return Written(text, "")

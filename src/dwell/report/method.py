@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
+from dwell.display import decimals_for
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem, Process, Trace
-from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_number
+from dwell.model.bounds import counted
+from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_ms, write_number
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import FAMILIES, Palette, contended
 from dwell.report.table import Columns, Table, Text
@@ -47,16 +49,19 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
     nodes = problem.fabric.nodes.values()
     return {
         "cell": problem.name,
-        "pipeline": " → ".join(pipeline.topological()),
-        "period": f"{write_number(pipeline.period_ms)} ms",
-        "deadline": f"{write_number(pipeline.deadline_ms)} ms",
-        "nodes": ", ".join(f"{node.name} ({node.tier}, {node.cores} cores)" for node in nodes),
-        "window": f"{problem.window_cycles} cycles, {write_number(span_s)} s",
-        "warm-up": f"{problem.warmup_windows} windows",
+        "pipeline": str(pipeline),
+        "period": write_ms(pipeline.period_ms),
+        "deadline": write_ms(pipeline.deadline_ms),
+        "nodes": ", ".join(
+            f"{one.name} ({one.tier}, {counted(one.cores, 'core')})" for one in nodes
+        ),
+        "window": f"{counted(problem.window_cycles, 'cycle')}, "
+        f"{write_number(span_s, decimals_for(span_s, 1))} s",
+        "warm-up": counted(problem.warmup_windows, "window"),
         "cost": _cost(problem),
         "caps": _caps(problem),
         "controller": f"on {problem.controller_node}, begins with {problem.initial}",
-        "N_min": f"{controller.min_dwell} windows",
+        "N_min": counted(controller.min_dwell, "window"),
         "Δ_min": f"{controller.min_improvement:g}",
         "estimator": controller.estimator,
     }
@@ -185,8 +190,8 @@ def describe_contenders(problem: Problem, names: Iterable[str]) -> dict[str, str
     return sentences
 
 
-def ranges(seeds: Sequence[int]) -> str:
-    """``1 to 20``, or the list where it is none."""
+def numbered(seeds: Sequence[int]) -> str:
+    """``seeds 1 to 20``, or a list of them where they are no range; ``seed 1``."""
     if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
-        return f"{seeds[0]} to {seeds[-1]}"
-    return ", ".join(map(str, seeds))
+        return f"seeds {seeds[0]} to {seeds[-1]}"
+    return f"{'seed' if len(seeds) == 1 else 'seeds'} {', '.join(map(str, seeds))}"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.model.bounds import counted
 from dwell.report.charts import (
     NO_LIMIT,
     PART_COLOURS,
@@ -277,7 +278,7 @@ class PolicyBlocks:
             columns,
             rows,
             Text("scenario", "", "scenario"),
-            f"Means over {len(set(self.runs['seed']))} seeds with their 95 % intervals"
+            f"Means over {counted(len(set(self.runs['seed'])), 'seed')} with their 95 % intervals"
             f"{' (±: their larger half)' if compact else ''}. L95: 95th "
             "percentile of a window’s latencies, mean over windows. U_r, U_e: busiest robot and "
             "edge node. Last columns: share of the windows under each placement. ATP is our "

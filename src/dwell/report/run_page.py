@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.display import decimals_for
+from dwell.model.bounds import counted
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
 from dwell.report.charts import (
     PART_COLOURS,
@@ -33,6 +35,7 @@ from dwell.report.formatting import (
     percent,
     shown_policy,
     shown_scenario,
+    write_ms,
     write_number,
 )
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
@@ -92,17 +95,17 @@ class _RunPage:
         ).head(WORST)
 
     def page(self) -> Page:
-        header, counted = self.header, self.counted
-        minutes = counted.cycles.height * header.period_ms / 60e3
+        header, windows = self.header, self.counted.windows.height
+        minutes = self.counted.cycles.height * header.period_ms / 60e3
         return Page(
             title=f"{self._policy()} on {header.problem.name}",
             subtitle=" · ".join(
                 (
                     header.kind if header.live else f"{header.kind}, seed {header.seed}",
                     f"scenario {shown_scenario(header.scenario)}",
-                    f"{counted.windows.height} windows of {header.window_cycles} cycles after the "
-                    "warm-up",
-                    f"{write_number(minutes)} minutes",
+                    f"{counted(windows, 'window')} of {counted(header.window_cycles, 'cycle')} "
+                    "after the warm-up",
+                    f"{write_number(minutes, decimals_for(minutes, 1))} minutes",
                 )
             ),
             facts=list(self._facts()),
@@ -119,9 +122,9 @@ class _RunPage:
         cycles, decisions = self.counted.cycles, self.counted.decisions
         missed = cycles["missed"].to_numpy()
         l95_ms = order_statistic(latency_ms(cycles), 95)
-        deadline = f"deadline {write_number(self.header.deadline_ms)} ms"
+        deadline = f"deadline {write_ms(self.header.deadline_ms)}"
         yield Fact("V_D, deadlines missed", percent(float(missed.mean()), 1), "aim: under 5 %")
-        yield Fact("L95 of all cycles", f"{write_number(l95_ms)} ms", deadline)
+        yield Fact("L95 of all cycles", write_ms(l95_ms), deadline)
         yield Fact("misses in a row", write_number(longest_streak(missed), 0), "at most")
         cost = self.counted.windows["cost"].mean()
         yield Fact("J", write_number(_number(cost), 2), "mean")
@@ -495,8 +498,8 @@ class _RunPage:
                 "record": f"{header.kind}, seed {header.seed}",
                 "policy": header.policy,
                 "estimator": header.estimator,
-                "window": f"{header.window_cycles} cycles of {write_number(header.period_ms)} ms, "
-                f"deadline {write_number(header.deadline_ms)} ms",
+                "window": f"{counted(header.window_cycles, 'cycle')} of "
+                f"{write_ms(header.period_ms)}, deadline {write_ms(header.deadline_ms)}",
                 "versions": ", ".join(f"{name} {text}" for name, text in header.versions.items()),
             }
         )

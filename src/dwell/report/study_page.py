@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
-from dwell.report.method import ranges
+from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
 from dwell.report.policy_blocks import COST, L95, RATE, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import Table, Text
@@ -33,9 +34,10 @@ def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
     points = study.runs.select(study.parameters).unique().height if study.parameters else 1
     return Page(
         title=f"Study {study.name}",
-        subtitle=f"{study.runs.height} runs: {len(study.scenarios)} scenarios, "
-        f"{len(study.policies)} policies, {points} points, seeds {ranges(study.seeds)}, "
-        f"{study.windows} windows",
+        subtitle=f"{counted(study.runs.height, 'run')}: "
+        f"{counted(len(study.scenarios), 'scenario')}, "
+        f"{counted(len(study.policies), 'policy')}, {counted(points, 'point')}, "
+        f"{numbered(study.seeds)}, {counted(study.windows, 'window')}",
         sections=list(islice(_sections(study, blocks), sections)),
         policies=blocks.colours,
         seeds=() if study.parameters else study.seeds,
@@ -70,7 +72,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
         yield Section("More numbers", [blocks.more()])
     method = blocks.method(
-        runs=f"{study.windows} windows, seeds {ranges(study.seeds)}",
+        runs=f"{counted(study.windows, 'window')}, {numbered(study.seeds)}",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own",
     )
     yield Section("How it was made", method)

@@ -145,7 +145,8 @@ class Table:
         low, high = (row.get(f"{column.column}{end}") for end in ("_low", "_high"))
         if low is None or high is None:
             shown = column.factor * number
-            text = write_number(shown, column.decimals, signed=column.signed) if shown else "0"
+            decimals = column.for_size(shown).decimals
+            text = write_number(shown, decimals, signed=column.signed) if shown else "0"
             return Cell(text, kind="num", sort=_sortable(shown))
         written = write_interval(Interval(number, low, high), column, larger_half=self.compact)
         return Cell(written.value, written.error, "num", _sortable(number))

@@ -6,9 +6,10 @@ import math
 from typing import TYPE_CHECKING
 
 from dwell.model import Problem, Trace
+from dwell.model.bounds import counted
 from dwell.report.charts import layer, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import write_number
+from dwell.report.formatting import write_ms, write_number
 from dwell.report.palette import INK, MUTED, PAPER, SHADE
 
 if TYPE_CHECKING:
@@ -36,7 +37,10 @@ def topology(problem: Problem) -> Figure:
         for i, node in enumerate(nodes)
     }
     texts = {
-        node.name: [f"{node.name}: {node.tier}, {node.cores} cores", *_tasks(problem, node.name)]
+        node.name: [
+            f"{node.name}: {node.tier}, {counted(node.cores, 'core')}",
+            *_tasks(problem, node.name),
+        ]
         for node in nodes
     }
     boxes = [
@@ -117,6 +121,6 @@ def _tasks(problem: Problem, node: str) -> list[str]:
 
 def _link(link: Link) -> str:
     replayed = isinstance(link.delay_ms, Trace)
-    delay = "as recorded" if replayed else f"{write_number(link.delay_ms.expectation, 1)} ms"
+    delay = "as recorded" if replayed else write_ms(link.delay_ms.expectation)
     rate = "" if math.isinf(link.rate_mbps) else f", {write_number(link.rate_mbps, 0)} Mbit/s"
     return f"{delay}{rate}"

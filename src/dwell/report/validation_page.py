@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.model.bounds import counted
 from dwell.report.charts import (
     NO_LIMIT,
     PART_COLOURS,
@@ -71,8 +72,9 @@ def validation_page(validation: Validation, *, sections: int | None = None) -> P
     minutes = sum(group.minutes for group in validation.groups)
     return Page(
         title=f"Predicted beside measured: {validation.problem.name}",
-        subtitle=f"{len(validation.groups)} groups of a scenario and a policy, {runs} runs, "
-        f"{write_number(minutes)} minutes that count, each run simulated {validation.seeds} times",
+        subtitle=f"{counted(len(validation.groups), 'group')} of a scenario and a policy, "
+        f"{counted(runs, 'run')}, {write_number(minutes)} minutes that count, each run simulated "
+        f"{counted(validation.seeds, 'time')}",
         sections=list(islice(_sections(validation), sections)),
     )
 

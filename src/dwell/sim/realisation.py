@@ -9,6 +9,8 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.model.bounds import counted
+
 
 class NodeChange(NamedTuple):
     """From `at_ns` on, a node has `threads` foreign threads in all, and is `down` or not."""
@@ -228,8 +230,9 @@ class Realisation:
 
     def __repr__(self) -> str:
         return (
-            f"<Realisation: {self.scenario}, seed {self.seed}, {self.windows} windows, "
-            f"{self.cycles} cycles; {len(self.sites)} sites, {len(self.hops)} hops>"
+            f"<Realisation: {self.scenario}, seed {self.seed}, "
+            f"{counted(self.windows, 'window')}, {counted(self.cycles, 'cycle')}; "
+            f"{counted(len(self.sites), 'site')}, {counted(len(self.hops), 'hop')}>"
         )
 
     @property

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from dwell.errors import SimulationError
+from dwell.model.bounds import counted
 from dwell.study.intervals import CONFIDENCE, Floats, median_interval, share_interval
 from dwell.study.over_seeds import interval_of, metric_values
 from dwell.study.pairs import (
@@ -202,7 +203,7 @@ def cannot_tell(seeds: int, comparisons: int = 1) -> str:
     """
     if _least_adjusted(seeds, comparisons) <= 1 - CONFIDENCE:
         return ""
-    return f"cannot tell with {seeds} {'seed' if seeds == 1 else 'seeds'}"
+    return f"cannot tell with {counted(seeds, 'seed')}"
 
 
 def _least_adjusted(pairs: int, comparisons: int) -> float:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.model import Problem
+from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
 from dwell.study.reference import References, kept, play_alone, references, regret, tier_use
 from dwell.study.software import software
@@ -40,7 +41,8 @@ class Example:
     decisions: pl.DataFrame
 
     def __repr__(self) -> str:
-        return f"<Example: {self.windows.height} windows, {self.decisions.height} decisions>"
+        windows, decisions = self.windows.height, self.decisions.height
+        return f"<Example: {counted(windows, 'window')}, {counted(decisions, 'decision')}>"
 
 
 @dataclass(frozen=True, slots=True)

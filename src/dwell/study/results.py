@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from dwell.display import Displayed
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import FrozenDict, Problem
+from dwell.model.bounds import counted
 from dwell.model.semantics import nearest
 from dwell.study.intervals import Floats, Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
@@ -67,9 +68,10 @@ class StudyRuns(Displayed):
 
     def __repr__(self) -> str:
         return (
-            f"<{type(self).__name__} {self.name}: {self.runs.height} runs, "
-            f"{len(self.scenarios)} scenarios, {len(self.policies)} policies, "
-            f"{len(self.seeds)} seeds, {self.windows} windows>"
+            f"<{type(self).__name__} {self.name}: {counted(self.runs.height, 'run')}, "
+            f"{counted(len(self.scenarios), 'scenario')}, "
+            f"{counted(len(self.policies), 'policy')}, {counted(len(self.seeds), 'seed')}, "
+            f"{counted(self.windows, 'window')}>"
         )
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 from dwell.control import window_close_ns
 from dwell.errors import PolicyError
 from dwell.model import Problem, QoS
+from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.sim import Realisation
@@ -55,7 +56,7 @@ class Script:
 
     def __repr__(self) -> str:
         moves = sum(here != there for here, there in itertools.pairwise(self.names))
-        return f"Script({len(self.names)} windows, {moves} migrations)"
+        return f"Script({counted(len(self.names), 'window')}, {counted(moves, 'migration')})"
 
     def placement(self, window: int) -> str:
         """Name of the candidate for a window."""

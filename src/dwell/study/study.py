@@ -14,6 +14,7 @@ from dwell.cellfile.study_file import Value, read_study
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict, Problem
+from dwell.model.bounds import counted
 from dwell.model.document import to_document
 from dwell.model.semantics import nearest
 from dwell.study.reference import CLAIRVOYANT, CLAIRVOYANT_DWELL
@@ -172,8 +173,10 @@ class Study:
 
     def __repr__(self) -> str:
         return (
-            f"<Study {self.name}: {len(self.points)} points, {len(self.scenarios)} scenarios, "
-            f"{len(self.contenders)} policies, {len(self.seeds)} seeds, {self.windows} windows>"
+            f"<Study {self.name}: {counted(len(self.points), 'point')}, "
+            f"{counted(len(self.scenarios), 'scenario')}, "
+            f"{counted(len(self.contenders), 'policy')}, {counted(len(self.seeds), 'seed')}, "
+            f"{counted(self.windows, 'window')}>"
         )
 
     def _check(self, point: Point) -> None:

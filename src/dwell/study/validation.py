@@ -27,6 +27,7 @@ import numpy as np
 from dwell.display import Displayed
 from dwell.errors import DwellError, RunError
 from dwell.model import Problem
+from dwell.model.bounds import counted
 from dwell.study.job_times import finished_jobs, job_times
 from dwell.study.judged_prediction import GroupJudge, Judged, Outcome, worst
 from dwell.study.measured_run import MeasuredRun, Simulated, Simulator, Unit, read_measured
@@ -141,8 +142,8 @@ class Validation(Displayed):
     def __repr__(self) -> str:
         runs = sum(len(group.runs) for group in self.groups)
         return (
-            f"<Validation of {self.problem.name}: {len(self.groups)} groups, {runs} runs, each "
-            f"simulated {self.seeds} times>"
+            f"<Validation of {self.problem.name}: {counted(len(self.groups), 'group')}, "
+            f"{counted(runs, 'run')}, each simulated {counted(self.seeds, 'time')}>"
         )
 
     def verdict(self, goal: str) -> Outcome:
