@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
-from dwell.report.palette import INK, MUTED, PAPER, PARTS, RULE, Palette
+import re
+
+import pytest
+
+from dwell.report.page import TEMPLATES
+from dwell.report.palette import (
+    APART,
+    HUES,
+    INK,
+    MUTED,
+    PAPER,
+    PARTS,
+    PRINTED,
+    RAMP,
+    RULE,
+    Palette,
+)
 
 CANDIDATES = ("LOC", "SO", "HYB")
 NAMES = (*CANDIDATES, "atp", "dtp", "latency-first", "dtp+corrected", "cusum+corrected")
@@ -41,3 +57,30 @@ def test_no_two_contenders_are_drawn_alike() -> None:
 
 def test_where_nobody_says_what_it_believes_nothing_changes() -> None:
     assert Palette.of(CANDIDATES, NAMES[:6], "profile") == Palette.of(CANDIDATES, NAMES[:6])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("dtp", "dtp+corrected", "dtp+shadow"),
+        ("dtp+corrected", "dtp+profile", "dtp+shadow", "dtp+scaling"),
+        ("dtp", "dtp-tuned", "dtp-eager"),
+        ("DTP (corrected)", "DTP, N_min 0", "DTP, N_min 9"),
+    ],
+)
+def test_several_dtps_differ_by_colour_marker_and_dashes(names: tuple[str, ...]) -> None:
+    styles = Palette.of(CANDIDATES, (*CANDIDATES, *names), "profile").policies
+    shown = [styles[name] for name in names]
+    for looks in ("colour", "marker", "dashes"):
+        assert len({getattr(style, looks) for style in shown}) == len(names)
+    assert not {style.colour for style in shown} & set(HUES)
+
+
+def test_every_colour_of_a_drawing_has_a_value_on_paper_and_in_the_page() -> None:
+    css = (TEMPLATES / "page.css").read_text(encoding="utf-8")
+    light, dark = re.findall(r":root \{\s*([^}]*)\}", css)
+    for colour in (*APART, *RAMP, *PARTS.values(), INK, MUTED):
+        assert PRINTED[colour].startswith("#")
+        name = colour.removeprefix("var(").removesuffix(")")
+        assert f"{name}: #" in light
+        assert f"{name}: #" in dark

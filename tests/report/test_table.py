@@ -31,8 +31,9 @@ def test_rows_that_follow_each_other_stand_under_one_heading() -> None:
     (first, stressed), (second, calm) = table.groups()
     assert (first, second) == ("Robot CPU stress", "Baseline")
     assert [row[0].text for row in stressed] == ["DTP", "LOC"]
-    # What moves has a ring, a placement a square in its colour.
-    assert [row[0].ring for row in stressed] == [True, False]
+    # As in figures.
+    markers = [palette.policies[name].marker for name in ("dtp", "LOC")]
+    assert [row[0].marker for row in stressed] == markers
     assert stressed[1][0].colour == palette.placements["LOC"]
     assert calm[0][0].text == "mine"
     assert table.headings == ("policy", "V_D (%)", "5 %")

@@ -51,9 +51,9 @@ class Measure(NamedTuple):
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
     def for_size(self, *values: float) -> Measure:
-        """Return the measure with decimals for numbers of this size.
+        """Return the measure with decimals for the largest of these numbers.
 
-        Times have more where they would be written as nothing.
+        Times have more where all would be written as nothing.
         """
         size = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
         if self.unit not in ("ms", "s") or size >= 10.0**-self.decimals:
@@ -104,7 +104,6 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
         finite: for tables that are short of room and say so.
     """
     value, low, high = (end * measure.factor for end in interval)
-    measure = measure.for_size(value, low, high)
     text = write_number(value, measure.decimals, signed=measure.signed) if value else "0"
     if not interval.known or low == high:
         return Written(text, "")

@@ -1,8 +1,9 @@
 """Colours: one a placement, the same in every figure, told apart by colour-blind readers too.
 
 The hues are those of Okabe and Ito (2008). Candidates take them from the front, in the order of
-the cell file; a policy that moves has a colour of its own, DTP that of the text, and a marker and
-dashes that say what it believes, so that no two lines differ by their colour alone. Colours of
+the cell file; a policy that moves has a colour of its own, DTP that of the text and several DTPs
+one each, and a marker and dashes that say what it believes, so that no two lines differ by their
+colour alone. Colours of
 text, rules and paper are CSS variables that the page gives a value to, light or dark, and paper
 another.
 """
@@ -28,6 +29,9 @@ PAPER, SHADE, BAD = "var(--paper)", "var(--shade)", "var(--bad)"
 RAMP = tuple(f"var(--ramp-{place})" for place in range(6))
 #: Where the time of a cycle goes: no placement's colours.
 PARTS = {part: f"var(--{part})" for part in ("compute", "queue", "network")}
+#: Of several DTPs, which differ in what they believe, the second and the third: apart from the
+#: hues, the text and each other for colour-blind readers, too.
+APART = ("var(--apart-0)", "var(--apart-1)")
 #: What a paper's figures have for the variables of a page.
 PRINTED = {
     INK: "#000000",
@@ -40,12 +44,22 @@ PRINTED = {
         zip(RAMP, ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862"), strict=True)
     ),
     **dict(zip(PARTS.values(), ("#4d4d4e", "#9a9a9b", "#cfcfd0"), strict=True)),
+    **dict(zip(APART, ("#5216c9", "#80340e"), strict=True)),
 }
 
 MARKERS = ("diamond", "square", "triangle-up", "triangle-down", "cross", "triangle-right", "circle")
 CIRCLE = "circle"
 SOLID: Dashes = ()
-DASHES: tuple[Dashes, ...] = (SOLID, (7, 3), (2, 2), (7, 2, 2, 2), (11, 3, 3, 3))
+DASHES: tuple[Dashes, ...] = (
+    SOLID,
+    (7, 3),
+    (2, 2),
+    (7, 2, 2, 2),
+    (11, 3, 3, 3),
+    (4, 4),
+    (9, 2, 2, 2, 2, 2),
+    (14, 4),
+)
 
 #: Policies that move, by family, and the references that stand beside them: their labels, their
 #: hues, from the back of the placements', and a sentence each.
@@ -167,8 +181,8 @@ class Palette:
             colour = COLOURS[known.family]
             if colour in placements.values():
                 colour = MUTED
-            if known.belief in BELIEFS[2:] and colour == INK:
-                colour = MUTED
+            if colour == INK:
+                colour = _of_several(place)
             shift = tuple(FAMILIES).index(known.family)
             styles[name] = _style(colour, place + shift, strong=known.family == "dtp")
         return cls(placements, {name: styles[name] for name in policies})
@@ -181,6 +195,14 @@ def _place(known: Contended, variants: dict[str, int]) -> int:
     place = variants.get(known.family, len(BELIEFS))
     variants[known.family] = place + 1
     return place
+
+
+def _of_several(place: int) -> str:
+    """Return the colour of a contender of the family that has the text's, by its place there."""
+    colours = (INK, *APART, MUTED)
+    if place < len(BELIEFS):
+        return colours[min(place, len(colours) - 1)]
+    return colours[1 + (place - len(BELIEFS)) % (len(colours) - 1)]
 
 
 def _style(colour: str, place: int, *, strong: bool = False) -> Style:

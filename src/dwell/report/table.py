@@ -17,7 +17,7 @@ from dwell.report.formatting import (
     write_interval,
     write_number,
 )
-from dwell.report.palette import MUTED, Palette
+from dwell.report.palette import CIRCLE, MUTED, Palette
 from dwell.study import Interval
 
 Row: TypeAlias = "Mapping[str, Any]"
@@ -75,8 +75,8 @@ class Cell(NamedTuple):
         By which rows are sorted.
     colour : str
         Colour of the mark before a name.
-    ring : bool
-        Whether that mark is a ring: of what moves.
+    marker : str
+        Shape of that mark, as in figures.
     """
 
     text: str
@@ -84,7 +84,7 @@ class Cell(NamedTuple):
     kind: str = "text"
     sort: float | str = ""
     colour: str = ""
-    ring: bool = False
+    marker: str = ""
     link: str = ""
 
 
@@ -129,11 +129,20 @@ class Table:
 
     def groups(self) -> Iterator[tuple[str, list[list[Cell]]]]:
         """Yield every group's heading, empty without groups, and the cells of its rows."""
-        group = self.group
+        group, columns = self.group, [self._sized(column) for column in self.columns]
         for heading, rows in itertools.groupby(
             self.rows, lambda row: "" if group is None else self._text(group, row).text
         ):
-            yield heading, [[self._cell(column, row) for column in self.columns] for row in rows]
+            yield heading, [[self._cell(column, row) for column in columns] for row in rows]
+
+    def _sized(self, column: Text | Measure) -> Text | Measure:
+        """Return a column with decimals for the largest of its numbers."""
+        if isinstance(column, Text):
+            return column
+        values = (row.get(column.column) for row in self.rows)
+        return column.for_size(
+            *(column.factor * one for one in values if isinstance(one, int | float))
+        )
 
     def _cell(self, column: Text | Measure, row: Row) -> Cell:
         if isinstance(column, Text):
@@ -145,8 +154,7 @@ class Table:
         low, high = (row.get(f"{column.column}{end}") for end in ("_low", "_high"))
         if low is None or high is None:
             shown = column.factor * number
-            decimals = column.for_size(shown).decimals
-            text = write_number(shown, decimals, signed=column.signed) if shown else "0"
+            text = write_number(shown, column.decimals, signed=column.signed) if shown else "0"
             return Cell(text, kind="num", sort=_sortable(shown))
         written = write_interval(Interval(number, low, high), column, larger_half=self.compact)
         return Cell(written.value, written.error, "num", _sortable(number))
@@ -165,10 +173,10 @@ class Table:
             case "placement" if known:
                 return cell._replace(kind="name", colour=placements.get(name, MUTED))
             case "policy" if known:
-                colour = policies[name].colour if name in policies else MUTED
-                ring = name not in placements
+                style = policies.get(name)
+                colour, marker = (style.colour, style.marker) if style else (MUTED, CIRCLE)
                 shown = shown_contender(name)
-                return cell._replace(text=shown, kind="name", colour=colour, ring=ring)
+                return cell._replace(text=shown, kind="name", colour=colour, marker=marker)
             case _:
                 return cell if known else cell._replace(sort="")
 
