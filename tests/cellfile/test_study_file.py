@@ -290,6 +290,11 @@ def test_every_fault_is_told_at_once_with_its_line(folder: Path) -> None:
             "300 is not allowed; it must be more than the 300 windows of warm-up",
         ),
         (
+            "windows: 10000\nparameters: {window_cycles: [50, 1000000]}",
+            "windows",
+            "10000 windows of window_cycles = 1000000 are 10000000000 cycles; a run has",
+        ),
+        (
             "parameters: {objective.weights: [{edge: 1}], objective.weights.edge: [2]}",
             "parameters.objective.weights.edge",
             "is a part of objective.weights; give one of them",

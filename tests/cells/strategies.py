@@ -298,7 +298,7 @@ def problems(draw: st.DrawFn) -> Problem:
         objective=draw(_objective(nodes)),
         scenarios={name: tuple(draw(st.lists(items, max_size=2))) for name in draw(_names(0, 2))},
         controller=draw(_controller(list(nodes), list(candidates))),
-        window_cycles=draw(_whole(1, 1_000_000)),
+        window_cycles=draw(_whole(1, int(min(1_000_000, 9.1e12 / period_ms)))),
         warmup_windows=draw(_whole(0, 1_000_000)),
         servo=draw(st.none() | _servo(period_ms)),
     )

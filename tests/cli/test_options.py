@@ -120,6 +120,35 @@ def test_seconds_of_windows_that_differ_in_length_are_refused(tmp_path: Path) ->
     assert "--seconds 20: windows last 1.66667, 3.33333 s here; give --windows" in refused.stderr
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("study", "no.yaml"),
+        ("demo",),
+        ("live", "run", str(CANONICAL)),
+        ("testbed", "run", str(CANONICAL)),
+        ("testbed", "campaign", str(CANONICAL)),
+        ("testbed", "calibrate", str(CANONICAL), "--out", "o.yaml"),
+    ],
+)
+def test_more_seconds_than_64_bits_of_nanoseconds_hold_are_refused(words: tuple[str, ...]) -> None:
+    refused = call(*words, "--seconds", "1e15")
+    assert (refused.exit_code, refused.stdout) == (2, "")
+    assert "'--seconds': 1e+15 is not allowed; it must be a number from 0 to 9.2e9" in (
+        refused.stderr
+    )
+
+
+@pytest.mark.parametrize(
+    "words", [("study", "no.yaml"), ("demo",), ("validate", "r", "--cell", "c")]
+)
+def test_more_seeds_than_a_study_has_are_refused(words: tuple[str, ...]) -> None:
+    refused = call(*words, "--seeds", "1000000000000")
+    assert refused.exit_code == 2
+    assert "--seeds" in refused.stderr
+    assert "from 1 to 100000" in refused.stderr
+
+
 def test_an_estimator_that_is_named_twice_is_refused(tmp_path: Path) -> None:
     words = ["run", str(CANONICAL), "--policy", "cusum+corrected", "--estimator", "shadow"]
     refused = call(*words, "--out", str(tmp_path / "run"))

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.model import Constant, Exponential, LogNormal, Process, Uniform
+from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
+from dwell.sim.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 
 S = 1_000_000_000
 
@@ -53,7 +54,7 @@ def test_a_ramp_is_a_staircase_up_and_its_mirror_image_down() -> None:
 
 
 def test_a_ramp_that_lasts_for_ever_does_not_fall() -> None:
-    intervals = ramp(0, LONGEST_NS, 31 * S)
+    intervals = ramp(0, HORIZON_NS, 31 * S)
     assert [level(intervals, at_s * S) for at_s in (0, 1, 30, 31, 10_000_000)] == [0, 1, 30, 31, 31]
 
 

@@ -152,6 +152,17 @@ def test_the_percentile_of_any_teeth_has_its_share_below(gaps: list[int], latenc
 # ---------------------------------------------------------------------------- misses in K
 
 
+def test_the_percentile_of_ages_whose_sum_64_bits_do_not_hold() -> None:
+    """Ten million seconds of a queue that only grows, by the number of its cycles."""
+    release_ns = np.arange(20_000, dtype=np.int64) * 10**15
+    latency_ns = release_ns // 2 + 1
+    actuated = actuations(release_ns, latency_ns)
+    end_ns = int(actuated.at_ns[-1])
+    age = age_of_information(actuated, 0, end_ns)
+    # At t the newest command in effect was released at 2 t / 3.
+    assert age.p95_ms == pytest.approx(0.95 * end_ns / 3 / 1e6, rel=1e-3)
+
+
 @given(st.lists(st.booleans(), min_size=1, max_size=60), st.integers(1, 70))
 def test_misses_in_every_stretch(missed: list[bool], stretch: int) -> None:
     counts = misses_in(np.array(missed), stretch)

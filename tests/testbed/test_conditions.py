@@ -107,3 +107,10 @@ def test_a_stream_goes_on_while_its_share_changes() -> None:
         found += [(changing.delay_ns() - 2_000_000, share) for _ in range(3)]
     expected = [delay * share for delay, (_, share) in zip(whole, found, strict=True)]
     assert [delay for delay, _ in found] == pytest.approx(expected, abs=1)
+
+
+def test_a_delay_that_64_bits_do_not_hold_is_for_ever() -> None:
+    drawn = list(islice(delays_ns(LogNormal(1e9, 100.0), np.random.default_rng(1)), 100_000))
+    assert 0 <= min(drawn) < max(drawn) <= 1 << 62
+    trace = Trace(TraceTable("far.csv", {"ms": np.array([1e300])}), "ms")
+    assert next(delays_ns(trace, np.random.default_rng(1))) == 1 << 62

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,7 +10,8 @@ import pytest
 
 from dwell.cellfile import from_document
 from dwell.errors import LiveError, ProblemError
-from dwell.model import Constant, Problem
+from dwell.model import Constant, NodeDisturbance, Problem
+from dwell.model.instants import NEVER_NS
 from dwell.sim import Realisation, draw
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.playing import play
@@ -18,6 +20,7 @@ from dwell.testbed.timeline import (
     NodeState,
     Timeline,
     differing,
+    last_ns,
     timeline_of,
     usual_conditions,
 )
@@ -198,3 +201,13 @@ def test_an_unknown_scenario_is_an_error() -> None:
 def test_a_loss_of_1_is_played_beside_the_own_of_its_link() -> None:
     links = conditions_of(planned({"link": "R1->E", "loss": 1, "at_s": 3, "for_s": 4}), "R1->E")
     assert [conditions.loss for conditions in links] == [1, usual_conditions(LINK).loss]
+
+
+def test_a_disturbance_of_any_length_lasts() -> None:
+    ends = [last_ns(NodeDisturbance("E", 1.0, for_s)) for for_s in (1e300, math.inf)]
+    assert ends == [NEVER_NS, NEVER_NS]
+
+
+def test_a_length_that_64_bits_do_not_hold_is_refused() -> None:
+    with pytest.raises(ProblemError, match=r"seconds = 1e[+]18: .*a run"):
+        planned({"node": "E", "stress_threads": 1}, seconds=1e18)

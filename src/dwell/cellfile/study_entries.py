@@ -13,13 +13,12 @@ from dwell.cellfile.document_faults import Step
 from dwell.cellfile.entries import Entry, Number, optional, wrong
 from dwell.cellfile.rendering import as_read
 from dwell.cellfile.structure import Form
-from dwell.model.bounds import MAX_COUNT, Bound
+from dwell.model.bounds import MAX_COUNT, SEEDS, Bound
 
 VERSION = 1
 
 WINDOWS = Bound(1, MAX_COUNT, whole=True)
 SEED = Bound(0, 10**15, whole=True)
-SEEDS = Bound(1, 100_000, whole=True)
 
 
 @dataclass(frozen=True, slots=True)

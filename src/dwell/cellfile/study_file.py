@@ -153,6 +153,8 @@ class _Reading:
         if windows <= warmup:
             bound = f"more than the {warmup} windows of warm-up"
             self.faults.add("windows", f"{windows} is not allowed; it must be {bound}")
+        for _, cell in points:
+            self.faults.attempt("", cell.problem.cycles_of, windows)
 
     # ------------------------------------------------------------------------------ cell
 

@@ -14,6 +14,7 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
+    require_few,
     require_one_length,
     windows_of,
 )
@@ -30,7 +31,10 @@ def demo(
         Path | None,
         typer.Option(metavar="FOLDER", help="Replay the measurements in this folder instead."),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 to N of every run.")] = 20,
+    seeds: Annotated[
+        int,
+        typer.Option(min=1, metavar="N", callback=require_few, help="Seeds 1 to N of every run."),
+    ] = 20,
     windows: Windows = None,
     seconds: Seconds = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where report.html goes.")] = Path(

@@ -25,6 +25,7 @@ from dwell.cli.options import (
     Keys,
     Policy,
     Seed,
+    require_held,
 )
 from dwell.cli.output import json_text, print_json, say
 from dwell.display import milliseconds
@@ -287,7 +288,10 @@ def run(
     seconds: Annotated[
         float | None,
         typer.Option(
-            min=5, metavar="S", help="Length, the warm-up included; as the scenario asks for."
+            min=5,
+            metavar="S",
+            callback=require_held,
+            help="Length, the warm-up included; as the scenario asks for.",
         ),
     ] = None,
     policy: Policy = None,

@@ -13,6 +13,37 @@ if TYPE_CHECKING:
 
     from dwell.model import Problem
 
+
+def require_few(seeds: int | None) -> int | None:
+    """Refuse more seeds than a study may have.
+
+    Raises
+    ------
+    typer.BadParameter
+        If they are more.
+    """
+    from dwell.model.bounds import SEEDS
+
+    if seeds is not None and not SEEDS.holds(seeds):
+        raise typer.BadParameter(f"{seeds} is not allowed; it must be {SEEDS}")
+    return seeds
+
+
+def require_held(seconds: float | None) -> float | None:
+    """Refuse a length that 64 bits of nanoseconds do not hold.
+
+    Raises
+    ------
+    typer.BadParameter
+        If they do not.
+    """
+    from dwell.model.bounds import LENGTH_S
+
+    if seconds is not None and not LENGTH_S.holds(seconds):
+        raise typer.BadParameter(f"{seconds:g} is not allowed; it must be {LENGTH_S}")
+    return seconds
+
+
 CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]
 CellOption = Annotated[Path, typer.Option("--cell", metavar="FILE", help="Cell file (YAML).")]
 Traces = Annotated[
@@ -48,7 +79,12 @@ Windows = Annotated[
 ]
 Seconds = Annotated[
     float | None,
-    typer.Option(min=1, metavar="S", help="Length in seconds instead, the warm-up included."),
+    typer.Option(
+        min=1,
+        metavar="S",
+        callback=require_held,
+        help="Length in seconds instead, the warm-up included.",
+    ),
 ]
 Processes = Annotated[
     int | None, typer.Option(min=1, metavar="N", help="How many to use; one a CPU if not given.")
@@ -122,14 +158,22 @@ def windows_of(seconds: float, *problems: Problem) -> int:
     ------
     typer.BadParameter
         If the problems' windows have not all the same length.
+    ProblemError
+        If they are more than a run may have.
     """
+    from dwell.model.instants import require_length
+
     each_s = sorted({one.window_cycles * one.pipeline.period_ms / 1e3 for one in problems})
     if len(each_s) > 1:
         lengths = ", ".join(f"{window_s:g}" for window_s in each_s)
         raise typer.BadParameter(
             f"--seconds {seconds:g}: windows last {lengths} s here; give --windows"
         )
-    return max(1, math.ceil(round(seconds / each_s[0], 9)))
+    windows = max(1, math.ceil(round(seconds / each_s[0], 9)))
+    for problem in problems:
+        period_ms = problem.pipeline.period_ms
+        require_length(windows, problem.window_cycles, period_ms, f"--seconds {seconds:g}")
+    return windows
 
 
 def seconds_of_runs(cell: Path, windows: int | None, seconds: float | None) -> float:

@@ -16,6 +16,7 @@ from dwell.cli.options import (
     Processes,
     Seconds,
     Windows,
+    require_few,
     require_one_length,
     windows_of,
 )
@@ -49,7 +50,10 @@ def study(
     seeds: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Seeds 1 to N of every run; the file's if not given."
+            min=1,
+            metavar="N",
+            callback=require_few,
+            help="Seeds 1 to N of every run; the file's if not given.",
         ),
     ] = None,
     windows: Windows = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import dwell
-from dwell.cli.options import Json, Processes, Traces
+from dwell.cli.options import Json, Processes, Traces, require_few
 from dwell.cli.output import json_text, print_json, progress, write_file
 from dwell.errors import RunError
 
@@ -31,7 +31,10 @@ def validate(
             metavar="FOLDER", help="Where page and table go; validations/CELL if not given."
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=2, metavar="N", help="Seeds 1 to N of every run.")] = 20,
+    seeds: Annotated[
+        int,
+        typer.Option(min=2, metavar="N", callback=require_few, help="Seeds 1 to N of every run."),
+    ] = 20,
     calibrated_from: Annotated[
         list[Path] | None,
         typer.Option(

@@ -25,7 +25,7 @@ from dwell.estimators.paths import Step, steps_of
 from dwell.estimators.profile import SEED, Profile, SampleCycles
 from dwell.estimators.protocol import Support
 from dwell.model.bounds import HALF_LIFE_WINDOWS
-from dwell.model.instants import NEVER_NS
+from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
@@ -185,7 +185,8 @@ class Shadow:
                 if step.inputs:
                     arrived_ns = shadows.arrived_ns[:, [entry.column for entry in step.inputs]]
                     ready_ns = _latest(arrived_ns)
-                end_ns = ready_ns + self._executed_ns(step, active, other, cycles)
+                executed_ns = self._executed_ns(step, active, other, cycles)
+                end_ns = ready_ns + np.minimum(executed_ns, HORIZON_NS - ready_ns)
             done_ns = np.where(ready_ns >= 0, end_ns - release_ns, NEVER_NS)
             latency_ns = np.maximum(latency_ns, done_ns)
         return latency_ns
@@ -197,7 +198,7 @@ class Shadow:
         rows = (self._taken + np.arange(len(end_ns))) % SINK_SAMPLES
         self._taken += len(rows)
         times_ms = self._sampled.executed(step.task, there)[rows]
-        usual_ns = np.rint(times_ms * NS_PER_MS).astype(np.int64)
+        usual_ns = np.rint(np.minimum(times_ms * NS_PER_MS, HORIZON_NS)).astype(np.int64)
         if here != there:
             return usual_ns
         return np.where(end_ns >= 0, end_ns - cycles.ready_ns[:, step.column], usual_ns)

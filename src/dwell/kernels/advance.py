@@ -22,12 +22,13 @@ from dwell.kernels.cycles import (
     release,
     shared_by,
 )
+from dwell.kernels.far_instants import later
 from dwell.kernels.heaps import pop_event, push_event
 from dwell.kernels.layout import (
     ARRIVAL,
     BASE,
     BEHIND_NS,
-    BUSY,
+    BUSY_NS,
     CANDIDATE_0,
     CELL_MASK,
     CELL_SHIFT,
@@ -201,7 +202,7 @@ def _snapshot(s: Tables, out: Floats, cell: int, row: int, now: int) -> None:
                 own += received
             elif whose == shadow:
                 extra += received
-        busy = s.servers[server, BUSY] * s.servers_f[server, PACE]
+        busy = s.servers_f[server, BUSY_NS] * s.servers_f[server, PACE]
         out[cell, row, 0, node] = busy + s.servers_f[server, BEHIND_NS]
         out[cell, row, 1, node] = own
         out[cell, row, 2, node] = extra
@@ -251,7 +252,8 @@ def _silent(s: Tables, cell: int, now: int) -> bool:
     while cycle < cycles and s.release_ns[cell, cycle] < now:
         if s.outcome[cell, cycle] == DONE:
             back = s.back_ns[index(s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle])]
-            if s.release_ns[cell, cycle] + s.latency_ns[cell, cycle] + back <= now:
+            done = s.release_ns[cell, cycle] + s.latency_ns[cell, cycle]
+            if later(done, back) <= now:
                 waited = cycle + 1
         cycle += 1
     moved = s.cells[cell, MOVED]
@@ -260,7 +262,7 @@ def _silent(s: Tables, cell: int, now: int) -> bool:
     s.cells[cell, WAITED] = waited
     if waited >= cycles:
         return False
-    due = s.release_ns[cell, waited] + s.cells[cell, GUARD_NS]
+    due = later(s.release_ns[cell, waited], s.cells[cell, GUARD_NS])
     if due <= now:
         return True
     s.cells[cell, GUARD_T] = due

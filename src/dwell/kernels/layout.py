@@ -152,7 +152,6 @@ FOREIGN = _number(-1)
     N_WAIT,
     DOWN,
     LAST,
-    BUSY,
     NEXT_T,
     NEXT_KEY,
     BASE,
@@ -180,7 +179,7 @@ FOREIGN = _number(-1)
     WAKES,
     WAKE_KEY,
     N_SERVER,
-) = range(36)
+) = range(35)
 
 # What a server's quota counts while the CPU of a node, server OTHER, has foreign threads; -1: while
 # none has of those for which there are rows.
@@ -196,7 +195,19 @@ FOREIGN = _number(-1)
 ) = range(8)
 
 # servers, float64
-VIRTUAL, SPEED, SPARE, BACKGROUND, BEHIND_NS, BESIDE, PACE, WAKE_GAP_NS, N_SERVER_F = range(9)
+# BUSY_NS is in core-nanoseconds, of which 64 bits may not hold those of all cores.
+(
+    VIRTUAL,
+    SPEED,
+    SPARE,
+    BACKGROUND,
+    BEHIND_NS,
+    BUSY_NS,
+    BESIDE,
+    PACE,
+    WAKE_GAP_NS,
+    N_SERVER_F,
+) = range(10)
 
 # hops
 LINK, PAYLOAD, N_HOP = range(3)

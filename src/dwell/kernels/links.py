@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from dwell.kernels.compiled import index, kernel, phase
+from dwell.kernels.far_instants import later, whole_ns
 from dwell.kernels.heaps import push_event
 from dwell.kernels.layout import (
     ARRIVAL,
@@ -97,9 +98,9 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
     lost = s.segments[segment, SEGMENT_DOWN] != 0
     if not lost:
         transmission = _transmission(s, hop, segment)
-        s.links[link, FREE] = start + transmission
+        s.links[link, FREE] = later(start, transmission)
         lost = _is_lost(s, hop, segment, cycle, attempt)
-    sent = start + transmission
+    sent = later(start, transmission)
     name = (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | flow
     if lost:
         timeout = s.links[link, RETRANSMIT_NS]
@@ -111,7 +112,7 @@ def send(s: Tables, cell: int, cycle: int, flow: int, hop: int, attempt: int, no
         else:
             s.attempts[slot_row(s.ring, cell, cycle), flow] = attempt
             key = (RETRY << KIND_SHIFT) | name
-            push_event(s.clock, s.event_t, s.event_key, sent + timeout, key)
+            push_event(s.clock, s.event_t, s.event_key, later(sent, timeout), key)
         return
     arrival = _arrival(s, hop, segment, cycle, sent)
     push_event(s.clock, s.event_t, s.event_key, arrival, (ARRIVAL << KIND_SHIFT) | name)
@@ -134,15 +135,16 @@ def send_state(s: Tables, hop: int, cycle: int, attempt: int, now: int) -> tuple
     start = _begin(s, link, now)
     segment = index(s.links[link, SEGMENT])
     if s.segments[segment, SEGMENT_DOWN] != 0:
-        for later in range(s.links[link, SEGMENT] + 1, s.links[link, SEGMENT_END]):
-            if s.segments[index(later), SEGMENT_DOWN] == 0:
-                return s.segments[index(later), SEGMENT_AT], False, attempt
+        for following in range(s.links[link, SEGMENT] + 1, s.links[link, SEGMENT_END]):
+            if s.segments[index(following), SEGMENT_DOWN] == 0:
+                return s.segments[index(following), SEGMENT_AT], False, attempt
         return UNKNOWN, False, attempt
-    sent = start + _transmission(s, hop, segment)
+    sent = later(start, _transmission(s, hop, segment))
     s.links[link, FREE] = sent
     if _is_lost(s, hop, segment, cycle, attempt):
         timeout = s.links[link, RETRANSMIT_NS]
-        return sent + (timeout if timeout >= 0 else STATE_TIMEOUT_NS), False, attempt + 1
+        again = later(sent, timeout if timeout >= 0 else STATE_TIMEOUT_NS)
+        return again, False, attempt + 1
     return _arrival(s, hop, segment, cycle, sent), True, attempt
 
 
@@ -151,7 +153,7 @@ def _transmission(s: Tables, hop: int, segment: int) -> int:
     """Time that a message takes at the rate of a link."""
     rate = s.segments_f[segment, SEGMENT_RATE]
     if rate < math.inf:
-        return int(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
+        return whole_ns(np.rint(s.hops[index(hop), PAYLOAD] * 8000.0 / rate))
     return 0
 
 
@@ -166,7 +168,7 @@ def _is_lost(s: Tables, hop: int, segment: int, cycle: int, attempt: int) -> boo
 def _arrival(s: Tables, hop: int, segment: int, cycle: int, sent: int) -> int:
     """Instant at which a message arrives whose transmission has ended."""
     link = index(s.hops[index(hop), LINK])
-    arrival = sent + _propagation(s, hop, segment, cycle)
+    arrival = later(sent, _propagation(s, hop, segment, cycle))
     if s.links[link, IN_ORDER] != 0:
         arrival = max(arrival, s.links[link, LAST_ARRIVAL])
         s.links[link, LAST_ARRIVAL] = arrival
@@ -181,7 +183,7 @@ def _propagation(s: Tables, hop: int, segment: int, cycle: int) -> int:
     layer = 0
     while layers != 0:
         if layers & 1:
-            delay += s.extra_ns[s.layer_rows[index(hop), layer], cycle]
+            delay = later(delay, s.extra_ns[s.layer_rows[index(hop), layer], cycle])
         layers >>= 1
         layer += 1
     return int(delay)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from dwell.kernels.compiled import index, phase
+from dwell.kernels.far_instants import LAST_NS, later, whole_ns
 from dwell.kernels.heaps import (
     pop_running,
     pop_waiting,
@@ -29,7 +30,7 @@ from dwell.kernels.layout import (
     BEFORE_NS,
     BEHIND_NS,
     BESIDE,
-    BUSY,
+    BUSY_NS,
     CELL_MASK,
     CELL_SHIFT,
     CHANGE,
@@ -104,7 +105,7 @@ from dwell.kernels.streams import attempt_uniform
 # Work left below this many nanoseconds is rounding, not work.
 SLACK = 1e-3
 # Of those that have received the same, jobs go first.
-LATE = 1 << 62
+LATE = LAST_NS
 
 
 @phase
@@ -148,11 +149,12 @@ def _account(s: Tables, server: int, now: int) -> int:
             background = min(background, max(s.servers[server, CORES] - busy, 0))
         s.servers_f[server, BEHIND_NS] += elapsed * background
     if elapsed > 0 and busy > 0 and s.servers[server, DOWN] == 0:
-        spent = elapsed * min(busy, s.servers[server, CORES])
+        taken = min(busy, s.servers[server, CORES])
         if s.servers[server, THROTTLED] == 0:
-            s.servers[server, BUSY] += spent
-            s.servers[server, LEFT_NS] -= spent
-            s.servers[server, TURN_NS] += spent
+            s.servers_f[server, BUSY_NS] += float(elapsed) * taken
+            if s.servers[server, QUOTA_NS] > 0:
+                s.servers[server, LEFT_NS] -= elapsed * taken
+                s.servers[server, TURN_NS] += elapsed * taken
     s.servers[server, LAST] = now
     return int(elapsed)
 
@@ -299,7 +301,8 @@ def _next_wake(s: Tables, server: int, now: int) -> int:
     while s.servers[server, WAKE_T] <= now:
         drawn = attempt_uniform(key, s.servers[server, WAKES], 0)
         s.servers[server, WAKES] += 1
-        s.servers[server, WAKE_T] += 1 + np.int64(-np.log(1.0 - drawn) * gap_ns)
+        gap = whole_ns(-np.log(1.0 - drawn) * gap_ns)
+        s.servers[server, WAKE_T] = later(s.servers[server, WAKE_T] + 1, gap)
     return int(s.servers[server, WAKE_T])
 
 
@@ -393,8 +396,8 @@ def repace(s: Tables, server: int, now: int) -> None:
         return
     tick(s, server, now)
     renew_before_stress(s, server, now)
-    s.servers_f[server, BEHIND_NS] += s.servers[server, BUSY] * s.servers_f[server, PACE]
-    s.servers[server, BUSY] = 0
+    s.servers_f[server, BEHIND_NS] += s.servers_f[server, BUSY_NS] * s.servers_f[server, PACE]
+    s.servers_f[server, BUSY_NS] = 0.0
     ratio = s.servers_f[server, PACE] / pace
     s.servers[server, LEFT_NS] = np.int64(np.rint(s.servers[server, LEFT_NS] * ratio))
     s.servers[server, POOL_NS] = np.int64(np.rint(s.servers[server, POOL_NS] * ratio))
@@ -442,13 +445,15 @@ def _average(s: Tables, server: int) -> int:
     """Mean core time that the threads of a server have received: where a new one begins."""
     base = s.servers[server, BASE]
     n = s.servers[server, N_WAIT]
-    received = 0
+    # Counted from one of them: 64 bits may not hold the sum.
+    origin = s.wait_rank[index(base)] if n > 0 else 0
+    beyond = 0
     for i in range(n):
-        received += s.wait_rank[index(base + i)]
+        beyond += s.wait_rank[index(base + i)] - origin
     if s.servers[server, TURN] != 0:
-        received += _by_turn(s, server)
+        beyond += _by_turn(s, server) - origin
         n += 1
-    return int(received // n) if n > 0 else 0
+    return int(origin + beyond // n) if n > 0 else 0
 
 
 @phase
@@ -579,7 +584,7 @@ def admit(s: Tables, site: int, key: int, row: int, work: int, now: int) -> None
             return
         lone = s.servers[server, N_RUN] == 1 and s.servers[server, QUOTA_NS] == 0
         if lone and s.servers_f[server, SPEED] == 1.0 and left == work:
-            _announce(s, server, now + work, key)
+            _announce(s, server, later(now, work), key)
         else:
             schedule(s, server, now)
         return
@@ -678,7 +683,7 @@ def schedule(s: Tables, server: int, now: int) -> None:
         return
     if speed != 1.0 and speed != 0.0:
         left = left / speed
-    t = now + max(int(np.ceil(left - SLACK)), 0)
+    t = later(now, max(whole_ns(np.ceil(left - SLACK)), 0))
     _announce(s, server, t, s.run_key[index(base)])
 
 

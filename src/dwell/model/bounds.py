@@ -75,7 +75,7 @@ class Bound:
     def __str__(self) -> str:
         """Return ``a number from 0 to 1e9``, or what the bound is."""
         kind = "a whole number" if self.whole else "a number"
-        low, high = _short(self.low), _short(self.high)
+        low, high = short(self.low), short(self.high)
         if self.high == math.inf:
             return f"{kind} above {low}" if self.above else f"{kind} of at least {low}"
         if not self.above and not self.below:
@@ -85,7 +85,7 @@ class Bound:
         return f"{kind} {first} and {last}"
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
     """Return a number as people write it: 1e9 and 1000000, not 1e+09."""
     if abs(value) <= MAX_COUNT and value == int(value):
         return str(int(value))
@@ -153,6 +153,14 @@ AGE_MS = Bound(0, LARGEST, above=True)
 CHECKPOINT_CYCLES = Bound(0, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
 HANDED_MS = Bound(0, 1e6)
+
+# Length of a run: the cycles that an event of the simulator counts, and the seconds that 64 bits of
+# nanoseconds hold.
+CYCLES = Bound(1, 2**32 - 1, whole=True)
+LENGTH_S = Bound(0, 9.2e9)
+
+# Seeds of a study are 1 to N.
+SEEDS = Bound(1, 100_000, whole=True)
 
 # Controller and windows.
 WINDOW_CYCLES = Bound(1, MAX_COUNT, whole=True)

@@ -24,6 +24,7 @@ from dwell.model.bounds import (
 )
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
+from dwell.model.instants import require_length
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
@@ -154,6 +155,7 @@ class Problem(Displayed):
     def __post_init__(self) -> None:
         WINDOW_CYCLES.check("window_cycles", self.window_cycles)
         WARMUP_WINDOWS.check("warmup_windows", self.warmup_windows)
+        require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
         declared = {name: tuple(items) for name, items in self.scenarios.items()}
@@ -242,6 +244,16 @@ class Problem(Displayed):
             initial=policy if policy in self.candidates else self.controller.initial,
         )
         return replace(self, controller=controller)
+
+    def cycles_of(self, windows: int) -> int:
+        """Return the number of cycles of a run of so many windows.
+
+        Raises
+        ------
+        ProblemError
+            If 64 bits do not hold them, or their instants in nanoseconds.
+        """
+        return require_length(windows, self.window_cycles, self.pipeline.period_ms)
 
     @property
     def censor_ms(self) -> float:

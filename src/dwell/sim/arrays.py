@@ -10,6 +10,7 @@ import numpy as np
 from dwell.control import window_close_ns
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
+from dwell.kernels.far_instants import LAST_NS
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.model.instants import NEVER_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
@@ -176,7 +177,7 @@ class _Layout:
                     if wakes_hz:
                         of[k.WAKE_GAP_NS] = 1e9 / wakes_hz
                     else:
-                        cpu[k.WAKE_T] = NEVER_NS
+                        cpu[k.WAKE_T] = LAST_NS
             for kind, count in node.accelerators.items():
                 self._add_server(key, kind, k.FIFO, count)
         for name in new:

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model import Process
+from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
 
 Ints = NDArray[np.int64]
-
-# A duration beyond three years is as good as for ever, and its sums still fit 64 bits.
-LONGEST_NS = 10**17
 
 
 class OnOffIntervals(NamedTuple):
@@ -54,12 +52,12 @@ def ramp(begin_ns: int, end_ns: int, ramp_ns: int) -> OnOffIntervals:
     """Return an interval that grows in equal steps, and falls in as many, each time for `ramp_ns`.
 
     Step n is reached n / `RAMP_STEPS` of that time after the begin, and left as long before the
-    end. One that ends no earlier than `LONGEST_NS` does not fall.
+    end. One that ends no earlier than `HORIZON_NS` does not fall.
     """
     step = np.arange(1, RAMP_STEPS + 1)
     after = np.rint(step * (ramp_ns / RAMP_STEPS)).astype(np.int64)
     begin, level, last = begin_ns + after, step, end_ns
-    if end_ns < LONGEST_NS:
+    if end_ns < HORIZON_NS:
         begin = np.concatenate((begin, end_ns - after[:0:-1]))
         level, last = np.concatenate((step, step[-2::-1])), end_ns - int(after[0])
     # Where growing and falling meet, rounding must not put the one behind the other.
@@ -101,6 +99,6 @@ def drawn_intervals(
         ends.append(end)
     begin = np.concatenate(begins)
     begun = int(np.searchsorted(begin, horizon_ns))
-    begin, end = begin[:begun], np.minimum(np.concatenate(ends)[:begun], LONGEST_NS)
+    begin, end = begin[:begun], np.minimum(np.concatenate(ends)[:begun], HORIZON_NS)
     level = np.full(begun, RAMP_STEPS)
     return OnOffIntervals(np.rint(begin).astype(np.int64), np.rint(end).astype(np.int64), level)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.errors import SimulationError
+from dwell.errors import Fault, ProblemError, SimulationError
 from dwell.kernels.compiled import COMPILED
 from dwell.kernels.streams import ar1_path, nanoseconds, standard_normals
 from dwell.model import (
@@ -28,8 +29,10 @@ from dwell.model import (
     Trace,
     TraceTable,
 )
+from dwell.model.bounds import short
+from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-from dwell.sim.on_off_intervals import LONGEST_NS, OnOffIntervals, drawn_intervals, interval, ramp
+from dwell.sim.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
 
 Ints = NDArray[np.int64]
@@ -39,6 +42,8 @@ NS_PER_MS = 1e6
 NS_PER_S = 1e9
 # Streams that belong to one job or message, not to the cycle or the fabric.
 OF_A_JOB = ("exec/", "delay/", "extra/", "loss/")
+# Numbers of a cycle beside its draws: release, latency and its parts, and the columns of a Run.
+OF_A_CYCLE = 8
 # Values drawn at a time: a block and its temporaries stay in the second-level cache.
 BLOCK = 16384
 NEVER = OnOffIntervals(*np.empty((3, 0), np.int64))
@@ -70,21 +75,41 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
     Raises
     ------
     ProblemError
-        If there is no such scenario.
+        If there is no such scenario, or 64 bits do not hold the cycles or their instants.
     TraceError
         If a trace that does not wrap is shorter than the run.
     SimulationError
-        If `seed` or `windows` is out of range.
+        If `seed` or `windows` is out of range, or the memory of this computer too small.
     """
     disturbances = problem.scenario(scenario)
     if isinstance(windows, bool) or windows < 1:
         raise SimulationError(f"windows is {windows!r}; it must be a whole number of at least 1")
     if isinstance(seed, bool) or seed < 0:
         raise SimulationError(f"seed is {seed!r}; it must be a whole number of at least 0")
-    cycles = windows * problem.window_cycles
-    if cycles >= 1 << 32:
-        raise SimulationError(f"windows is {windows}; {cycles} cycles are more than 2^32")
-    return _Draw(problem, scenario, disturbances, seed, windows).realisation()
+    _require_memory(problem, windows)
+    try:
+        return _Draw(problem, scenario, disturbances, seed, windows).realisation()
+    except MemoryError:
+        raise SimulationError(
+            f"{windows} windows of {scenario!r} need more memory than there is, for their cycles, "
+            "or for the episodes and bursts that come in them: ask for fewer windows"
+        ) from None
+
+
+def _require_memory(problem: Problem, windows: int) -> None:
+    """Refuse a run whose arrays are larger than this computer's memory."""
+    pipeline = problem.pipeline
+    sites = sum(len(task.on) for task in pipeline.tasks.values())
+    columns = OF_A_CYCLE + sites + len(_hops(problem)) + len(pipeline.scales)
+    cycles = problem.cycles_of(windows)
+    needed = 8 * columns * cycles
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > memory:
+        raise SimulationError(
+            f"{windows} windows of window_cycles = {problem.window_cycles} are {cycles} cycles, "
+            f"which take at least {needed / 1e9:.1f} GB; this computer has {memory / 1e9:.1f}: ask "
+            "for fewer windows"
+        )
 
 
 def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) -> Scenario:
@@ -151,7 +176,7 @@ class _Draw:
         self.problem, self.name, self.scenario = problem, name, scenario
         self.seed, self.windows = seed, windows
         self.shadow = shadow
-        self.cycles = windows * problem.window_cycles
+        self.cycles = problem.cycles_of(windows)
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
 
@@ -215,6 +240,13 @@ class _Draw:
             self.release_ns = release
         late = np.zeros(self.cycles + 1, np.int64)
         self._fill(late[:-1], jitter, "release")
+        if int(release[-1]) + int(late.max()) > HORIZON_NS:
+            late_s, latest_s = short(late.max() / NS_PER_S), short(HORIZON_NS / NS_PER_S)
+            message = (
+                f"moves one of these {self.cycles} cycles by {late_s} s, beyond {latest_s} s, "
+                "where a run ends at the latest: lower it, or ask for fewer windows"
+            )
+            raise ProblemError([Fault("release_jitter_ms", message)])
         # A cycle is never released before the one ahead of it.
         ordered: Ints = np.maximum.accumulate(release + late)
         return ordered
@@ -234,12 +266,12 @@ class _Draw:
     def _fill(self, out: Ints, process: Process, name: str, scale: Floats | None = None) -> None:
         """Fill `out` with a path of the process in nanoseconds, block by block."""
         if isinstance(process, Constant) and scale is None:
-            out[:] = round(min(process.value * NS_PER_MS, LONGEST_NS))
+            out[:] = round(min(process.value * NS_PER_MS, HORIZON_NS))
             return
         for rows, values in self._blocks(process, name, len(out)):
             if scale is not None:
                 np.multiply(values, scale[rows], out=values)
-            nanoseconds(values, NS_PER_MS, LONGEST_NS, out[rows])
+            nanoseconds(values, NS_PER_MS, HORIZON_NS, out[rows])
 
     def _blocks(self, process: Process, name: str, count: int) -> Iterator[tuple[slice, Floats]]:
         """Draw a path of a process; each block may be changed."""
@@ -322,7 +354,7 @@ class _Draw:
     def _intervals(self, item: Disturbance) -> OnOffIntervals:
         """Return the times at which a disturbance is on, up to the end of the run."""
         begin_ns = round(item.at_s * NS_PER_S)
-        end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, LONGEST_NS)))
+        end_ns = max(begin_ns, round(min(begin_ns + item.for_s * NS_PER_S, HORIZON_NS)))
         if item.ramp_s:
             return ramp(begin_ns, end_ns, round(item.ramp_s * NS_PER_S))
         if item.episodes is None:
@@ -408,7 +440,9 @@ class _Draw:
 def _split(rows: Ints) -> None:
     """Split the last row into layers that weigh 1, 2, 4, ... of `RAMP_STEPS` and sum up to it."""
     weights = 2 ** np.arange(len(rows) - 1)
-    rows[:-1] = rows[-1] * weights[:, None] // RAMP_STEPS
+    # The whole and the rest apart: 64 bits may not hold the product.
+    whole, rest = np.divmod(rows[-1], RAMP_STEPS)
+    rows[:-1] = whole * weights[:, None] + rest * weights[:, None] // RAMP_STEPS
     rows[-1] -= rows[:-1].sum(axis=0)
 
 

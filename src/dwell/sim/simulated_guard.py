@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from dwell.control import Presence, Probation, parts_of, rest_cycles
 from dwell.kernels import layout as k
+from dwell.kernels.far_instants import LAST_NS
 from dwell.kernels.heaps import post_event
 from dwell.model import Placement, Problem
-from dwell.model.instants import NEVER_NS
+from dwell.model.instants import HORIZON_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 
@@ -54,7 +55,7 @@ class SimulatedGuard:
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
         self.names = tuple(problem.candidates)
         period_ns = round(problem.pipeline.period_ms * 1e6)
-        self.patience_ns = problem.controller.guard_cycles * period_ns
+        self.patience_ns = min(problem.controller.guard_cycles * period_ns, HORIZON_NS)
         self.presence_ns = Presence.of(problem).within_ns
         self.probation = Probation.of(problem)
         self.probes = _Probes(problem, realisation)
@@ -78,7 +79,9 @@ class SimulatedGuard:
 
     def _due_ns(self, first: int) -> int:
         """Instant at which the guard fires if no cycle from `first` on completes."""
-        return int(self.release_ns[first]) + self.patience_ns if first < self.cycles else NEVER_NS
+        if first >= self.cycles:
+            return LAST_NS
+        return min(int(self.release_ns[first]) + self.patience_ns, LAST_NS)
 
     def _look_at(self, tables: k.Tables, at_ns: int) -> None:
         """Look at an instant, and not before."""
@@ -114,11 +117,11 @@ class SimulatedGuard:
                 for _, up in self._outages.of(part)
                 if up > now
             )
-            again = min(ends, default=NEVER_NS)
+            again = min(ends, default=LAST_NS)
             moved = int(tables.cells[0, k.MOVED])
             if self.release_ns[moved] >= now:
                 again = min(again, self._due_ns(moved))
-        if again < NEVER_NS:
+        if again < LAST_NS:
             self._look_at(tables, again)
         return None
 
@@ -147,7 +150,7 @@ class SimulatedGuard:
         cell[k.MOVED] = first
         # Other fallbacks may be open to the new placement than those that were not whole.
         due_ns, next_ns = self._due_ns(first), int(cell[k.GUARD_T])
-        if due_ns < NEVER_NS and not 0 <= next_ns <= due_ns:
+        if due_ns < LAST_NS and not 0 <= next_ns <= due_ns:
             self._look_at(tables, due_ns)
 
     def _note_health(self, tables: k.Tables, now: int) -> None:
@@ -157,9 +160,10 @@ class SimulatedGuard:
         last = int(np.searchsorted(self.release_ns[: self.cycles], now))
         cycles = slice(self.since, last)
         code = tables.stamps[0, cycles].astype(np.int64)
-        heard = self.release_ns[cycles] + tables.latency_ns[0, cycles] + tables.back_ns[code]
+        ended = self.release_ns[cycles] + tables.latency_ns[0, cycles]
         done = tables.outcome[0, cycles] == k.DONE
-        self.probation.healthy(int(np.count_nonzero(done & (heard <= now))))
+        heard = ended <= now - tables.back_ns[code]
+        self.probation.healthy(int(np.count_nonzero(done & heard)))
 
     def proven(self, tables: k.Tables, now: int) -> str | None:
         """Return the candidate that probes have proven by now."""
@@ -223,7 +227,7 @@ def _intervals(at_ns: NDArray[np.int64], down: NDArray[np.int64]) -> Iterator[tu
             yield begun, at
             begun = None
     if begun is not None:
-        yield begun, NEVER_NS
+        yield begun, LAST_NS
 
 
 def _joined(intervals: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int]]:

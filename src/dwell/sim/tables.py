@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dwell.control import ClosedWindow, Controller, final_l95_ms, static_columns
 from dwell.kernels import layout as k
 from dwell.model import Problem
-from dwell.model.instants import NEVER_NS
+from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.record import OUTCOMES, Feature, frame_of
 from dwell.sim.arrays import Arrays
 from dwell.sim.realisation import Realisation
@@ -203,7 +203,10 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, NDArray[np.generic]]
     sent = played.by_window(_shadow_bytes(played))
     return {
         "shadow_cycles": (other >= 0).sum(axis=1),
-        "shadow_bytes": sent.sum(axis=1),
+        # What 64 bits do not hold is as good as that.
+        "shadow_bytes": np.where(
+            sent.sum(axis=1, dtype=np.float64) < HORIZON_NS, sent.sum(axis=1), HORIZON_NS
+        ),
         **{f"shadow_{node}": used[:, i] for i, node in enumerate(controller.nodes)},
     }
 

@@ -154,12 +154,12 @@ def _age_percentile(low: Ints, high: Ints, percent: int) -> int:
     percent : int
         The share, less than 100.
     """
-    floor = int(low.sum())
-    wanted = (int(high.sum()) - floor) * percent / 100
+    # Of differences, because 64 bits may not hold a sum of ages.
+    wanted = int((high - low).sum()) * percent / 100
     under, over = int(low.min()), int(high.max())
     age = int(high.mean())
     while over - under > 1:
-        spent = int(np.clip(age, low, high).sum()) - floor
+        spent = int((np.clip(age, low, high) - low).sum())
         if spent < wanted:
             under = age
         else:

@@ -142,7 +142,7 @@ class Study:
     SimulationError
         If no study can be made of it.
     ProblemError
-        If a scenario is unknown.
+        If a scenario is unknown, or 64 bits do not hold the runs (see `Problem.cycles_of`).
     """
 
     name: str
@@ -191,6 +191,7 @@ class Study:
                 raise SimulationError(f"the points differ in {what}: {other}, and {has}")
         for scenario in self.scenarios:
             problem.scenario(scenario)
+        problem.cycles_of(self.windows)
         if self.windows <= problem.warmup_windows:
             raise SimulationError(
                 f"windows is {self.windows}; it must be more than the "

@@ -9,9 +9,11 @@ from itertools import cycle
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.errors import LiveError
 from dwell.model import bounds
+from dwell.model.instants import NEVER_NS
 from dwell.model.process import (
     AR1,
     DRAWN,
@@ -160,13 +162,17 @@ def delays_ns(process: Process, rng: np.random.Generator) -> Iterator[int]:
         while True:
             yield value
     if isinstance(process, Trace):
-        values = np.rint(process.values * NS_PER_MS).astype(np.int64)
+        values = _whole_ns(process.values)
         yield from cycle(np.roll(values, -rng.integers(len(values))).tolist())
     if isinstance(process, AR1) and process.cv > 0:
         yield from _remembering(process, rng)
     while True:
-        block = np.rint(process.marginal(rng, BLOCK) * NS_PER_MS).astype(np.int64)
-        yield from block.tolist()
+        yield from _whole_ns(process.marginal(rng, BLOCK)).tolist()
+
+
+def _whole_ns(delays_ms: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return delays in nanoseconds; one longer than a century is for ever."""
+    return np.rint(np.minimum(delays_ms * NS_PER_MS, NEVER_NS)).astype(np.int64)
 
 
 def _remembering(process: AR1, rng: np.random.Generator) -> Iterator[int]:

@@ -40,7 +40,7 @@ def length_s(problem: Problem, windows: int) -> float:
 
     Every move makes the window after it begin later: a run with moves has some windows less.
     """
-    cycles_ms = windows * problem.window_cycles * problem.pipeline.period_ms
+    cycles_ms = problem.cycles_of(windows) * problem.pipeline.period_ms
     return (cycles_ms + problem.controller.close_grace_ms) / 1e3 + LAST_S
 
 

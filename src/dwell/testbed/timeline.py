@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError
 from dwell.model import Link, LinkDisturbance, Problem, Scenario
-from dwell.model.instants import NEVER_NS
+from dwell.model.instants import NEVER_NS, require_length
 from dwell.model.scenario import RAMP_STEPS, Disturbance
 from dwell.testbed.conditions import Conditions
 
@@ -88,7 +88,7 @@ def timeline_of(
     Raises
     ------
     ProblemError
-        If there is no such scenario, or a link would lose everything.
+        If there is no such scenario, a link would lose everything, or it is too long.
     LiveError
         If it has something that real links and CPUs cannot be made to do; all of it at once.
     """
@@ -100,6 +100,8 @@ def timeline_of(
 
     window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
     windows = math.floor(seconds / window_s) + 1
+    period_ms = problem.pipeline.period_ms
+    require_length(windows, problem.window_cycles, period_ms, f"seconds = {seconds:g}")
     problem = _without_bursts(problem)
     items, nodes, segments = draw_changes(problem, scenario=scenario, seed=seed, windows=windows)
     changes = [Change(one.at_ns, one.node, NodeState(one.threads, one.down)) for one in nodes]
@@ -122,7 +124,7 @@ def last_ns(item: Disturbance) -> int:
     """Instant of the change after which a disturbance is over; beyond all of them if it lasts."""
     if math.isinf(item.for_s):
         return NEVER_NS
-    end_ns: int = round(round(item.at_s * NS_PER_S) + item.for_s * NS_PER_S)
+    end_ns = round(min(round(item.at_s * NS_PER_S) + item.for_s * NS_PER_S, NEVER_NS))
     return end_ns - step_ns(item)
 
 
