@@ -13,8 +13,9 @@ import pytest
 
 import dwell
 from dwell.model import REASONS, Problem, Reason
+from dwell.model.table_columns import TABLES, Column, Feature
 from dwell.record import OUTCOME_SENTENCES, OUTCOMES, REASON_SENTENCES, column_types
-from dwell.record.schema import TABLES, Column, Feature, frame_of, polars_schema, row_of
+from dwell.record.schema import frame_of, polars_schema, row_of
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "columns.md"

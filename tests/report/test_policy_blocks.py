@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
 
+import dwell
 from dwell.report.policy_blocks import RATE, PolicyBlocks, scaled
-from dwell.study import over_seeds
+from dwell.study import compare, over_seeds
+from tests.cells.examples import EXAMPLES
 from tests.cells.small import SEEDS, make_comparison
 from tests.report.pages import small_comparison
 
@@ -48,6 +51,21 @@ def test_a_figure_shows_every_seed_and_the_interval() -> None:
     (row,) = mine.filter(pl.col("seed").is_null()).to_dicts()
     shown = [row[name] for name in ("mean", "low", "high")]
     assert shown == pytest.approx([100 * end for end in known])
+
+
+def test_candidates_may_be_called_as_columns_are() -> None:
+    problem = dwell.load(EXAMPLES / "canonical.yaml")
+    names = dict(zip(problem.candidates, ("policy", "scenario", "part"), strict=True))
+    candidates = {names[name]: placed for name, placed in problem.candidates.items()}
+    controller = replace(problem.controller, initial="policy", fallbacks=())
+    problem = replace(problem, candidates=candidates, controller=controller)
+    policies = ("dtp", "cusum")
+    scenarios = ("baseline",)
+    found = compare(
+        problem, policies=policies, scenarios=scenarios, seeds=(1, 2), windows=30, processes=1
+    )
+    (figure,) = PolicyBlocks(found).placed()
+    assert set(figure.frames["rows"]["part"]) == set(candidates)
 
 
 def test_shares_of_a_whole_are_drawn_of_those_that_move() -> None:

@@ -18,6 +18,7 @@ from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
 from dwell.model.semantics import too_many_shadows
+from dwell.model.table_columns import DECISIONS, columns_of
 from dwell.model.user_classes import is_class_path
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
@@ -165,15 +166,12 @@ class Controller:
         it is over them at most (null without caps), and where the estimator says it, how many
         samples stand behind the estimate and how old (windows) the newest is.
         """
-        behind = ("est_samples", "est_age_windows") if self.supports else ()
-        each = (
-            *("j", "est_l95_ms", "est_violation_rate"),
-            *(f"est_u_{node}" for node in self.nodes),
-            *("eligible", "excess", *behind),
-        )
-        return (
-            *("window", "incumbent", "placement", "migrated", "reason", "dwell", "delta_j"),
-            *(f"{column}_{name}" for column in each for name in self._names),
+        features = {"support"} if self.supports else set()
+        declared = (one for one in DECISIONS if not one.of or not features.isdisjoint(one.of))
+        return tuple(
+            column.name
+            for one in declared
+            for column in columns_of(one.name, self.nodes, self._names)
         )
 
     def described(self) -> dict[str, object]:

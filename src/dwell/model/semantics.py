@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
+from dwell.model import table_columns
 from dwell.model.bounds import shown
 from dwell.model.fabric import Link, Node
 from dwell.model.live import LiveSettings
@@ -46,8 +47,8 @@ class CellParts:
     fault is reported elsewhere): references to it resolve, and nothing more is asked of it.
 
     ``policies`` and ``estimators`` are the names that there are, and ``shadowing`` the estimators
-    that send shadow jobs. Where they are None names are not judged: whoever makes a policy or an
-    estimator does that.
+    that send shadow jobs. Where they are None names are not judged, nor the columns that are made
+    of names: whoever makes a policy, an estimator or a run does that.
     """
 
     nodes: Mapping[str, Node | None] = field(default_factory=dict)
@@ -107,6 +108,7 @@ def find_faults(parts: CellParts) -> list[Fault]:
         *_objective(parts),
         *_controller(parts),
         *_live(parts),
+        *_columns(parts),
     ]
 
 
@@ -410,6 +412,12 @@ def _live(parts: CellParts) -> Iterator[Fault]:
         yield from known
         if not known and any(flow.source == task for _, flow in parts.flows):
             yield Fault(path, f"{task} is no sink: other tasks take what it sends; leave it out")
+
+
+def _columns(parts: CellParts) -> Iterator[Fault]:
+    """Names of which two columns of a table would be called the same."""
+    if parts.policies is not None:
+        yield from table_columns.clash_faults(list(parts.nodes), list(parts.candidates))
 
 
 def _shadow_budget(settings: ControllerSettings, candidates: int) -> Iterator[Fault]:

@@ -1,5 +1,6 @@
 """The Run: its schema, tables, open, save; the journal of one that is still going on."""
 
+from dwell.model.table_columns import Feature
 from dwell.record.journal import Journal
 from dwell.record.run import Run, open_run, require_free, seal_run
 from dwell.record.schema import (
@@ -8,7 +9,6 @@ from dwell.record.schema import (
     REASON_SENTENCES,
     SCHEMA_VERSION,
     Columns,
-    Feature,
     Row,
     Types,
     Values,

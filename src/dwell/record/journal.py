@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import RunError, UnwritableError
-from dwell.record.schema import TABLES, Columns, Types, polars_schema
+from dwell.model.table_columns import TABLES
+from dwell.record.schema import Columns, Types, polars_schema
 
 if TYPE_CHECKING:
     import polars as pl

@@ -17,8 +17,9 @@ from dwell.display import Displayed
 from dwell.errors import ProblemError, RunError
 from dwell.files import write_whole
 from dwell.model import Problem, Scenario
+from dwell.model.table_columns import TABLES
 from dwell.record.journal import JOURNAL, Journal, read_journal
-from dwell.record.schema import SCHEMA_VERSION, TABLES
+from dwell.record.schema import SCHEMA_VERSION
 
 if TYPE_CHECKING:
     import polars as pl

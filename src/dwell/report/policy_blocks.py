@@ -208,12 +208,13 @@ class PolicyBlocks:
             self.runs.filter(pl.col("policy").is_in(list(policies)))
             .group_by(KEYS, maintain_order=True)
             .agg(
-                (pl.col(name).cast(pl.Float64).mean() * factor).alias(shown)
-                for name, (shown, factor) in columns.items()
+                pl.col(name).cast(pl.Float64).mean() * factor
+                for name, (_, factor) in columns.items()
             )
         )
-        shown = [shown for shown, _ in columns.values()]
-        return named(means.unpivot(shown, index=KEYS, variable_name="part", value_name="value"))
+        parts = means.unpivot(list(columns), index=KEYS, variable_name="part", value_name="value")
+        names = {name: shown for name, (shown, _) in columns.items()}
+        return named(parts.with_columns(part=pl.col("part").replace_strict(names)))
 
     # -------------------------------------------------------------------------------- tables
 

@@ -29,6 +29,7 @@ from dwell.kernels.advance import advance
 from dwell.kernels.compiled import COMPILED
 from dwell.model import Problem
 from dwell.model.document import to_document
+from dwell.model.table_columns import require_apart
 from dwell.record import Run
 from dwell.sim.arrays import Arrays, lay_out, ordered_flows
 from dwell.sim.cold_migration import ColdMigration
@@ -99,6 +100,7 @@ def simulate_realisation(
         Stop at every window even where nothing that is decided could matter; the Run is the same.
     """
     _check_fit(problem, realisation)
+    require_apart(tuple(problem.fabric.nodes), tuple(problem.candidates))
     try:
         played = _play(problem, realisation, policy, estimator, jobs, guard, by_window)
     except _ProbesWantedError:

@@ -25,6 +25,8 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.model.table_columns import ENDS
+
 Floats: TypeAlias = NDArray[np.float64]
 Values: TypeAlias = Sequence[float] | Floats
 Verdict: TypeAlias = Literal["under", "over", "not shown"]
@@ -56,7 +58,8 @@ class Interval(NamedTuple):
 
     def columns(self, name: str) -> dict[str, float]:
         """Return it as columns of a table: ``name``, ``name_low`` and ``name_high``."""
-        return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
+        ends = (f"{name}{end}" for end in ENDS)
+        return dict(zip(ends, (self.value, self.low, self.high), strict=True))
 
 
 def mean_interval(values: Values, *, seed: int = RESAMPLING_SEED) -> Interval:

@@ -31,6 +31,7 @@ from dwell.cost import tier_nodes
 from dwell.errors import SimulationError
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
+from dwell.model.table_columns import NODE_OF, SHARE_OF
 from dwell.study.quality import actuations, age_of_information, misses_in, track
 
 if TYPE_CHECKING:
@@ -254,7 +255,9 @@ def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
     """Mean over windows of the busiest node of a tier, and of every node."""
     busiest = windows.select(**busiest_nodes(problem))
     used = {name: mean_of(busiest[name]) for name in ("u_robot", "u_edge")}
-    return used | {f"node_{node}": mean_of(windows[f"u_{node}"]) for node in problem.fabric.nodes}
+    return used | {
+        NODE_OF.format(node=node): mean_of(windows[f"u_{node}"]) for node in problem.fabric.nodes
+    }
 
 
 def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
@@ -269,7 +272,7 @@ def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
 
 def _shares(placements: pl.Series, candidates: tuple[str, ...]) -> dict[str, float]:
     """Share of windows that began under each candidate."""
-    return {f"share_{name}": mean_of(placements == name) for name in candidates}
+    return {SHARE_OF.format(candidate=name): mean_of(placements == name) for name in candidates}
 
 
 def _costs(

@@ -1,0 +1,365 @@
+"""Columns of the tables that are made of a cell: each declared once, with the names in them.
+
+A `Column` says what a column is called, what it holds, in which unit, and when it is null. A table
+may have one for each node, each candidate, or each pair of them; `find_clashes` says where two of
+a cell's are called the same.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, TypeAlias
+
+from dwell.errors import Fault, ProblemError
+
+#: What a column holds: a number, a truth value, a text, or a name of the cell's.
+Kind: TypeAlias = Literal[
+    "Int64", "Float64", "Boolean", "String", "candidate", "node", "task", "outcome", "reason"
+]
+#: What a run has that not every run has: `live` processes; cycles that may be sent through
+#: alternatives, too (`shadows`); an estimator that says what stands behind its estimates
+#: (`support`).
+Feature: TypeAlias = Literal["live", "shadows", "support"]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a table, or one for each node or candidate.
+
+    Parameters
+    ----------
+    name : str
+        With ``{node}`` and ``{candidate}`` where there is one for each.
+    kind : str
+        A type of Polars', or what its names are names of.
+    sentence : str
+        Meaning of the column.
+    unit : str
+        Unit of a number; empty for a count, a share and a bare number.
+    null : str
+        When it is null; empty where it never is. NaN is null there, too.
+    of : tuple of {"live", "shadows", "support"}
+        Runs that have it: those with one of these; all where empty.
+    """
+
+    name: str
+    kind: Kind
+    sentence: str
+    unit: str = ""
+    null: str = ""
+    of: tuple[Feature, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TableSchema:
+    """A table of a Run.
+
+    Parameters
+    ----------
+    sentence : str
+        Meaning of a row.
+    columns : tuple of tuple of Column
+        In their order; one for each node and candidate goes through the candidates of a node first.
+    numbered : bool
+        Whether its first column numbers the rows; a row that comes again replaces the one before.
+    on_request : bool
+        Whether a run has it only where it was asked for.
+    """
+
+    sentence: str
+    columns: tuple[Column, ...]
+    numbered: bool = False
+    on_request: bool = False
+
+
+LOST = "no sink completed the cycle"
+UNCOMPARED = "the clocks were not compared"
+APART = f"{LOST}, or {UNCOMPARED}"
+UNSEEN = "the controller did not see the close"
+GUARD = "a move of the guard's own"
+UNTOLD = "not counted"
+LIVE: tuple[Feature, ...] = ("live",)
+SHADOWS: tuple[Feature, ...] = ("shadows",)
+SUPPORT: tuple[Feature, ...] = ("support",)
+
+CYCLES = (
+    Column("cycle", "Int64", "Number of the cycle, from 0 without gaps."),
+    Column("release_ns", "Int64", "Its release, since the beginning of the run.", "ns"),
+    Column("placement", "candidate", "The candidate that it was stamped with."),
+    Column("latency_ns", "Int64", "Release to completion of the last sink.", "ns", LOST),
+    Column(
+        "missed",
+        "Boolean",
+        "Later than D, or unfinished when its window closed, which is no earlier.",
+    ),
+    Column("outcome", "outcome", "What became of it."),
+    Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
+    Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),
+    Column("network_ns", "Int64", "Part of the latency: links.", "ns", APART),
+    Column("run", "Int64", "Id of the run, as stamped.", of=LIVE),
+    Column("number", "Int64", "Number of the cycle, as stamped.", of=LIVE),
+    Column("term", "Int64", "Term of the order, as stamped.", of=LIVE),
+    Column("lead", "Boolean", "Whether it belongs to no window.", of=LIVE),
+    Column("heard", "Boolean", "False where it is known by its neighbours only.", of=LIVE),
+    Column("actuated", "Boolean", "Whether all its commands were applied.", of=LIVE),
+    Column(
+        "interval_ns",
+        "Int64",
+        "From its stamp to its last completion, as both arrived at the controller: one clock "
+        "alone, but with what the two messages' ways differ by.",
+        "ns",
+        "one of them was not heard",
+        LIVE,
+    ),
+    Column(
+        "stamper_interval_ns",
+        "Int64",
+        "From its release to the arrival of its last completion at the stamper, less half the "
+        "best round trip to the sink's node: the stamper's clock alone, with what the completion "
+        "was late.",
+        "ns",
+        "it came over the detour, or not at all",
+        LIVE,
+    ),
+    Column(
+        "bound_ns",
+        "Int64",
+        "Bound of the error of its latency, by the clocks.",
+        "ns",
+        UNCOMPARED,
+        LIVE,
+    ),
+)
+WINDOWS = (
+    Column("window", "Int64", "Number of the window, from 0."),
+    Column("first_cycle", "Int64", "Its first cycle."),
+    Column("warmup", "Boolean", "Whether statistics leave it out."),
+    Column("placement", "candidate", "The candidate of its first cycle."),
+    Column("mixed", "Boolean", "Whether its cycles had more than one placement."),
+    Column("l95_ms", "Float64", "L95 of final latencies; infinite of a lost cycle.", "ms"),
+    Column("violation_rate", "Float64", "V_D: share of its cycles that missed."),
+    Column("seen_l95_ms", "Float64", "L95 as seen at the close.", "ms", UNSEEN),
+    Column("seen_violation_rate", "Float64", "V_D as seen at the close.", null=UNSEEN),
+    Column("u_{node}", "Float64", "Utilisation of a node, foreign work included."),
+    Column("cost", "Float64", "J of what was seen.", null=UNSEEN),
+    Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
+    Column("shadow_bytes", "Int64", "What their shadows put on links.", "bytes", of=SHADOWS),
+    Column("shadow_{node}", "Float64", "Share of a node's cores for shadows.", of=SHADOWS),
+    Column("term", "Int64", "Term of its last cycle.", of=LIVE),
+    Column("lead", "Int64", "Cycles before it that belong to no window.", of=LIVE),
+    Column("heard", "Int64", "Cycles of which anything was heard.", of=LIVE),
+    Column("bound_ms", "Float64", "The largest bound of its cycles.", "ms", UNCOMPARED, LIVE),
+    Column("unproven", "Boolean", "Whether that is over 20 % of D.", of=LIVE),
+    Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=LIVE),
+)
+DECISIONS = (
+    Column("window", "Int64", "The window that it was made on."),
+    Column("incumbent", "candidate", "The placement before."),
+    Column("placement", "candidate", "The placement after."),
+    Column("migrated", "Boolean", "Whether they differ."),
+    Column("reason", "reason", "Which rule made it."),
+    Column("dwell", "Int64", "n_d after it: windows since the last migration."),
+    Column(
+        "delta_j",
+        "Float64",
+        "Measured J of the incumbent less the estimated J of the best candidate.",
+        null="the policy computes none",
+    ),
+    Column(
+        "j_{candidate}",
+        "Float64",
+        "Estimated J of a candidate against the incumbent.",
+        null="the policy prices none",
+    ),
+    Column("est_l95_ms_{candidate}", "Float64", "Its estimated L95.", "ms", GUARD),
+    Column("est_violation_rate_{candidate}", "Float64", "Its estimated V_D.", null=GUARD),
+    Column(
+        "est_u_{node}_{candidate}", "Float64", "Its estimated utilisation of a node.", null=GUARD
+    ),
+    Column("eligible_{candidate}", "Boolean", "Whether it is within the caps.", null=GUARD),
+    Column(
+        "excess_{candidate}",
+        "Float64",
+        "Its largest value / cap − 1; ∞ where its L95 is lost, and has a cap.",
+        null=f"{GUARD}, or no caps",
+    ),
+    Column(
+        "est_samples_{candidate}", "Float64", "Samples behind its estimate.", null=GUARD, of=SUPPORT
+    ),
+    Column(
+        "est_age_windows_{candidate}",
+        "Float64",
+        "Age of the newest of them.",
+        "windows",
+        GUARD,
+        SUPPORT,
+    ),
+    Column(
+        "refused",
+        "String",
+        "What was decided and not done, and why: `migrated` is false then, `placement` the old "
+        "one, and `reason` the policy's.",
+        null="what was decided was done",
+        of=LIVE,
+    ),
+)
+JOBS = (
+    Column("cycle", "Int64", "Its cycle."),
+    Column("task", "task", "Its task."),
+    Column("node", "node", "Where it ran."),
+    Column("ready_ns", "Int64", "When it became ready, as `release_ns`.", "ns"),
+    Column("start_ns", "Int64", "When it started.", "ns", "it did not"),
+    Column(
+        "end_ns",
+        "Int64",
+        "When it completed, or was lost.",
+        "ns",
+        "neither by the end of the run, or it was replaced in a live one",
+    ),
+    Column("outcome", "outcome", "What became of it."),
+    Column("shadow", "Boolean", "Whether it is a shadow's.", of=("live", "shadows")),
+    Column(
+        "cpu_ns",
+        "Int64",
+        "CPU time from its start until the stage's `process()` has returned, reading the inputs "
+        "included.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "others_ns",
+        "Int64",
+        "CPU time of all other processes of its node meanwhile.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "outside_ns",
+        "Int64",
+        "CPU time of everybody else on its node's CPUs meanwhile.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "handover_ns",
+        "Int64",
+        "CPU time of its node between a release, or the end of the job before on the same node, "
+        "and its start.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+    Column(
+        "ending_ns",
+        "Int64",
+        "CPU time of its node between the end of a sink's and the hand-over of its command.",
+        "ns",
+        UNTOLD,
+        LIVE,
+    ),
+)
+PROCESSES = (
+    Column("window", "Int64", "The window."),
+    Column("process", "String", "Name of the process."),
+    Column("node", "node", "Its node."),
+    Column(
+        "cpu_ns",
+        "Int64",
+        "CPU time that it took from the release of the window's first cycle to its close.",
+        "ns",
+    ),
+)
+
+TABLES: Mapping[str, TableSchema] = {
+    "cycles": TableSchema("a cycle", CYCLES, numbered=True),
+    "windows": TableSchema("a window", WINDOWS, numbered=True),
+    "decisions": TableSchema("a decision, or a move of the guard", DECISIONS),
+    "jobs": TableSchema("a job that is known to have become ready", JOBS, on_request=True),
+    "processes": TableSchema("a window and a process of a live cell", PROCESSES, on_request=True),
+}
+
+#: Columns of a study's tables that are made of names: share of the windows that began under a
+#: candidate, and mean utilisation of a node.
+SHARE_OF, NODE_OF = "share_{candidate}", "node_{node}"
+#: What follows the name of a column over seeds: its mean, and the ends of its interval.
+ENDS = ("", "_low", "_high")
+
+#: By table, how its columns are called.
+TEMPLATES: Mapping[str, Sequence[str]] = {
+    **{name: [column.name for column in table.columns] for name, table in TABLES.items()},
+    "runs": [of + end for of in (SHARE_OF, NODE_OF) for end in ENDS],
+}
+
+
+class NamedColumn(NamedTuple):
+    """A column of one cell: its name, and the node and the candidate in it; empty for none."""
+
+    name: str
+    node: str
+    candidate: str
+
+    @property
+    def of(self) -> str:
+        """The names that it is made of, as messages have them."""
+        made_of = {"node": self.node, "candidate": self.candidate}
+        names = [f"{kind} {name}" for kind, name in made_of.items() if name]
+        return ", ".join(names) or "every cell"
+
+
+class Clash(NamedTuple):
+    """Two columns of a table with one name."""
+
+    table: str
+    first: NamedColumn
+    second: NamedColumn
+
+
+def columns_of(
+    template: str, nodes: Iterable[str], candidates: Iterable[str]
+) -> Iterator[NamedColumn]:
+    """Yield the columns that one declaration is for a cell: all candidates of a node, then on."""
+    of_nodes = nodes if "{node}" in template else [""]
+    of_candidates = list(candidates) if "{candidate}" in template else [""]
+    for node, candidate in itertools.product(of_nodes, of_candidates):
+        name = template.format(node=node, candidate=candidate)
+        yield NamedColumn(name, node, candidate)
+
+
+def clash_faults(nodes: Sequence[str], candidates: Sequence[str]) -> Iterator[Fault]:
+    """Yield a fault for every two columns of a table that would have one name."""
+    for table, first, second in find_clashes(nodes, candidates):
+        path = f"candidates.{second.candidate}" if second.candidate else f"nodes.{second.node}"
+        yield Fault(
+            path,
+            f"a table of {table} would have two columns {second.name!r}: of {first.of} and of "
+            f"{second.of}; rename one of them",
+        )
+
+
+def find_clashes(nodes: Sequence[str], candidates: Sequence[str]) -> Iterator[Clash]:
+    """Yield where two columns of a table would have one name."""
+    for table, templates in TEMPLATES.items():
+        known: dict[str, NamedColumn] = {}
+        # The table's own come first, so that a clash with one is that of the cell's name.
+        for template in sorted(templates, key=lambda one: "{" in one):
+            for column in columns_of(template, nodes, candidates):
+                first = known.setdefault(column.name, column)
+                if first is not column:
+                    yield Clash(table, first, column)
+
+
+def require_apart(nodes: Sequence[str], candidates: Sequence[str]) -> None:
+    """Refuse names of a cell of which two columns of a table would be called the same.
+
+    Raises
+    ------
+    ProblemError
+        With every pair of them.
+    """
+    if faults := list(clash_faults(nodes, candidates)):
+        raise ProblemError(faults)
