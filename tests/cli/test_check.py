@@ -51,10 +51,12 @@ def test_check_prints_every_fault_with_its_line(cell: Path) -> None:
             "exec_ms: 30",
             ("candidates.LOC: its own work takes 155% of the cores of R",),
         ),
+        ("OFF: {plan: E}", "OFF: {plan: R}", ("candidates.OFF: is the same placement as LOC",)),
+        ("stress_threads: 3", "at_s: 1", ("scenarios.stress[0]: does nothing to R",)),
         (
             "tier: edge, cores: 4}",
             "tier: edge, cores: 4, quota: {cpu: 0.08, period_ms: 100}}",
-            ("takes 125% of the quota (cpu 0.08) of E", "raise nodes.E.quota.cpu"),
+            ("takes 125% of the quota of E (0.08 of 4 cores)", "raise nodes.E.quota.cpu"),
         ),
         (
             "candidates:",
@@ -113,7 +115,7 @@ def test_no_warning_about_a_guard_that_is_off_or_has_nowhere_to_go(cell: Path) -
     slow = SMALL.replace("E: {exec_ms: 2}}}", "E: {exec_ms: 37.5, workers: 2}}}")
     for controller in ("", "controller: {fallbacks: [OFF]}\n"):
         cell.write_text(slow + controller, encoding="utf-8")
-        assert call("check", cell).stderr == ""
+        assert "controller.guard_cycles" not in call("check", cell).stderr
 
 
 @pytest.mark.parametrize(("grace_ms", "warned"), [(59, True), (60, False)])

@@ -178,6 +178,18 @@ def test_a_wrong_argument_changes_nothing(
     assert [path.name for path in cell.parent.iterdir()] == ["small.yaml"]
 
 
+def test_a_scenario_that_the_run_does_not_reach_is_warned_of(cell: Path) -> None:
+    late = cell.read_text(encoding="utf-8") + "  late: [{node: R, at_s: 1000, stress_threads: 3}]\n"
+    cell.write_text(late, encoding="utf-8")
+    done = call("run", cell, "--scenario", "late", "--windows", "5")
+    assert done.exit_code == 0
+    assert f"{cell}: warning: scenarios.late: begins at 1000 s, " in done.stderr
+    for words in (("--scenario", "stress"), ("--scenario", "late", "--seconds", "1001")):
+        length = () if "--seconds" in words else ("--windows", "5")
+        again = call("run", cell, *words, *length, "--force")
+        assert (again.exit_code, "warning" in again.stderr) == (0, False)
+
+
 def test_another_run_is_not_replaced_unless_asked_for(cell: Path) -> None:
     words = ("run", cell, "--windows", "5", "--out", "kept")
     assert call(*words).exit_code == 0

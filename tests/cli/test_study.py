@@ -50,6 +50,14 @@ def test_a_study_prints_tables_and_keeps_them(study: Path) -> None:
     assert (again.exit_code, again.stdout) == (0, result.stdout)
 
 
+def test_scenarios_that_no_run_reaches_are_warned_of_once(study: Path) -> None:
+    late = "scenarios: {baseline: , late: [{node: R, at_s: 1000, stress_threads: 3}]}\n"
+    study.write_text(STUDY.replace("references: true\n", late), encoding="utf-8")
+    done = call("study", study, "--processes", "1")
+    assert done.exit_code == 0, done.output
+    assert done.stderr.count(f"{study}: warning: scenarios.late: begins at 1000 s, ") == 1
+
+
 def test_a_study_as_json(study: Path) -> None:
     arguments = ("--seeds", "1", "--windows", "10", "--out", "out", "--processes", "1")
     found = read_json(call("study", study, *arguments, "--json"))

@@ -6,7 +6,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ import typer
 from dwell.files import write_whole
 
 if TYPE_CHECKING:
+    from dwell.errors import Fault
     from dwell.report.page import Page
 
 #: Takes how many are done, and of how many.
@@ -31,6 +32,12 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         cells = [first[0].ljust(first[1]), *(text.rjust(width) for text, width in rest)]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
+
+
+def warn(file: Path, warnings: Iterable[Fault]) -> None:
+    """Print what is seldom meant in a file on stderr, one a line."""
+    for warning in warnings:
+        typer.echo(f"{file}: warning: {warning}", err=True)
 
 
 def print_json(value: Mapping[str, Any]) -> None:

@@ -26,7 +26,7 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import file_name, print_json, working
+from dwell.cli.output import file_name, print_json, warn, working
 from dwell.display import milliseconds
 from dwell.errors import RunError
 from dwell.model.bounds import counted
@@ -88,6 +88,7 @@ def run(
     windows = windows or 300
     # Before the kernels are imported.
     how = prepare(windows * problem.window_cycles)
+    from dwell.estimators import unplayed
     from dwell.record import require_free
     from dwell.sim import describe
     from dwell.study.summary import summarise
@@ -105,6 +106,7 @@ def run(
     }
     if not force:
         _require_same(folder, describe(problem, **arguments))
+    warn(cell, unplayed(problem, scenario, windows))
     remark = f" ({how})" if how else ""
     with working(f"simulating {counted(windows, 'window')}{remark}"):
         realisation = dwell.draw(problem, scenario=scenario, seed=seed, windows=windows)

@@ -20,10 +20,12 @@ from dwell.cli.options import (
     require_one_length,
     windows_of,
 )
-from dwell.cli.output import Progress, aligned, file_name, print_json, progress, working
+from dwell.cli.output import Progress, aligned, file_name, print_json, progress, warn, working
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
+    from dwell.errors import Fault
+    from dwell.model import Problem
     from dwell.report.formatting import Measure
     from dwell.study import Study, StudyResult
 
@@ -86,6 +88,7 @@ def study(
         windows = windows_of(seconds, *(point.problem for point in plan.points))
     if windows is not None:
         plan = replace(plan, windows=windows)
+    warn(file, {one: None for each in plan.points for one in _unplayed(plan, each.problem)})
     folder = out or Path("studies", file_name(plan.name))
     if dask is None:
         compile_first()
@@ -106,6 +109,14 @@ def study(
     with working("intervals"):
         text = _text(result)
     typer.echo(f"{text}\n\ntables: {folder}")
+
+
+def _unplayed(study: Study, problem: Problem) -> Iterator[Fault]:
+    """Yield the scenarios of which nothing is played at a point."""
+    from dwell.estimators import unplayed
+
+    for scenario in study.scenarios:
+        yield from unplayed(problem, scenario, study.windows)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dwell.estimators.cell_warnings import unplayed, warnings_of
     from dwell.estimators.corrected import Corrected
     from dwell.estimators.evidence import Evidence, Instants
     from dwell.estimators.profile import Profile
@@ -25,6 +26,8 @@ __all__ = [
     "Shadow",
     "Support",
     "by_name",
+    "unplayed",
+    "warnings_of",
 ]
 
 _HOME = {
@@ -38,6 +41,8 @@ _HOME = {
     "Shadow": "dwell.estimators.shadow",
     "Support": "dwell.estimators.protocol",
     "by_name": "dwell.estimators.registry",
+    "warnings_of": "dwell.estimators.cell_warnings",
+    "unplayed": "dwell.estimators.cell_warnings",
 }
 
 

@@ -1,0 +1,257 @@
+"""Settings that are allowed and seldom meant: each is said, and what is near it is not."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.cellfile import from_document
+from dwell.errors import Fault
+from dwell.estimators import unplayed, warnings_of
+from dwell.estimators.cell_warnings import longest_delay_s
+from dwell.model import MovingTarget, Servo
+from dwell.study.quality import actuations, track
+from tests.cells.examples import CELLS, EXAMPLES
+
+LINKS = [{"from": "R", "to": "E", "both_ways": True, "delay_ms": 1}]
+
+
+def cell(**more: Any) -> dict[str, Any]:
+    """Return a cell without a warning: three stages, two placements."""
+    return {
+        "dwell": 1,
+        "period_ms": 100,
+        "window_cycles": 10,
+        "nodes": {"R": {"tier": "robot"}, "E": {"tier": "edge"}},
+        "links": LINKS,
+        "tasks": {
+            "cam": {"on": {"R": {"exec_ms": 1}}},
+            "see": {"on": {"R": {"exec_ms": 30}, "E": {"exec_ms": 10}}},
+            "act": {"on": {"R": {"exec_ms": 1}}},
+        },
+        "flows": [{"from": "cam", "to": "see"}, {"from": "see", "to": "act"}],
+        "candidates": {"LOC": {"see": "R"}, "SO": {"see": "E"}},
+        **more,
+    }
+
+
+def on_one(node: Mapping[str, Any], tasks: Mapping[str, Any], **more: Any) -> dict[str, Any]:
+    """Return a cell of stages on one node, with a period of 10 ms."""
+    return {
+        "dwell": 1,
+        "period_ms": 10,
+        "nodes": {"E": {"tier": "edge", **node}},
+        "tasks": {name: {**task, "on": {"E": task["on"]}} for name, task in tasks.items()},
+        "candidates": {"SO": {}},
+        **more,
+    }
+
+
+def stage(exec_ms: float, priority: int = 0, **on: Any) -> dict[str, Any]:
+    return {"priority": priority, "on": {"exec_ms": exec_ms, **on}}
+
+
+def warned(document: Mapping[str, Any]) -> list[Fault]:
+    return list(warnings_of(from_document(document)))
+
+
+def bursts(own_ms: float, threads: int = 4) -> dict[str, Any]:
+    """Return a stage beside bursts that are on for a fifth of the time."""
+    node = {"bursts": {"every_ms": 80, "for_ms": 20, "threads": threads}}
+    return on_one(node, {"a": stage(own_ms)})
+
+
+def gpu(exec_ms: float, count: int = 1) -> dict[str, Any]:
+    both = stage(exec_ms, accelerator="gpu")
+    return on_one({"accelerators": {"gpu": count}}, {"a": both, "b": both})
+
+
+def by_priority(timer_ms: float) -> dict[str, Any]:
+    tasks = {"timer": stage(timer_ms, 1), "rest": stage(0.5)}
+    return on_one({"scheduler": "priority"}, tasks)
+
+
+def quota(exec_ms: float, cpu: float) -> dict[str, Any]:
+    return on_one({"cores": 4, "quota": {"cpu": cpu, "period_ms": 100}}, {"a": stage(exec_ms)})
+
+
+def objective(targets: Any = None, weights: Any = None, caps: Any = None) -> dict[str, Any]:
+    given = {"targets": targets, "weights": weights, "caps": caps}
+    return cell(objective={name: value for name, value in given.items() if value is not None})
+
+
+def servo(gain: float, delay_ms: float = 250) -> dict[str, Any]:
+    links = [{"from": "R", "to": "E", "both_ways": True, "delay_ms": delay_ms / 2}]
+    target = {"amplitude_mm": 10, "period_s": 8}
+    return cell(links=links, servo={"plant": "integrator", "gain": gain, "target": target})
+
+
+def guarded(**settings: Any) -> dict[str, Any]:
+    return cell(controller={"guard_cycles": 5, **settings})
+
+
+def disturbed(*items: Mapping[str, Any]) -> dict[str, Any]:
+    return cell(scenarios={"s": list(items)})
+
+
+LINK = {"link": "R->E"}
+
+
+@pytest.mark.parametrize(
+    ("document", "path", "words"),
+    [
+        (gpu(8), "candidates.SO", ("160% of gpu of E", "raise nodes.E.accelerators.gpu")),
+        (quota(6, 0.5), "candidates.SO", ("120% of the quota of E", "nodes.E.quota.cpu")),
+        (bursts(9.1), "candidates.SO", ("91% of the cores of E, of which bursts leave 84%",)),
+        (
+            on_one({"background": 0.3}, {"a": stage(8)}),
+            "candidates.SO",
+            ("80% of the cores of E, of which background leave 70%",),
+        ),
+        (by_priority(10), "candidates.SO", ("rest is never done", "timer of a higher priority")),
+        (objective(caps={"utilisation": 98}), "objective.caps.utilisation", ("0.98 instead",)),
+        (objective({"robot": 70}), "objective.targets.robot", ("0.7 instead of 70?",)),
+        (objective({"edge": 1.5}), "objective.targets.edge", ("1.5 is more than all cores",)),
+        (quota(6, 60), "nodes.E.quota.cpu", ("0.6 instead of 60?",)),
+        (
+            objective({"robot": 0.0001}, {"robot": 10}),
+            "objective.weights.robot",
+            ("of J or more in every candidate", "raise targets.robot"),
+        ),
+        (objective(weights={"latency": 1000}), "objective.weights.latency", ("latency_ms",)),
+        (
+            cell(candidates={"A": {"see": "E"}, "B": {"see": "E"}}),
+            "candidates.B",
+            ("same placement as A",),
+        ),
+        (disturbed({"node": "R", "at_s": 1}), "scenarios.s[0]", ("does nothing to R",)),
+        (disturbed({"node": "R", "down": True}, LINK), "scenarios.s[1]", ("nothing to R->E",)),
+        (disturbed({**LINK, "add_delay_ms": 0}), "scenarios.s[0]", ("does nothing to R->E",)),
+        (
+            cell(nodes={"R": {"tier": "robot", "bursts": {"every_ms": 9, "for_ms": 1}},
+                        "E": {"tier": "edge"}}),
+            "nodes.R.bursts",
+            ("give them threads",),
+        ),
+        (servo(6), "servo.gain", ("under SO", "261.8 at most")),
+        (
+            guarded(fallbacks=["SO"], initial="SO"),
+            "controller.fallbacks",
+            ("no fallback without E", "add LOC"),
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_never_meant_is_said(
+    document: Mapping[str, Any], path: str, words: tuple[str, ...]
+) -> None:
+    found = warned(document)
+    said = [
+        fault
+        for fault in found
+        if fault.path == path and all(word in fault.message for word in words)
+    ]
+    assert len(said) == 1, found
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        cell(),
+        gpu(8, count=2),
+        gpu(5),
+        quota(5, 0.5),
+        quota(6, 4),
+        bursts(8),
+        bursts(9.1, threads=0) | {"nodes": {"E": {"tier": "edge"}}},
+        on_one({"background": 0.3}, {"a": stage(7)}),
+        by_priority(9),
+        objective({"robot": 1, "edge": 1}, caps={"utilisation": 1}),
+        objective({"robot": 0.01}),
+        objective(weights={"latency": 10, "violations": 0, "robot": 0, "edge": 0, "switching": 0}),
+        disturbed({**LINK, "loss": 0.1}, {**LINK, "rate_mbps": 5}, {"node": "E", "down": True}),
+        servo(5),
+        guarded(fallbacks=["SO", "LOC"], initial="SO"),
+        guarded(),
+    ],
+)
+def test_what_is_near_it_is_not(document: Mapping[str, Any]) -> None:
+    assert warned(document) == []
+
+
+def test_what_no_other_placement_helps_against_is_not_said_of_fallbacks() -> None:
+    """A stage that stays on E needs it wherever the others go."""
+    tasks = {**cell()["tasks"], "map": {"on": {"E": {"exec_ms": 1}}}}
+    assert warned(cell(tasks=tasks, controller={"guard_cycles": 5, "fallbacks": ["SO"]})) == []
+
+
+@pytest.mark.parametrize("own_ms", [7.5, 9.1])
+def test_beside_bursts_a_queue_grows_where_it_is_said(own_ms: float) -> None:
+    """What bursts leave is what the simulator leaves."""
+    document = bursts(own_ms)
+    run = dwell.simulate(from_document({**document, "window_cycles": 1000}), seed=1, windows=20)
+    latency_ms = run.cycles["latency_ns"].drop_nulls().to_numpy() / 1e6
+    assert bool(latency_ms[-1000:].min() > 1000) is bool(warned(document))
+
+
+def test_below_a_full_priority_nothing_is_done() -> None:
+    document = {**by_priority(10), "window_cycles": 100}
+    run = dwell.simulate(from_document(document), seed=1, windows=5)
+    assert (run.cycles["outcome"] == "in_flight").all()
+
+
+@pytest.mark.parametrize(
+    ("plant", "gain", "damping"),
+    [("integrator", 4.0, 0.0), ("double-integrator", 9.0, 4.0), ("double-integrator", 2.0, 6.0)],
+)
+@pytest.mark.parametrize(("share", "grows"), [(0.9, False), (1.1, True)])
+def test_a_loop_is_stable_up_to_its_longest_delay(
+    plant: str, gain: float, damping: float, share: float, grows: bool
+) -> None:
+    """As the reference loop has it, with commands far closer together than the delay is long."""
+    servo = Servo(plant, gain, MovingTarget(1.0, 10.0), damping)  # type: ignore[arg-type]
+    delay_ns = round(share * longest_delay_s(servo) * 1e9)
+    release_ns = np.arange(60_000, dtype=np.int64) * 1_000_000
+    actuated = actuations(release_ns, np.full(60_000, delay_ns - 500_000))
+    early, late = (
+        track(servo, actuated, begin_s * 10**9, (begin_s + 10) * 10**9).rms_mm
+        for begin_s in (10, 50)
+    )
+    assert (late > 2 * early or math.isinf(late)) is grows
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_the_examples_have_no_warning(name: str) -> None:
+    assert not list(warnings_of(dwell.load(EXAMPLES / f"{name}.yaml")))
+
+
+@pytest.mark.parametrize(
+    ("at_s", "for_s", "warmup", "words"),
+    [
+        (1000, math.inf, 0, "begins at 1000 s, and the run counts from 0 to 10 s"),
+        (10, math.inf, 0, "begins at 10 s"),
+        (0, 3, 3, "is over before the warm-up is, and the run counts from 3 to 10 s"),
+        (9.9, math.inf, 3, ""),
+        (0, 3.1, 3, ""),
+        (0, math.inf, 9, ""),
+    ],
+)
+def test_a_scenario_that_a_run_does_not_reach_is_said(
+    at_s: float, for_s: float, warmup: int, words: str
+) -> None:
+    item = {"node": "R", "at_s": at_s, "stress_threads": 1}
+    item |= {} if math.isinf(for_s) else {"for_s": for_s}
+    problem = from_document({**disturbed(item), "warmup_windows": warmup})
+    found = [str(fault) for fault in unplayed(problem, "s", 10)]
+    assert [words in text for text in found] == [True] * bool(words)
+    assert not list(unplayed(problem, "baseline", 10))
+
+
+def test_one_disturbance_that_falls_into_a_run_is_enough() -> None:
+    items = ({"node": "R", "at_s": at_s, "stress_threads": 1} for at_s in (5, 1000))
+    assert not list(itertools.chain(unplayed(from_document(disturbed(*items)), "s", 10)))
