@@ -7,6 +7,7 @@ from functools import cache
 from html.parser import HTMLParser
 
 from dwell import Run, simulate
+from dwell.report.figure import Figure
 from dwell.report.page import Fact
 from dwell.report.page import Page as Shown
 from dwell.report.table import Table
@@ -90,3 +91,8 @@ def facts_of(page: Shown) -> dict[str, Fact]:
 def table_of(page: Shown, slug: str) -> Table:
     """Return one of a page's tables."""
     return next(table for table in page.tables if table.slug == slug)
+
+
+def figure_of(page: Shown, slug: str) -> Figure:
+    """Return one of a page's figures."""
+    return next(figure for figure in page.figures if figure.slug == slug)

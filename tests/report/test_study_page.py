@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -13,10 +14,13 @@ from dwell.cellfile.study_paths import with_settings
 from dwell.cli.commands import app
 from dwell.errors import RunError
 from dwell.report import study_html
+from dwell.report.figure import printed_svg, svg
+from dwell.report.figure_files import figure_files, table_tex
+from dwell.report.page import Definitions
 from dwell.report.study_page import study_page
 from dwell.study import Contender, Point, Study, open_study, run_study
 from tests.cells.small import make_problem
-from tests.report.pages import Page, table_of
+from tests.report.pages import Page, figure_of, table_of
 
 DWELL, LATE = "controller.min_dwell", "controller.min_improvement"
 
@@ -49,15 +53,68 @@ def test_a_measure_is_pivoted_over_any_parameter(folder: Path) -> None:
     assert [section.title for section in page.sections][:4] == [
         f"By {DWELL}", f"More by {DWELL}", f"By {LATE}", f"More by {LATE}"
     ]  # fmt: skip
-    rows = table_of(page, "pivot-cost-0").rows
-    row = next(one for one in rows if (one["scenario"], one["policy"]) == ("baseline", "dtp"))
-    mine = saved.runs.filter(pl.col(f"parameter.{DWELL}") == 4, scenario="baseline", policy="dtp")
-    # Means over the other parameter, seed by seed, and then over the seeds.
-    by_seed = mine.group_by("seed", maintain_order=True).agg(pl.col("cost").mean())
-    assert row["4"] == pytest.approx(by_seed["cost"].mean())
-    curve = next(one for one in page.figures if one.slug == "cost-0").frames["rows"]
+    # Nothing is averaged but seeds: the other parameter has a row and a panel for each value.
+    late = f"parameter.{LATE}"
+    at = {"scenario": "baseline", "policy": "dtp", late: 0.2}
+    mine = saved.runs.filter(pl.col(f"parameter.{DWELL}") == 4, **at)
+    row = next(one for one in table_of(page, "pivot-cost-0").rows if at.items() <= one.items())
+    assert row["4"] == pytest.approx(mine["cost"].mean())
+    curve = figure_of(page, "cost-0").frames["rows"]
     assert set(curve["at"]) == {1, 4}
+    point = curve.filter(at=4, policy="DTP", scenario="Baseline", panel=f"{LATE}: 0.2")
+    assert point["mean"].to_list() == [pytest.approx(mine["cost"].mean())]
     assert len(table_of(page, "points").rows) == 4 * 2 * 2
+
+
+def test_a_table_and_a_figure_say_what_they_average_over(folder: Path) -> None:
+    """Of three parameters, the third: in the page, in LaTeX, in CSV and on paper."""
+    saved = open_study(folder)
+    third = "parameter.window_cycles"
+    wider = saved.runs.with_columns(pl.lit(50).alias(third), violation_rate=pl.lit(0.0))
+    runs = pl.concat([saved.runs.with_columns(pl.lit(20).alias(third)), wider], how="diagonal")
+    three = replace(saved, runs=runs, labels={"window_cycles": "W"})
+    page = study_page(three)
+    assert Definitions({"averaged over": "W"}) in page.sections[0].blocks
+    files = {name: data for name, data in figure_files(page) if name.endswith("-0.csv")}
+    assert "averaged_over" in str(files["violation_rate-0.csv"])
+    assert "averaged_over" in str(files["pivot-violation_rate-0.csv"])
+    assert "averaged over" in table_tex(table_of(page, "pivot-violation_rate-0"))
+    assert "averaged over W" in printed_svg(figure_of(page, "violation_rate-0"))
+    at = {"scenario": "baseline", "policy": "dtp", f"parameter.{LATE}": 0.2}
+    mine = saved.runs.filter(pl.col(f"parameter.{DWELL}") == 4, **at)
+    rows = table_of(page, "pivot-violation_rate-0").rows
+    row = next(one for one in rows if at.items() <= one.items())
+    # Seed by seed, and then over the seeds.
+    assert row["4"] == pytest.approx(mine["violation_rate"].to_numpy().mean() / 2)
+    two = {name for name, _ in figure_files(study_page(saved)) if name.endswith("-0.csv")}
+    assert two == set(files)
+    assert "averaged" not in table_tex(table_of(study_page(saved), "pivot-violation_rate-0"))
+
+
+def test_parameters_that_go_together_are_one_axis_with_its_label(tmp_path: Path) -> None:
+    points = tuple(
+        Point({"period_ms": period_ms, DWELL: n}, with_settings(make_problem(), {DWELL: n}))
+        for period_ms, n in ((40, 1), (50, 4))
+    )
+    labelled = replace(study(points), labels={"period_ms": "P (ms)"})
+    run_study(labelled, folder=tmp_path / "one", processes=1)
+    page = study_page(open_study(tmp_path / "one"))
+    assert [section.title for section in page.sections[:3]] == [
+        "By P (ms)",
+        "More by P (ms)",
+        "Every point",
+    ]
+    assert Definitions({"together with it": DWELL}) in page.sections[0].blocks
+    assert figure_of(page, "cost-0").frames["rows"]["at"].unique().sort().to_list() == [40, 50]
+    assert "panel" not in figure_of(page, "cost-0").frames["rows"].columns
+    # Points of several deadlines have no deadline in common.
+    assert "deadline" not in str(figure_of(page, "l95_ms-0").spec())
+
+
+def test_panels_of_two_parameters_are_told_apart(folder: Path) -> None:
+    drawn = svg(figure_of(study_page(open_study(folder)), "violation_rate-0"))
+    for heading in ("Baseline", "Robot CPU stress", f"{LATE}: 0.01", f"{LATE}: 0.2"):
+        assert heading in drawn
 
 
 def test_the_page_is_whole(folder: Path) -> None:

@@ -168,8 +168,7 @@ def _text(result: StudyResult) -> str:
     for labels, runs in some.group_by(keys, maintain_order=True):
         *values, scenario = labels
         at = ", ".join(
-            f"{result.shown_parameter(name)} = {value}"
-            for name, value in zip(result.parameters, values, strict=True)
+            f"{name} = {value}" for name, value in zip(study.parameters, values, strict=True)
         )
         table = over_seeds(runs, ("policy",), [measure.column for measure in measures])
         rows = [

@@ -312,6 +312,7 @@ def curves(
     styles: Mapping[str, Style],
     heading: str,
     limit: Limit = NO_LIMIT,
+    remark: str = "",
 ) -> Draw:
     """Draw a measure over a parameter, a line a policy and a panel a scenario.
 
@@ -319,9 +320,12 @@ def curves(
     ----------
     frame : DataFrame
         ``scenario``, ``policy``, ``at`` (the parameter's values, texts or numbers), ``mean``,
-        ``low``, ``high`` in the measure's shown unit.
+        ``low``, ``high`` in the measure's shown unit; with ``panel``, a text, there is a panel for
+        each of its values in each scenario.
     heading : str
         Heading of the parameter.
+    remark : str
+        Stands above the panels, on paper too.
     """
     numeric = frame["at"].dtype.is_numeric()
     values = frame["at"].unique(maintain_order=True).to_list()
@@ -353,7 +357,7 @@ def curves(
         shared = {"x": across, "y": up, **_of(look, "color")}
         return [*limit_rule("y", *limit), {"encoding": shared, "layer": marks}]
 
-    return _panels(frame, list(styles), layers, 170, most=3)
+    return _panels(frame, list(styles), layers, 170, most=3, remark=remark)
 
 
 def _mean_and_ends(measure: Measure) -> list[Spec]:
@@ -372,8 +376,11 @@ def _panels(
     *,
     most: int = 4,
     seeds: bool = False,
+    remark: str = "",
 ) -> Draw:
-    """Draw layers, a panel for each value of ``scenario``; a single one has no heading.
+    """Draw layers, a panel for each value of ``scenario`` and, where it is given, of ``panel``.
+
+    A heading names what differs between panels.
 
     Parameters
     ----------
@@ -386,27 +393,39 @@ def _panels(
     seeds : bool
         Whether a reader can choose a seed, beside policies.
     """
-    facets = [str(name) for name in frame["scenario"].unique(maintain_order=True)]
+    given = [name for name in ("scenario", "panel") if name in frame.columns]
+    values = {name: frame[name].unique(maintain_order=True).to_list() for name in given}
+    varying = [name for name in given if len(values[name]) > 1]
+    facets = ["\n".join(one) for one in itertools.product(*(values[name] for name in varying))]
+    heading = " + '\\n' + ".join(f"datum.{name}" for name in varying)
     params: list[Spec] = [{"name": "policies", "value": list(policies)}]
     if seeds:
         params.append({"name": "seed", "value": None})
 
     def draw(width: float) -> Spec:
         room_px = width - (NAMES_PX if tallest_px is None else AXIS_PX)
-        columns = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
+        fitting = max(1, min(most, len(facets), int((room_px + GAP_PX) // (PANEL_PX + GAP_PX))))
+        columns = _in_rows(len(values.get("panel", ())), fitting)
         across_px = max(60, int((room_px - (columns - 1) * GAP_PX) / columns))
         height_px = ROW_PX * max(len(policies), 1)
         if tallest_px is not None:
             height_px = min(tallest_px, round(0.6 * across_px))
         spec: Spec = {"width": across_px, "height": height_px, "layer": layers(width)}
         if len(facets) > 1:
-            header = {"labelLimit": across_px + GAP_PX}
+            header = {"labelLimit": across_px + GAP_PX, "labelExpr": "split(datum.value, '\\n')"}
             spec = {
-                "facet": name_of("scenario", sort=facets, header=header),
+                "transform": [{"calculate": heading, "as": "facet"}],
+                "facet": name_of("facet", sort=facets, header=header),
                 "columns": columns,
                 "spacing": {"row": 14, "column": GAP_PX},
                 "spec": spec,
             }
-        return {"data": {"name": "rows"}, **spec, "params": params}
+        above = {"title": remark} if remark else {}
+        return {"data": {"name": "rows"}, **above, **spec, "params": params}
 
     return draw
+
+
+def _in_rows(panels: int, most: int) -> int:
+    """Return how many panels stand beside each other so that scenarios begin with a row."""
+    return next((n for n in range(most, 1, -1) if not (panels % n and n % panels)), most)

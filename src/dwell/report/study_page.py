@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING
 
 from dwell.model.bounds import counted
-from dwell.report.charts import NO_LIMIT, curves
+from dwell.report.charts import NO_LIMIT, Limit, curves
 from dwell.report.figure import Figure
 from dwell.report.formatting import Measure
 from dwell.report.method import numbered
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     import polars as pl
 
 REGRET = Measure("regret", "regret", "%", 100.0)
+#: Parameters that change the deadline.
+DEADLINES = ("parameter.deadline_ms", "parameter.period_ms")
 MIGRATIONS = Measure("migrations", "migrations")
 
 
@@ -46,22 +49,8 @@ def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
 
 def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
-        for place, (parameter, *others) in enumerate(study.axes):
-            shown = study.shown_parameter(parameter)
-            together = {"together with it": ", ".join(map(study.shown_parameter, others))}
-            figures: list[Block] = []
-            tables: list[Block] = []
-            for measure in _measures(study):
-                means = _means(study, parameter, measure)
-                figures.append(_curve(means, blocks, parameter, measure, place))
-                tables.append(_pivot(means, blocks, parameter, measure, place))
-            yield Section(
-                f"By {shown}",
-                [*([Definitions(together)] if others else []), figures[0], tables[0]],
-                note="Means over the other parameters and seeds; intervals are over seeds, of "
-                "their means.",
-            )
-            yield Section(f"More by {shown}", [*figures[1:], *tables[1:]], folded=True)
+        for place in range(len(study.axes)):
+            yield from _by_axis(study, blocks, place)
         yield Section("Every point", [_points(study, blocks)], folded=True)
     else:
         yield Section("", blocks.answer())
@@ -83,51 +72,132 @@ def _measures(study: StudyRuns) -> list[Measure]:
     return [one for one in measures if one.column in study.runs.columns]
 
 
-def _means(study: StudyRuns, parameter: str, measure: Measure) -> pl.DataFrame:
-    """Return a measure by a parameter's values: means over the others, a run a seed."""
-    import polars as pl
+@dataclass(frozen=True, slots=True)
+class _View:
+    """What is shown over an axis of parameters.
 
-    keys = ("scenario", "policy", parameter)
-    runs = study.runs.group_by(*keys, "seed", maintain_order=True).agg(
-        pl.col(measure.column).cast(pl.Float64).mean()
+    Parameters
+    ----------
+    place : int
+        Place of the axis in the study.
+    at : str
+        Column of the parameter along it.
+    panels : tuple of str
+        Column of the parameter that has a panel and a row for each value; none where there is no
+        other axis.
+    averaged : tuple of str
+        Columns that are averaged over.
+    """
+
+    study: StudyRuns
+    place: int
+    at: str
+    panels: tuple[str, ...]
+    averaged: tuple[str, ...]
+
+    @property
+    def shown(self) -> str:
+        """Name of the parameter along the axis."""
+        return self.study.shown_parameter(self.at)
+
+    @property
+    def shown_averaged(self) -> str:
+        """Names of what is averaged over."""
+        return ", ".join(map(self.study.shown_parameter, self.averaged))
+
+    def means(self, measure: Measure) -> pl.DataFrame:
+        """Return a measure by scenario, policy, panel and value: means over seeds.
+
+        Of what is averaged over, every seed has its mean first.
+        """
+        import polars as pl
+
+        keys = ("scenario", "policy", *self.panels, self.at)
+        runs = self.study.runs.group_by(*keys, "seed", maintain_order=True).agg(
+            pl.col(measure.column).cast(pl.Float64).mean()
+        )
+        return over_seeds(runs, keys, [measure.column])
+
+
+def _by_axis(study: StudyRuns, blocks: PolicyBlocks, place: int) -> Iterator[Section]:
+    """Yield what is shown over an axis: small multiples over another one, means over the rest."""
+    axes = list(study.axes)
+    at, *together = axes.pop(place)
+    first = [axis[0] for axis in axes]
+    view = _View(study, place, at, tuple(first[:1]), tuple(first[1:]))
+    about = {
+        "together with it": ", ".join(map(study.shown_parameter, together)),
+        "averaged over": view.shown_averaged,
+    }
+    said = {term: meaning for term, meaning in about.items() if meaning}
+    figures: list[Block] = []
+    tables: list[Block] = []
+    for measure in _measures(study):
+        means = view.means(measure)
+        figures.append(_curve(means, blocks, view, measure))
+        tables.append(_pivot(means, blocks, view, measure))
+    yield Section(
+        f"By {view.shown}",
+        [*([Definitions(said)] if said else []), figures[0], tables[0]],
+        note="Means over seeds with their 95 % intervals.",
     )
-    return over_seeds(runs, keys, [measure.column])
+    yield Section(f"More by {view.shown}", [*figures[1:], *tables[1:]], folded=True)
 
 
-def _curve(
-    means: pl.DataFrame, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
-) -> Figure:
+def _curve(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Measure) -> Figure:
     import polars as pl
 
-    limits = {RATE.column: THE_AIM, L95.column: blocks.deadline}
-    shown = blocks.found.shown_parameter(parameter)
-    table = scaled(means, measure)
-    at = table[parameter]
-    rows = table.with_columns(at=at if at.dtype.is_numeric() else at.cast(pl.String))
-    frame = named(rows.select("scenario", "policy", "at", "mean", "low", "high"))
+    at = means[view.at]
+    columns = ["scenario", "policy", "at", "mean", "low", "high"]
+    rows = scaled(means, measure).with_columns(
+        at=at if at.dtype.is_numeric() else at.cast(pl.String),
+        averaged_over=pl.lit(view.shown_averaged),
+    )
+    for name in view.panels:
+        shown = pl.lit(view.study.shown_parameter(name))
+        rows = rows.with_columns(panel=pl.format("{}: {}", shown, pl.col(name)))
+        columns.append("panel")
+    if view.averaged:
+        columns.append("averaged_over")
+    frame = named(rows.select(columns))
     if at.dtype.is_numeric():
         frame = frame.sort("at", maintain_order=True)
-    draw = curves(frame, measure, blocks.styles, shown, limits.get(measure.column, NO_LIMIT))
-    return Figure(f"{measure.column}-{place}", f"{measure.name} by {shown}", {"rows": frame}, draw)
+    limit = _limits(view.study, blocks).get(measure.column, NO_LIMIT)
+    remark = f"averaged over {view.shown_averaged}" if view.averaged else ""
+    draw = curves(frame, measure, blocks.styles, view.shown, limit, remark)
+    title = f"{measure.name} by {view.shown}"
+    return Figure(f"{measure.column}-{view.place}", title, {"rows": frame}, draw)
 
 
-def _pivot(
-    means: pl.DataFrame, blocks: PolicyBlocks, parameter: str, measure: Measure, place: int
-) -> Table:
-    """Return a measure, a row a policy and scenario and a column a value of the parameter."""
-    values = [str(value) for value in means[parameter].unique(maintain_order=True)]
-    rows: dict[tuple[str, str], dict[str, object]] = {}
+def _limits(study: StudyRuns, blocks: PolicyBlocks) -> dict[str, Limit]:
+    """Return the lines of measures; the deadline where it is the same at every point."""
+    one_deadline = not set(DEADLINES) & set(study.parameters)
+    return {RATE.column: THE_AIM, **({L95.column: blocks.deadline} if one_deadline else {})}
+
+
+def _pivot(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Measure) -> Table:
+    """Return a measure: a row a scenario, policy and panel, a column a value of the parameter."""
+    values = [str(value) for value in means[view.at].unique(maintain_order=True)]
+    texts = {
+        **{name: view.study.shown_parameter(name) for name in view.panels},
+        **({"averaged_over": "averaged over"} if view.averaged else {}),
+    }
+    rows: dict[tuple[object, ...], dict[str, object]] = {}
     for row in means.iter_rows(named=True):
-        key = row["scenario"], row["policy"]
-        mine = rows.setdefault(key, {"scenario": key[0], "policy": key[1]})
+        keys = {name: row[name] for name in ("scenario", "policy", *view.panels)}
+        mine = rows.setdefault(tuple(keys.values()), {**keys, "averaged_over": view.shown_averaged})
         for end in ("", "_low", "_high"):
-            mine[f"{row[parameter]}{end}"] = row[f"{measure.column}{end}"]
+            mine[f"{row[view.at]}{end}"] = row[f"{measure.column}{end}"]
     columns = [measure._replace(column=value, name=value, unit="") for value in values]
     return Table(
-        f"pivot-{measure.column}-{place}",
-        f"{measure.heading} by {blocks.found.shown_parameter(parameter)}",
-        [Text("policy", "policy", "policy"), *columns],
-        list(rows.values()),
+        f"pivot-{measure.column}-{view.place}",
+        f"{measure.heading} by {view.shown}",
+        [
+            Text("policy", "policy", "policy"),
+            *(Text(column, name) for column, name in texts.items()),
+            *columns,
+        ],
+        sorted(rows.values(), key=lambda row: blocks.scenarios.index(str(row["scenario"]))),
         Text("scenario", "", "scenario"),
         palette=blocks.palette,
     )
