@@ -22,6 +22,7 @@ from dwell.study import (
     Interval,
     Study,
     StudyResult,
+    keeps,
     mean_interval,
     share_interval,
     under,
@@ -203,7 +204,7 @@ def aims(
 
 def within(known: Interval, bound: float) -> str:
     """Say whether a number is at most a bound, by its interval."""
-    return "met" if known.high <= bound else "missed" if known.low > bound else "not shown"
+    return {True: "met", False: "missed", None: "not shown"}[keeps(known, at_most=bound)]
 
 
 def parts(runs: pl.DataFrame, candidates: Sequence[str]) -> pl.DataFrame:

@@ -123,7 +123,7 @@ def predictions_table(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         paper_predictions(comparison, policies).to_dicts(),
         Text("scenario", "", "scenario"),
         "Its words are read as conditions on numbers. A condition holds, or fails, only where the "
-        "95 % interval over seeds says so; else it is open.",
+        "whole 95 % interval over seeds says so; else it is open.",
         blocks.palette,
     )
 

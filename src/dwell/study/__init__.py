@@ -5,6 +5,7 @@ from dwell.study.demo import canonical_demo, longest_run, real_demo, tenants_dem
 from dwell.study.family import Family
 from dwell.study.hindsight import Hindsight
 from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
+from dwell.study.kept_bounds import keeps
 from dwell.study.over_seeds import over_seeds
 from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
 from dwell.study.player import Example
@@ -32,6 +33,7 @@ __all__ = [
     "Validation",
     "canonical_demo",
     "compare",
+    "keeps",
     "load_study",
     "longest_run",
     "mean_interval",

@@ -100,6 +100,7 @@ def compare(
         seeds=study.seeds,
         windows=windows,
         **tables,
+        labels=study.labels,
         examples={(item.scenario, policy): one for (item, _, policy), one in kept.items()},
         versions=versions(),
     )

@@ -1,9 +1,9 @@
 """Predictions of the paper for its cell (its table of scenarios), and whether runs agree.
 
 The predictions are qualitative: words. To hold them against runs, each is read as a condition on
-numbers, which is stated beside it, and the answer is one of four: it agrees, it agrees in part, it
-differs, or the runs do not tell. A condition holds, or fails, only where the 95 % interval over
-seeds says so.
+numbers, which is stated beside it, and the answer is one of three: it agrees, it differs, or the
+runs leave it open. A condition holds, or fails, only where the whole 95 % interval over seeds says
+so.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from dwell.study.intervals import (
     Interval,
     mean_interval,
     median_interval,
-    share_difference_interval,
     share_interval,
     under,
 )
+from dwell.study.kept_bounds import ABOVE_ZERO, keeps
 from dwell.study.over_seeds import difference_of
 from dwell.study.results import StudyRuns
 
 if TYPE_CHECKING:
     import polars as pl
 
-Answer: TypeAlias = Literal["agrees", "agrees in part", "differs", "open"]
+Answer: TypeAlias = Literal["agrees", "differs", "open"]
 Test: TypeAlias = Callable[[StudyRuns, str], bool | None]
 
 CANDIDATES = {"LOC", "SO", "HYB"}
@@ -82,7 +82,7 @@ class Prediction(NamedTuple):
     def reading(self) -> str:
         """Reading of the paper's words on DTP."""
         names = " or ".join(self.dominant)
-        return f"{names} leads, with at least {self.share * 100:.0f} % of the windows"
+        return f"at least {self.share * 100:.0f} % of the windows under {names}"
 
 
 def _under_aim(words: str, policy: str) -> PaperClaim:
@@ -115,7 +115,7 @@ def _more(
         second = _values(comparison, than_in or scenario, other, column)
         if first is None or second is None or not np.isfinite([*first, *second]).all():
             return None
-        return _sign(difference_of(column)(first, second))
+        return keeps(difference_of(column)(first, second), at_least=ABOVE_ZERO)
 
     return PaperClaim(words, reading, holds)
 
@@ -127,7 +127,7 @@ def _saturated(words: str, reading: str, policy: str, column: str) -> PaperClaim
         values = _values(comparison, scenario, policy, column)
         cap = min(comparison.problem.objective.caps.utilisation, 1.0)
         # Just under the cap, so that a node at exactly 1 all the time counts.
-        return None if values is None else _sign(mean_interval(values - (cap - 1e-9)))
+        return None if values is None else keeps(mean_interval(values), at_least=cap - 1e-9)
 
     return PaperClaim(words, reading, holds)
 
@@ -139,10 +139,7 @@ def _typically_in_time(words: str, policy: str) -> PaperClaim:
         values = _values(comparison, scenario, policy, "p50_ms")
         if values is None:
             return None
-        median, deadline_ms = median_interval(values), comparison.problem.pipeline.deadline_ms
-        if not median.known:
-            return None
-        return True if median.high <= deadline_ms else False if median.low > deadline_ms else None
+        return keeps(median_interval(values), at_most=comparison.problem.pipeline.deadline_ms)
 
     return PaperClaim(words, "the median latency is within D", holds)
 
@@ -222,9 +219,9 @@ class Judgement(NamedTuple):
 
     Parameters
     ----------
-    answer : {"agrees", "agrees in part", "differs", "open"}
-        In part: the predicted placement leads, and neither every seed nor the interval has the
-        share that its words ask for. Open: the interval over seeds allows for either.
+    answer : {"agrees", "differs", "open"}
+        Whether the whole interval of the share lies at or above what the words ask for, or below;
+        open where it allows for either.
     leader : str
         Placement with the largest mean share of the windows.
     share : Interval
@@ -260,14 +257,8 @@ def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str =
     }
     together = np.sum([shares[name] for name in prediction.dominant], axis=0)
     together = np.minimum(together, 1.0)
-    others = [name for name in shares if name not in prediction.dominant]
-    rival = max(others, key=lambda name: shares[name].mean())
     share = share_interval(together)
-    answer = _answer(_sign(share_difference_interval(together, shares[rival])))
-    # Few seeds that all have the whole share leave an interval below it, which says nothing.
-    enough = share.low >= prediction.share or together.min() >= prediction.share
-    if answer == "agrees" and not enough:
-        answer = "agrees in part"
+    answer = _answer(keeps(share, at_least=prediction.share))
     leader = max(shares, key=lambda name: shares[name].mean())
     return Judgement(answer, leader, share)
 
@@ -296,9 +287,9 @@ def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -
     -------
     DataFrame
         One row a prediction: ``scenario``; ``policy``, or the placement that it is about; the
-        paper's ``words`` and their ``reading``; ``answer`` (agrees, agrees in part, differs,
-        open); of a policy also ``leader``, the placement with most windows, and the ``share`` of
-        the predicted one in them with ``share_low`` and ``share_high``. No rows for another cell.
+        paper's ``words`` and their ``reading``; ``answer`` (agrees, differs, open); of a policy
+        also ``leader``, the placement with most windows, and the ``share`` of the predicted one in
+        them with ``share_low`` and ``share_high``. No rows for another cell.
     """
     import polars as pl
 
@@ -319,12 +310,3 @@ def paper_predictions(comparison: StudyRuns, policies: Sequence[str] = (DTP,)) -
     numbers = ("share", "share_low", "share_high")
     schema = {**dict.fromkeys(texts, pl.String), **dict.fromkeys(numbers, pl.Float64)}
     return pl.DataFrame(rows, schema=schema, orient="row").fill_nan(None)
-
-
-def _sign(difference: Interval) -> bool | None:
-    """Whether a difference is above 0; None where its interval does not tell."""
-    if not difference.known:
-        return None
-    if difference.low > 0:
-        return True
-    return False if difference.high < 0 else None
