@@ -10,6 +10,8 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.report import comparison_text
+from dwell.report.comparison_page import comparison_page
 from dwell.report.policy_blocks import RATE, PolicyBlocks, scaled
 from dwell.study import compare, over_seeds
 from tests.cells.examples import EXAMPLES
@@ -38,6 +40,51 @@ def test_a_rate_is_under_the_aim_only_where_its_limit_is() -> None:
     counts = {row["policy"]: row for row in blocks.counts().rows}
     assert counts["LOC"]["under"] == 1
     assert counts["HYB"]["over"] == 1
+
+
+LOW, NEAR, HIGH = (rates(mean) for mean in (0.02, 0.047, 0.08))
+
+
+@pytest.mark.parametrize(
+    ("loc", "so", "atp", "line"),
+    [
+        (
+            (LOW, LOW),
+            (LOW, HIGH),
+            (NEAR, NEAR),
+            "LOC in 2 of 2 scenarios; in all: LOC; not shown: ATP (our reconstruction) in 2.",
+        ),
+        (
+            (LOW, HIGH),
+            (NEAR, LOW),
+            (HIGH, HIGH),
+            "LOC, SO in 1 of 2 scenarios; in all: none; not shown: SO in 1.",
+        ),
+        (
+            (HIGH, HIGH),
+            (HIGH, HIGH),
+            (HIGH, HIGH),
+            "none in any of 2 scenarios; in all: none; not shown: none.",
+        ),
+    ],
+)
+def test_one_sentence_says_who_is_under_the_aim(
+    loc: tuple[Mapping[str, list[float]], ...],
+    so: tuple[Mapping[str, list[float]], ...],
+    atp: tuple[Mapping[str, list[float]], ...],
+    line: str,
+) -> None:
+    scenarios = ("baseline", "robot-cpu-stress")
+    shown = {
+        (scenario, name): rates
+        for name, each in (("LOC", loc), ("SO", so), ("atp", atp))
+        for scenario, rates in zip(scenarios, each, strict=True)
+    }
+    found = make_comparison(shown, scenarios=scenarios, policies=("LOC", "SO", "atp"))
+    headline = f"V_D under 5 %: {line}"
+    assert PolicyBlocks(found).headline() == headline
+    assert comparison_page(found).sections[0].note == headline
+    assert " ".join(comparison_text(found, width=70).split()).endswith(headline)
 
 
 def test_a_figure_shows_every_seed_and_the_interval() -> None:

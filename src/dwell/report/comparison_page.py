@@ -15,7 +15,7 @@ from dwell.report.page import Page, Section, page_html
 from dwell.report.palette import Palette
 from dwell.report.phases import disturbed
 from dwell.report.policy_blocks import COST, RATE, THE_AIM, PolicyBlocks, named, scaled
-from dwell.report.table import Columns, Table, Text, table_text
+from dwell.report.table import Columns, Table, Text, table_text, wrapped
 from dwell.report.timeline import begins_by_number, run_timeline
 from dwell.study import Comparison, StudyResult, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
@@ -74,7 +74,7 @@ def comparison_page(
 def _sections(
     comparison: Comparison, blocks: PolicyBlocks, tenants: StudyResult | None
 ) -> Iterator[Section]:
-    yield Section("", blocks.answer())
+    yield Section("", blocks.answer(), note=blocks.headline())
     predictions = predictions_table(comparison, blocks)
     if predictions.rows:
         yield Section("What the paper predicts", [predictions])
@@ -216,4 +216,5 @@ def comparison_text(comparison: Comparison, *, width: int | None = None) -> str:
     """Return the tables of a comparison as `dwell.report.table.table_text`, the answer last."""
     blocks = PolicyBlocks(comparison)
     tables = [blocks.results(compact=True), predictions_table(comparison, blocks), blocks.counts()]
-    return "\n".join(table_text(one, width=width) for one in tables if one.rows)
+    texts = [table_text(one, width=width) for one in tables if one.rows]
+    return "\n".join([*texts, *wrapped(blocks.headline(), width), ""])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ from dwell.report.charts import (
     stacked,
 )
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, shown_contender, shown_scenario
+from dwell.report.formatting import Measure, shown_contender, shown_policy, shown_scenario
 from dwell.report.method import method_blocks
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
@@ -58,6 +59,8 @@ MORE = (
 )
 #: In the unit of `RATE`.
 THE_AIM = Limit(100 * AIM, "the aim, 5 %")
+#: The one sentence that is made of numbers (docs/decisions/0007-reports.md).
+HEADLINE = "V_D under 5 %: {most} in {count} of {of} scenarios; in all: {all}; not shown: {open}."
 KEYS = ("scenario", "policy")
 #: Lines of a distribution have so many points at most.
 POINTS = 60
@@ -223,13 +226,45 @@ class PolicyBlocks:
         mine = self.runs.filter(scenario=scenario, policy=policy)
         return under(mine["violation_rate"].to_list(), AIM) if mine.height else ""
 
+    def standings(self) -> dict[str, Counter[str]]:
+        """Return, by policy, in how many scenarios which word is said of V_D."""
+        return {
+            policy: Counter(self.standing(scenario, policy) for scenario in self.scenarios)
+            for policy in self.policies
+        }
+
+    def headline(self) -> str:
+        """Return who is under the aim in most scenarios, who in all, and of whom it is not shown.
+
+        Each list of policies is `none` where there is no such policy.
+        """
+        counts, of = self.standings(), len(self.scenarios)
+        best = max(words["under"] for words in counts.values())
+
+        def listed(names: Iterable[str]) -> str:
+            return ", ".join(names) or "none"
+
+        def under_in(count: int) -> str:
+            return listed(shown_policy(name) for name in counts if counts[name]["under"] == count)
+
+        return HEADLINE.format(
+            most=under_in(best) if best else "none",
+            count=best or "any",
+            of=of,
+            all=under_in(of),
+            open=listed(
+                f"{shown_policy(name)} in {words['not shown']}"
+                for name, words in counts.items()
+                if words["not shown"]
+            ),
+        )
+
     def counts(self) -> Table:
         """Return in how many scenarios V_D of each policy is under the aim, or over it."""
-        rows = []
-        for policy in self.policies:
-            words = [self.standing(scenario, policy) for scenario in self.scenarios]
-            counts = {word: words.count(word) for word in ("under", "over", "not shown")}
-            rows.append({"policy": policy, **counts})
+        rows = [
+            {"policy": policy, **{word: words[word] for word in ("under", "over", "not shown")}}
+            for policy, words in self.standings().items()
+        ]
         columns: Columns = [
             Text("policy", "policy", "policy"),
             *(Measure(word, word, decimals=0) for word in ("under", "over", "not shown")),

@@ -236,5 +236,10 @@ def table_text(table: Table, *, width: int | None = None) -> str:
         console.print()
     lines = [line.rstrip() for line in buffer.getvalue().rstrip().splitlines()]
     head = [table.title, ""] if table.title else []
-    prose = textwrap.wrap(table.caption, min(width or PROSE, PROSE), break_on_hyphens=False)
+    prose = wrapped(table.caption, width)
     return "\n".join([*head, *lines, *([""] if prose else []), *prose]) + "\n"
+
+
+def wrapped(text: str, width: int | None = None) -> list[str]:
+    """Return a sentence as lines of at most `PROSE` columns, and of the terminal's where given."""
+    return textwrap.wrap(text, min(width or PROSE, PROSE), break_on_hyphens=False)
