@@ -9,7 +9,8 @@ from typing import NamedTuple
 import jinja2
 import polars as pl
 
-from reproduction.verdicts import Answer, counted
+from dwell.study import UNTOLD, untold
+from reproduction.verdicts import Answer, brief, counted
 
 #: Metrics that are written in per cent.
 SHARES = (
@@ -47,13 +48,17 @@ def page(
             "name": one.name,
             "title": one.title,
             "counts": _table("", counted(one.answer.verdicts)),
-            "verdicts": _table("", one.answer.verdicts),
+            "verdicts": _table("", brief(one.answer.verdicts)),
             "tables": [_table(title, frame) for title, frame in one.answer.tables.items()],
         }
         for one in questions
     ]
+    words = [word for one in questions for word in one.answer.verdicts["word"]]
+    once = {"sign": UNTOLD, "words": untold(words), "of": len(words)}
     template = environment.get_template("page.html")
-    return template.render(questions=shown, scale=scale, version=version, pictures=pictures)
+    return template.render(
+        questions=shown, scale=scale, version=version, pictures=pictures, untold=once
+    )
 
 
 def _table(title: str, frame: pl.DataFrame) -> dict[str, object]:
@@ -72,7 +77,8 @@ def _cell(name: str, row: Mapping[str, object]) -> str:
         return "" if value is None else str(value)
     low, high = ("low", "high") if name == "effect" else (f"{name}_low", f"{name}_high")
     metric = str(row.get("metric", "")) if name == "effect" else name
-    interval = [_number(row[end], metric) for end in (low, high) if end in row]
+    ends = [row[end] for end in (low, high) if row.get(end) is not None]
+    interval = [_number(end, metric) for end in ends]
     return f"{_number(value, metric)} [{', '.join(interval)}]" if interval else _number(value, name)
 
 

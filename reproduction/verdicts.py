@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from dwell.study import AIM, Family, Interval, Study, over_seeds, under
+from dwell.study import AIM, UNTOLD, Family, Interval, Study, over_seeds, under, untold
 
 NUMBERS = ("effect", "low", "high", "p", "p_least")
 COLUMNS = ("claim", "design", "scenario", "first", "second", "metric", *NUMBERS, "word")
@@ -102,9 +102,19 @@ def under_aim(rows: pl.DataFrame, runs: pl.DataFrame, *studies: Study) -> pl.Dat
     return pl.concat(found)
 
 
+def brief(verdicts: pl.DataFrame) -> pl.DataFrame:
+    """Put `UNTOLD` for the words that say that nothing can be told: the page has them once."""
+    once = dict.fromkeys(untold(verdicts["word"]), UNTOLD)
+    return verdicts.with_columns(pl.col("word").replace(once))
+
+
 def counted(verdicts: pl.DataFrame) -> pl.DataFrame:
-    """Count the words of every claim, pair and metric: one row each, a column a word."""
+    """Count the words of every claim, pair and metric: one row each, a column a word.
+
+    What cannot be told is one word, `UNTOLD`.
+    """
     keys = ("claim", "first", "second", "metric")
+    verdicts = brief(verdicts)
     words = list(dict.fromkeys(verdicts["word"]))
     return verdicts.group_by(keys, maintain_order=True).agg(
         pl.len().alias("of"), *((pl.col("word") == word).sum().alias(word) for word in words)

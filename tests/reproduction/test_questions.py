@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from dwell.study import UNTOLD
 from reproduction.__main__ import main
 from reproduction.questions import QUESTIONS
 from reproduction.questions.jitter import turning_point
@@ -16,6 +17,7 @@ from reproduction.questions.weights import luck
 
 WORDS = {"lower", "higher", "no difference shown", "under", "over", "not shown", "met", "missed"}
 WORDS |= {"not asked", "turns", "never", "always", "cannot tell", "cannot tell with 2 seeds"}
+WORDS |= {"same run"}
 
 
 @pytest.mark.parametrize("name", [name for name in QUESTIONS if name not in ("weights", "real")])
@@ -32,6 +34,9 @@ def test_a_question_is_answered(
     assert not set(verdicts.filter(pl.col("p").is_not_null())["word"]) & {"lower", "higher"}
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f'<h2 id="{name}">' in page
+    # Once, and not in every row.
+    assert page.count("cannot tell with 2 seeds") == 1
+    assert page.count(f">{UNTOLD}</td>") >= (verdicts["word"] == "cannot tell with 2 seeds").sum()
 
 
 def test_studies_have_pictures_that_the_page_leads_to(tmp_path: Path) -> None:

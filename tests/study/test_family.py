@@ -11,8 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import MetricError, SimulationError
-from dwell.study.family import Family, cannot_tell, holm, seed_values
-from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
+from dwell.study.family import Family, cannot_tell, holm, same_run, seed_values
+from dwell.study.pairs import (
+    PairedDifference,
+    PairedMedian,
+    SameRun,
+    paired_difference,
+    paired_median,
+)
 
 chances = st.lists(st.floats(0, 1), max_size=12)
 
@@ -186,9 +192,56 @@ def test_a_family_of_runs_has_a_comparison_for_each_pair() -> None:
     first = found.comparisons["one"]
     assert isinstance(first, PairedDifference)
     assert first.mean == first.low == first.high == 0.5
-    assert found.comparisons["other"].direction == -1
+    assert found.tested["other"].direction == -1
     # Three pairs have no p value below 2 / 2^3, and the least of two is doubled.
     assert found.table()["p_least"].to_list() == [0.5, 0.5]
+
+
+def test_what_is_the_same_run_is_no_comparison() -> None:
+    """Its difference is 0 without an interval, and it does not count in its family."""
+    alike = RUNS.with_columns(
+        pl.col("cost", "tracking_rms_mm").sort_by("seed").over("seed"),
+        played=pl.format("{}", pl.col("seed")),
+    ).with_columns(cost=pl.col("seed").cast(pl.Float64), tracking_rms_mm=pl.lit(1.0))
+    for metric in ("cost", "tracking_rms_mm"):
+        found = Family.of_runs(alike, "which?", metric, {"one": PAIR})
+        assert found.comparisons == {"one": SameRun(3)}
+        row = found.table().row(0, named=True)
+        assert (row["difference"], row["n"], row["verdict"]) == (0.0, 3, "same run")
+        known = ("low", "high", "d_z", "p", "p_holm", "p_least")
+        assert [row[name] for name in known] == [None] * 6
+    third = RUNS.filter(policy="a").with_columns(
+        policy=pl.lit("c"), played=pl.format("c{}", pl.col("seed")), cost=pl.col("cost") + 9
+    )
+    three = pl.concat([alike, third], how="diagonal")
+    pairs = {"same": PAIR, "other": ({"policy": "c"}, {"policy": "a"})}
+    family = Family.of_runs(three, "which?", "cost", pairs)
+    # Three pairs have no p value below 2 / 2^3, and there is one comparison.
+    assert family.table()["p_least"].to_list() == [None, 0.25]
+    assert family.verdicts == {"same": "same run", "other": "cannot tell with 3 seeds"}
+    assert list(family.adjusted) == ["other"]
+
+
+@pytest.mark.parametrize(
+    "played",
+    [
+        pl.lit("equal").alias("another column"),
+        pl.format("{} {}", "policy", "seed").alias("played"),
+        pl.when(pl.col("seed") < 3).then(pl.lit("equal")).otherwise("policy").alias("played"),
+        pl.lit(None, pl.String).alias("played"),
+    ],
+)
+def test_what_is_not_known_to_be_the_same_run_is_compared(played: pl.Expr) -> None:
+    """Of older runs, of other runs, and of runs that are the same under some seeds only."""
+    equal = RUNS.with_columns(played, cost=pl.lit(1.0))
+    assert not same_run(equal, PAIR)
+    assert Family.of_runs(equal, "which?", "cost", {"one": PAIR}).tested.keys() == {"one"}
+
+
+def test_the_same_cycles_priced_otherwise_are_compared() -> None:
+    alike = RUNS.with_columns(played=pl.lit("equal"))
+    assert same_run(alike, PAIR)
+    assert Family.of_runs(alike, "which?", "cost", {"one": PAIR}).tested.keys() == {"one"}
 
 
 def test_what_may_be_infinite_is_compared_by_its_median() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -123,6 +124,7 @@ def test_a_run_of_warm_up_alone_is_refused() -> None:
 
 def test_a_row_holds_what_the_tables_show() -> None:
     row = summarise(make_run(), make_problem(warmup_windows=1, window_cycles=W), LABELS).row
+    assert re.fullmatch(r"[0-9a-f]{16}", str(row.pop("played")))
     expected = {
         **LABELS,
         "windows": 3,
@@ -163,6 +165,31 @@ def test_a_row_holds_what_the_tables_show() -> None:
         "network_ms": pytest.approx(0.4),
     }
     assert row == expected
+
+
+def test_runs_are_told_apart_by_what_was_played_and_by_nothing_else() -> None:
+    problem = make_problem(warmup_windows=1, window_cycles=W)
+
+    def played(table: str = "", **columns: pl.Expr) -> object:
+        tables = {name: getattr(make_run(), name) for name in ("cycles", "windows", "decisions")}
+        if table:
+            tables[table] = tables[table].with_columns(**columns)
+        return summarise(Run({}, tables), problem, LABELS).row["played"]
+
+    same = played()
+    # Another policy believes otherwise; what is left out does not count.
+    assert played("decisions", j_LOC=pl.lit(7.0)) == same
+    assert played("cycles", placement=before(4, "SO", pl.col("placement"))) == same
+    assert played("cycles", placement=before(5, "SO", pl.col("placement"))) != same
+    assert played("cycles", latency_ns=before(5, 1, pl.col("latency_ns"))) != same
+    assert played("cycles", latency_ns=before(5, None, pl.col("latency_ns"))) != same
+    # Shadow jobs that delay nobody load a node.
+    assert played("windows", u_E=pl.lit(0.2)) != same
+
+
+def before(cycle: int, value: object, other: pl.Expr) -> pl.Expr:
+    """Return a column with a value in the cycles before one."""
+    return pl.when(pl.col("cycle") < cycle).then(pl.lit(value)).otherwise(other)
 
 
 def test_costs_are_those_estimated_while_idle_and_measured_while_active() -> None:

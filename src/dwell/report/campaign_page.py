@@ -16,6 +16,7 @@ from dwell.report.palette import ramp_styles
 from dwell.report.policy_blocks import MEASURES, PolicyBlocks, named
 from dwell.report.table import Columns, Table, Text, table_text
 from dwell.study.campaign_questions import CampaignQuestion, questions
+from dwell.study.family import UNTOLD, untold
 from dwell.study.measured_campaign import MeasuredCampaign
 
 #: Points of a distribution over windows.
@@ -101,11 +102,14 @@ def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Sect
 def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -> Table:
     measures = {measure.column: measure for measure in MEASURES}
     rows = []
+    once = untold(asked.table["word"])
     for row in asked.table.iter_rows(named=True):
         measure = measures[row["metric"]]
         effect = {"effect": row["effect"], "effect_low": row["low"], "effect_high": row["high"]}
         scaled = {key: one if one is None else measure.factor * one for key, one in effect.items()}
-        rows.append({**row, **scaled, "metric": measure.heading})
+        word = UNTOLD if row["word"] in once else row["word"]
+        rows.append({**row, **scaled, "metric": measure.heading, "word": word})
+    said = "".join(f" {UNTOLD}: {word}." for word in once)
     return Table(
         f"question-{place}",
         f"Answer: {asked.answer}",
@@ -122,7 +126,7 @@ def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -
         rows,
         Text("scenario", "", "scenario"),
         "Paired by repetition; sign-flip tests, Holm over all comparisons of a metric. Least p: "
-        "the smallest that so few repetitions and so many comparisons allow.",
+        f"the smallest that so few repetitions and so many comparisons allow.{said}",
         blocks.palette,
     )
 

@@ -2,7 +2,7 @@
 
 from dwell.study.comparison import AIM, Comparison, compare
 from dwell.study.demo import canonical_demo, longest_run, real_demo, tenants_demo
-from dwell.study.family import Family
+from dwell.study.family import SAME_RUN, UNTOLD, Family, same_run, untold
 from dwell.study.hindsight import Hindsight
 from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
 from dwell.study.kept_bounds import keeps
@@ -18,6 +18,8 @@ from dwell.study.validation import Validation, validate
 
 __all__ = [
     "AIM",
+    "SAME_RUN",
+    "UNTOLD",
     "Comparison",
     "Contender",
     "Example",
@@ -45,8 +47,10 @@ __all__ = [
     "paper_predictions",
     "real_demo",
     "run_study",
+    "same_run",
     "share_interval",
     "tenants_demo",
     "under",
+    "untold",
     "validate",
 ]

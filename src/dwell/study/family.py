@@ -8,7 +8,8 @@ family: the 5 % hold for each, and a report says how many there are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -21,22 +22,29 @@ from dwell.study.over_seeds import interval_of, metric_values
 from dwell.study.pairs import (
     PairedDifference,
     PairedMedian,
+    SameRun,
     least_p,
     paired_difference,
     paired_median,
 )
+from dwell.study.summary import PLAYED
 
 if TYPE_CHECKING:
     import polars as pl
+
+#: Begin of a verdict that is none, and what stands for it in the rows of a page.
+CANNOT_TELL, UNTOLD = "cannot tell", "–"
+#: Verdict of a pair that is the same run.
+SAME_RUN = "same run"
 
 #: Columns of runs and what they have to be, for one run a seed to be left.
 Labels: TypeAlias = Mapping[str, object]
 #: Two groups of runs, one run a seed each.
 Contrast: TypeAlias = "tuple[Labels, Labels]"
 
-#: ``lower``, ``higher``, ``no difference shown``, or what `cannot_tell` says.
+#: ``lower``, ``higher``, ``no difference shown``, ``same run``, or what `cannot_tell` says.
 Comparative: TypeAlias = str
-Difference: TypeAlias = PairedDifference | PairedMedian
+Difference: TypeAlias = PairedDifference | PairedMedian | SameRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +57,9 @@ class Family:
         The question in words, for instance ``is DTP cheaper than each static placement?``
     metric : str
         Column that is compared.
-    comparisons : mapping of str to PairedDifference or PairedMedian
+    comparisons : mapping of str to PairedDifference, PairedMedian or SameRun
         By a name, for instance ``baseline: dtp, LOC``. The first of a pair is what a verdict is
-        about.
+        about. What is the same run is not tested, and does not count among the comparisons.
     """
 
     question: str
@@ -64,7 +72,8 @@ class Family:
     ) -> Family:
         """Compare a metric between pairs of groups of runs, seed by seed.
 
-        Metrics that may be infinite are compared by medians, the others by means.
+        Metrics that may be infinite are compared by medians, the others by means; pairs that
+        played every cycle alike under every seed are the same run.
 
         Parameters
         ----------
@@ -85,10 +94,16 @@ class Family:
         )
 
     @property
+    def tested(self) -> dict[str, PairedDifference | PairedMedian]:
+        """The comparisons that have a p value: all but the same run."""
+        known = self.comparisons.items()
+        return {name: item for name, item in known if not isinstance(item, SameRun)}
+
+    @property
     def adjusted(self) -> dict[str, float]:
-        """Holm's p value of each comparison."""
-        adjusted = holm([item.p for item in self.comparisons.values()])
-        return dict(zip(self.comparisons, adjusted, strict=True))
+        """Holm's p value of each comparison that is tested."""
+        tested = self.tested
+        return dict(zip(tested, holm([item.p for item in tested.values()]), strict=True))
 
     @property
     def verdicts(self) -> dict[str, Comparative]:
@@ -98,12 +113,13 @@ class Family:
         nothing can be shown, whatever the numbers are, `cannot_tell` says so.
         """
         words: dict[int, Comparative] = {-1: "lower", 1: "higher", 0: "no difference shown"}
-        adjusted, count = self.adjusted, len(self.comparisons)
-        return {
-            name: cannot_tell(item.n, count)
+        adjusted, tested = self.adjusted, self.tested
+        told = {
+            name: cannot_tell(item.n, len(tested))
             or words[item.direction if adjusted[name] <= 1 - CONFIDENCE else 0]
-            for name, item in self.comparisons.items()
+            for name, item in tested.items()
         }
+        return {name: told.get(name, SAME_RUN) for name in self.comparisons}
 
     def verdict(self, name: str) -> Comparative:
         """Return the verdict of one comparison."""
@@ -123,7 +139,8 @@ class Family:
             ``question``, ``metric``, ``comparison``; ``centre`` (mean or median), ``difference``,
             ``low``, ``high``; ``d_z`` (null for medians), ``superiority``; ``n`` (pairs), ``p``,
             ``p_holm``, ``p_least`` (the smallest that ``p_holm`` can be with so many pairs and
-            comparisons) and ``verdict``. What is NaN is null.
+            comparisons) and ``verdict``. What is NaN is null; of the same run, all but the
+            difference and the superiority.
         """
         import polars as pl
 
@@ -134,24 +151,19 @@ class Family:
             **dict.fromkeys(("p", "p_holm", "p_least"), pl.Float64),
             "verdict": pl.String,
         }
-        adjusted, verdicts = self.adjusted, self.verdicts
+        adjusted, verdicts, count = self.adjusted, self.verdicts, len(self.tested)
         rows = []
         for name, item in self.comparisons.items():
-            centre = "mean" if isinstance(item, PairedDifference) else "median"
-            known = asdict(item)
-            rows.append(
-                {
-                    "question": self.question,
-                    "metric": self.metric,
-                    "comparison": name,
-                    "centre": centre,
-                    "difference": known.pop(centre),
-                    **known,
-                    "p_holm": adjusted[name],
-                    "p_least": _least_adjusted(item.n, len(self.comparisons)),
-                    "verdict": verdicts[name],
-                }
-            )
+            centre = "median" if interval_of(self.metric) is median_interval else "mean"
+            known = {"difference": 0.0, "superiority": 0.5, "n": item.n}
+            if not isinstance(item, SameRun):
+                centre = "mean" if isinstance(item, PairedDifference) else "median"
+                known = asdict(item)
+                known["difference"] = known.pop(centre)
+                known["p_holm"] = adjusted[name]
+                known["p_least"] = _least_adjusted(item.n, count)
+            labels = {"question": self.question, "metric": self.metric, "comparison": name}
+            rows.append({**labels, "centre": centre, **known, "verdict": verdicts[name]})
         return pl.DataFrame(rows, schema=columns).fill_nan(None)
 
 
@@ -183,9 +195,33 @@ def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
     return metric_values(group.sort("seed"), column)
 
 
+def same_run(runs: pl.DataFrame, pair: Contrast) -> bool:
+    """Whether two groups of runs, one run a seed each, played every cycle alike.
+
+    Parameters
+    ----------
+    runs : DataFrame
+        One row a run. Those of older versions do not have what tells it: then it is not known, and
+        this is False.
+    """
+    import polars as pl
+
+    if PLAYED not in runs.columns:
+        return False
+    first, second = (
+        runs.filter(*(pl.col(name) == value for name, value in labels.items()))
+        .sort("seed")
+        .select("seed", PLAYED)
+        for labels in pair
+    )
+    return first.equals(second, null_equal=False)
+
+
 def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
     """Compare the first of a pair to the second; by medians where a column may be infinite."""
     first, second = (seed_values(runs, metric, labels) for labels in pair)
+    if same_run(runs, pair) and np.array_equal(first, second):
+        return SameRun(len(first))
     if interval_of(metric) is median_interval:
         return paired_median(first, second)
     return paired_difference(first, second, shares=interval_of(metric) is share_interval)
@@ -203,7 +239,15 @@ def cannot_tell(seeds: int, comparisons: int = 1) -> str:
     """
     if _least_adjusted(seeds, comparisons) <= 1 - CONFIDENCE:
         return ""
-    return f"cannot tell with {counted(seeds, 'seed')}"
+    return f"{CANNOT_TELL} with {counted(seeds, 'seed')}"
+
+
+def untold(words: Iterable[str]) -> dict[str, int]:
+    """Return how often each word stands there that says that nothing can be told.
+
+    A page says each of them once, and `UNTOLD` in its rows.
+    """
+    return dict(Counter(word for word in words if word.startswith(CANNOT_TELL)))
 
 
 def _least_adjusted(pairs: int, comparisons: int) -> float:

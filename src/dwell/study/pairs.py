@@ -7,7 +7,8 @@ large it is in its own unit, with an interval; how large it is beside what diffe
 
 `paired_difference` is about the mean. `paired_median` is for numbers that may be infinite, such as
 a percentile of latencies where cycles are lost; which of the two is right depends on the metric,
-never on the values that came out.
+never on the values that came out. Where both of every pair are the same run there is nothing to
+compare: their difference is 0 by what was played, and not by luck (`SameRun`).
 """
 
 from __future__ import annotations
@@ -95,6 +96,19 @@ class PairedMedian:
     def direction(self) -> int:
         """-1 where the first is lower in most pairs, 1 where it is higher, 0 where in neither."""
         return _sign(0.5 - self.superiority)
+
+
+@dataclass(frozen=True, slots=True)
+class SameRun:
+    """Two that played every cycle alike under every seed: one run, and no comparison.
+
+    Parameters
+    ----------
+    n : int
+        Number of pairs.
+    """
+
+    n: int
 
 
 def paired_difference(

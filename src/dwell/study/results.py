@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from dwell.display import Displayed
 from dwell.errors import PolicyError, SimulationError
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
 from dwell.model.semantics import nearest
+from dwell.study.family import same_run
 from dwell.study.intervals import Floats, Interval
 from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
 
@@ -135,9 +139,13 @@ class StudyRuns(Displayed):
         """Return the mean over seeds of what the first policy shows less what the second does.
 
         Its interval is that of pairs of runs, and for shares (the violation rate, say) no narrower
-        than what either policy's own leaves open (see `share_difference_interval`).
+        than what either policy's own leaves open (see `share_difference_interval`). Policies that
+        played every cycle alike are the same run: 0, without an interval.
         """
         first, second = (self.values(scenario, policy, column) for policy in policies)
+        one, other = ({"scenario": scenario, "policy": policy} for policy in policies)
+        if same_run(self.runs, (one, other)) and np.array_equal(first, second):
+            return Interval(0.0, math.nan, math.nan)
         return difference_of(column)(first, second)
 
     def table(self, columns: Sequence[str] | None = None) -> pl.DataFrame:

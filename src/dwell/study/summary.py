@@ -19,6 +19,7 @@ these stretches begin at every cycle.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -46,6 +47,9 @@ Row: TypeAlias = dict[str, float | int | str]
 #: Points of the latency distributions: so many to a deadline, up to four deadlines.
 GRID_PER_DEADLINE = 80
 DEADLINES = 4
+
+#: Column of what tells runs apart that differ in anything but their names.
+PLAYED = "played"
 
 #: K, the lengths of stretches of cycles, with m, the misses that are 5 % of one.
 STRETCHES = {20: 1, 100: 5}
@@ -151,9 +155,26 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         "compute_ms": mean_of(cycles["compute_ns"]) / 1e6,
         "queue_ms": mean_of(cycles["queue_ns"]) / 1e6,
         "network_ms": mean_of(cycles["network_ns"]) / 1e6,
+        PLAYED: _played(windows, cycles, problem),
     }
     within = count_within(ascending_ns, problem.pipeline.deadline_ms)
     return Summary(row, _costs(windows, decisions, problem, labels), within)
+
+
+def _played(windows: pl.DataFrame, cycles: pl.DataFrame, problem: Problem) -> str:
+    """Digest of what was played: of runs on one realisation, equal ones are the same run.
+
+    It is that of every cycle's placement and latency, and of the nodes' utilisation, to which
+    shadow jobs add where they delay nobody.
+    """
+    latencies_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
+    digest = hashlib.blake2b(latencies_ns.tobytes(), digest_size=8)
+    for name in problem.candidates:
+        placed = (cycles["placement"] == name).fill_null(value=False)
+        digest.update(np.packbits(placed.to_numpy()).tobytes())
+    for node in problem.fabric.nodes:
+        digest.update(windows[f"u_{node}"].to_numpy().tobytes())
+    return digest.hexdigest()
 
 
 def longest_streak(missed: NDArray[np.bool_]) -> int:
