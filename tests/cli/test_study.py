@@ -70,6 +70,13 @@ def test_a_study_as_json(study: Path) -> None:
     assert pl.read_parquet("out/runs.parquet")["windows"].unique().to_list() == [10]
 
 
+def test_where_seeds_are_few_the_text_asks_for_five(study: Path) -> None:
+    arguments = ("--windows", "2", "--processes", "1")
+    few = call("study", study, "--seeds", "2", "--out", "few", *arguments).stdout
+    assert "at least 5" in few
+    assert "at least 5" not in call("study", study, "--seeds", "5", *arguments).stdout
+
+
 def test_every_fault_of_a_study_is_printed(study: Path) -> None:
     text = STUDY.replace("LOC, dtp", "LOC, dpt").replace("[0, 1]", "[0, -1]")
     study.write_text(text, encoding="utf-8")

@@ -8,6 +8,7 @@ import pytest
 
 from dwell.report.formatting import (
     Measure,
+    few_seeds,
     listed,
     percent,
     shown_contender,
@@ -16,6 +17,7 @@ from dwell.report.formatting import (
     write_interval,
     write_number,
 )
+from dwell.report.table import Table
 from dwell.study import Interval
 
 MS = Measure("l95_ms", "L95", "ms")
@@ -97,3 +99,17 @@ def test_lists_and_shares() -> None:
     assert listed(["a", "b"], "or") == "a or b"
     assert percent(0.05) == "5 %"
     assert percent(0.139, 1) == "13.9 %"
+
+
+def test_few_seeds_ask_for_more() -> None:
+    assert [bool(few_seeds(count)) for count in (1, 3, 4, 5, 20)] == [True] * 3 + [False] * 2
+    assert "at least 5" in few_seeds(3)
+
+
+def test_times_that_would_be_nothing_have_more_decimals_and_others_as_before() -> None:
+    sizes = (40.0, 0.2, 0.012, 0.0, math.inf)
+    assert [MS.for_size(size).decimals for size in sizes] == [1, 1, 3, 1, 1]
+    assert SHARE.for_size(0.012).decimals == SHARE.decimals
+    table = Table("t", "", [MS], [{"l95_ms": 0.0121}, {"l95_ms": 0.0038}])
+    ((_, rows),) = table.groups()
+    assert [row[0].text for row in rows] == ["0.012", "0.004"]

@@ -12,6 +12,7 @@ from dwell import Run, draw, open_run, simulate
 from dwell.errors import RunError
 from dwell.model import Episodes, Exponential, LinkDisturbance, NodeDisturbance
 from dwell.report import run_html
+from dwell.report.figure import svg
 from dwell.report.run_page import run_page
 from tests.cells.small import make_problem
 from tests.report.pages import Page, facts_of, small_run, table_of
@@ -136,3 +137,12 @@ def test_a_record_without_its_problem_is_refused() -> None:
     bare = Run({}, {"cycles": run.cycles, "windows": run.windows, "decisions": run.decisions})
     with pytest.raises(RunError, match="record of the problem is incomplete"):
         run_html(bare)
+
+
+def test_final_l95_in_tables_and_l95_as_seen_in_the_figure_have_names_of_their_own() -> None:
+    page = run_page(small_run())
+    worst = next(table for table in page.tables if table.slug == "worst")
+    assert "L95 final (ms)" in worst.headings
+    figure = next(page.figures)
+    assert "L95 seen (ms)" in svg(figure)
+    assert "L95 seen" in figure.caption

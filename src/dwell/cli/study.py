@@ -155,7 +155,7 @@ def _measures(study: Study) -> list[Measure]:
 
 def _text(result: StudyResult) -> str:
     """Return the tables of a study as text: one a point and scenario, as many as a screen takes."""
-    from dwell.report.formatting import shown_policy, shown_scenario
+    from dwell.report.formatting import few_seeds, shown_policy, shown_scenario
     from dwell.study.over_seeds import over_seeds
 
     study = result.study
@@ -179,7 +179,8 @@ def _text(result: StudyResult) -> str:
         lines += [f"{title} ({at})" if at else title]
         lines += [aligned(["", *(measure.heading for measure in measures)], rows), ""]
     seeds = len(study.seeds)
-    lines.append(f"Mean over {seeds} seeds, with its 95 % interval." if seeds > 1 else "One seed.")
+    means = f"Mean over {seeds} seeds, with its 95 % interval" if seeds > 1 else "One seed"
+    lines.append(f"{means}{few_seeds(seeds) or '.'}")
     if groups > SHOWN:
         lines.append(f"{SHOWN} of {groups} tables are shown; runs.parquet has all runs.")
     return "\n".join(lines)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from dwell.model.bounds import counted
 from dwell.report.charts import curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, shown_policy, shown_scenario
+from dwell.report.formatting import Measure, few_seeds, shown_policy, shown_scenario
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
 from dwell.report.palette import Palette
@@ -64,7 +64,7 @@ def comparison_page(
         title=f"Placement policies compared on {cells}",
         subtitle=f"{counted(runs, 'simulated run')}: {counted(len(first.scenarios), 'scenario')}, "
         f"{counted(len(first.policies), 'policy')}, {numbered(first.seeds)}, "
-        f"{counted(first.windows, 'window')}",
+        f"{counted(first.windows, 'window')}{few_seeds(len(first.seeds))}",
         sections=parts,
         policies=policies,
         seeds=first.seeds,

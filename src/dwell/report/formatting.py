@@ -13,6 +13,8 @@ from dwell.study import Interval
 
 #: What has to stand beside everything that shows ATP.
 OURS = "ATP is our reconstruction."
+#: Fewer make intervals that say little, and this is said beside them.
+FEW_SEEDS = 5
 #: A symbol with its index: V_D, N_min, α_L.
 SYMBOL = re.compile(r"(?<![\w.])([A-ZΔα-ωdp])_(D|L|V|S|r|e|z|min|max|loss)(?!\w)")
 ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}
@@ -143,6 +145,13 @@ def _fixed(value: float, places: int) -> str:
 def _between(low: float, high: float, measure: Measure) -> str:
     ends = (write_number(end, measure.decimals, signed=measure.signed) for end in (low, high))
     return f"[{', '.join(ends)}]"
+
+
+def few_seeds(count: int) -> str:
+    """Return the end of a text that asks for more seeds; nothing where they are enough."""
+    if count >= FEW_SEEDS:
+        return ""
+    return f". Few seeds: give at least {FEW_SEEDS} for intervals that say something."
 
 
 def percent(share: float, decimals: int = 0) -> str:

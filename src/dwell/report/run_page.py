@@ -52,6 +52,8 @@ if TYPE_CHECKING:
 
     from dwell.record import Run
 
+#: Of the latencies that cycles had in the end.
+FINAL_L95 = L95._replace(name="L95 final")
 MOST_ROWS = 200
 WORST = 10
 #: Share of a deadline that clocks may be off by, where a window's latencies are proven.
@@ -173,9 +175,11 @@ class _RunPage:
             tracking=self.header.tracking,
             links=links,
             caption=(
-                "Thin lines: J of the other placements as the policy estimated it. Dashed: the aim "
-                "of 5 %, and the deadline. Upright lines: migrations; in colour, the guard's. "
-                "Shaded: warm-up and disturbances. U: all of a node's load, foreign work included."
+                "L95 seen: of the latencies at the window's close, where a cycle that has not "
+                "finished counts with its age. Thin lines: J of the other placements as the policy "
+                "estimated it. Dashed: the aim of 5 %, and the deadline. Upright lines: "
+                "migrations; in colour, the guard's. Shaded: warm-up and disturbances. U: all of a "
+                "node's load, foreign work included."
                 f"{' Marks of the worst windows lead to their cycles.' if links else ''}"
             ),
         )
@@ -190,7 +194,7 @@ class _RunPage:
             Measure("begin_s", "from", "s", decimals=0),
             Measure("end_s", "to", "s", decimals=0),
             RATE,
-            L95,
+            FINAL_L95,
             Measure("lost", "lost", decimals=0),
             *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
             Measure("migrations", "migrations", decimals=0),
@@ -228,11 +232,14 @@ class _RunPage:
             Measure("begin_s", "at", "s"),
             Text("placement", "placement", "placement"),
             RATE,
-            L95,
+            FINAL_L95,
             COST,
             *(Measure(f"u_{node}", node, "%", 100.0, 0) for node in self.header.nodes),
         ]
-        caption = "The windows with the most misses; L95 is ∞ where more than 5 % never finished."
+        caption = (
+            "The windows with the most misses. L95 final: of the latencies that cycles had in the "
+            "end, ∞ where more than 5 % never finished; the figure has what was seen at the close."
+        )
         return Table("worst", "", columns, rows, caption=caption, palette=self.palette)
 
     def _cycles(self, window: Mapping[str, object]) -> Figure:

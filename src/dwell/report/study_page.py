@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, Limit, curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure
+from dwell.report.formatting import Measure, few_seeds
 from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
 from dwell.report.policy_blocks import COST, L95, RATE, THE_AIM, PolicyBlocks, named, scaled
@@ -40,7 +40,7 @@ def study_page(study: StudyRuns, *, sections: int | None = None) -> Page:
         subtitle=f"{counted(study.runs.height, 'run')}: "
         f"{counted(len(study.scenarios), 'scenario')}, "
         f"{counted(len(study.policies), 'policy')}, {counted(points, 'point')}, "
-        f"{numbered(study.seeds)}, {counted(study.windows, 'window')}",
+        f"{numbered(study.seeds)}, {counted(study.windows, 'window')}{few_seeds(len(study.seeds))}",
         sections=list(islice(_sections(study, blocks), sections)),
         policies=blocks.colours,
         seeds=() if study.parameters else study.seeds,

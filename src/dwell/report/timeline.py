@@ -34,7 +34,7 @@ PANEL_PX, USE_PX = 86, 56
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 #: Scales that every panel has for itself.
 OWN = ("color", "strokeDash")
-L95 = "L95 (ms)"
+L95 = "L95 seen (ms)"
 WARMUP, UNPROVEN = "warm-up", "clocks unproven"
 AT = quantity("time", "at (s)", format=".1f")
 #: Layers of every panel.
