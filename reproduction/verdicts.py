@@ -14,7 +14,17 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from dwell.study import AIM, UNTOLD, Family, Interval, Study, over_seeds, under, untold
+from dwell.study import (
+    AIM,
+    UNTOLD,
+    Family,
+    Interval,
+    Study,
+    over_seeds,
+    under,
+    untold,
+    windows_behind,
+)
 
 NUMBERS = ("effect", "low", "high", "p", "p_least")
 COLUMNS = ("claim", "design", "scenario", "first", "second", "metric", *NUMBERS, "word")
@@ -93,10 +103,10 @@ def under_aim(rows: pl.DataFrame, runs: pl.DataFrame, *studies: Study) -> pl.Dat
     """Judge of every policy whether V_D is under 5 %: of `rows` over seeds, made of `runs`."""
     found = [pl.DataFrame(schema=SCHEMA)]
     for row in rows.iter_rows(named=True):
-        mine = runs.filter(scenario=row["scenario"], policy=row["policy"])["violation_rate"]
+        mine = runs.filter(scenario=row["scenario"], policy=row["policy"])
         limits = (row["violation_rate_at_least"], row["violation_rate_at_most"])
         known = Interval(row["violation_rate"], *limits)
-        word = under(mine.to_list(), AIM)
+        word = under(mine["violation_rate"].to_list(), AIM, windows=windows_behind(mine))
         names = ("V_D under 5 %", row["scenario"], row["policy"], "violation_rate")
         found.append(judge(*names, known, word, *studies))
     return pl.concat(found)

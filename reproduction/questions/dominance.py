@@ -23,7 +23,7 @@ from dwell.model import (
     Task,
     Uniform,
 )
-from dwell.study import Interval, Point, Study, paired_difference
+from dwell.study import Interval, Point, Study, paired_difference, windows_behind
 from reproduction.cell import RULES, STEADY, of_cell, rules, statics, with_candidate, with_scenarios
 from reproduction.questions import Run
 from reproduction.scale import Scale, thinned
@@ -186,7 +186,8 @@ def winners(runs: pl.DataFrame, metric: str, candidates: Sequence[str]) -> pl.Da
         found = {name: values(here, metric, policy=name) for name in candidates}
         first, second, *_ = sorted(candidates, key=lambda name: float(found[name].mean()))
         shares = metric == "violation_rate"
-        margin = paired_difference(found[second], found[first], shares=shares)
+        windows = windows_behind(*(here.filter(policy=name) for name in (first, second)))
+        margin = paired_difference(found[second], found[first], shares=shares, windows=windows)
         rows.append(
             {
                 "metric": metric,

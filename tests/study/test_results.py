@@ -29,7 +29,9 @@ def test_the_table_has_every_column_with_its_interval(comparison: Comparison) ->
     assert row.select("cost", "cost_low", "cost_high").row(0) == over
     rates = comparison.values("baseline", "dtp", "violation_rate")
     limits = row.select("violation_rate_at_least", "violation_rate_at_most").row(0)
-    assert limits == share_limits(rates)
+    windows = comparison.windows_behind("baseline", "dtp")
+    assert windows == comparison.runs.filter(scenario="baseline", policy="dtp")["windows"].sum()
+    assert limits == share_limits(rates, windows=windows)
     for name in ("l95_ms", "u_robot", "u_edge", "migrations", "share_LOC", "share_HYB"):
         assert {name, f"{name}_low", f"{name}_high"} <= set(table.columns)
 

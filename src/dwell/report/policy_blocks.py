@@ -25,7 +25,7 @@ from dwell.report.method import method_blocks
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
 from dwell.report.table import Columns, Table, Text
-from dwell.study import AIM, over_seeds, under
+from dwell.study import AIM, over_seeds, under, windows_behind
 
 if TYPE_CHECKING:
     import polars as pl
@@ -224,7 +224,9 @@ class PolicyBlocks:
     def standing(self, scenario: str, policy: str) -> str:
         """Return whether V_D is shown to be under 5 %: a word of docs/background/statistics.md."""
         mine = self.runs.filter(scenario=scenario, policy=policy)
-        return under(mine["violation_rate"].to_list(), AIM) if mine.height else ""
+        if mine.is_empty():
+            return ""
+        return under(mine["violation_rate"].to_list(), AIM, windows=windows_behind(mine))
 
     def standings(self) -> dict[str, Counter[str]]:
         """Return, by policy, in how many scenarios which word is said of V_D."""

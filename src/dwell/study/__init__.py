@@ -6,7 +6,7 @@ from dwell.study.family import SAME_RUN, UNTOLD, Family, same_run, untold
 from dwell.study.hindsight import Hindsight
 from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
 from dwell.study.kept_bounds import keeps
-from dwell.study.over_seeds import over_seeds
+from dwell.study.over_seeds import over_seeds, windows_behind
 from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
 from dwell.study.player import Example
 from dwell.study.predictions import paper_predictions
@@ -53,4 +53,5 @@ __all__ = [
     "under",
     "untold",
     "validate",
+    "windows_behind",
 ]

@@ -17,8 +17,8 @@ import numpy as np
 
 from dwell.errors import SimulationError
 from dwell.model.bounds import counted
-from dwell.study.intervals import CONFIDENCE, Floats, median_interval, share_interval
-from dwell.study.over_seeds import interval_of, metric_values
+from dwell.study.intervals import CONFIDENCE, Floats
+from dwell.study.over_seeds import has_median, is_share, metric_values, windows_behind
 from dwell.study.pairs import (
     PairedDifference,
     PairedMedian,
@@ -154,7 +154,7 @@ class Family:
         adjusted, verdicts, count = self.adjusted, self.verdicts, len(self.tested)
         rows = []
         for name, item in self.comparisons.items():
-            centre = "median" if interval_of(self.metric) is median_interval else "mean"
+            centre = "median" if has_median(self.metric) else "mean"
             known = {"difference": 0.0, "superiority": 0.5, "n": item.n}
             if not isinstance(item, SameRun):
                 centre = "mean" if isinstance(item, PairedDifference) else "median"
@@ -184,15 +184,20 @@ def seed_values(runs: pl.DataFrame, column: str, labels: Labels) -> Floats:
     MetricError
         If there is no such column; with the nearest name.
     """
-    import polars as pl
-
-    group = runs.filter(*(pl.col(name) == value for name, value in labels.items()))
+    group = _group(runs, labels)
     if group.is_empty() or group["seed"].n_unique() != group.height:
         raise SimulationError(
             f"{dict(labels)} leaves {group.height} runs of {group['seed'].n_unique()} seeds; it "
             "must leave one a seed"
         )
-    return metric_values(group.sort("seed"), column)
+    return metric_values(group, column)
+
+
+def _group(runs: pl.DataFrame, labels: Labels) -> pl.DataFrame:
+    """Return the runs with some labels, in the order of their seeds."""
+    import polars as pl
+
+    return runs.filter(*(pl.col(name) == value for name, value in labels.items())).sort("seed")
 
 
 def same_run(runs: pl.DataFrame, pair: Contrast) -> bool:
@@ -204,16 +209,9 @@ def same_run(runs: pl.DataFrame, pair: Contrast) -> bool:
         One row a run. Those of older versions do not have what tells it: then it is not known, and
         this is False.
     """
-    import polars as pl
-
     if PLAYED not in runs.columns:
         return False
-    first, second = (
-        runs.filter(*(pl.col(name) == value for name, value in labels.items()))
-        .sort("seed")
-        .select("seed", PLAYED)
-        for labels in pair
-    )
+    first, second = (_group(runs, labels).select("seed", PLAYED) for labels in pair)
     return first.equals(second, null_equal=False)
 
 
@@ -222,9 +220,10 @@ def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
     first, second = (seed_values(runs, metric, labels) for labels in pair)
     if same_run(runs, pair) and np.array_equal(first, second):
         return SameRun(len(first))
-    if interval_of(metric) is median_interval:
+    if has_median(metric):
         return paired_median(first, second)
-    return paired_difference(first, second, shares=interval_of(metric) is share_interval)
+    windows = windows_behind(*(_group(runs, labels) for labels in pair))
+    return paired_difference(first, second, shares=is_share(metric), windows=windows)
 
 
 def cannot_tell(seeds: int, comparisons: int = 1) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 from dwell.errors import MetricError
@@ -61,29 +62,60 @@ def over_seeds(
     rows: list[Row] = []
     for labels, mine in runs.group_by(keys, maintain_order=True):
         row: Row = {**dict(zip(keys, labels, strict=True)), "seeds": mine.height}
+        windows = windows_behind(mine)
         for column in columns:
-            row |= interval_of(column)(metric_values(mine, column)).columns(column)
+            row |= interval_of(column, windows)(metric_values(mine, column)).columns(column)
         if "violation_rate" in columns:
-            at_least, at_most = share_limits(metric_values(mine, "violation_rate"))
+            rates = metric_values(mine, "violation_rate")
+            at_least, at_most = share_limits(rates, windows=windows)
             row["violation_rate_at_least"] = at_least
             row["violation_rate_at_most"] = at_most
         rows.append(row)
     return pl.DataFrame(rows, infer_schema_length=None).fill_nan(None)
 
 
-def interval_of(column: str) -> Callable[[Floats], Interval]:
-    """Which interval a column of runs takes: of a median where it may be infinite, or a mean."""
-    if column in ("p95_ms", "p50_ms", "spread_ms") or column.startswith("tracking_"):
+def windows_behind(*groups: pl.DataFrame) -> int | None:
+    """Windows behind the runs of each of some groups: the fewest; None where it is not known.
+
+    Parameters
+    ----------
+    *groups : DataFrame
+        One row a run each; their column ``windows`` counts those after the warm-up.
+    """
+    if any("windows" not in runs.columns for runs in groups):
+        return None
+    return min(int(runs["windows"].sum()) for runs in groups)
+
+
+def has_median(column: str) -> bool:
+    """Whether a column of runs may be infinite, so that its median stands for it."""
+    return column in ("p95_ms", "p50_ms", "spread_ms") or column.startswith("tracking_")
+
+
+def is_share(column: str) -> bool:
+    """Whether a column of runs is a share of cycles or windows, in [0, 1]."""
+    return column == "violation_rate" or column.startswith(("share_", "over_"))
+
+
+def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], Interval]:
+    """Which interval a column of runs takes: of a median where it may be infinite, or a mean.
+
+    Parameters
+    ----------
+    windows : int, optional
+        Behind the runs (see `windows_behind`); shares have wide intervals where None.
+    """
+    if has_median(column):
         return median_interval
-    if column == "violation_rate" or column.startswith(("share_", "over_")):
-        return share_interval
+    if is_share(column):
+        return partial(share_interval, windows=windows)
     return _not_negative if column in NOT_NEGATIVE or column.startswith("u_") else mean_interval
 
 
-def difference_of(column: str) -> Callable[[Floats, Floats], Interval]:
+def difference_of(column: str, windows: int | None = None) -> Callable[[Floats, Floats], Interval]:
     """Which interval the mean difference of a column of runs takes, between pairs of runs."""
-    if interval_of(column) is share_interval:
-        return share_difference_interval
+    if is_share(column):
+        return partial(share_difference_interval, windows=windows)
     return lambda first, second: mean_interval(first - second)
 
 

@@ -112,7 +112,12 @@ class SameRun:
 
 
 def paired_difference(
-    first: Values, second: Values, *, shares: bool = False, seed: int = RESAMPLING_SEED
+    first: Values,
+    second: Values,
+    *,
+    shares: bool = False,
+    windows: int | None = None,
+    seed: int = RESAMPLING_SEED,
 ) -> PairedDifference:
     """Compare the means of two samples that are paired by seed.
 
@@ -122,6 +127,8 @@ def paired_difference(
         One a seed, in the same order, finite.
     shares : bool
         Whether they are shares, in [0, 1].
+    windows : int, optional
+        Windows behind each of the samples, where they are shares (see `share_interval`).
     seed : int
         Seed of resamples and of drawn flips: the same samples always give the same numbers.
 
@@ -146,7 +153,7 @@ def paired_difference(
             )
     differences = _differences(one, other)
     mean, low, high = (
-        share_difference_interval(one, other, seed=seed)
+        share_difference_interval(one, other, windows=windows, seed=seed)
         if shares
         else mean_interval(differences, seed=seed)
     )

@@ -24,7 +24,7 @@ from dwell.study.intervals import (
     under,
 )
 from dwell.study.kept_bounds import ABOVE_ZERO, keeps
-from dwell.study.over_seeds import difference_of
+from dwell.study.over_seeds import difference_of, windows_behind
 from dwell.study.results import StudyRuns
 
 if TYPE_CHECKING:
@@ -102,7 +102,10 @@ def _over_aim(policy: str) -> PaperClaim:
 
 def _is_under_aim(policy: str, comparison: StudyRuns, scenario: str) -> bool | None:
     rates = _values(comparison, scenario, policy, "violation_rate")
-    return None if rates is None else {"under": True, "over": False}.get(under(rates, AIM))
+    if rates is None:
+        return None
+    word = under(rates, AIM, windows=comparison.windows_behind(scenario, policy))
+    return {"under": True, "over": False}.get(word)
 
 
 def _more(
@@ -111,11 +114,17 @@ def _more(
     """A policy shows more in a column than another policy, which may be in another scenario."""
 
     def holds(comparison: StudyRuns, scenario: str) -> bool | None:
+        elsewhere = than_in or scenario
         first = _values(comparison, scenario, policy, column)
-        second = _values(comparison, than_in or scenario, other, column)
+        second = _values(comparison, elsewhere, other, column)
         if first is None or second is None or not np.isfinite([*first, *second]).all():
             return None
-        return keeps(difference_of(column)(first, second), at_least=ABOVE_ZERO)
+        groups = (
+            comparison.runs.filter(scenario=scenario, policy=policy),
+            comparison.runs.filter(scenario=elsewhere, policy=other),
+        )
+        difference = difference_of(column, windows_behind(*groups))(first, second)
+        return keeps(difference, at_least=ABOVE_ZERO)
 
     return PaperClaim(words, reading, holds)
 
@@ -257,7 +266,8 @@ def judge_placement(comparison: StudyRuns, prediction: Prediction, policy: str =
     }
     together = np.sum([shares[name] for name in prediction.dominant], axis=0)
     together = np.minimum(together, 1.0)
-    share = share_interval(together)
+    windows = comparison.windows_behind(prediction.scenario, policy)
+    share = share_interval(together, windows=windows)
     answer = _answer(keeps(share, at_least=prediction.share))
     leader = max(shares, key=lambda name: shares[name].mean())
     return Judgement(answer, leader, share)

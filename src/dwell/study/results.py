@@ -16,7 +16,13 @@ from dwell.model.bounds import counted
 from dwell.model.semantics import nearest
 from dwell.study.family import same_run
 from dwell.study.intervals import Floats, Interval
-from dwell.study.over_seeds import difference_of, interval_of, metric_values, over_seeds
+from dwell.study.over_seeds import (
+    difference_of,
+    interval_of,
+    metric_values,
+    over_seeds,
+    windows_behind,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -133,7 +139,14 @@ class StudyRuns(Displayed):
 
     def interval(self, scenario: str, policy: str, column: str) -> Interval:
         """Return a column over seeds: its mean, or its median where it may be infinite."""
-        return interval_of(column)(self.values(scenario, policy, column))
+        windows = self.windows_behind(scenario, policy)
+        return interval_of(column, windows)(self.values(scenario, policy, column))
+
+    def windows_behind(self, scenario: str, *policies: str) -> int | None:
+        """Return the windows behind the runs of a policy; of several, the fewest."""
+        return windows_behind(
+            *(self.runs.filter(scenario=scenario, policy=policy) for policy in policies)
+        )
 
     def difference(self, scenario: str, policies: tuple[str, str], column: str) -> Interval:
         """Return the mean over seeds of what the first policy shows less what the second does.
@@ -146,7 +159,8 @@ class StudyRuns(Displayed):
         one, other = ({"scenario": scenario, "policy": policy} for policy in policies)
         if same_run(self.runs, (one, other)) and np.array_equal(first, second):
             return Interval(0.0, math.nan, math.nan)
-        return difference_of(column)(first, second)
+        windows = self.windows_behind(scenario, *policies)
+        return difference_of(column, windows)(first, second)
 
     def table(self, columns: Sequence[str] | None = None) -> pl.DataFrame:
         """Return one row a point, scenario and policy: columns over seeds with their intervals.
