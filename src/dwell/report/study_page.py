@@ -114,7 +114,7 @@ class _View:
 
         keys = ("scenario", "policy", *self.panels, self.at)
         runs = self.study.runs.group_by(*keys, "seed", maintain_order=True).agg(
-            pl.col(measure.column).cast(pl.Float64).mean()
+            pl.col(measure.column).cast(pl.Float64).mean(), pl.col("windows").sum()
         )
         return over_seeds(runs, keys, [measure.column])
 
