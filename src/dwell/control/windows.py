@@ -85,17 +85,20 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     Returns
     -------
     l95_ms, uncut_ms : float64 array, shape (...)
-        At most `censor_ms`, as J is made of it; and as caps are compared with it, infinite where
-        the L95 is that of an unfinished cycle, which is lost or later than nearly all others.
+        At most `censor_ms`, as J is made of it; and as caps are compared with it: infinite where
+        more cycles are unfinished than L95 leaves out, and it is the age of one of them.
     """
     # The last bit tells unfinished cycles apart; of equal values theirs come last.
-    seen = 2 * np.minimum(latency_ns, age_ns) + (latency_ns > age_ns)
-    rank = l95_rank(seen.shape[-1])
+    unfinished = latency_ns > age_ns
+    seen = 2 * np.minimum(latency_ns, age_ns) + unfinished
+    count = seen.shape[-1]
+    rank = l95_rank(count)
     seen.partition(rank - 1, axis=-1)
     l95 = seen[..., rank - 1]
+    lost = (l95 % 2 == 1) & (np.count_nonzero(unfinished, axis=-1) > count - rank)
     # Censoring is monotone, so censoring the order statistic is censoring every latency.
     cut_ns = np.minimum(l95 // 2, round(censor_ms * 1e6))
-    return cut_ns / 1e6, np.where(l95 % 2, np.inf, l95 // 2 / 1e6)
+    return cut_ns / 1e6, np.where(lost, np.inf, l95 // 2 / 1e6)
 
 
 def final_l95_ms(latency_ns: Ints) -> Floats:

@@ -229,7 +229,9 @@ class Shadow:
         rank = int(np.searchsorted(reached, 0.95 * total * (1 - 1e-12)))
         seen_ms = float(samples.seen_ms[order[rank]])
         l95_ms = min(seen_ms, self.problem.censor_ms)
-        uncut_ms = math.inf if samples.unfinished[order[rank]] else seen_ms
+        unfinished = float(samples.weight[samples.unfinished].sum())
+        lost = samples.unfinished[order[rank]] and unfinished > 0.05 * total
+        uncut_ms = math.inf if lost else seen_ms
         missed = float(samples.weight[samples.missed].sum()) / total
         return QoS(l95_ms, min(missed, 1.0), known.utilisation, uncut_ms)
 
