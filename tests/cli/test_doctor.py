@@ -103,7 +103,7 @@ def test_compiled_kernels_of_older_versions_go_and_all_if_asked(
     assert not old.exists()
     assert ours.exists() == (not clear)
     assert foreign.exists()
-    whose = "2 files, 2.0 MB, removed" if clear else "1 files, 1.0 MB, of older versions, removed"
+    whose = "2 files, 2.0 MB, removed" if clear else "1 file, 1.0 MB, of older versions, removed"
     assert removed["found"] == whose
     assert ("not yet there" if clear else "of this version, 1.0 MB") in kept["found"]
     assert str(kernels.folder) in kept["found"]

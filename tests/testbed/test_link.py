@@ -305,7 +305,7 @@ def test_messages_are_lost_by_the_transport_only() -> None:
 @needs_hosts
 def test_values_out_of_their_bounds_change_nothing(hosts: TwoHosts, link: TunLink) -> None:
     with pytest.raises(LiveError, match="loss"):
-        link.set(*AB, loss=1.0, delay_ms=Constant(500.0))
+        link.set(*AB, loss=1.5, delay_ms=Constant(500.0))
     with pytest.raises(LiveError, match="a link has no delay"):
         link.set(*AB, delay=Constant(500.0))
     probe = Probe(hosts)
