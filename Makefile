@@ -12,10 +12,10 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench paper faults chaos soak fuzz audit sbom lock clean
+.PHONY: help env demo test check bench paper deadlines faults chaos soak fuzz audit sbom lock clean
 
 help: ## Show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-6s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
 
 env: $(VENV)/.installed ## Make .venv from the lock files (only when they changed)
 
@@ -58,6 +58,12 @@ bench: env ## Run the benchmarks
 
 paper: env ## Ask the paper's questions; hours (ARGS="--scale quick": minutes; --help)
 	$(BIN)/python -m reproduction $(ARGS)
+
+# What the demo shows of it is kept beside the study.
+deadlines: env ## Play the study behind the demo's figure of deadlines again; minutes
+	$(BIN)/dwell study examples/studies/deadline.yaml --out build/deadline
+	$(BIN)/dwell report build/deadline --figures build/deadline/figures
+	cp build/deadline/figures/violation_rate-0.csv examples/studies/deadline.csv
 
 faults: env ## Kill, freeze and cut real processes, 60 times each way; goes on where it was stopped
 	$(BIN)/python -m tests.live.faults $(ARGS)

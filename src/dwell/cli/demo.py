@@ -23,6 +23,8 @@ from dwell.cli.output import print_json, progress, working, write_file
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import polars as pl
+
     from dwell.study import Comparison, StudyResult
 
 
@@ -53,7 +55,7 @@ def demo(
     """
     from dwell.cli.first_answer import compile_first
     from dwell.report import comparison_html, comparison_text
-    from dwell.study import canonical_demo, real_demo, tenants_demo
+    from dwell.study import canonical_demo, real_demo, stored_deadlines, tenants_demo
     from dwell.study.demo import CANONICAL, REAL, WINDOWS
 
     require_one_length(windows, seconds)
@@ -66,7 +68,9 @@ def demo(
     with progress("simulating") as shown:
         comparisons: Sequence[Comparison]
         tenants: StudyResult | None = None
+        deadlines: pl.DataFrame | None = None
         if real is None:
+            deadlines = stored_deadlines(folder)
             comparisons = [
                 canonical_demo(
                     folder, seeds=seeds, windows=windows, processes=processes, progress=shown
@@ -85,7 +89,7 @@ def demo(
             typer.echo(f"Cell {comparison.problem.name}\n")
             typer.echo(comparison_text(comparison))
     with working("writing the report"):
-        write_file(page, comparison_html(*comparisons, tenants=tenants))
+        write_file(page, comparison_html(*comparisons, tenants=tenants, deadlines=deadlines))
     if as_json:
         tables = {one.problem.name: one.table().to_dicts() for one in comparisons}
         print_json({"report": page, "comparisons": tables})

@@ -21,13 +21,20 @@ from dwell.study import Comparison, StudyResult, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from dwell.model import Node
 
 DTP = "dtp"
+#: Scenarios in which perception's time on R1 decides between placements.
+ROBOT_DECIDES = ("baseline", "robot-cpu-stress")
 
 
 def comparison_html(
-    *comparisons: Comparison, tenants: StudyResult | None = None, static: bool = False
+    *comparisons: Comparison,
+    tenants: StudyResult | None = None,
+    deadlines: pl.DataFrame | None = None,
+    static: bool = False,
 ) -> str:
     """Return a page about one comparison, or about several one after the other.
 
@@ -37,14 +44,20 @@ def comparison_html(
         At least one, of cells with different names.
     tenants : StudyResult, optional
         Runs of `dwell.study.tenants_demo`; a section of its own.
+    deadlines : DataFrame, optional
+        Rows of `dwell.study.stored_deadlines`; a section of its own.
     static : bool
         See `dwell.report.page.page_html`.
     """
-    return page_html(comparison_page(*comparisons, tenants=tenants), static=static)
+    page = comparison_page(*comparisons, tenants=tenants, deadlines=deadlines)
+    return page_html(page, static=static)
 
 
 def comparison_page(
-    *comparisons: Comparison, tenants: StudyResult | None = None, sections: int | None = None
+    *comparisons: Comparison,
+    tenants: StudyResult | None = None,
+    deadlines: pl.DataFrame | None = None,
+    sections: int | None = None,
 ) -> Page:
     """Return what there is to show of comparisons; the first `sections` only of each."""
     several = len(comparisons) > 1
@@ -54,7 +67,7 @@ def comparison_page(
         prefix = f"{comparison.problem.name}-" if several else ""
         blocks = PolicyBlocks(comparison, prefix)
         policies |= blocks.colours
-        for part in islice(_sections(comparison, blocks, tenants), sections):
+        for part in islice(_sections(comparison, blocks, tenants, deadlines), sections):
             title = f"{comparison.problem.name}: {part.title}" if several else part.title
             parts.append(Section(title.removesuffix(": "), part.blocks, part.note))
     first = comparisons[0]
@@ -72,7 +85,10 @@ def comparison_page(
 
 
 def _sections(
-    comparison: Comparison, blocks: PolicyBlocks, tenants: StudyResult | None
+    comparison: Comparison,
+    blocks: PolicyBlocks,
+    tenants: StudyResult | None,
+    deadlines: pl.DataFrame | None,
 ) -> Iterator[Section]:
     yield Section("", blocks.answer(), note=blocks.headline())
     predictions = predictions_table(comparison, blocks)
@@ -84,6 +100,11 @@ def _sections(
     yield Section("Figures", figures)
     if tenants is not None:
         yield Section("V_D by the share of time that E’s tenants take", [_tenants(tenants)])
+    if deadlines is not None:
+        yield Section(
+            "V_D by the deadline, and by how long perception takes on R1",
+            [_deadlines(deadlines, blocks)],
+        )
     shown = _shown_in_time(comparison)
     if shown is not None and comparison.examples:
         timelines = [_timeline(comparison, blocks, one, shown) for one in comparison.scenarios]
@@ -202,6 +223,21 @@ def _tenants(result: StudyResult) -> Figure:
     draw = curves(frame, RATE, PolicyBlocks(result).styles, "share of the time (%)", THE_AIM)
     caption = "Means over seeds with their 95 % intervals."
     return Figure("tenants", "", {"rows": frame}, draw, caption)
+
+
+def _deadlines(rows: pl.DataFrame, blocks: PolicyBlocks) -> Figure:
+    """Draw V_D over P = D, a panel for each time of perception on R1."""
+    import polars as pl
+
+    shown = [shown_scenario(name) for name in ROBOT_DECIDES]
+    frame = rows.filter(pl.col("scenario").is_in(shown))
+    styles = {name: style for name, style in blocks.styles.items() if name in frame["policy"]}
+    draw = curves(frame, RATE, styles, "P = D (ms)", THE_AIM)
+    caption = (
+        "Means over 10 seeds with their 95 % intervals. Played beforehand "
+        "(examples/studies/deadline.yaml)."
+    )
+    return Figure("deadlines", "", {"rows": frame}, draw, caption)
 
 
 def _share_of_bursts(node: Node) -> float:

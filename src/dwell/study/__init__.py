@@ -1,7 +1,13 @@
 """Studies: many runs, and the statistics over their seeds."""
 
 from dwell.study.comparison import AIM, Comparison, compare
-from dwell.study.demo import canonical_demo, longest_run, real_demo, tenants_demo
+from dwell.study.demo import (
+    canonical_demo,
+    longest_run,
+    real_demo,
+    stored_deadlines,
+    tenants_demo,
+)
 from dwell.study.family import SAME_RUN, UNTOLD, Family, same_run, untold
 from dwell.study.hindsight import Hindsight
 from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
@@ -49,6 +55,7 @@ __all__ = [
     "run_study",
     "same_run",
     "share_interval",
+    "stored_deadlines",
     "tenants_demo",
     "under",
     "untold",

@@ -12,14 +12,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from dwell.errors import TraceError
+from dwell.errors import ProblemError, TraceError
 from dwell.model import Problem
 from dwell.study.comparison import Comparison, compare
 from dwell.study.runner import StudyResult, run_study
 from dwell.study.study import Contender, load_study
 from dwell.study.workers import Progress
+
+if TYPE_CHECKING:
+    import polars as pl
 
 #: Policies beside every candidate as a static placement.
 POLICIES = (
@@ -38,6 +41,8 @@ CANONICAL = "canonical.yaml"
 REAL = ("real.yaml", "real-5g.yaml")
 #: Study of the assumption that decides the demo's answer, in the same folder.
 TENANTS = "studies/tenants.yaml"
+#: What `make deadlines` kept of the study of periods and perception times beside it.
+DEADLINES = "studies/deadline.csv"
 
 Folder: TypeAlias = "str | os.PathLike[str]"
 
@@ -95,6 +100,28 @@ def tenants_demo(
     study = load_study(Path(examples) / TENANTS)
     study = replace(study, seeds=tuple(range(1, seeds + 1)), windows=windows)
     return run_study(study, processes=processes, progress=progress)
+
+
+def stored_deadlines(examples: Folder) -> pl.DataFrame:
+    """Return V_D over P = D and perception's time on R1, as `make deadlines` played it.
+
+    Returns
+    -------
+    DataFrame
+        One row a scenario, policy and point, as the figure of the study's report has them:
+        ``scenario``, ``policy``, ``at`` (P = D, ms), ``mean``, ``low``, ``high`` (%), ``panel``.
+
+    Raises
+    ------
+    ProblemError
+        If the file is missing.
+    """
+    import polars as pl
+
+    file = Path(examples) / DEADLINES
+    if not file.is_file():
+        raise ProblemError(f"{file} is missing; `make deadlines` plays it again")
+    return pl.read_csv(file)
 
 
 def real_demo(
