@@ -97,8 +97,8 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     l95 = seen[..., rank - 1]
     lost = (l95 % 2 == 1) & (np.count_nonzero(unfinished, axis=-1) > count - rank)
     # Censoring is monotone, so censoring the order statistic is censoring every latency.
-    cut_ns = np.minimum(l95 // 2, round(censor_ms * 1e6))
-    return cut_ns / 1e6, np.where(lost, np.inf, l95 // 2 / 1e6)
+    l95_ms = l95 // 2 / 1e6
+    return np.minimum(l95_ms, round(censor_ms * 1e6) / 1e6), np.where(lost, np.inf, l95_ms)
 
 
 def final_l95_ms(latency_ns: Ints) -> Floats:
