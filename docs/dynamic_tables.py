@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dwell
-from dwell.model import Problem
+from dwell.model import NodeDisturbance, Problem
 from dwell.study import load_study, mean_interval
 from dwell.study.drawn_disturbances import drawn_disturbances
 
@@ -92,7 +92,7 @@ def faults(
     items = drawn_disturbances(problem, scenario, seed, 300)
     spans: dict[str, list[tuple[float, float]]] = {}
     for item in items:
-        where = getattr(item, "node", None) or item.link
+        where = item.node if isinstance(item, NodeDisturbance) else item.link
         spans.setdefault(where, []).append((item.at_s, item.at_s + item.for_s))
     for begin, end in zip(windows.begin_s, windows.end_s, strict=True):
         on = set()
