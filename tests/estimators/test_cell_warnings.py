@@ -115,6 +115,16 @@ LINK = {"link": "R->E"}
             ("80% of the cores of E, of which background leave 70%",),
         ),
         (by_priority(10), "candidates.SO", ("rest is never done", "timer of a higher priority")),
+        # Wider than its node, a job is as much work under each scheduler.
+        (on_one({"scheduler": "fifo"}, {"a": stage(3, threads=4)}), "candidates.SO", ("120%",)),
+        (
+            on_one(
+                {"scheduler": "priority"},
+                {"timer": stage(5, priority=1, threads=2), "rest": stage(1)},
+            ),
+            "candidates.SO",
+            ("rest is never done", "timer of a higher priority"),
+        ),
         (objective(caps={"utilisation": 98}), "objective.caps.utilisation", ("0.98 instead",)),
         (objective({"robot": 70}), "objective.targets.robot", ("0.7 instead of 70?",)),
         (objective({"edge": 1.5}), "objective.targets.edge", ("1.5 is more than all cores",)),

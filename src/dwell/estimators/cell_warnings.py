@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from dwell.cost import tier_utilisation
+from dwell.cost import price, tier_utilisation
 from dwell.display import milliseconds
 from dwell.errors import Fault
 from dwell.estimators.profile import SEED, Profile, SampleCycles, mean_ms
@@ -22,7 +22,6 @@ from dwell.model.pipeline import Execution, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import Trace
-from dwell.model.qos import QoS
 from dwell.model.scenario import Disturbance, NodeDisturbance
 from dwell.model.servo import Servo
 
@@ -128,9 +127,7 @@ def _own_share(problem: Problem, node: Node, placement: Placement) -> float:
     """Share of a node's capacity that its own work asks for."""
     work_ms = 0.0
     for task, execution in _on_cpu(problem, node, placement):
-        fair = node.scheduler == "fair"
-        threads = execution.threads if fair else min(execution.threads, node.cores)
-        work_ms += mean_ms(problem.pipeline, task, execution) * threads
+        work_ms += mean_ms(problem.pipeline, task, execution) * execution.threads
     return work_ms / (problem.pipeline.period_ms * node.capacity)
 
 
@@ -193,9 +190,10 @@ def _starved_stages(problem: Problem) -> Iterator[Fault]:
                 held = 0.0
                 for other in above:
                     execution = other.on[node.name]
-                    busy = mean_ms(pipeline, other, execution) / pipeline.period_ms
                     threads = min(execution.threads, node.cores)
-                    held += min(busy, execution.workers) * threads / node.cores
+                    job_ms = mean_ms(pipeline, other, execution) * execution.threads / threads
+                    busy = min(job_ms / pipeline.period_ms, execution.workers)
+                    held += busy * threads / node.cores
                 if held >= 1:
                     names = ", ".join(other.name for other in above)
                     yield Fault(
@@ -304,20 +302,13 @@ _TARGETS = {"latency": "latency_ms"}
 
 def _terms(objective: Objective, profile: Profile, candidate: str) -> dict[str, float]:
     """Terms of J of a candidate as it is expected undisturbed, by their weights' names."""
-    used = profile.own[candidate]
-    qos = QoS(profile.l95_ms[candidate], profile.violation_rate[candidate], used)
-    weights, targets = objective.weights, objective.targets
-    robot, edge, cloud = tier_utilisation(qos.utilisation, objective)
-    terms = {
-        "latency": weights.latency * qos.l95_ms / targets.latency_ms,
-        "violations": weights.violations * qos.violation_rate,
-        "robot": weights.robot * robot / targets.robot,
-        "edge": weights.edge * edge / targets.edge,
-        "cloud": 0.0,
-    }
-    if weights.cloud is not None and targets.cloud is not None:
-        terms["cloud"] = weights.cloud * cloud / targets.cloud
-    return terms
+    used = tier_utilisation(profile.own[candidate], objective)
+    # One metric at a time, and 0 for the others.
+    l95_ms, rate, robot, edge, cloud = np.diag(
+        [profile.l95_ms[candidate], profile.violation_rate[candidate], *used]
+    )
+    terms = price(l95_ms, rate, robot, edge, cloud, 0.0, objective)
+    return dict(zip(("latency", *_OTHERS), terms.tolist(), strict=True))
 
 
 # ---------------------------------------------------------------------------------- the guard
