@@ -8,7 +8,7 @@ the canonical cell, whose means are those of all seeds played (8,000: an hour on
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 import dwell
-from dwell.study import compare
+from dwell.study import Interval, compare
 from dwell.study.intervals import (
     mean_interval,
     share_difference_interval,
@@ -58,6 +58,11 @@ POPULATIONS: dict[str, tuple[Draw, float]] = {
 }
 
 
+def holding(intervals: Sequence[Interval], mean: float) -> float:
+    """Share of some intervals that hold a mean."""
+    return float(np.mean([one.low <= mean <= one.high for one in intervals]))
+
+
 def of_populations() -> Iterator[str]:
     """Yield a row a population and number of seeds."""
     yield "| rates of the runs | seeds | interval | upper limit | Student's limit |"
@@ -67,15 +72,13 @@ def of_populations() -> Iterator[str]:
             rates = draw(rng, (SAMPLES, size))
             windows = WINDOWS * size
             intervals = [share_interval(row, windows=windows) for row in rates]
-            limits = [share_limits(row, windows=windows)[1] for row in rates]
+            limits = np.array([share_limits(row, windows=windows)[1] for row in rates])
             errors = rates.std(axis=1, ddof=1) / size**0.5
             students = rates.mean(axis=1) + student.ppf(0.95, size - 1) * errors
-            held = (
-                np.mean([one.low <= mean <= one.high for one in intervals]),
-                np.mean(np.array(limits) >= mean),
-                np.mean(students >= mean),
+            shares = (holding(intervals, mean), (limits >= mean).mean(), (students >= mean).mean())
+            yield (
+                f"| {name} | {size} | " + " | ".join(f"{100 * one:.1f} %" for one in shares) + " |"
             )
-            yield f"| {name} | {size} | " + " | ".join(f"{100 * one:.1f} %" for one in held) + " |"
 
 
 def of_the_cell(runs: pl.DataFrame) -> Iterator[str]:
@@ -93,10 +96,10 @@ def of_the_cell(runs: pl.DataFrame) -> Iterator[str]:
                 shown = [(rates[name][one], int(windows[name][one].sum())) for one in studies]
                 mean = rates[name].mean()
                 intervals = [share_interval(row, windows=count) for row, count in shown]
-                limits = [share_limits(row, windows=count)[1] for row, count in shown]
-                held = np.mean([one.low <= mean <= one.high for one in intervals])
-                kept = np.mean(np.array(limits) >= mean)
-                row = f"{100 * mean:.2f} % | {100 * held:.1f} % | {100 * kept:.1f} %"
+                limits = np.array([share_limits(row, windows=count)[1] for row, count in shown])
+                kept = (limits >= mean).mean()
+                row = f"{100 * mean:.2f} % | {100 * holding(intervals, mean):.1f} %"
+                row += f" | {100 * kept:.1f} %"
                 yield f"| {scenario} | {name} | {size} | {row} | {_costs(costs[name], studies)} |"
             for pair in combinations(POLICIES, 2):
                 first, second = (rates[name] for name in pair)
@@ -108,8 +111,7 @@ def of_the_cell(runs: pl.DataFrame) -> Iterator[str]:
                     )
                     for one in studies
                 ]
-                held = np.mean([one.low <= mean <= one.high for one in intervals])
-                row = f"{100 * mean:.2f} % | {100 * held:.1f} % | "
+                row = f"{100 * mean:.2f} % | {100 * holding(intervals, mean):.1f} % | "
                 more = _costs(np.subtract(*(costs[name] for name in pair)), studies)
                 yield f"| {scenario} | {' − '.join(pair)} | {size} | {row} | {more} |"
 
@@ -118,8 +120,7 @@ def _costs(values: Floats, studies: list[slice]) -> str:
     """Mean, and share of the studies whose interval holds it."""
     mean = values.mean()
     intervals = [mean_interval(values[one]) for one in studies]
-    held = np.mean([one.low <= mean <= one.high for one in intervals])
-    return f"{mean:.3f} | {100 * held:.1f} %"
+    return f"{mean:.3f} | {100 * holding(intervals, mean):.1f} %"
 
 
 def main() -> None:

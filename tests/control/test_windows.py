@@ -93,6 +93,8 @@ def test_an_l95_that_no_completion_showed_is_known_as_an_age_alone() -> None:
     assert seen(latency, age, 60.0) == (60.0, 90.0)
     # A cap of any size is a bound.
     assert seen(latency, age, 1e300) == (90.0, 90.0)
+    far = np.full(20, NEVER_NS - 1)
+    assert seen(np.full(20, NEVER_NS), far, 1e300)[1] == math.inf
     # One of the two, released of late, is neither lost nor known to be: there are five percent.
     latency[:], age[0] = 8 * MS, 20 * MS
     latency[0], latency[1] = NEVER_NS, 90 * MS

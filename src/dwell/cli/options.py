@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from dwell.model import Problem
+    from dwell.model.bounds import Bound
 
 
 def require_few(seeds: int | None) -> int | None:
@@ -24,8 +25,7 @@ def require_few(seeds: int | None) -> int | None:
     """
     from dwell.model.bounds import SEEDS
 
-    if seeds is not None and not SEEDS.holds(seeds):
-        raise typer.BadParameter(f"{seeds} is not allowed; it must be {SEEDS}")
+    _require(SEEDS, seeds)
     return seeds
 
 
@@ -39,9 +39,14 @@ def require_held(seconds: float | None) -> float | None:
     """
     from dwell.model.bounds import LENGTH_S
 
-    if seconds is not None and not LENGTH_S.holds(seconds):
-        raise typer.BadParameter(f"{seconds:g} is not allowed; it must be {LENGTH_S}")
+    _require(LENGTH_S, seconds)
     return seconds
+
+
+def _require(bound: Bound, value: float | None) -> None:
+    if value is not None and not bound.holds(value):
+        shown = value if isinstance(value, int) else f"{value:g}"
+        raise typer.BadParameter(f"{shown} is not allowed; it must be {bound}")
 
 
 CellArgument = Annotated[Path, typer.Argument(metavar="CELL", help="Cell file (YAML).")]

@@ -18,7 +18,7 @@ from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
 from dwell.model.semantics import too_many_shadows
-from dwell.model.table_columns import DECISIONS, columns_of
+from dwell.model.table_columns import DECISIONS, Feature, columns_of, those_with
 from dwell.model.user_classes import is_class_path
 from dwell.policies import MinimalPolicy, Static, parameters_of
 from dwell.policies import by_name as policy_by_name
@@ -146,6 +146,7 @@ class Controller:
         self._cores = np.array([node.capacity for node in problem.fabric.nodes.values()], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._censor_ms = problem.censor_ms
         #: By which caps candidates are eligible: the policy's own, where it has any.
         self.objective: Objective = getattr(self.policy, "objective", None) or problem.objective
         self._has_caps = self.objective.caps != Caps()
@@ -166,11 +167,10 @@ class Controller:
         it is over them at most (null without caps), and where the estimator says it, how many
         samples stand behind the estimate and how old (windows) the newest is.
         """
-        features = {"support"} if self.supports else set()
-        declared = (one for one in DECISIONS if not one.of or not features.isdisjoint(one.of))
+        features: tuple[Feature, ...] = ("support",) if self.supports else ()
         return tuple(
             column.name
-            for one in declared
+            for one in those_with(features, DECISIONS)
             for column in columns_of(one.name, self.nodes, self._names)
         )
 
@@ -228,7 +228,7 @@ class Controller:
         """
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
-        l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self.problem.censor_ms)
+        l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
         used, own, shadow = self.utilisation(window)
         if self._learner is not None and window.evidence is not None:
             self._learner.learn(window.evidence())
@@ -516,7 +516,7 @@ def static_columns(
     missed = missed_cycles(window.latency_ns, age_ns, controller._deadline_ns)
     share = controller.utilisation(window)
     used, own = share[:, 0], share[:, 1]
-    seen_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, problem.censor_ms)
+    seen_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, controller._censor_ms)
     seen: dict[str, Floats] = {"l95_ms": seen_ms, "violation_rate": missed / age_ns.shape[-1]}
     by_node = {node: used[:, i] for i, node in enumerate(controller.nodes)}
     seen["cost"] = _priced(problem, seen["l95_ms"], seen["violation_rate"], by_node, 0.0)

@@ -88,17 +88,22 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
         At most `censor_ms`, as J is made of it; and as caps are compared with it: infinite where
         more cycles are unfinished than L95 leaves out, and it is the age of one of them.
     """
-    # The last bit tells unfinished cycles apart; of equal values theirs come last.
-    unfinished = latency_ns > age_ns
-    seen = 2 * np.minimum(latency_ns, age_ns) + unfinished
+    seen = np.minimum(latency_ns, age_ns)
     count = seen.shape[-1]
     rank = l95_rank(count)
-    seen.partition(rank - 1, axis=-1)
-    l95 = seen[..., rank - 1]
-    lost = (l95 % 2 == 1) & (np.count_nonzero(unfinished, axis=-1) > count - rank)
+    l95 = np.partition(seen, rank - 1, axis=-1)[..., rank - 1]
     # Censoring is monotone, so censoring the order statistic is censoring every latency.
-    l95_ms = l95 // 2 / 1e6
-    return np.minimum(l95_ms, round(censor_ms * 1e6) / 1e6), np.where(lost, np.inf, l95_ms)
+    uncut_ms = l95 / 1e6
+    l95_ms = np.minimum(uncut_ms, round(censor_ms * 1e6) / 1e6)
+    unfinished = latency_ns > age_ns
+    lost = np.count_nonzero(unfinished, axis=-1) > count - rank
+    if np.any(lost):
+        # Of equal values those of unfinished cycles come last.
+        at = l95[..., None]
+        before = (seen < at) | ((seen == at) & ~unfinished)
+        lost = lost & (np.count_nonzero(before, axis=-1) < rank)
+        uncut_ms = np.where(lost, np.inf, uncut_ms)
+    return l95_ms, uncut_ms
 
 
 def final_l95_ms(latency_ns: Ints) -> Floats:

@@ -8,7 +8,7 @@ a cell's are called the same.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -317,6 +317,13 @@ class Clash(NamedTuple):
     table: str
     first: NamedColumn
     second: NamedColumn
+
+
+def those_with(features: Collection[Feature], columns: Iterable[Column]) -> Iterator[Column]:
+    """Yield the columns that a run with some features has."""
+    for column in columns:
+        if not column.of or not set(column.of).isdisjoint(features):
+            yield column
 
 
 def columns_of(

@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
 from dwell.model import REASONS, Problem, Reason
-from dwell.model.table_columns import TABLES, Column, Feature, columns_of
+from dwell.model.table_columns import TABLES, Column, Feature, columns_of, those_with
 
 if TYPE_CHECKING:
     import polars as pl
@@ -72,9 +72,7 @@ def _columns(
         "outcome": list(OUTCOMES),
         "reason": list(REASONS),
     }
-    for column in TABLES[table].columns:
-        if column.of and set(column.of).isdisjoint(features):
-            continue
+    for column in those_with(features, TABLES[table].columns):
         kind: str | list[str] = names.get(column.kind) or column.kind
         for one in columns_of(column.name, names["node"], names["candidate"]):
             yield one.name, column, kind

@@ -234,7 +234,7 @@ def _deadlines(rows: pl.DataFrame, blocks: PolicyBlocks) -> Figure:
     styles = {name: style for name, style in blocks.styles.items() if name in frame["policy"]}
     draw = curves(frame, RATE, styles, "P = D (ms)", THE_AIM)
     caption = (
-        "Means over 10 seeds with their 95 % intervals. Played beforehand "
+        "Means over seeds with their 95 % intervals. Played beforehand "
         "(examples/studies/deadline.yaml)."
     )
     return Figure("deadlines", "", {"rows": frame}, draw, caption)
