@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -10,10 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.control import Controller, Guard, Presence, Probation, parts_of
+from dwell.control import (
+    Controller,
+    Failures,
+    Guard,
+    Presence,
+    Probation,
+    parts_of,
+)
 from dwell.cost import hamming
 from dwell.errors import PolicyError, ProblemError
 from dwell.model import Decision, FrozenDict, QoS
+from dwell.model.instants import EVIDENCE_NS
 from tests.cells.deterministic import cell
 
 P = 1000
@@ -274,14 +283,17 @@ def test_it_never_fires_while_completions_flow(data: st.DataObject, g: int) -> N
 
 
 @given(data=st.data(), g=st.integers(2, 6), h=st.integers(1, 40))
-def test_it_rests_after_its_own_move_and_is_on_watch_again(
+def test_it_rests_once_its_own_move_carries_and_is_on_watch_again(
     data: st.DataObject, g: int, h: int
 ) -> None:
     mine = guard(g=g, h=h)
     released(mine, range(g + 1))
     mine.adopt("LOC", fallback=True)
     first = g + 1
-    for cycle in range(first, first + h):
+    mine.released(first, first * P)
+    assert mine.due_ns == (first + g) * P
+    mine.completed(first, first * P + 1)
+    for cycle in range(first + 1, first + h):
         assert mine.resting
         mine.released(cycle, cycle * P)
         if data.draw(st.booleans()):
@@ -306,7 +318,7 @@ def test_an_order_ends_its_rest() -> None:
     assert mine.due_ns == 7 * P
 
 
-def test_its_rest_doubles_with_its_own_moves_in_a_row_up_to_32_times() -> None:
+def test_its_rest_doubles_with_every_rest_before_an_order_up_to_32_times() -> None:
     mine = guard(h=2)
     last = -1
 
@@ -316,6 +328,7 @@ def test_its_rest_doubles_with_its_own_moves_in_a_row_up_to_32_times() -> None:
         while mine.resting:
             last, count = last + 1, count + 1
             mine.released(last, last * P)
+            mine.completed(last, last * P)
         return count
 
     rests = []
@@ -327,6 +340,179 @@ def test_its_rest_doubles_with_its_own_moves_in_a_row_up_to_32_times() -> None:
     assert rest() == 0
     mine.adopt("LOC", fallback=True)
     assert rest() == 2
+
+
+# ------------------------------------------------------------------------------------ rounds
+
+
+class Cell:
+    """Cycles one period apart; only placements that are `able` complete them, after `latency`.
+
+    The guard looks as a stamper's does: at its due instants, and four times a period.
+    """
+
+    def __init__(self, mine: Guard, *, latency: int = P // 2) -> None:
+        self.guard, self.latency = mine, latency
+        self.able: set[str] = set()
+        self.whole, self.heard = dict(WHOLE), dict(WHOLE)
+        self.done: list[bool] = []
+        self.moves: list[str] = []
+        self.resting: list[bool] = []
+        self._ends: list[tuple[int, int]] = []
+
+    def play(self, cycles: int = 1) -> None:
+        for _ in range(cycles):
+            now = len(self.done) * P
+            for quarter in range(4):
+                self._look(now + quarter * P // 4)
+            cycle = len(self.done)
+            self.done.append(False)
+            self.resting.append(self.guard.resting and self.guard._spent_ns is not None)
+            self._look(now)
+            self.guard.released(cycle, now)
+            if self.guard.placement in self.able:
+                heapq.heappush(self._ends, (now + self.latency, cycle))
+            for quarter in range(1, 5):
+                self._look(now + quarter * P // 4 - 1)
+
+    def _look(self, now: int) -> None:
+        while self._ends and self._ends[0][0] <= now:
+            at, cycle = heapq.heappop(self._ends)
+            self.done[cycle] = True
+            self.guard.completed(cycle, at)
+        to = self.guard.check(now, self.whole, self.heard)
+        if to is not None:
+            self.moves.append(to)
+            self.guard.adopt(to, fallback=True)
+
+
+def test_a_fallback_under_which_nothing_completes_earns_no_rest() -> None:
+    cell = Cell(guard("LOC", "HYB", "EDGE", placement="LOC"))
+    cell.whole = cell.heard = {"LOC": True, "HYB": True, "EDGE": True}
+    cell.able = {"LOC"}
+    cell.play(5)
+    cell.able = {"EDGE"}
+    cell.play(40)
+    assert cell.moves == ["HYB", "EDGE"]
+    assert longest_gap(cell.done) <= 2 * (3 + 1)
+    assert all(cell.done[5 + 2 * 4 : -1])
+
+
+def test_what_failed_last_is_tried_last_and_each_once_before_it_rests() -> None:
+    cell = Cell(guard("LOC", "HYB", "EDGE", h=10, placement="LOC"))
+    cell.whole = cell.heard = {"LOC": True, "HYB": True, "EDGE": True}
+    cell.play(4 * 4 + 1)
+    assert cell.moves == ["HYB", "EDGE", "LOC"]
+    cell.play(8)
+    assert cell.moves == ["HYB", "EDGE", "LOC"]
+    # After the rest another round, in the order of the failures.
+    cell.play(6)
+    assert cell.moves == ["HYB", "EDGE", "LOC", "HYB", "EDGE"]
+    assert cell.guard.resting
+
+
+def test_a_fallback_that_is_back_while_the_others_rest_is_tried_at_once() -> None:
+    cell = Cell(guard("LOC", "HYB", h=1000))
+    cell.whole = cell.heard = {"LOC": False, "HYB": True}
+    cell.play(40)
+    assert cell.moves == ["HYB"]
+    cell.able = {"LOC"}
+    cell.whole = cell.heard = WHOLE
+    cell.play(3)
+    assert cell.moves == ["HYB", "LOC"]
+    assert all(cell.done[41:-1])
+
+
+def test_what_is_heard_but_fails_is_tried_after_what_is_whole() -> None:
+    cell = Cell(guard("HYB", "LOC"))
+    cell.whole = {"LOC": True, "HYB": False}
+    cell.play(12)
+    assert cell.moves == ["LOC", "HYB"]
+
+
+def test_after_a_return_that_fails_it_goes_back_to_what_carried_the_cell() -> None:
+    cell = Cell(guard("HYB", "LOC", h=5))
+    cell.whole = cell.heard = {"HYB": False, "LOC": True}
+    cell.able = {"LOC"}
+    cell.play(20)
+    assert cell.moves == ["LOC"]
+    cell.whole = cell.heard = WHOLE
+    cell.guard.adopt("SO")
+    cell.play(20)
+    assert cell.moves == ["LOC", "LOC"]
+    assert longest_gap(cell.done[5:]) <= 3 + 1
+    # A return that holds, and fails later: the best first.
+    cell.able = {"LOC", "SO"}
+    cell.guard.adopt("SO")
+    cell.play(20)
+    cell.able = {"HYB"}
+    cell.play(20)
+    assert cell.moves == ["LOC", "LOC", "HYB"]
+
+
+def test_an_order_begins_anew() -> None:
+    cell = Cell(guard("LOC", "HYB", h=1000))
+    cell.play(20)
+    assert cell.moves == ["LOC", "HYB"]
+    assert cell.guard.resting
+    cell.guard.adopt("SO")
+    cell.play(5)
+    assert cell.moves == ["LOC", "HYB", "LOC"]
+
+
+@given(data=st.data(), g=st.integers(2, 4), h=st.integers(1, 12), f=st.integers(1, 4))
+def test_f_plus_1_times_g_plus_1_cycles_at_most_once_a_fallback_can_carry(
+    data: st.DataObject, g: int, h: int, f: int
+) -> None:
+    names = [f"F{i}" for i in range(f)]
+    everything = ["SO", *names]
+    mine = Guard(
+        names,
+        guard_cycles=g,
+        period_ns=P,
+        probe_cycles=h,
+        placement=data.draw(st.sampled_from(everything)),
+    )
+    cell = Cell(mine, latency=data.draw(st.integers(0, (g - 1) * P - 1)))
+    subsets = st.sets(st.sampled_from(everything))
+    for cycles in data.draw(st.lists(st.integers(1, 3 * g + h), max_size=5)):
+        cell.able, whole, heard = (data.draw(subsets) for _ in range(3))
+        cell.heard = {name: name in heard | whole for name in everything}
+        cell.whole = {name: name in whole for name in everything}
+        if data.draw(st.booleans()):
+            mine.adopt(data.draw(st.sampled_from(everything)))
+        cell.play(cycles)
+    # From now on all are heard, and some can carry the cell.
+    begun = len(cell.done)
+    cell.able = data.draw(st.sets(st.sampled_from(names), min_size=1))
+    cell.heard = dict.fromkeys(everything, True)
+    cell.whole = {name: name in cell.whole for name in everything}
+    cell.play((f + 2) * (g + 1) + 70 * h)
+    lost = itertools.takewhile(lambda cycle: not cell.done[cycle], range(begun, len(cell.done) - g))
+    stretches = itertools.groupby(lost, key=lambda cycle: cell.resting[cycle])
+    for resting, stretch in stretches:
+        assert resting or len(list(stretch)) <= (f + 1) * (g + 1)
+    assert all(cell.done[-g - 4 : -g])
+
+
+# ---------------------------------------------------------------------------- failures
+
+
+def test_as_many_failures_in_a_row_as_k_none_of_them_old() -> None:
+    failures = Failures(["SO"], 3, 2 * P)
+    for cycle in range(4):
+        failures.released("SO", cycle, cycle * P)
+    assert not failures.failing("SO", 4 * P - 1)
+    assert failures.failing("SO", 4 * P)
+    failures.completed("SO", 1)
+    assert not failures.failing("SO", 5 * P)
+    for cycle in range(4, 100, 10):
+        failures.released("SO", cycle, cycle * P)
+    assert failures.failing("SO", 100 * P)
+    assert failures.failing("SO", 74 * P + EVIDENCE_NS)
+    assert not failures.failing("SO", 74 * P + EVIDENCE_NS + 1)
+    failures.completed("SO", 94)
+    assert not failures.failing("SO", 100 * P)
 
 
 def test_numbers_that_do_not_grow_do_not_shorten_its_rest() -> None:

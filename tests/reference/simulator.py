@@ -20,7 +20,7 @@ from typing import Any
 
 import simpy
 
-from dwell.control import Guard, Presence, Probation
+from dwell.control import Failures, Guard, Presence, Probation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
@@ -696,6 +696,7 @@ class Simulation:
 
         self.guard = Guard.of(problem) if guarded else None
         self.presence, self.probation = Presence.of(problem), Probation.of(problem)
+        self.failures = Failures.of(problem)
         self.guarded: list[tuple[int, str, str]] = []
         # First cycle that is under orders; candidates that cycles are probes of, from which on.
         self.ordered = 0
@@ -1056,7 +1057,14 @@ class Simulation:
         self.hear()
         if self.guard is None or self.nodes[self.problem.stamper_node].down:
             return
-        fallback = self.guard.check(self.now, lambda name: self.presence.whole(name, self.now))
+
+        def heard(name: str) -> bool:
+            return self.presence.whole(name, self.now)
+
+        def whole(name: str) -> bool:
+            return heard(name) and not self.failures.failing(name, self.now)
+
+        fallback = self.guard.check(self.now, whole, heard)
         if fallback is None:
             return
         first = [*(k for k in range(self.number) if self.release[k] >= self.now), self.number][0]
@@ -1083,6 +1091,9 @@ class Simulation:
         """The guard hears of the completion of a cycle or a probe."""
         if self.guard is None:
             return
+        through = self.stamps[cycle][cell]
+        if through is not None:
+            self.failures.completed(through, cycle)
         if cell == SHADOW:
             if self.is_probe(cycle):
                 self.probation.completed(cycle, self.now)
@@ -1128,6 +1139,9 @@ class Simulation:
                 if active != self.guard.placement:
                     self.guard.adopt(active)
                 self.guard.released(cycle, self.now)
+                for through in (active, other):
+                    if through is not None:
+                        self.failures.released(through, cycle, self.now)
                 if self.is_probe(cycle):
                     self.probation.released(cycle, self.now)
             for name in self.sources:

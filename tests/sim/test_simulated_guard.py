@@ -224,7 +224,10 @@ def test_it_takes_the_first_fallback_whose_parts_were_heard() -> None:
         early = {"E": [(42, 10_000)], part: [(49, 10_000)]}
         assert moves(play(problem, down=early)) == [(1, "OFF", "LOC")]
         late = {"E": [(42, 10_000)], part: [(51, 10_000)]}
-        assert moves(play(problem, down=late)) == [(1, "OFF", "ALT")]
+        # X is tried, completes nothing, and is left again.
+        found = play(problem, down=late)
+        assert moves(found) == [(1, "OFF", "ALT"), (1, "ALT", "LOC")]
+        assert lost(found) == list(range(4, 10))
 
 
 def test_workers_that_are_still_starting_are_not_there() -> None:
@@ -279,10 +282,10 @@ def test_a_fallback_that_the_policy_wants_is_watched_without_an_order() -> None:
 
 def test_its_own_moves_in_a_row_double_its_rest() -> None:
     problem = cell(fallbacks=("ALT", "OFF"), probe_cycles=3)
-    down = {"E": [(42, 62), (142, 10_000)], "X": [(42, 52), (112, 132)]}
+    down = {"E": [(42, 62), (152, 10_000)], "X": [(42, 52), (112, 132)]}
     found = play(problem, ("OFF", "ALT", "OFF", "OFF", "ALT"), down=down, windows=12)
     # To ALT at cycle 7, on watch from cycle 10; to OFF at cycle 14, on watch from cycle 20: OFF has
-    # been silent since cycle 14.
+    # been silent since cycle 15.
     assert [(left, to) for _, left, to in moves(found)] == [
         *(("OFF", "ALT"), ("ALT", "OFF"), ("OFF", "ALT"))
     ]
@@ -292,8 +295,8 @@ def test_its_own_moves_in_a_row_double_its_rest() -> None:
 @pytest.mark.usefixtures("_early_health")
 def test_an_order_that_stamps_nothing_before_the_guard_moves_does_not_count() -> None:
     problem = cell(fallbacks=("ALT", "OFF"), probe_cycles=1, order_delay_ms=45.0)
-    # Ordered at 190 ms to take effect with cycle 24; X is lost with cycle 19, OFF with cycle 22.
-    down = {"E": [(42, 62), (222, 10_000)], "X": [(192, 240)]}
+    # Ordered at 190 ms to take effect with cycle 24; X is lost with cycle 19, OFF with cycle 23.
+    down = {"E": [(42, 62), (232, 10_000)], "X": [(192, 240)]}
     found = play(problem, down=down, windows=12)
     assert [(left, to) for _, left, to in moves(found)] == [
         *(("OFF", "ALT"), ("ALT", "OFF"), ("OFF", "ALT"))
@@ -305,16 +308,61 @@ def test_an_order_that_stamps_nothing_before_the_guard_moves_does_not_count() ->
 @pytest.mark.usefixtures("_early_health")
 def test_what_is_ordered_while_it_rests_is_watched_at_once() -> None:
     problem = cell(fallbacks=("ALT", "OFF"), probe_cycles=3)
-    down = {"E": [(42, 62), (142, 240), (332, 10_000)], "X": [(112, 132)]}
+    down = {"E": [(42, 62), (152, 240), (332, 10_000)], "X": [(112, 132)]}
     found = play(problem, down=down, windows=14)
     # The third rest would be that of cycles 23 to 34; OFF is proven and ordered for cycle 31.
     assert placements(found)[:5] == [("OFF", 7), ("ALT", 7), ("OFF", 9), ("ALT", 8), ("OFF", 5)]
-    assert lost(found) == [4, 5, 6, *range(11, 23), 33, 34, 35]
+    assert lost(found) == [4, 5, 6, 11, 12, 13, *range(15, 23), 33, 34, 35]
 
 
 def test_a_fallback_that_was_ordered_is_watched() -> None:
     found = play(cell(fallbacks=("ALT", "LOC")), ("ALT",), down={"X": [(62, 10_000)]})
     assert moves(found) == [(2, "ALT", "LOC")]
+
+
+# ------------------------------------------------------------------------------------ rounds
+
+
+def stuck(*nodes: str) -> dict[tuple[str, str], list[float]]:
+    """Execution times, in twelve windows, of stages that end no more from cycle 4 on."""
+    return {("act", node): [1.0] * 4 + [1000.0] * 44 for node in nodes}
+
+
+def test_each_fallback_is_tried_once_and_then_it_rests() -> None:
+    problem = cell(fallbacks=("OFF", "ALT", "LOC"), probe_cycles=5)
+    found = play(problem, exec_ms=stuck(*NODES), windows=12)
+    # ALT, LOC, and OFF last, as it has failed first; each for three cycles; a rest of five cycles
+    # from cycle 16 on, and cycle 21 is old enough at 240 ms. Then in the order of the failures.
+    assert [(left, to) for _, left, to in moves(found)][:5] == [
+        *(("OFF", "ALT"), ("ALT", "LOC"), ("LOC", "OFF")),
+        *(("OFF", "ALT"), ("ALT", "LOC")),
+    ]
+    assert placements(found)[:5] == [("OFF", 7), ("ALT", 3), ("LOC", 3), ("OFF", 11), ("ALT", 3)]
+
+
+def test_windows_close_while_it_rests() -> None:
+    problem = cell(fallbacks=("ALT", "LOC"), probe_cycles=9)
+    found = play(problem, exec_ms=stuck(*NODES), windows=12)
+    windows = found.windows.filter(pl.col("first_cycle") > 10)
+    assert len(windows) >= 2
+    assert windows["violation_rate"].to_list() == [1.0] * len(windows)
+
+
+def test_what_is_back_while_the_others_rest_is_tried_at_once() -> None:
+    problem = cell(fallbacks=("LOC", "ALT"), probe_cycles=1000)
+    found = play(problem, down={"X": [(42, 203)]}, exec_ms=stuck("R", "E"), windows=12)
+    # LOC for three cycles, and a rest; X is back at 203 ms.
+    assert placements(found)[:3] == [("OFF", 7), ("LOC", 14), ("ALT", 24)]
+    assert lost(found) == list(range(4, 21))
+
+
+@pytest.mark.usefixtures("_early_health")
+def test_after_a_return_that_fails_it_goes_back_to_what_carried_the_cell() -> None:
+    problem = cell(fallbacks=("ALT", "LOC"), probe_cycles=3)
+    # X is not there when E goes, and LOC carries the cell; OFF is proven, ordered and fails.
+    down = {"E": [(42, 62), (150, 10_000)], "X": [(30, 90)]}
+    found = play(problem, down=down, windows=12)
+    assert [(left, to) for _, left, to in moves(found)][:2] == [("OFF", "LOC"), ("OFF", "LOC")]
 
 
 # ------------------------------------------------------------------------------ orders and moves

@@ -1,7 +1,15 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
 from dwell.control.controller import ClosedWindow, Controller, DecisionLog, static_columns
-from dwell.control.guard import Guard, Presence, Probation, parts_of, rest_cycles
+from dwell.control.guard import (
+    Failures,
+    FallbackRound,
+    Guard,
+    Presence,
+    Probation,
+    parts_of,
+    rest_cycles,
+)
 from dwell.control.shadows import shadow_stamps
 from dwell.control.windows import final_l95_ms, window_close_ns
 from dwell.estimators import Estimator, Evidence, Instants
@@ -13,6 +21,8 @@ __all__ = [
     "DecisionLog",
     "Estimator",
     "Evidence",
+    "Failures",
+    "FallbackRound",
     "Guard",
     "Instants",
     "MinimalPolicy",

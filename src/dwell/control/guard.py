@@ -13,32 +13,37 @@ from typing import TypeAlias
 
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import GUARD_CYCLES, PROBE_CYCLES, require
+from dwell.model.instants import EVIDENCE_NS
 
 #: However often a cell relapses, no more than this many times as many.
 MOST_DOUBLINGS = 5
 #: Windows' worth of completed cycles that make a cell healthy (see `Probation`).
 HEALTH_WINDOWS = 10
 
-#: Whether all parts of a candidate have been heard lately.
+
+#: Whether a candidate may be moved to.
 Whole: TypeAlias = Callable[[str], bool] | Mapping[str, bool]
 
 
-def rest_cycles(probe_cycles: int, own_moves: int) -> int:
-    """Return how many cycles the guard rests for after so many moves of its own in a row."""
-    return probe_cycles << min(own_moves - 1, MOST_DOUBLINGS) if own_moves else 0
+def rest_cycles(probe_cycles: int, rests: int) -> int:
+    """Return how many cycles the guard rests for, the so-manieth time before an order."""
+    return probe_cycles << min(rests - 1, MOST_DOUBLINGS) if rests else 0
 
 
 class _Silence:
     """Wait for the cycle after the newest completed one.
 
-    Cycles older than the patience are all alike, so no more of them are kept than were released
-    within it, and one.
+    Parameters
+    ----------
+    kept : int
+        How many cycles older than the patience are kept, the newest of them; there is no bound on
+        how many are released meanwhile.
     """
 
-    __slots__ = ("newest", "patience_ns", "released", "waiting")
+    __slots__ = ("kept", "newest", "patience_ns", "released", "waiting")
 
-    def __init__(self, patience_ns: int) -> None:
-        self.patience_ns = patience_ns
+    def __init__(self, patience_ns: int, kept: int = 1) -> None:
+        self.patience_ns, self.kept = patience_ns, kept
         self.waiting: deque[tuple[int, int]] = deque()
         self.released = self.newest = -1
 
@@ -47,16 +52,19 @@ class _Silence:
         if cycle <= self.released:
             return
         self.released = cycle
-        waiting = self.waiting
+        waiting, kept = self.waiting, self.kept
         waiting.append((cycle, at_ns))
-        while len(waiting) > 1 and waiting[1][1] <= at_ns - self.patience_ns:
+        while len(waiting) > kept and waiting[kept][1] <= at_ns - self.patience_ns:
             waiting.popleft()
 
     def complete(self, cycle: int) -> None:
         """Wait no longer for a cycle, nor for those before it; unknown ones are ignored."""
-        if not self.newest < cycle <= self.released:
-            return
-        self.newest = cycle
+        if self.newest < cycle <= self.released:
+            self.newest = cycle
+            self.skip(cycle)
+
+    def skip(self, cycle: int) -> None:
+        """Wait no longer for a cycle, nor for those before it, though it has not completed."""
         while self.waiting and self.waiting[0][0] <= cycle:
             self.waiting.popleft()
 
@@ -73,6 +81,73 @@ class _Silence:
         """Whether the patience has ended."""
         due_ns = self.due_ns
         return due_ns is not None and now_ns >= due_ns
+
+
+class FallbackRound:
+    """Which fallback is tried next: each once, those that have failed last.
+
+    A *round* lasts from the placement under which nothing completes any more until a cycle has
+    completed, or an order has come.
+
+    Parameters
+    ----------
+    fallbacks : iterable of str
+        Candidates, best first.
+    """
+
+    __slots__ = ("_failed", "_tried", "fallbacks")
+
+    def __init__(self, fallbacks: Iterable[str]) -> None:
+        self.fallbacks = tuple(dict.fromkeys(fallbacks))
+        # In the order of their failures; and what the guard has moved to.
+        self._failed: dict[str, None] = {}
+        self._tried: set[str] = set()
+
+    @property
+    def begun(self) -> bool:
+        """Whether any has been tried."""
+        return bool(self._tried)
+
+    def options(self, placement: str, carrier: str | None = None) -> list[str]:
+        """Return the other fallbacks that have not been tried, the next one first.
+
+        Parameters
+        ----------
+        carrier : str, optional
+            Fallback that carried the cell before an order left it.
+        """
+        first = [] if carrier is None else [carrier]
+        fresh = (name for name in self.fallbacks if name not in self._failed)
+        order = dict.fromkeys((*first, *fresh, *self._failed))
+        return [name for name in order if name != placement and name not in self._tried]
+
+    def next(
+        self, placement: str, whole: Whole, heard: Whole, carrier: str | None = None
+    ) -> str | None:
+        """Return the first option that is whole, or else the first whose parts were heard."""
+        options = self.options(placement, carrier)
+        for asked in (whole, heard):
+            ask = asked.__getitem__ if isinstance(asked, Mapping) else asked
+            for name in options:
+                if ask(name):
+                    return name
+        return None
+
+    def moved(self, left: str, to: str) -> None:
+        """Note a move of the guard away from what has failed."""
+        if left in self.fallbacks:
+            self._failed.pop(left, None)
+            self._failed[left] = None
+        self._tried.add(to)
+
+    def again(self) -> None:
+        """Begin another round: all may be tried again, in the order of their failures."""
+        self._tried.clear()
+
+    def over(self) -> None:
+        """Note that a cycle has completed, or that an order has come."""
+        self._failed.clear()
+        self._tried.clear()
 
 
 class Guard:
@@ -93,20 +168,30 @@ class Guard:
       late completion of a cycle of the placement before changes nothing.
     * Completions of cycles that were never released here are ignored.
 
-    The guard is *on a fallback* from its own move until the next order. There it *rests* at first:
-    the first `probe_cycles` cycles after the move are not waited for, and every further move of its
-    own before an order doubles that, up to 32 times, so that a cell none of whose fallbacks can
-    carry it is not thrown about. The cycles after these are waited for as under any placement: the
-    controller may be content with the fallback, or gone. A fallback that the controller ordered is
-    watched at once.
+    The guard is *on a fallback* from its own move until the next order. A fallback *carries* the
+    cell once one of its cycles has completed. One that does not within g periods has failed, and
+    the next is tried at once: first what carried the cell before an order left it, until the
+    cycle has completed that is `probe_cycles` after that; then the others, best first; then those
+    that have failed since the last completed cycle or order, in the order of their failures. Each
+    is tried once a round.
 
-    **Bound.** After a single fault from which on one fallback is whole, of a cell whose guard does
-    not rest, at most g + 1 consecutive cycles bring no actuation: the first that is lost, those
-    released within the g periods after its release, and the one that may be released at the instant
-    of the move. (At most 2g + 1 if an order to another placement that the fault broke takes effect
-    within these g periods.) Without a fault it does not fire while every cycle completes, and is
-    heard, within g periods of its release, nor, where single cycles are lost, while the others are
-    heard within g - 1.
+    A fallback that carries earns a *rest*: of the first `probe_cycles` cycles after the move those
+    that come after the first completed one are not waited for. When each fallback that is there has
+    been tried and nothing has completed, the guard rests for as many cycles as well; another
+    round begins when it would fire again, and what was not there is tried as soon as it is. Every
+    further rest before an order doubles them, up to 32 times, so that a cell none of whose
+    fallbacks can carry it is not thrown about. Afterwards cycles are waited for as under any
+    placement: the controller may be content with the fallback, or gone. A fallback that the
+    controller ordered is watched at once.
+
+    **Bound.** While the guard does not rest, and f fallbacks are there of which one can carry the
+    cell, at most (f + 1)(g + 1) consecutive cycles bring no actuation: for each placement before
+    that one the first that is lost, those released within the g periods after its release, and the
+    one that may be released at the instant of the move. So it is g + 1 after a single fault from
+    which on the first fallback that is tried works. (2g + 1 if an order to another placement that
+    the fault broke takes effect within these g periods.) Without a fault it does not fire while
+    every cycle completes, and is heard, within g periods of its release, nor, where single cycles
+    are lost, while the others are heard within g - 1.
 
     Parameters
     ----------
@@ -117,7 +202,7 @@ class Guard:
     period_ns : int
         P.
     probe_cycles : int
-        Cycles that it rests for after its own move, at least 1: as many as would prove a placement.
+        Cycles that it rests for, at least 1: as many as would prove a placement.
     placement : str
         Candidate that the first cycles are stamped with.
 
@@ -132,10 +217,15 @@ class Guard:
     """
 
     __slots__ = (
-        "_own_moves",
+        "_carrier",
         "_rest",
+        "_rest_last",
+        "_rests",
+        "_returned",
+        "_round",
         "_silence",
-        "fallbacks",
+        "_since",
+        "_spent_ns",
         "on_fallback",
         "placement",
         "probe_cycles",
@@ -154,10 +244,17 @@ class Guard:
         PROBE_CYCLES.check("probe_cycles", probe_cycles)
         require(period_ns > 0, "period_ns", period_ns, "at least 1")
         self.probe_cycles = probe_cycles
-        self.fallbacks = tuple(dict.fromkeys(fallbacks))
         self.placement, self.on_fallback = placement, False
-        self._own_moves = self._rest = 0
         self._silence = _Silence(guard_cycles * period_ns)
+        self._round = FallbackRound(fallbacks)
+        # Last cycle before the last move; and before an order left the fallback that carried.
+        self._since = self._returned = -1
+        self._carrier: str | None = None
+        # Rests since the last order; cycles left of this one, and the last that it has waited for
+        # all the same; when each fallback had been tried.
+        self._rests = self._rest = 0
+        self._rest_last = -1
+        self._spent_ns: int | None = None
 
     @classmethod
     def of(cls, problem: Problem, placement: str | None = None) -> Guard:
@@ -177,6 +274,11 @@ class Guard:
         return f"Guard({', '.join(self.fallbacks)}; at {where}, newest={self.newest})"
 
     @property
+    def fallbacks(self) -> tuple[str, ...]:
+        """Candidates that it may move to, best first."""
+        return self._round.fallbacks
+
+    @property
     def newest(self) -> int:
         """Highest cycle completed, -1 for none."""
         return self._silence.newest
@@ -187,53 +289,83 @@ class Guard:
         return self._silence.patience_ns
 
     @property
+    def carries(self) -> bool:
+        """Whether a cycle has completed since the last move."""
+        return self._silence.newest > self._since
+
+    @property
     def resting(self) -> bool:
-        """Whether the next cycle would not be waited for, so soon after its own move."""
+        """Whether it rests, or will when a cycle has completed, so soon after its own move."""
         return self._rest > 0
 
     def released(self, cycle: int, at_ns: int) -> None:
         """Note a cycle that has been stamped and released."""
-        if self._rest and cycle > self._silence.released:
-            self._rest -= 1
-            self._silence.released = cycle
+        silence = self._silence
+        if not self._rest or cycle <= silence.released:
+            silence.release(cycle, at_ns)
+            return
+        self._rest -= 1
+        if self._spent_ns is None and not self.carries:
+            silence.release(cycle, at_ns)
+            self._rest_last = cycle
         else:
-            self._silence.release(cycle, at_ns)
+            silence.released = cycle
 
     def completed(self, cycle: int, at_ns: int) -> None:
         """Note that the completion of a cycle (by every sink) has been heard."""
         self._silence.complete(cycle)
+        if self.carries:
+            self._silence.skip(self._rest_last)
 
     @property
     def due_ns(self) -> int | None:
         """Next instant at which it would fire if nothing completed; None where it would not.
 
-        It lies in the past where the guard has fired and no fallback was whole.
+        It lies in the past where the guard has fired and a fallback was not there.
         """
         if not any(name != self.placement for name in self.fallbacks):
             return None
+        if self._spent_ns is not None and not self.carries and self._round.options(self.placement):
+            return self._spent_ns
         return self._silence.due_ns
 
-    def check(self, now_ns: int, whole: Whole) -> str | None:
-        """Look whether to move, and where to.
+    def check(self, now_ns: int, whole: Whole, heard: Whole | None = None) -> str | None:
+        """Look whether to move, and where to; the rest after a round begins here, too.
 
         Parameters
         ----------
         whole : callable of str to bool, or mapping
-            Whether all nodes, links and workers of a candidate were heard lately; see
-            `Presence`. Fallbacks are asked for in order, up to the first that is.
+            Whether all nodes, links and workers of a candidate were heard lately, and not all of
+            its last cycles failed; see `Presence` and `Failures`.
+        heard : callable of str to bool, or mapping, optional
+            Whether they were heard; asked where no fallback that may be tried is whole.
 
         Returns
         -------
         str or None
-            The first other fallback that is whole; `adopt` it. None where there is no reason to
-            move, or no such fallback: the guard stays armed, so ask again when one may be.
+            The fallback to try; `adopt` it. None where there is no reason to move, or no such
+            fallback: the guard stays armed, so ask again when one may be there.
         """
         due_ns = self.due_ns
         if due_ns is None or now_ns < due_ns:
             return None
-        ask = whole.__getitem__ if isinstance(whole, Mapping) else whole
-        others = (name for name in self.fallbacks if name != self.placement)
-        return next((name for name in others if ask(name)), None)
+        if self.carries:
+            self._round.over()
+        elif self._spent_ns is not None and self._silence.over(now_ns):
+            self._round.again()
+        recent = self.newest <= self._returned + self.probe_cycles
+        carrier = self._carrier if recent else None
+        found = self._round.next(self.placement, whole, whole if heard is None else heard, carrier)
+        if found is None and self._fails and self._round.begun:
+            self._spent_ns = now_ns
+            self._rest, self._rest_last = rest_cycles(self.probe_cycles, self._rests), -1
+            self._silence.forget()
+        return found
+
+    @property
+    def _fails(self) -> bool:
+        """Whether it is on a fallback that is being tried, and has not carried the cell yet."""
+        return self.on_fallback and self._spent_ns is None and not self.carries
 
     def adopt(self, candidate: str, fallback: bool = False) -> None:
         """Take note of a move: cycles released from now on have another placement.
@@ -244,8 +376,18 @@ class Guard:
             Whether the guard itself makes it (`check` said so), and no order. An order for the
             placement that holds already is a move, too: it makes a fallback the controller's.
         """
-        self._own_moves = self._own_moves + 1 if fallback else 0
-        self._rest = rest_cycles(self.probe_cycles, self._own_moves)
+        if fallback:
+            self._rests += not self._fails
+            self._round.moved(self.placement, candidate)
+            self._carrier = None
+        else:
+            if self.on_fallback:
+                self._carrier = self.placement if self.carries else None
+                self._returned = self._silence.released
+            self._rests = 0
+            self._round.over()
+        self._rest, self._rest_last = rest_cycles(self.probe_cycles, self._rests), -1
+        self._spent_ns, self._since = None, self._silence.released
         self.placement, self.on_fallback = candidate, fallback
         self._silence.forget()
 
@@ -311,6 +453,10 @@ class Presence:
         """Forget a part that has said itself that it cannot do its work."""
         self._heard_ns.pop(part, None)
 
+    def restart(self) -> None:
+        """Forget everything: nobody has been heard yet."""
+        self._heard_ns.clear()
+
     def missing(self, candidate: str, now_ns: int) -> frozenset[str]:
         """Return the parts of a candidate that were not heard lately."""
         since_ns = now_ns - self.within_ns
@@ -322,6 +468,53 @@ class Presence:
     def whole(self, candidate: str, now_ns: int) -> bool:
         """Whether all parts of a candidate were heard lately."""
         return not self.missing(candidate, now_ns)
+
+
+class Failures:
+    """The last cycles and shadows through every candidate that nobody has heard complete.
+
+    Parameters
+    ----------
+    candidates : iterable of str
+    in_a_row : int
+        k: as many failures make a candidate fail.
+    patience_ns : int
+        Time from a release after which a cycle that is not heard to complete has failed.
+    """
+
+    __slots__ = ("_through", "in_a_row")
+
+    def __init__(self, candidates: Iterable[str], in_a_row: int, patience_ns: int) -> None:
+        self.in_a_row = in_a_row
+        self._through = {name: _Silence(patience_ns, kept=in_a_row) for name in candidates}
+
+    @classmethod
+    def of(cls, problem: Problem) -> Failures:
+        """Make that of a cell: g + 1 in a row, each g periods old."""
+        settings = problem.controller
+        patience_ns = settings.guard_cycles * round(problem.pipeline.period_ms * 1e6)
+        return cls(problem.candidates, settings.failures_in_a_row, patience_ns)
+
+    def released(self, candidate: str, cycle: int, at_ns: int) -> None:
+        """Note that a cycle, or its shadow, has been sent through a candidate."""
+        self._through[candidate].release(cycle, at_ns)
+
+    def completed(self, candidate: str, cycle: int) -> None:
+        """Note that a completion has been heard; unknown ones are ignored."""
+        self._through[candidate].complete(cycle)
+
+    def failing(self, candidate: str, now_ns: int) -> bool:
+        """Whether the last k have all failed, none of them more than `EVIDENCE_NS` ago."""
+        silence = self._through[candidate]
+        failed_ns = [at for _, at in silence.waiting if at <= now_ns - silence.patience_ns]
+        if len(failed_ns) < self.in_a_row:
+            return False
+        return failed_ns[-self.in_a_row] >= now_ns - EVIDENCE_NS
+
+    def restart(self) -> None:
+        """Forget everything."""
+        for silence in self._through.values():
+            silence.forget()
 
 
 class Probation:

@@ -108,6 +108,7 @@ from dwell.kernels.layout import (
     RELEASE,
     REST,
     RESTART,
+    RESTED,
     RETRY,
     SCHEDULER,
     SERVER,
@@ -254,7 +255,7 @@ def _silent(s: Tables, cell: int, now: int) -> bool:
             back = s.back_ns[index(s.cells[cell, CANDIDATE_0] + s.stamps[cell, cycle])]
             done = s.release_ns[cell, cycle] + s.latency_ns[cell, cycle]
             if later(done, back) <= now:
-                waited = cycle + 1
+                waited = max(cycle + 1, s.cells[cell, RESTED])
         cycle += 1
     moved = s.cells[cell, MOVED]
     if waited < moved and s.release_ns[cell, moved] < now:

@@ -71,7 +71,7 @@ FAIR, FIFO, PRIORITY, TURNS = range(4)
 # cells
 # GUARD_T is when the guard looks next, -1 for never, and GUARD_NS is g periods; WAITED is the first
 # cycle that no completion has been heard of or after, MOVED the first one of the newest placement
-# that is waited for.
+# that is waited for; once a completion has been heard, no cycle before RESTED is.
 (
     TASK_0,
     N_TASKS,
@@ -93,8 +93,9 @@ FAIR, FIFO, PRIORITY, TURNS = range(4)
     GUARD_NS,
     WAITED,
     MOVED,
+    RESTED,
     N_CELL,
-) = range(21)
+) = range(22)
 
 # Where a link has no timeout of its own, state that was lost is sent again after Linux's least
 # TCP retransmission timeout.

@@ -8,6 +8,8 @@ from dwell.model.bounds import CYCLES, LENGTH_S, short
 #: Later than every instant of people, longer than every latency; the sum with any of them fits 64
 #: bits.
 NEVER_NS = 1 << 62
+#: Age beyond which failures of calls, cycles and shadows say nothing any more.
+EVIDENCE_NS = 10_000_000_000
 #: Last instant at which a run may release a cycle, since its first (291 years). Twenty times of a
 #: cell file (1e9 ms each) can be added to it, and 64 bits hold the sum.
 HORIZON_NS = 9_200_000_000_000_000_000

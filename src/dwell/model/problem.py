@@ -110,6 +110,11 @@ class ControllerSettings:
         bound = f"one of {', '.join(MIGRATIONS)}"
         require(self.migration in MIGRATIONS, "migration", self.migration, bound)
 
+    @property
+    def failures_in_a_row(self) -> int:
+        """Failures in a row that count as a fault of a worker, or of a candidate: g + 1."""
+        return self.guard_cycles + 1
+
 
 @dataclass(frozen=True, slots=True)
 class Problem(Displayed):

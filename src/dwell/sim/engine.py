@@ -385,7 +385,7 @@ class _Stamper:
         if fallback is None:
             return
         cell = tables.cells[0]
-        watch.fell(tables, now, first)
+        watch.fell(tables, now, first, active, fallback)
         if self.cold is not None:
             self.cold.stop()
         cell[k.MIGRATING] = cell[k.CLOSE_PENDING] = 0

@@ -9,12 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import Presence, Probation, parts_of, rest_cycles
+from dwell.control import (
+    FallbackRound,
+    Presence,
+    Probation,
+    parts_of,
+    rest_cycles,
+)
 from dwell.kernels import layout as k
 from dwell.kernels.far_instants import LAST_NS
 from dwell.kernels.heaps import post_event
 from dwell.model import Placement, Problem
-from dwell.model.instants import HORIZON_NS
+from dwell.model.instants import EVIDENCE_NS, HORIZON_NS
 from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
 
 
@@ -60,20 +66,31 @@ class SimulatedGuard:
         self.probation = Probation.of(problem)
         self.probes = _Probes(problem, realisation)
         self.since: int | None = 0
-        self._own_moves = 0
+        self._round = FallbackRound(problem.controller.fallbacks)
+        # What the guard itself has moved to, with its first cycle, until an order takes effect;
+        # and what carried the cell until then.
+        self._own: tuple[str, int] | None = None
+        self._carrier: str | None = None
+        # Rests since the last order; first cycle after the one that a round has ended with.
+        self._rests = 0
+        self._spent_until: int | None = None
         self._outages = _Outages(problem, realisation)
-        self._arm(tables, 0)
+        self._arm(tables, 0, rest=0)
 
     @property
     def on_fallback(self) -> bool:
         """Whether the guard's own move holds."""
         return self.since is None
 
-    def _arm(self, tables: k.Tables, first: int) -> None:
-        """Wait for the completions of the cycles from `first` on, and of none before."""
+    def _arm(self, tables: k.Tables, first: int, *, rest: int) -> None:
+        """Wait for the completions of the cycles from `first` on, and of none before.
+
+        Once one has completed, of those after the first `rest` cycles alone.
+        """
         cell = tables.cells[0]
         cell[k.GUARD_NS] = self.patience_ns
         cell[k.WAITED] = cell[k.MOVED] = min(first, self.cycles)
+        cell[k.RESTED] = min(first + rest, self.cycles)
         if first < self.cycles:
             self._look_at(tables, self._due_ns(first))
 
@@ -93,50 +110,147 @@ class SimulatedGuard:
         """Return the fallback that the cell moves to now; None where it has to wait for one.
 
         It waits where its own node is down, or was since the release of the cycle it waits for,
-        until cycles released since then are missing; and where no fallback is whole, until one is.
+        until cycles released since then are missing; and where no fallback is left to be tried,
+        until one is there, or the rest is over.
         """
-        own = self._outages.of(self.problem.stamper_node)
-        waited = int(tables.cells[0, k.WAITED])
-        back_at = max((up for down, up in own if down <= now), default=0)
-        if back_at > self.release_ns[waited]:
-            first = int(np.searchsorted(self.release_ns[: self.cycles], back_at))
-            tables.cells[0, k.WAITED] = first
-            again = max(back_at, now)
-        else:
-            others = [name for name in self.problem.controller.fallbacks if name != active]
+        first = self._released(now)
+        carrier = self._settle(tables, now, first)
+        if self._waits(tables, now, first):
+            return None
+
+        def there(name: str) -> bool:
             since_ns = now - self.presence_ns
-            for name in others:
-                if not any(
-                    self._outages.missing(part, since_ns, now) for part in self._parts(name)
-                ):
-                    return name
-            ends = (
-                up
-                for name in others
-                for part in self._parts(name)
-                for _, up in self._outages.of(part)
-                if up > now
-            )
-            again = min(ends, default=LAST_NS)
-            moved = int(tables.cells[0, k.MOVED])
-            if self.release_ns[moved] >= now:
-                again = min(again, self._due_ns(moved))
+            return not any(self._outages.missing(part, since_ns, now) for part in self._parts(name))
+
+        def whole(name: str) -> bool:
+            return there(name) and not self._failing(tables, name, now, first)
+
+        fallback = self._round.next(active, whole, there, carrier)
+        if fallback is None:
+            if self._tries(tables, now, first) and self._round.begun:
+                rest = rest_cycles(self.probation.probe_cycles, self._rests)
+                self._spent_until = min(first + rest, self.cycles)
+                tables.cells[0, k.RESTED] = self._spent_until
+            self._look_later(tables, now, self._round.options(active, carrier))
+        return fallback
+
+    def _released(self, now: int) -> int:
+        """Return how many cycles were released before an instant."""
+        return int(np.searchsorted(self.release_ns[: self.cycles], now))
+
+    def _settle(self, tables: k.Tables, now: int, first: int) -> str | None:
+        """Begin anew where an order has taken effect; returns what carried the cell before it."""
+        since = self.since
+        if since is None or since >= first:
+            return None
+        self._round.over()
+        self._rests, self._spent_until = 0, None
+        if self._own is not None:
+            fallback, begun = self._own
+            carried = self._newest(tables, begun, since, int(self.release_ns[since])) >= 0
+            self._own, self._carrier = None, fallback if carried else None
+        recent = self._newest(tables, since, first, now) < since + self.probation.probe_cycles
+        return self._carrier if recent else None
+
+    def _waits(self, tables: k.Tables, now: int, first: int) -> bool:
+        """Whether it is too early to move: the guard rests, or its own node has been away."""
+        cell, own = tables.cells[0], self._outages.of(self.problem.stamper_node)
+        back_ns = max((up for down, up in own if down <= now), default=0)
+        if self._own is not None and self._carries(tables, now, first):
+            self._round.over()
+            self._spent_until = None
+            cell[k.WAITED] = max(cell[k.WAITED], cell[k.RESTED])
+        spent = self._spent_until
+        waited = int(cell[k.WAITED]) if spent is None else spent
+        if waited < self.cycles and back_ns > self.release_ns[waited]:
+            waited = self._released(back_ns)
+        due_ns = self._due_ns(waited)
+        if spent is None:
+            cell[k.WAITED] = waited
+            if due_ns > now:
+                self._look_at(tables, due_ns)
+            return due_ns > now
+        self._spent_until = waited
+        if back_ns > now:
+            self._look_at(tables, back_ns)
+            return True
+        if due_ns <= now:
+            self._round.again()
+        return False
+
+    def _look_later(self, tables: k.Tables, now: int, options: Iterable[str]) -> None:
+        """Look again when what may be tried is back, or a rest is over, or an order was in vain."""
+        ends = (
+            up for name in options for part in self._parts(name) for _, up in self._outages.of(part)
+        )
+        waited = [int(tables.cells[0, k.MOVED]), self._spent_until]
+        dues = (self._due_ns(cycle) for cycle in waited if cycle is not None)
+        again = min((at for at in (*ends, *dues) if at > now), default=LAST_NS)
         if again < LAST_NS:
             self._look_at(tables, again)
-        return None
+
+    def _heard(self, tables: k.Tables, first: int, stop: int, now: int) -> NDArray[np.bool_]:
+        """Return which of some cycles have been heard to complete by an instant."""
+        cycles = slice(first, stop)
+        code = tables.stamps[0, cycles].astype(np.int64)
+        ended = self.release_ns[cycles] + tables.latency_ns[0, cycles]
+        done = tables.outcome[0, cycles] == k.DONE
+        return np.asarray(done & (ended <= now - tables.back_ns[code]))
+
+    def _newest(self, tables: k.Tables, first: int, stop: int, now: int) -> int:
+        """Return the highest of some cycles that has been heard to complete; -1 for none."""
+        heard = np.flatnonzero(self._heard(tables, first, stop, now))
+        return first + int(heard[-1]) if len(heard) else -1
+
+    def _carries(self, tables: k.Tables, now: int, first: int) -> bool:
+        """Whether what the guard has moved to has completed a cycle."""
+        return self._own is not None and self._newest(tables, self._own[1], first, now) >= 0
+
+    def _tries(self, tables: k.Tables, now: int, first: int) -> bool:
+        """Whether a fallback is being tried, and has not carried the cell yet."""
+        spent = self._spent_until is not None
+        return self._own is not None and not spent and not self._carries(tables, now, first)
+
+    def _failing(self, tables: k.Tables, name: str, now: int, first: int) -> bool:
+        """Whether the last k cycles and shadows through a candidate failed, none of them long ago.
+
+        As `dwell.control.Failures`.
+        """
+        code, failed = self.names.index(name), 0
+        for cycle in range(first - 1, -1, -1):
+            released_ns = int(self.release_ns[cycle])
+            cells = np.flatnonzero(tables.stamps[:, cycle] == code)
+            if released_ns < now - EVIDENCE_NS:
+                break
+            if not len(cells):
+                continue
+            if self._completed(tables, int(cells[0]), cycle, now):
+                break
+            failed += released_ns <= now - self.patience_ns
+            if failed == self.problem.controller.failures_in_a_row:
+                return True
+        return False
+
+    def _completed(self, tables: k.Tables, cell: int, cycle: int, now: int) -> bool:
+        """Whether a cycle, or its shadow, has been heard to complete by an instant."""
+        if cell == 0:
+            return bool(self._heard(tables, cycle, cycle + 1, now)[0])
+        heard_ns = self.probes.heard_ns(tables, cycle)
+        return heard_ns is not None and heard_ns <= now
 
     def _parts(self, name: str) -> Iterable[str]:
         return sorted(parts_of(self.problem, name))
 
-    def fell(self, tables: k.Tables, now: int, first: int) -> None:
-        """Rest: the cell has moved to a fallback, which is stamped from a cycle on."""
+    def fell(self, tables: k.Tables, now: int, first: int, left: str, to: str) -> None:
+        """Note that the cell has moved to a fallback, which is stamped from a cycle on."""
         self._note_health(tables, now)
         self.probation.fell()
+        self._rests += not self._tries(tables, now, first)
+        self._round.moved(left, to)
         # An order that has not stamped a cycle yet is void.
-        under_orders = self.since is not None and self.since < first
-        self._own_moves = 1 if under_orders else self._own_moves + 1
-        self.since = None
-        self._arm(tables, first + rest_cycles(self.probation.probe_cycles, self._own_moves))
+        self._own, self._carrier, self.since = (to, first), None, None
+        self._spent_until = None
+        self._arm(tables, first, rest=rest_cycles(self.probation.probe_cycles, self._rests))
 
     def moved(self, tables: k.Tables, first: int) -> None:
         """Take note of an order that takes effect at a cycle."""
@@ -147,6 +261,7 @@ class SimulatedGuard:
         cell = tables.cells[0]
         # Cycles before are waited for, but those for which it still rests.
         cell[k.WAITED] = min(max(cell[k.WAITED], cell[k.MOVED]), first)
+        cell[k.RESTED] = min(cell[k.RESTED], first)
         cell[k.MOVED] = first
         # Other fallbacks may be open to the new placement than those that were not whole.
         due_ns, next_ns = self._due_ns(first), int(cell[k.GUARD_T])
@@ -157,13 +272,8 @@ class SimulatedGuard:
         """Count what was heard to complete since the cell has been under orders."""
         if self.since is None:
             return
-        last = int(np.searchsorted(self.release_ns[: self.cycles], now))
-        cycles = slice(self.since, last)
-        code = tables.stamps[0, cycles].astype(np.int64)
-        ended = self.release_ns[cycles] + tables.latency_ns[0, cycles]
-        done = tables.outcome[0, cycles] == k.DONE
-        heard = ended <= now - tables.back_ns[code]
-        self.probation.healthy(int(np.count_nonzero(done & heard)))
+        heard = self._heard(tables, self.since, self._released(now), now)
+        self.probation.healthy(int(np.count_nonzero(heard)))
 
     def proven(self, tables: k.Tables, now: int) -> str | None:
         """Return the candidate that probes have proven by now."""
@@ -303,7 +413,7 @@ class _Probes:
         unknown = [*self._open, *range(self._next, last)]
         self._next, self._open = max(self._next, last), []
         for cycle in unknown:
-            heard_ns = self._heard_ns(tables, cycle)
+            heard_ns = self.heard_ns(tables, cycle)
             if heard_ns is not None and heard_ns <= now:
                 found.append((heard_ns, True, cycle))
             elif heard_ns is not None or self._under_way(tables, cycle):
@@ -315,7 +425,7 @@ class _Probes:
 
         return sorted(found, key=order)
 
-    def _heard_ns(self, tables: k.Tables, cycle: int) -> int | None:
+    def heard_ns(self, tables: k.Tables, cycle: int) -> int | None:
         """Instant at which the completion of a probe is heard: all sinks have their inputs.
 
         A sink that the probe shares with its cycle must have completed.
