@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -13,10 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dwell.live.messages import Order, State, encode
+from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
 from tests.live.memory_transport import Clock
-from tests.live.small_world import MS, Counting, World, canonical, on, stateful
+from tests.live.small_world import MS, Counting, Passing, World, canonical, on, stateful
 
 EDGE = ("perception@E", "perception@E.shadow", "planning@E", "planning@E.shadow", "agent@E")
 
@@ -157,6 +158,101 @@ def test_rule_5_the_guard_rests_after_its_own_move(problem: Problem) -> None:
     # Cycles that were released after its rest, still under the silence, are waited for.
     assert world.stamper.placement == "HYB"
     assert world.stamper.guard.on_fallback
+
+
+class Broken(Passing):
+    """A stage that raises in every cycle, if it is told to."""
+
+    broken = False
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        if self.broken:
+            raise ValueError("no plan")
+        return super().process(inputs)
+
+
+def break_stage(world: World, who: str, *, broken: bool = True) -> None:
+    stage = world.worker(who).stage
+    assert isinstance(stage, Broken)
+    stage.broken = broken
+
+
+def test_rule_5_a_stage_that_fails_on_one_node_is_left_behind(problem: Problem) -> None:
+    """LOC and HYB need the planner on R2, SO does not; all that lives goes on beating."""
+    world = World(on(problem, "LOC"), stages={"planning": Broken})
+    world.run(1_000)
+    break_stage(world, "planning@R2")
+    world.run(2_000)
+    guard_cycles = problem.controller.guard_cycles
+    assert world.stamper.placement == "SO"
+    assert [name for _, name, _ in world.stamper.moves] in (["SO"], ["HYB", "SO"])
+    assert lost(world) <= 2 * (guard_cycles + 1)
+    beat = world.stamper.pulse.detector.last("planning@R2")
+    assert beat is not None
+    assert not beat.ready
+    assert "calls in a row have failed" in beat.note
+    # It is worth a try when nothing has been heard to fail for ten seconds.
+    world.run(11_000)
+    beat = world.stamper.pulse.detector.last("planning@R2")
+    assert beat is not None
+    assert beat.ready
+
+
+def test_one_success_makes_a_worker_ready_again(problem: Problem) -> None:
+    unguarded = replace(problem, controller=replace(problem.controller, fallbacks=()))
+    world = World(on(unguarded, "LOC"), stages={"perception": Broken})
+    world.run(1_000)
+    break_stage(world, "perception@R1")
+    world.run(500)
+    assert world.order("HYB") == ""
+    assert world.order("LOC").startswith("not ready: perception@R1")
+    world.run(500)
+    break_stage(world, "perception@R1", broken=False)
+    # A failure or two are no more than a cycle or two each.
+    world.run(10_000)
+    assert world.order("LOC") == ""
+    break_stage(world, "perception@R1")
+    world.run(500)
+    beat = world.stamper.pulse.detector.last("perception@R1")
+    assert beat is not None
+    assert not beat.ready
+    break_stage(world, "perception@R1", broken=False)
+    world.run(2.5 * problem.pipeline.period_ms)
+    beat = world.stamper.pulse.detector.last("perception@R1")
+    assert beat is not None
+    assert (beat.ready, world.stamper.placement) == (True, "LOC")
+
+
+def test_rule_5_images_that_do_not_arrive_are_no_sign_of_life(problem: Problem) -> None:
+    """Beats pass from R1 to E, images do not: HYB and SO are tried once, LOC when it is back."""
+    world = running(problem, "LOC")
+    world.network.cut("R1", "E", key="**/in/**")
+    world.network.freeze("perception@R1")
+    world.run(1_000)
+    tried = [name for _, name, _ in world.stamper.moves]
+    assert tried == ["HYB", "SO"]
+    begun = world.stamper.cycle
+    world.network.thaw("perception@R1")
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    last = [cycle for cycle in world.cycles if cycle >= begun]
+    # A beat, the move, and the cycle that is on its way.
+    assert last[0] - begun <= problem.controller.guard_cycles + 1
+    require_ordered(world)
+
+
+def test_rule_5_what_shadows_fail_through_is_not_whole(problem: Problem) -> None:
+    controller = replace(problem.controller, fallbacks=("SO", "HYB"))
+    world = running(replace(problem, controller=controller), "LOC")
+    stamper = world.stamper
+    stamper._fraction = 0.4
+    world.network.cut("E", "E", key="**/in/planning/E/shadow")
+    world.run(2_000)
+    assert stamper.presence.whole("SO", world.network.now_ns)
+    world.kill("perception@R1")
+    world.run(1_000)
+    assert [name for _, name, _ in stamper.moves] == ["HYB"]
+    assert lost(world) <= problem.controller.guard_cycles + 1
 
 
 def test_rule_5_holds_without_a_controller(problem: Problem) -> None:

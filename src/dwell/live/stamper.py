@@ -8,8 +8,7 @@ from typing import Protocol
 
 from msgspec.structs import asdict
 
-from dwell.control import shadow_stamps
-from dwell.control.guard import Guard, Presence, Probation
+from dwell.control import Failures, Guard, Presence, Probation, shadow_stamps
 from dwell.errors import LiveError
 from dwell.live.continuity import RESERVED
 from dwell.live.control_group import UNKNOWN
@@ -91,7 +90,7 @@ class Stamper:
         self.guard = Guard.of(problem, entry.placement)
         if entry.on_fallback:
             self.guard.adopt(entry.placement, fallback=True)
-        self.presence = Presence.of(problem)
+        self.presence, self.failures = Presence.of(problem), Failures.of(problem)
         self.probation = Probation.of(problem)
         if entry.on_fallback:
             self.probation.fell()
@@ -99,6 +98,7 @@ class Stamper:
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
         self._framed_ns = now_ns - place.period_ns
+        self._woken_ns = now_ns
         # A run that goes on does so at once; a new one waits until its placement is there.
         self._begun, self._since_ns = entry.reserved > 0, now_ns
         # Sources on other nodes get their stamps a cycle early.
@@ -191,8 +191,9 @@ class Stamper:
         if stamp.run != self.run:
             return
         if done.outcome == "shadow":
-            if done.sink not in self._sinks:
+            if done.sink not in self._sinks or stamp.shadow not in self._names:
                 return
+            self.failures.completed(stamp.shadow, stamp.cycle)
             if stamp.shadow == self.probation.wanted and stamp.cycle in self._probes:
                 self._probes.discard(stamp.cycle)
                 self.probation.completed(stamp.cycle, now_ns)
@@ -206,6 +207,8 @@ class Stamper:
         sinks.add(done.sink)
         if sinks == self._sinks:
             self.guard.completed(stamp.cycle, now_ns)
+            if stamp.placement in self._names:
+                self.failures.completed(stamp.placement, stamp.cycle)
             self.probation.healthy()
         if len(self._partial) > MAX_PARTIAL:
             for cycle in sorted(self._partial)[: MAX_PARTIAL // 2]:
@@ -333,12 +336,13 @@ class Stamper:
         """Release the cycle that is due, let the guard look, beat; returns what is due next."""
         if not self._begun and not self._begin(now_ns):
             return min(self.pulse.wake(now_ns), now_ns + self.place.period_ns)
-        fallback = self.guard.check(now_ns, lambda name: self.presence.whole(name, now_ns))
+        if now_ns < self._woken_ns - self.place.period_ns // 4:
+            self._begin_anew(now_ns)
+        self._woken_ns = now_ns
+        fallback = self.guard.check(now_ns, *self._guards_view(now_ns))
         if fallback is not None:
             self._move(fallback, by_guard=True)
             self.pulse.send(now_ns)
-        if self._next_ns > now_ns + self.place.period_ns:
-            self._next_ns = now_ns  # the clock has been set back
         if self.timer and now_ns >= self._next_ns:
             behind = (now_ns - self._next_ns) // self.place.period_ns
             self.skipped += behind
@@ -352,6 +356,23 @@ class Stamper:
         # Where no fallback is whole, the guard looks again every quarter of a period.
         again_ns = now_ns + self.place.period_ns // 4
         return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
+
+    def _guards_view(self, now_ns: int) -> tuple[Callable[[str], bool], Callable[[str], bool]]:
+        """Return whether a candidate is whole, and whether its parts were heard."""
+
+        def heard(name: str) -> bool:
+            return self.presence.whole(name, now_ns)
+
+        def whole(name: str) -> bool:
+            return heard(name) and not self.failures.failing(name, now_ns)
+
+        return whole, heard
+
+    def _begin_anew(self, now_ns: int) -> None:
+        """The clock has been set back: instants noted so far mean nothing any more."""
+        self._next_ns, self._framed_ns = now_ns, now_ns - self.place.period_ns
+        for noted in (self.presence, self.failures, self.guard):
+            noted.restart()
 
     def _begin(self, now_ns: int) -> bool:
         """Look whether the first cycle can be released."""
@@ -376,6 +397,9 @@ class Stamper:
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
         self.guard.released(stamp.cycle, released_ns)
+        self.failures.released(stamp.placement, stamp.cycle, released_ns)
+        if stamp.shadow:
+            self.failures.released(stamp.shadow, stamp.cycle, released_ns)
         if stamp.shadow and stamp.shadow == self.probation.wanted:
             self.probation.released(stamp.cycle, released_ns)
             self._probes.add(stamp.cycle)

@@ -29,7 +29,7 @@ from dwell.live.routing import STAMPER, Routes
 from dwell.live.stage import Message, Stage, Stateful
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import SPARE, lane_of, longest_bytes
-from dwell.model.instants import NEVER_NS
+from dwell.model.instants import EVIDENCE_NS, NEVER_NS
 
 #: Cycles that may wait for the rest of their inputs.
 MAX_JOINS = 64
@@ -222,6 +222,8 @@ class Worker:
         self._busy_cycle = 0
         self.replaced = 0
         self.failures = 0
+        # Calls of process() in a row that brought nothing that could be sent; when the last ended.
+        self._failed_in_a_row, self._failed_ns = 0, 0
         self._now_ns = 0
         # Of each link that its inputs may take, and of the stamper, whose clock counts.
         before = [
@@ -539,6 +541,8 @@ class Worker:
             self._worked_at = max(self._worked_at, job.order)
             self._follows = False
             self._forked.clear()
+        # Until it is known that there is something to send.
+        self._failed_in_a_row, self._failed_ns = self._failed_in_a_row + 1, ended_ns
         if output is None:
             return
         try:
@@ -547,7 +551,7 @@ class Worker:
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return
-        self.trouble = ""
+        self.trouble, self._failed_in_a_row = "", 0
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
         times = job.arrived_ns, started_ns, ended_ns
         before, cpu_ns, after = self._counted
@@ -602,6 +606,10 @@ class Worker:
             return False, f"{where}: cycle {cycle}: process() has not returned for {since_s:.0f} s"
         if not self.started:
             return False, self.trouble or f"{where}: start() has not returned yet"
+        count = self._failed_in_a_row
+        recent = self._now_ns < self._failed_ns + EVIDENCE_NS
+        if recent and count >= self.place.problem.controller.failures_in_a_row:
+            return False, f"{self.trouble} ({count} calls in a row have failed)"
         if self.triggers and self._framed_ns is None:
             self._framed_ns = self._now_ns
         if self._framed_ns is not None and self._now_ns - self._framed_ns > limit_ns:
