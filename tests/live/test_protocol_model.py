@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
-from docs.protocol import gate, orders, states
+from docs.protocol import fallbacks, gate, orders, states
 from docs.protocol.checker import Rules, Step, explore, stuck, without
+from dwell.control import Guard
 from dwell.model import Problem
 from tests.live.small_world import World, canonical
 
-MODELS = {"gate": gate, "orders": orders, "states": states}
+MODELS = {"fallbacks": fallbacks, "gate": gate, "orders": orders, "states": states}
 WALKS = 6
 STEPS = 24
 
@@ -23,11 +24,13 @@ STEPS = 24
 @pytest.mark.parametrize(
     ("model", "limits"),
     [
+        *((fallbacks, limits) for limits in fallbacks.CASES),
         (gate, gate.LIMITS),
         *((orders, limits) for limits in orders.CASES),
         *((states, limits) for limits in states.CASES),
     ],
     ids=[
+        *(f"fallbacks {i}" for i, _ in enumerate(fallbacks.CASES)),
         "gate",
         *(f"orders {i}" for i, _ in enumerate(orders.CASES)),
         *(f"states {i}" for i, _ in enumerate(states.CASES)),
@@ -145,3 +148,77 @@ def test_the_stamper_does_what_the_model_does(problem: Problem, seed: int) -> No
     assert state.now.term > 1, "a walk on which nothing happened"
     cycles = mirror.world.cycles
     assert cycles == sorted(set(cycles))
+
+
+class MirroredGuard:
+    """Does to a real guard what happens in the model; g = 2, and P = 1."""
+
+    def __init__(self) -> None:
+        self.guard = Guard(
+            fallbacks.FALLBACKS,
+            guard_cycles=2,
+            period_ns=1,
+            probe_cycles=8,
+            placement=fallbacks.WANTED,
+        )
+        self.heard = dict.fromkeys(fallbacks.FALLBACKS, True)
+        self.cycle = -1
+
+    def _release(self) -> None:
+        self.cycle += 1
+        self.guard.released(self.cycle, self.cycle)
+
+    def _look(self) -> bool:
+        found = self.guard.check(self.cycle, self.heard)
+        if found is not None:
+            self.guard.adopt(found, fallback=True)
+        return found is not None
+
+    def follow(self, label: str) -> None:
+        """Have happen what a step of the model is called after."""
+        name = label.split(maxsplit=1)[0]
+        if label == "a cycle completes":
+            # As many as make a return hold.
+            for _ in range(10):
+                self._release()
+                self.guard.completed(self.cycle, self.cycle)
+        elif label.startswith("the guard moves"):
+            while not self._look():
+                self._release()
+        elif label == "the guard rests":
+            for _ in range(4):
+                self._release()
+                assert not self._look()
+            assert self.guard.resting
+        elif label == "the rest is over":
+            while self.guard.resting:
+                self._release()
+            # It is over when the guard would fire again.
+            for _ in range(3):
+                self._release()
+        elif label.startswith("an order"):
+            self.guard.adopt(label.rsplit(maxsplit=1)[-1])
+        elif "is heard" in label:
+            self.heard[name] = not self.heard[name]
+
+
+def test_the_guard_does_what_the_model_does() -> None:
+    """Random walks through the model, and the same of a real guard."""
+    rng, moves = random.Random(1), 0
+    limits = fallbacks.Limits(faults=12, orders=4)
+    for _ in range(200):
+        mirror, state, followed = MirroredGuard(), fallbacks.initial(), list[str]()
+        while len(followed) < 60:
+            steps = list(fallbacks.successors(state, limits=limits))
+            if rng.random() < 0.7:
+                steps = [step for step in steps if not step.fault] or steps
+            if not steps:
+                break
+            step = rng.choice(steps)
+            mirror.follow(step.label)
+            followed.append(step.label)
+            state = step.state
+            real = mirror.guard.placement, mirror.guard.on_fallback
+            assert real == (state.at, state.own), "; ".join(followed)
+        moves += sum("the guard moves" in label for label in followed)
+    assert moves > 1_000
