@@ -117,6 +117,7 @@ def _names(home: str) -> Iterator[str]:
             ),
         }
         yield from (f"{how} {who}" for who in whom[home])
+    yield from {"SO": ("slow R1->E", "fail perception@E"), "LOC": ("fail planning@R2",)}[home]
     for a, b in {"SO": (("R1", "E"), ("E", "R2")), "LOC": (("R1", "R2"),)}[home]:
         yield from (f"cut {a}->{b}", f"cut {b}->{a}", f"cut {a}-{b}")
 
@@ -136,7 +137,7 @@ FAULTS = {fault.name: fault for fault in _faults()}
 
 def moves(fault: HomeFault) -> bool:
     """Whether the guard has to move the cell, for which it should have been healthy before."""
-    if fault.how == "cut":
+    if fault.how in ("cut", "slow"):
         return True
     relocatable = any(who.startswith(("perception", "planning", "*E")) for who in fault.whom)
     return fault.bound is not None and relocatable

@@ -79,6 +79,10 @@ class LocalTestbed(Testbed):
     #: Those that hold now, by link.
     _conditions: dict[str, Conditions]
 
+    def conditions(self, name: str) -> Conditions:
+        """Return the conditions of a link that hold now."""
+        return self._conditions[name]
+
     def _changes(self, name: str, now: Conditions) -> dict[str, Any]:
         """Note the conditions of a link that hold now; returns the fields that have changed."""
         before, self._conditions[name] = self._conditions[name], now

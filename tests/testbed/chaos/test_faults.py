@@ -27,6 +27,19 @@ def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
     assert [fault.whom for fault in left if fault.how == "fill"] == [("runs",)]
 
 
+def test_only_stages_that_know_of_it_are_told_to_fail(problem: Problem) -> None:
+    assert any(fault.how == "fail" for fault in faults_of(problem))
+    assert not any(fault.how == "fail" for fault in faults_of(problem, stages=False))
+
+
+def test_images_do_not_fit_through_a_link_that_is_slow(problem: Problem) -> None:
+    slow = [fault for fault in faults_of(problem) if fault.how == "slow"]
+    assert {fault.whom for fault in slow} == {("R1->E",)}
+    image = max(flow.payload_bytes for flow in problem.pipeline.flows)
+    needed_mbps = image * 8 / problem.pipeline.period_ms / 1e3
+    assert slow[0].amount == pytest.approx(needed_mbps / 4)
+
+
 @pytest.mark.parametrize(
     ("name", "at_so", "at_loc"),
     [
@@ -41,6 +54,9 @@ def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
         ("cut R1->E", 4, 4),
         ("cut R1-R2", 4, 4),
         ("lose relay agent@E", 4, 4),
+        ("slow R1->E", 4, 4),
+        ("fail perception@E", 4, 4),
+        ("fail planning@R2", 4, 8),
         ("jump +5000 ms E", 4, 4),
         ("jump +5000 ms R2", None, None),
         ("drift +80 ppm R1", 4, 4),
@@ -71,6 +87,7 @@ def test_every_kind_has_its_turn_in_every_round(problem: Problem) -> None:
     assert {one.fault.kind for one in first} == kinds
     assert kinds == {
         *("kill", "kill node", "freeze", "freeze node", "cut", "cut one way", "relay"),
+        *("slow", "fail"),
         *("jump", "drift", "starve", "fill", "hog"),
     }
 

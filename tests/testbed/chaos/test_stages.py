@@ -45,6 +45,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     told = {
         "exec_ms": EXEC_MS,
         "observed": str(tmp_path / "log"),
+        "failing": str(tmp_path / "failing"),
         "actuators": {"control": f"{__name__}:Behind"},
     }
     monkeypatch.setenv(TOLD, json.dumps(told))

@@ -206,7 +206,8 @@ class FaultCampaign:
 
     def _plan(self, faults: int | None, only: int | None) -> Any:
         testbed, _ = self._staging.testbed(1)
-        faults_here = list(faults_of(testbed.problem, disks=self._disks))
+        light = self._staging.cell is None
+        faults_here = list(faults_of(testbed.problem, disks=self._disks, stages=light))
         timeline = planned(self._seed, faults_here)
         if only is not None:
             return islice(timeline, only - 1, only)

@@ -9,10 +9,12 @@ from itertools import combinations
 from typing import Literal, TypeAlias
 
 from dwell.control.guard import parts_of
-from dwell.live.wiring import roles
+from dwell.live.wiring import lane_of, roles
 from dwell.model import Problem
 
-How: TypeAlias = Literal["kill", "freeze", "cut", "jump", "drift", "starve", "fill", "hog"]
+How: TypeAlias = Literal[
+    "kill", "freeze", "cut", "slow", "fail", "jump", "drift", "starve", "fill", "hog"
+]
 
 #: What oscillators do, and what nobody's should.
 WITHIN_PPM, BEYOND_PPM = 80.0, 2_000.0
@@ -30,10 +32,10 @@ class Fault:
     Parameters
     ----------
     whom : tuple of str
-        Processes, ``*E`` for all of a node; directions of a cut, as ``R1->E``; nodes; ``runs`` for
+        Processes, ``*E`` for all of a node; directions of a link, as ``R1->E``; nodes; ``runs`` for
         the disk that the runs are kept on.
     amount : float
-        Jump in ms, drift in parts per million.
+        Jump in ms, drift in parts per million, rate in Mbit/s.
     kind : str
         Kind that shares its turns; `how` if left out.
     """
@@ -48,13 +50,15 @@ class Fault:
         object.__setattr__(self, "kind", self.kind or self.how)
 
 
-def faults_of(problem: Problem, *, disks: bool = True) -> Iterator[Fault]:
+def faults_of(problem: Problem, *, disks: bool = True, stages: bool = True) -> Iterator[Fault]:
     """Yield every fault of a cell; `bound_of` says what is promised for it.
 
     Parameters
     ----------
     disks : bool
         Whether nodes have disks of their own that can be made full.
+    stages : bool
+        Whether stages raise when they are told to, as those of the light cell.
     """
     everybody = roles(problem)
     relay = problem.relay_node
@@ -76,6 +80,11 @@ def faults_of(problem: Problem, *, disks: bool = True) -> Iterator[Fault]:
         yield Fault(f"cut {one}-{other}", "cut", (f"{one}->{other}", f"{other}->{one}"))
         for a, b in ((one, other), (other, one)):
             yield Fault(f"cut {a}->{b}", "cut", (f"{a}->{b}",), kind="cut one way")
+    yield from _slow_links(problem)
+    if stages:
+        for role in everybody:
+            if role.kind == "worker" and len(problem.pipeline.tasks[role.task].on) > 1:
+                yield Fault(f"fail {role.who}", "fail", (role.who,))
     yield from _clocks(nodes)
     for node in nodes:
         yield Fault(f"starve {node}", "starve", (node,))
@@ -88,6 +97,22 @@ def faults_of(problem: Problem, *, disks: bool = True) -> Iterator[Fault]:
 
 def _linked(problem: Problem) -> set[tuple[str, str]]:
     return {(link.source, link.target) for link in problem.fabric.links.values()}
+
+
+def _slow_links(problem: Problem) -> Iterator[Fault]:
+    """Yield each direction that images may take, with a quarter of the rate that they need."""
+    pipeline = problem.pipeline
+    for link in problem.fabric.links.values():
+        crossing = [
+            flow.payload_bytes
+            for placement in problem.candidates.values()
+            for flow in pipeline.flows
+            if (placement[flow.source], placement[flow.target]) == (link.source, link.target)
+        ]
+        largest = max(crossing, default=0)
+        if lane_of(largest) == "images":
+            rate_mbps = largest * 8 / (pipeline.period_ms * 1e3) / 4
+            yield Fault(f"slow {link.name}", "slow", (link.name,), rate_mbps)
 
 
 def _clocks(nodes: Sequence[str]) -> Iterator[Fault]:
@@ -106,7 +131,7 @@ def hit_by(problem: Problem, fault: Fault) -> frozenset[str] | None:
     everybody = {role.who: role for role in roles(problem)}
     vital = {role.node for role in everybody.values() if role.kind in ("stamper", "sink")}
     match fault.how:
-        case "cut":
+        case "cut" | "slow" | "fail":
             return frozenset(fault.whom)
         case "fill" | "hog":
             return frozenset()
@@ -147,8 +172,12 @@ def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
     bound = problem.controller.guard_cycles + 1
     if not parts_of(problem, placement) & hit:
         return bound
-    others = (name for name in problem.controller.fallbacks if name != placement)
-    return bound if any(not parts_of(problem, name) & hit for name in others) else None
+    others = [name for name in problem.controller.fallbacks if name != placement]
+    struck = [bool(parts_of(problem, name) & hit) for name in others]
+    if all(struck):
+        return None
+    # What is heard all the same is tried before what works.
+    return bound * (1 + struck.index(False)) if fault.how in ("slow", "fail") else bound
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,12 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from dwell.errors import LiveError
+from dwell.files import write_whole
 from dwell.live.hosting import clock_of
 from dwell.live.supervision import survivor
 from dwell.model import Problem
@@ -22,11 +24,12 @@ from dwell.testbed.chaos.faults import Fault
 from dwell.testbed.chaos.stages import APPLY, TOLD
 from dwell.testbed.child import Started
 from dwell.testbed.clocks import ClockFile
+from dwell.testbed.conditions import Conditions
 from dwell.testbed.processes import expected
 from dwell.testbed.testbed import LocalTestbed
 from dwell.testbed.timeline import Change, NodeState
 
-OBSERVED, CLOCK_FILE = "observed", "clocks"
+OBSERVED, CLOCK_FILE, FAILING = "observed", "clocks", "failing"
 #: Ten windows without a fault make the next one no relapse; of long ones, no more than this.
 HEALTH_S = 5.0
 #: Busy threads beside the processes of a node that starves.
@@ -36,8 +39,8 @@ STARVING_THREADS = 32
 def environment_of(folder: Path, exec_ms: Mapping[str, object], **more: object) -> dict[str, str]:
     """Return the variables that stages and actuator of a cell in a folder need."""
     folder = folder.resolve()
-    settings = {"observed": str(folder / OBSERVED), "exec_ms": exec_ms, **more}
-    return {TOLD: json.dumps(settings)}
+    files = {"observed": str(folder / OBSERVED), "failing": str(folder / FAILING)}
+    return {TOLD: json.dumps({**files, "exec_ms": exec_ms, **more})}
 
 
 def pid_of(mark: Path) -> int | None:
@@ -72,6 +75,7 @@ class Harness(Started):
         self._hog: DiskHog | None = None
         self._burner: Burner | None = None
         self._stressed = ""
+        self._usual: dict[str, Conditions] = {}
 
     @property
     def problem(self) -> Problem:
@@ -266,6 +270,12 @@ class Harness(Started):
             _send(pid, _SIGNALS[fault.how])
         for what in fault.whom:
             match fault.how:
+                case "slow":
+                    self._usual[what] = usual = self.testbed.conditions(what)
+                    slow = replace(usual, rate_mbps=fault.amount)
+                    self.testbed.apply(Change(0, what, slow))
+                case "fail":
+                    write_whole(self.folder / FAILING, what, durable=False)
                 case "jump":
                     self.set_clock(what, jump_ms=fault.amount)
                 case "drift":
@@ -284,6 +294,11 @@ class Harness(Started):
             case "cut":
                 for way in fault.whom:
                     self.testbed.heal(*way.split("->"))
+            case "slow":
+                for way in fault.whom:
+                    self.testbed.apply(Change(0, way, self._usual.pop(way)))
+            case "fail":
+                (self.folder / FAILING).unlink()
             case "freeze":
                 self.signal(self.names(fault), signal.SIGCONT)
             case "kill":

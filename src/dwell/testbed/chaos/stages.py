@@ -13,11 +13,14 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
 
 from dwell.live.stage import Actuator, Message, load_actuator
 
 #: Variable with what the processes are told: ``observed`` (file), ``exec_ms`` (by task and node),
-#: ``actuators`` (by task, those that are called behind the witness).
+#: ``actuators`` (by task, those that are called behind the witness), ``failing`` (file with the
+#: workers whose stages raise, while it is there).
 TOLD = "DWELL_CHAOS"
 
 #: Cycle and release as the source saw them; where perception and planning ran (index of node).
@@ -41,11 +44,16 @@ class _Timed(ABC):
         task, _, rest = _where().partition("@")
         node = rest.partition(".")[0]
         self.node = NODES.index(node)
-        self.seconds = json.loads(os.environ[TOLD])["exec_ms"][task][node] / 1e3
+        told = json.loads(os.environ[TOLD])
+        self.seconds = told["exec_ms"][task][node] / 1e3
+        self._failing = Path(told["failing"])
 
     def process(self, inputs: Mapping[str, Message]) -> Message:
-        """Take the time that it takes."""
+        """Take the time that it takes; raise where it is told to."""
         (message,) = inputs.values()
+        with suppress(FileNotFoundError):
+            if _where() in self._failing.read_text(encoding="utf-8").split():
+                raise RuntimeError("told to fail")
         begin = time.monotonic()
         output = self.turn(message)
         time.sleep(max(self.seconds - (time.monotonic() - begin), 0.0))
