@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 
-from dwell.cellfile import from_document, load
+from dwell.cellfile import from_document, from_record, load
 from dwell.errors import ProblemError
 from dwell.model import (
     AR1,
@@ -138,6 +138,26 @@ def test_a_cell_without_a_name_has_that_of_its_file(tmp_path: Path) -> None:
     path.write_text(text + "tasks: {t: {on: {n: {exec_ms: 1}}}}\ncandidates: {LOC: {}}\n")
     assert load(path).name == "arm"
     assert load(path).pipeline.period_ms == 10
+
+
+@pytest.mark.parametrize("name", ["../../evil", "a?b", "a/b", "a  b", " a", "", "@a", "a" * 65])
+def test_the_name_of_a_cell_is_a_name(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "arm.yaml"
+    path.write_text(yaml.safe_dump({**LEAST, "name": name}))
+    with pytest.raises(ProblemError) as caught:
+        load(path)
+    (fault,) = caught.value.faults
+    assert fault.path == "name"
+    assert fault.line is not None
+    # What an earlier version has recorded can still be read.
+    assert from_record({**LEAST, "name": name}).name == name
+
+
+def test_the_name_of_a_file_has_to_be_one_where_the_cell_has_none(tmp_path: Path) -> None:
+    path = tmp_path / "a?b.yaml"
+    path.write_text(yaml.safe_dump(LEAST))
+    with pytest.raises(ProblemError, match="name: 'a\\?b' is not a name"):
+        load(path)
 
 
 @pytest.mark.parametrize(

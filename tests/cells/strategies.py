@@ -284,7 +284,7 @@ def problems(draw: st.DrawFn) -> Problem:
     items = _disturbance(list(nodes), [link.name for link in links])
     period_ms = draw(_reals(1e-3, 1e9))
     return Problem(
-        name=draw(st.text(min_size=1, max_size=8)),
+        name=draw(_names(1, 1))[0],
         pipeline=Pipeline(
             tasks,
             tuple(Flow(a, b, draw(_whole(0, 10**12))) for a, b in chosen),

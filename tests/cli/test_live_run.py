@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -173,14 +174,17 @@ def test_killed_it_leaves_no_process_port_or_shared_memory(demo: subprocess.Pope
 
 @TWO_CPUS
 def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> None:
-    """The tutorial's cell with a delay on a link, and an observer beside it."""
+    """The tutorial's cell under other names, with a delay on a link, and an observer beside it."""
     beside = CELL.parents[1] / "live"
-    document = to_document(dwell.load(beside / "cell.yaml"))
+    text = re.sub(r"\bplanning\b", "plan it", (beside / "cell.yaml").read_text())
+    (tmp_path / "cell.yaml").write_text(text.replace("name: light-follower", "name: S\u00fcd x"))
+    document = to_document(dwell.load(tmp_path / "cell.yaml"))
     delay = {"link": "R1->E", "both_ways": True, "at_s": 3, "for_s": 60, "add_delay_ms": 400}
     document["scenarios"] = {"calm": [], "far": [delay]}
     document["live"] = {**document.get("live", {}), "observer": "looking:Looking"}
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(document))
-    (tmp_path / "stages.py").write_text((beside / "stages.py").read_text())
+    stages = (beside / "stages.py").read_text().replace('"planning"', '"plan it"')
+    (tmp_path / "stages.py").write_text(stages)
     (tmp_path / "looking.py").write_text(OBSERVER)
     words = ["--scenario", "far", "--seconds", "12", "--policy", "SO", "--seed", "3"]
     done = subprocess.run(

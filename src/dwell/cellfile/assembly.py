@@ -84,7 +84,8 @@ class Assembly:
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
     judged : bool
-        Whether policies and estimators must be known here. A record names what its machine had.
+        Whether policies and estimators must be known here, and the cell's name be one. A record
+        names what its machine had.
     home : str, optional
         `Problem.folder`.
     """
@@ -130,7 +131,9 @@ class Assembly:
             for name, items in (entry.scenarios or {}).items()
         }
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
+        called = name if entry.name is None else entry.name
         parts = CellParts(
+            name=called if self.judged else None,
             nodes=nodes,
             links=links,
             links_complete=len(dict(links)) == len(entry.links or ()),
@@ -169,7 +172,7 @@ class Assembly:
         return self.faults.attempt(
             "",
             Problem,
-            name=entry.name or name,
+            name=called,
             pipeline=pipeline,
             fabric=fabric,
             candidates={name: _complete(moves, whole) for name, moves in candidates.items()},

@@ -87,6 +87,7 @@ def from_document(
     *,
     folder: str | PathLike[str] = ".",
     source: str | None = None,
+    judged: bool = True,
 ) -> Problem:
     """Read a cell from plain values, as `dwell.model.document.to_document` makes them.
 
@@ -101,13 +102,16 @@ def from_document(
         Where the traces that it names are.
     source : str, optional
         Name of the document in messages.
+    judged : bool
+        See `read_problem`.
 
     Raises
     ------
     ProblemError
         With every fault found.
     """
-    return read_problem(document, Faults(source), Path(folder), "cell", anchored=True)
+    faults = Faults(source)
+    return read_problem(document, faults, Path(folder), "cell", anchored=True, judged=judged)
 
 
 def from_record(document: Mapping[str, object]) -> Problem:
@@ -162,7 +166,8 @@ def read_problem(
     anchored : bool
         Whether a candidate may name anchored tasks where they are.
     judged : bool
-        Whether policies and estimators must be known here; a record names what its machine had.
+        Whether policies and estimators must be known here, and the cell's name be one; a record
+        names what its machine had.
     home : str, optional
         Folder of the modules that it names, for `Problem.folder`.
 

@@ -48,9 +48,11 @@ class CellParts:
 
     ``policies`` and ``estimators`` are the names that there are, and ``shadowing`` the estimators
     that send shadow jobs. Where they are None names are not judged, nor the columns that are made
-    of names: whoever makes a policy, an estimator or a run does that.
+    of names: whoever makes a policy, an estimator or a run does that. ``name`` is the cell's own,
+    not judged either where it is None.
     """
 
+    name: str | None = None
     nodes: Mapping[str, Node | None] = field(default_factory=dict)
     links: Sequence[tuple[str, Link]] = ()
     links_complete: bool = True
@@ -121,6 +123,8 @@ def _unknown(path: str, what: str, word: str, known: Iterable[str]) -> Iterator[
 
 
 def _names(parts: CellParts) -> Iterator[Fault]:
+    if parts.name is not None and (message := bad_name(parts.name)):
+        yield Fault("name", message)
     sections: dict[str, Iterable[str]] = {
         "nodes": parts.nodes,
         "tasks": parts.tasks,

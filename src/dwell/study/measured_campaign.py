@@ -100,7 +100,8 @@ def read_measured(folder: Path) -> MeasuredCampaign:
     if not kept.done:
         raise RunError(f"{folder}: none of its {len(kept.description['plan'])} runs is done yet")
     described = kept.description
-    problem = from_document(described["cell"], folder=folder, source=str(folder))
+    cell = described["cell"]
+    problem = from_document(cell, folder=folder, source=str(folder), judged=False)
     rows: list[Row] = []
     costs: list[Row] = []
     logged: list[dict[str, Any]] = []

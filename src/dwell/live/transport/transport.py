@@ -18,8 +18,10 @@ from dwell.errors import LiveError
 #: `control` is for what is small and must not wait; `images` for payloads, newest first.
 Lane: TypeAlias = Literal["control", "images"]
 
-# What Zenoh forbids, and `@` in front, which no wildcard of Zenoh's would match.
-_CHUNK = re.compile(r"[^/*$?#@\s][^/*$?#\s]*")
+# What Zenoh forbids, and `@` in front, which no wildcard of Zenoh's would match. Names of cells and
+# tasks are chunks as they are, with single spaces between their words.
+_WORD = r"[^/*$?#\s]+"
+_CHUNK = re.compile(rf"(?!@){_WORD}(?: {_WORD})*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +79,8 @@ def require_key(key: str) -> None:
     for chunk in key.split("/"):
         if not _CHUNK.fullmatch(chunk):
             raise LiveError(
-                f"key {key!r}: chunk {chunk!r} is empty, starts with @, or has white space or one "
-                "of * $ ? #"
+                f"key {key!r}: chunk {chunk!r} is empty, starts with @, or has one of * $ ? # or "
+                "white space other than single spaces between words"
             )
 
 
