@@ -7,7 +7,6 @@ import os
 import platform
 import re
 import shutil
-import socket
 import sys
 import textwrap
 import time
@@ -25,6 +24,7 @@ import dwell
 from dwell.calibration.machine_conditions import MachineCounters, processor
 from dwell.cli.output import print_json
 from dwell.errors import DISTRIBUTION, OPTIONAL, LiveError, TrustError, installing
+from dwell.live.local_addresses import is_here, taken_ports
 from dwell.model import Host, Problem
 from dwell.model.bounds import counted
 from dwell.testbed import doctor as testbed_doctor
@@ -45,7 +45,6 @@ DEFAULT_PORTS = 50
 SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "refined-jiffies")
 #: Files of compiled kernels, in a folder that has no others.
 CACHED = ("*.nbi", "*.nbc", "compiling.*.lock")
-LISTENS = "0A"
 
 
 def consult(
@@ -309,15 +308,10 @@ def _ports(problem: Problem | None) -> Finding:
         return Finding("TCP", False, "; ".join(str(error).splitlines()), "mend live.hosts")
     if not wanted:
         return Finding("TCP", True, "no node of the cell is this computer")
-    taken = {port: inode for port, inode in _listening().items() if port in wanted}
     span = f"{min(wanted)} to {max(wanted)}"
-    if not taken:
+    whom = taken_ports(wanted)
+    if not whom:
         return Finding("TCP", True, f"{span} are free")
-    owners = _owners(set(taken.values()))
-    ports: dict[str, list[str]] = {}
-    for port, inode in sorted(taken.items()):
-        ports.setdefault(owners.get(inode, "another user's process"), []).append(str(port))
-    whom = "; ".join(f"{', '.join(some)} by {owner}" for owner, some in ports.items())
     remedy = "end it, or give the nodes in live.hosts other ports"
     return _optional("TCP", False, f"of {span} are taken: {whom}", remedy)
 
@@ -329,50 +323,14 @@ def _ports_here(problem: Problem | None) -> set[int]:
     try:
         from dwell.live.wiring import PORTS_PER_ROLE, wire
     except ImportError:
-        return {host.port for host in problem.live.hosts.values() if _is_here(host.address)}
+        return {host.port for host in problem.live.hosts.values() if is_here(host.address)}
     ports: set[int] = set()
     wiring = wire(problem)
     for node, host in problem.live.hosts.items():
-        if _is_here(host.address):
+        if is_here(host.address):
             count = PORTS_PER_ROLE * len(list(wiring.on(node)))
             ports.update(range(host.port, host.port + count))
     return ports
-
-
-def _is_here(address: str) -> bool:
-    with suppress(OSError):
-        kind, *_, place = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(kind) as probe:
-            probe.bind(place)
-            return True
-    return False
-
-
-def _listening() -> dict[int, str]:
-    """Return the ports that somebody listens on, with the inode of the socket (proc_net(5))."""
-    inodes = {}
-    for file in ("/proc/net/tcp", "/proc/net/tcp6"):
-        with suppress(OSError):
-            for line in Path(file).read_text(encoding="utf-8").splitlines()[1:]:
-                words = line.split()
-                if words[3] == LISTENS:
-                    inodes[int(words[1].rpartition(":")[2], 16)] = words[9]
-    return inodes
-
-
-def _owners(inodes: set[str]) -> dict[str, str]:
-    """Return the process that has each socket, as far as this user may see it."""
-    owners = {}
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
-            for file in (process / "fd").iterdir():
-                with suppress(OSError):
-                    inode = os.readlink(file).removeprefix("socket:[").removesuffix("]")
-                    if inode in inodes:
-                        line = " ".join([Path(words[0]).name, *words[1:]]).strip()
-                        owners[inode] = f"{textwrap.shorten(line, 60)} (process {process.name})"
-    return owners
 
 
 def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Finding]:

@@ -24,7 +24,6 @@ from dwell.live.security import Security
 from dwell.live.state_files import make_folder
 from dwell.live.supervision import Supervisor
 from dwell.live.transport.orphans import remove_orphans
-from dwell.live.transport.transport import Transport
 from dwell.live.wiring import wire
 from dwell.model import Problem
 
@@ -81,7 +80,7 @@ def run_agent(
     security.remember(make_folder(folder))
     security.remind(say, stopped)
     platform = platform or Platform()
-    transport = _listening(platform, security, who, node)
+    transport = platform.transport(security, who, node)
     launcher = ForkServer(program, environment)
     supervisor = Supervisor(make_folder(folder), say, launcher=launcher)
     try:
@@ -113,20 +112,6 @@ def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCo
             "utilisation counts all that its CPUs do"
         )
     return CpuCount(group=group)
-
-
-def _listening(platform: Platform, security: Security, who: str, node: str) -> Transport:
-    """Open an agent's sessions.
-
-    Raises
-    ------
-    LiveError
-        If its port is taken: an agent of this node is there already.
-    """
-    try:
-        return platform.transport(security, who, node)
-    except LiveError as error:
-        raise LiveError(f"{error}\nis there another agent for node {node} here?") from None
 
 
 def _use_cpus(cpus: Iterable[int]) -> None:

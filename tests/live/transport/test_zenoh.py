@@ -23,6 +23,7 @@ from dwell.live.transport.zenoh import (
     _Route,
     _Sender,
 )
+from dwell.live.wiring import Locator, Role, WiringEntry
 from tests.live.transport.meshes import PATIENCE_S, Inbox, ZenohMesh, introduce
 from tests.live.transport.peer import digest
 
@@ -165,6 +166,18 @@ def test_a_taken_port_is_named(mesh: ZenohMesh) -> None:
     mesh.open(ME)
     with pytest.raises(LiveError, match=rf"{ME} .*control.*{mesh.first_port}.*taken"):
         mesh.open(ME)
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [("no.such.host.invalid", "cannot be resolved"), ("192.0.2.7", "is no address of this")],
+)
+def test_an_address_that_is_not_here_is_no_taken_port(address: str, words: str) -> None:
+    role = Role(ME, "R1", "agent")
+    entry = WiringEntry(role, {"control": Locator(address, 7_450)}, {})
+    with pytest.raises(LiveError, match=words) as caught:
+        ZenohTransport(entry)
+    assert "taken" not in str(caught.value)
 
 
 def test_a_receiver_that_fails_goes_on_hearing(

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
+from dwell.live.local_addresses import why_not_listen
 from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 from dwell.live.wiring import Session, WiringEntry, session_of
@@ -130,7 +131,7 @@ class ZenohTransport:
     Raises
     ------
     LiveError
-        If Zenoh is not installed, or a port is taken.
+        If Zenoh is not installed, or it cannot listen.
     """
 
     def __init__(self, entry: WiringEntry, settings: ZenohSettings | None = None) -> None:
@@ -222,7 +223,7 @@ class ZenohTransport:
         Raises
         ------
         LiveError
-            With what Zenoh says, and where it should have listened.
+            With where it should have listened, and why it cannot.
         """
         config = self._zenoh.Config()
         for path, value in _configuration(self.entry, name, self.settings).items():
@@ -231,10 +232,10 @@ class ZenohTransport:
             return self._zenoh.open(config)
         except self._zenoh.ZError as error:
             where = self.entry.listen.get(name)
+            why = "" if where is None else why_not_listen(where.address, where.port)
             raise LiveError(
                 f"{self.entry.role.who} cannot open its session {name!r}"
-                f"{f' on {where}' if where else ''}: {error}; is the port taken, by an older "
-                "process or another cell?"
+                f"{f' on {where}' if where else ''}: {why or error}"
             ) from None
 
     def _route(self, key: str, lane: Lane) -> _Route | None:

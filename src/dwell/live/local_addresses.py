@@ -1,0 +1,99 @@
+"""Addresses and ports of this computer: which of them a process can listen on, and who does."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import textwrap
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+#: State of a socket that listens, in /proc/net/tcp.
+LISTENS = "0A"
+
+
+def is_here(address: str) -> bool:
+    """Return whether an address, or the name of one, is this computer's."""
+    try:
+        _bind(address, 0)
+    except OSError:
+        return False
+    return True
+
+
+def why_not_listen(address: str, port: int) -> str:
+    """Return what keeps a process from listening at an address, and what to do; empty if nothing.
+
+    Parameters
+    ----------
+    address : str
+        An IP address or a host's name, as in `live.hosts`.
+    """
+    try:
+        _bind(address, port)
+    except socket.gaierror as error:
+        why = (error.strerror or str(error)).lower()
+        return (
+            f"{address!r} cannot be resolved to an address ({why}); correct it in live.hosts, or "
+            "have this computer's /etc/hosts or DNS know it"
+        )
+    except OSError as error:
+        return {
+            errno.EADDRINUSE: (
+                f"port {port} of {address} is taken, by an older process, another agent of the "
+                "node or another cell; end it, or give the node another port in live.hosts"
+            ),
+            errno.EADDRNOTAVAIL: (
+                f"{address} is no address of this computer; is this another node's, or has the "
+                "address changed?"
+            ),
+        }.get(error.errno or 0, f"port {port} of {address} cannot be had ({error.strerror})")
+    return ""
+
+
+def _bind(address: str, port: int) -> None:
+    kind, *_, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(kind) as probe:
+        # Connections of a process that has ended keep nobody from its port.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(place)
+
+
+def listening_ports() -> dict[int, str]:
+    """Return the ports that somebody listens on, with the inode of the socket (proc_net(5))."""
+    inodes = {}
+    for file in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with suppress(OSError):
+            for line in Path(file).read_text(encoding="utf-8").splitlines()[1:]:
+                words = line.split()
+                if words[3] == LISTENS:
+                    inodes[int(words[1].rpartition(":")[2], 16)] = words[9]
+    return inodes
+
+
+def owners_of(inodes: Iterable[str]) -> dict[str, str]:
+    """Return the process that has each socket, by its inode, as far as this user may see it."""
+    wanted, owners = set(inodes), {}
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+            for file in (process / "fd").iterdir():
+                with suppress(OSError):
+                    inode = os.readlink(file).removeprefix("socket:[").removesuffix("]")
+                    if inode in wanted:
+                        line = " ".join([Path(words[0]).name, *words[1:]]).strip()
+                        owners[inode] = f"{textwrap.shorten(line, 60)} (process {process.name})"
+    return owners
+
+
+def taken_ports(wanted: Iterable[int]) -> str:
+    """Return which of some ports are taken, and by whom: ``7450, 7451 by NAME (process 7)``."""
+    wanted = set(wanted)
+    taken = {port: inode for port, inode in listening_ports().items() if port in wanted}
+    owners = owners_of(taken.values())
+    ports: dict[str, list[str]] = {}
+    for port, inode in sorted(taken.items()):
+        ports.setdefault(owners.get(inode, "another user's process"), []).append(str(port))
+    return "; ".join(f"{', '.join(some)} by {owner}" for owner, some in ports.items())
