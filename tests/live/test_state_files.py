@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -97,6 +98,37 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(LiveError, match="file/inside: cannot be made"):
         make_folder(tmp_path / "file" / "inside")
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o770])
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path, mode: int) -> None:
+    folder = make_folder(tmp_path / "state")
+    folder.chmod(mode)
+    with pytest.raises(LiveError, match=f"state: others may write to it .*{mode:o}.*chmod go-w"):
+        make_folder(folder)
+    folder.chmod(0o755)
+    make_folder(folder)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="nobody but root gives folders away")
+def test_a_folder_of_another_user_is_refused(tmp_path: Path) -> None:
+    folder = make_folder(tmp_path / "state")
+    os.chown(folder, 12_345, -1)
+    with pytest.raises(LiveError, match="state: belongs to user 12345"):
+        make_folder(folder)
+
+
+@pytest.mark.parametrize("kind", [BookFile, HighestFile])
+def test_a_link_does_not_stand_for_a_file(tmp_path: Path, kind: Callable[[Path], object]) -> None:
+    target, link = tmp_path / "target", tmp_path / "link"
+    target.write_text("of somebody else")
+    link.symlink_to(target)
+    with pytest.raises(LiveError, match="link: is a symbolic link; remove it"):
+        kind(link)
+    inflight = InFlight(link)
+    inflight.begin(b"a job")
+    inflight.end()
+    assert target.read_text() == "of somebody else"
 
 
 def test_a_book_that_is_spoilt_is_that_of_the_time_before(tmp_path: Path) -> None:

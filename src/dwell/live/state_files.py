@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import mmap
 import os
+import shlex
+import stat
 import struct
 import zlib
 from collections.abc import Iterator
@@ -20,15 +23,17 @@ _LENGTH = struct.Struct("<QI")
 # How often the book had been written, the length of what was, and a checksum of both.
 _PAGE = struct.Struct("<QII")
 _BOOK_BYTES = 2_048
+#: Bits of a folder's mode by which its group, or everybody, may change what is in it.
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def make_folder(path: Path) -> Path:
-    """Make a folder for a node's files.
+    """Make a folder for a node's files; nobody else may change what is in it.
 
     Raises
     ------
     LiveError
-        If it cannot be made or written to.
+        If it cannot be made or written to, or belongs to another user, or others may write to it.
     """
     try:
         path.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -36,7 +41,29 @@ def make_folder(path: Path) -> Path:
         raise LiveError(f"{path}: cannot be made ({error.strerror})") from None
     if not os.access(path, os.W_OK):
         raise LiveError(f"{path}: cannot be written to")
+    status, own = path.stat(), os.geteuid()
+    if status.st_uid != own:
+        raise LiveError(
+            f"{path}: belongs to user {status.st_uid}, and this process is user {own}'s: who has "
+            "the folder can change what the node relies on; name another one"
+        )
+    if status.st_mode & OTHERS_WRITE:
+        raise LiveError(
+            f"{path}: others may write to it (mode {stat.S_IMODE(status.st_mode):o}), and change "
+            f"what the node relies on; see what it holds, then chmod go-w {shlex.quote(str(path))}"
+        )
     return path
+
+
+def open_own(path: str | os.PathLike[str], flags: int) -> int:
+    """Open a file of a node's folder as `open` does, and no symbolic link to one elsewhere.
+
+    Raises
+    ------
+    OSError
+        If it is a link (ELOOP), or cannot be opened.
+    """
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def _mapped(path: Path, size: int) -> mmap.mmap:
@@ -48,13 +75,29 @@ def _mapped(path: Path, size: int) -> mmap.mmap:
     Raises
     ------
     OSError
-        If the disk is full.
+        If the disk is full, or it is a symbolic link.
     """
-    with path.open("a+b") as file:
+    with open(path, "a+b", opener=open_own) as file:
         if file.seek(0, os.SEEK_END) != size:
             file.truncate(0)
         os.posix_fallocate(file.fileno(), 0, size)
         return mmap.mmap(file.fileno(), size)
+
+
+def _required(path: Path, size: int) -> mmap.mmap:
+    """Map a file that its process cannot do without.
+
+    Raises
+    ------
+    LiveError
+        If it is not there yet, and the disk is full; or it is a symbolic link.
+    """
+    try:
+        return _mapped(path, size)
+    except OSError as error:
+        link = error.errno == errno.ELOOP
+        why = "is a symbolic link; remove it" if link else f"cannot be made ({error.strerror})"
+        raise LiveError(f"{path}: {why}") from None
 
 
 class BookFile:
@@ -62,18 +105,10 @@ class BookFile:
 
     A disk that is full keeps nobody from writing it, and a process that dies while it writes spoils
     the slot only that was not the last.
-
-    Raises
-    ------
-    LiveError
-        If it is not there yet, and the disk is full.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            self._map = _mapped(path, 2 * _BOOK_BYTES)
-        except OSError as error:
-            raise LiveError(f"{path}: cannot be made ({error.strerror})") from None
+        self._map = _required(path, 2 * _BOOK_BYTES)
         self._number = max((number for number, _ in self._good()), default=0)
 
     def _good(self) -> Iterator[tuple[int, StamperState]]:
@@ -118,7 +153,7 @@ class HighestFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._map = _mapped(path, 2 * _SLOT.size)
+        self._map = _required(path, 2 * _SLOT.size)
         self._slot = 0
 
     def load(self) -> tuple[int, int]:

@@ -19,7 +19,7 @@ import psutil
 from dwell.files import write_whole
 from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running, Survivor
 from dwell.live.log import printable
-from dwell.live.state_files import InFlight
+from dwell.live.state_files import InFlight, open_own
 
 #: Waits between two starts of a process that keeps dying.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
@@ -219,7 +219,7 @@ class Supervisor:
             return
 
     def _run(self, child: SupervisedProcess) -> None:
-        with child.log.open("ab") as log:
+        with open(child.log, "ab", opener=open_own) as log:
             child.process = self._launcher.start(child.command, log)
 
     def tend(self) -> None:
@@ -340,7 +340,8 @@ def _shorten(path: Path, longest: int) -> None:
     try:
         if path.stat().st_size <= longest:
             return
-        shutil.copyfile(path, path.with_suffix(".log.1"))
+        older = path.with_suffix(".log.1")
+        write_whole(older, lambda draft: shutil.copyfile(path, draft), durable=False)
         os.truncate(path, 0)
     except OSError:
         return
