@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 __all__ = [
     "DwellError",
@@ -20,6 +21,7 @@ __all__ = [
     "TraceError",
     "TrustError",
     "UnwritableError",
+    "absent",
     "installing",
     "missing_package",
 ]
@@ -148,6 +150,15 @@ class TrustError(DwellError, ValueError):
 def installing(extra: str) -> str:
     """Return the command that installs what an extra brings, for a message that misses it."""
     return f"pip install '{DISTRIBUTION}[{extra}]'"
+
+
+def absent(*extras: str) -> list[str]:
+    """Return the packages of some extras that are not installed."""
+    return [
+        package
+        for module, (package, extra) in OPTIONAL.items()
+        if extra in extras and find_spec(module) is None
+    ]
 
 
 def missing_package(error: ModuleNotFoundError) -> DwellError | None:

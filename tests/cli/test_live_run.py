@@ -21,7 +21,7 @@ import yaml
 
 import dwell
 from dwell.cli.live_run import MARK, _ObservedRun
-from dwell.errors import LiveError
+from dwell.errors import OPTIONAL, LiveError, installing
 from dwell.live.trust import KEYS
 from dwell.model import Problem
 from dwell.model.document import to_document
@@ -49,7 +49,7 @@ def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path
     timeline = timeline_of(problem, "demo", seed=5, seconds=100)
     told = _ObservedRun(problem, "demo", 5, timeline)
     told.changed(timeline.changes[0], 20 * PERIOD_NS)
-    run = told.note(folder, **told.observed(folder))
+    run = told.note(folder, **told.observed(None))
     assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
     # Interrupted: it was on until the end.
     (played,) = run.meta["played"]
@@ -210,6 +210,47 @@ def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> 
     if on_edge.height:
         assert on_edge["missed"].all()
         assert on_edge["latency_ns"].drop_nulls().min() > 400e6  # type: ignore[operator]
+
+
+#: Hides packages from a process and those that it starts.
+BARE = """
+import sys
+for module in {hidden!r}:
+    sys.modules[module] = None
+"""
+
+
+@TWO_CPUS
+@pytest.mark.parametrize("extra", ["live", "sim"])
+def test_it_needs_no_more_than_the_extra_live(extra: str, tmp_path: Path) -> None:
+    beside, site = CELL.parents[1] / "live", tmp_path / "site"
+    site.mkdir()
+    hidden = [module for module, (_, of) in OPTIONAL.items() if of not in ("live", extra)]
+    (site / "sitecustomize.py").write_text(BARE.format(hidden=hidden))
+    path = os.pathsep.join((str(site), str(ROOT / "src")))
+    words = ["--scenario", "slow-link", "--seconds", "12", "--out", str(tmp_path / "out"), "--json"]
+    done = subprocess.run(
+        [*LIVE_RUN, str(beside / "cell.yaml"), *words],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    # What will be missing is said before anything is started, with what brings it.
+    assert done.stderr.startswith("note: there will be no report")
+    assert installing("report") in done.stderr.splitlines()[0]
+    told = json.loads(done.stdout)
+    assert told["cycles"] > 0
+    assert told["report"] is None
+    run = dwell.open_run(told["run"])
+    assert len(run.cycles) == told["cycles"]
+    assert run.meta["scenario"] == "slow-link"
+    assert len(run.meta["played"]) == 2
+    assert Path(told["run"], "run.json").exists() == (extra == "sim")
+    # Where everything is installed there is a report on it.
+    assert call("report", told["run"]).exit_code == 0
 
 
 OBSERVER = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -19,7 +20,7 @@ import pytest
 
 from dwell.errors import RunError, UnwritableError
 from dwell.record import Journal, Run, open_run, require_free, seal_run
-from dwell.record.journal import JOURNAL
+from dwell.record.journal import JOURNAL, note_in_journal, read_plain_journal
 from dwell.testbed.chaos.disk import SmallDisk, limit_file_size, may_mount
 
 COLUMNS: dict[str, dict[str, Any]] = {
@@ -450,6 +451,22 @@ for extra in ("msgspec", "zenoh", "psutil"):
 from dwell.record import open_run
 print(open_run(sys.argv[1]).meta["windows"])
 """
+
+
+def test_a_journal_says_the_same_without_polars(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    write(folder, 30)
+    with (folder / JOURNAL).open("ab") as stream:
+        stream.write(b"torn")
+    note_in_journal(folder, scenario="storm")
+    run, (meta, tables) = open_run(folder), read_plain_journal(folder)
+    assert_holds(run, 30)
+    for name in COLUMNS:
+        assert tables[name] == getattr(run, name).to_dict(as_series=False)
+    assert meta == {**META, "scenario": "storm"}
+    assert meta.items() <= run.meta.items()
+    with contextlib.closing(start(folder)), pytest.raises(RunError, match="cannot be written"):
+        note_in_journal(folder, scenario="calm")
 
 
 def test_a_journal_is_read_without_what_wrote_it(tmp_path: Path) -> None:

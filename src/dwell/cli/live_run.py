@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import typer
 
@@ -16,11 +16,12 @@ import dwell
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
-from dwell.errors import LiveError, missing_package
+from dwell.errors import LiveError, absent, installing, missing_package
 from dwell.model import Problem, Scenario
 from dwell.model.bounds import counted
 from dwell.model.user_classes import import_user_module
 from dwell.record import Run, open_run, seal_run
+from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
 from dwell.report.formatting import listed, percent, write_ms
 from dwell.report.phases import Disturbed, PhaseRow, disturbed, phase_rows
@@ -33,6 +34,7 @@ from dwell.testbed.playing import (
     begun,
     crowded,
     interruptible,
+    longest_journal,
     longest_run,
     make_folder,
     play_on,
@@ -76,6 +78,7 @@ def run_live(
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
     _require_stages(problem, file)
     out = out or Path("live-out", problem.name)
+    reported, told = _announce_left_out()
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
     played = _ObservedRun(problem, scenario, seed, timeline)
@@ -90,16 +93,40 @@ def run_live(
         finally:
             with working("ending the cell"):
                 cell.stop()
-    folder = longest_run(out / "runs")
+    folder = longest_run(out / "runs") if told else longest_journal(out / "runs")
     if folder is None and interrupted:
         raise typer.Exit(ExitCode.INTERRUPTED)
     if folder is None:
         raise LiveError(f"{out}: the controller has written no run; see {out}/controller*.log")
-    run = played.note(folder, **played.observed(folder))
-    run = seal_run(folder, warnings=crowded(run, problem))
-    _sum_up(run, folder, out, interrupted=interrupted, as_json=as_json)
+    if told:
+        run = played.note(folder, **played.observed(begun(open_run(folder))))
+        outcome = _told(seal_run(folder, warnings=crowded(run, problem)), out, reported=reported)
+    else:
+        outcome = _counted(played, folder)
+    _print(outcome, folder, interrupted=interrupted, as_json=as_json)
     if interrupted:
         raise typer.Exit(ExitCode.INTERRUPTED)
+
+
+def _announce_left_out() -> tuple[bool, bool]:
+    """Say what a run will be without, as the packages are not here that make it.
+
+    Returns
+    -------
+    tuple of bool
+        Whether there will be a report, and whether there will be tables.
+    """
+    lacking = absent("sim", "report")
+    if not lacking:
+        return True, True
+    tables = "Polars" not in lacking
+    left_out = "no report" if tables else "no report, and no tables: the run stays a journal"
+    typer.echo(
+        f"note: there will be {left_out}, for {listed(lacking)} "
+        f"{'is' if len(lacking) == 1 else 'are'} not installed; {installing('report')}",
+        err=True,
+    )
+    return False, tables
 
 
 def _require_stages(problem: Problem, cell: Path) -> None:
@@ -151,9 +178,8 @@ class _ObservedRun(Played):
         """Return what is on now, as it is shown."""
         return disturbed(self.active(), self.problem.fabric)
 
-    def observed(self, folder: Path) -> dict[str, Any]:
-        """Return what the cell's observer has to say of the run."""
-        span = begun(open_run(folder))
+    def observed(self, span: tuple[int, int] | None) -> dict[str, Any]:
+        """Return what the cell's observer has to say of a run with this first and last release."""
         if self.observer is None or span is None:
             return {}
         return dict(self.observer.told(span[0]))
@@ -209,54 +235,105 @@ def _watch(cell: Loopback, seconds: float, played: _ObservedRun, view: View) -> 
     play_on(cell, played, seconds, show)
 
 
-def _sum_up(run: Run, folder: Path, out: Path, *, interrupted: bool, as_json: bool) -> None:
-    """Write the report, and print what the run was."""
-    cycles, decisions = run.cycles, run.decisions
-    guard = decisions.filter((decisions["reason"].cast(str) == "guard") & decisions["migrated"])
-    missed = cycles["missed"].to_numpy()
+class _Table(Protocol):
+    """Columns of a run's table, whoever keeps them."""
+
+    def __getitem__(self, column: str, /) -> Iterable[Any]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What a run was, as far as it is told; what needs tables is empty where there are none."""
+
+    meta: Mapping[str, Any]
+    cycles: int
+    missed: float
+    lost: int
+    migrations: int
+    guard_moves: int
+    phases: Sequence[PhaseRow] = ()
+    report: Path | None = None
+    instead: str = ""
+
+    @classmethod
+    def of(cls, meta: Mapping[str, Any], cycles: _Table, decisions: _Table) -> _Outcome:
+        """Count what was missed, lost and moved."""
+        missed, moved = list(cycles["missed"]), list(decisions["migrated"])
+        by_guard = [reason == "guard" for reason in decisions["reason"]]
+        guard_moves = sum(map(all, zip(moved, by_guard, strict=True)))
+        return cls(
+            meta,
+            cycles=len(missed),
+            missed=sum(map(bool, missed)) / len(missed) if missed else math.nan,
+            lost=sum(latency is None for latency in cycles["latency_ns"]),
+            migrations=sum(map(bool, moved)) - guard_moves,
+            guard_moves=guard_moves,
+        )
+
+
+def _told(run: Run, out: Path, *, reported: bool) -> _Outcome:
+    """Tell a run by its tables, and write its report."""
+    outcome = _Outcome.of(run.meta, run.cycles, run.decisions)
     phases = phase_rows(run, RunHeader.of(run))
     page = out / "report.html"
-    report: Path | None = page
     # A run that ended within its warm-up has nothing to report on.
     if run.windows.filter(~run.windows["warmup"]).is_empty():
-        report = None
-    else:
-        write_file(page, run_html(run))
-    rate = float(missed.mean()) if len(missed) else math.nan
-    lost = int(cycles["latency_ns"].is_null().sum())
-    migrations = int(decisions["migrated"].sum()) - len(guard)
+        return replace(outcome, phases=phases, instead="no report: it ended within its warm-up")
+    if not reported:
+        return replace(outcome, phases=phases, instead=f"no report; {installing('report')}")
+    write_file(page, run_html(run))
+    return replace(outcome, phases=phases, report=page)
+
+
+def _counted(played: _ObservedRun, folder: Path) -> _Outcome:
+    """Tell a run that stays a journal, and note in it what was played."""
+    meta, tables = read_plain_journal(folder)
+    releases, span = tables["cycles"]["release_ns"], None
+    if releases and "origin_ns" in meta:
+        span = meta["origin_ns"], meta["origin_ns"] + releases[-1]
+    notes = {**played.notes(span), **played.observed(span)}
+    note_in_journal(folder, **notes)
+    outcome = _Outcome.of({**meta, **notes}, tables["cycles"], tables["decisions"])
+    instead = f"no report; {installing('report')}, then: dwell report {folder}"
+    return replace(outcome, instead=instead)
+
+
+def _print(outcome: _Outcome, folder: Path, *, interrupted: bool, as_json: bool) -> None:
+    warnings = outcome.meta.get("warnings", [])
     if as_json:
         print_json(
             {
-                "cell": run.meta["cell"],
-                "scenario": run.meta["scenario"],
-                "seed": run.meta["seed"],
+                "cell": outcome.meta["cell"],
+                "scenario": outcome.meta["scenario"],
+                "seed": outcome.meta["seed"],
                 "interrupted": interrupted,
-                "cycles": len(cycles),
-                "violation_rate": rate,
-                "lost": lost,
-                "migrations": migrations,
-                "guard_moves": len(guard),
-                "warnings": run.meta["warnings"],
-                "phases": [row._asdict() for row in phases],
+                "cycles": outcome.cycles,
+                "violation_rate": outcome.missed,
+                "lost": outcome.lost,
+                "migrations": outcome.migrations,
+                "guard_moves": outcome.guard_moves,
+                "warnings": warnings,
+                "phases": [row._asdict() for row in outcome.phases],
                 "run": folder,
-                "report": report,
+                "report": outcome.report,
             }
         )
         return
+    share = f"{100 * outcome.missed:.1f} % missed, " if outcome.cycles else ""
     typer.echo(
-        f"{counted(len(cycles), 'cycle')}, {100 * rate:.1f} % missed, {lost} without a command; "
-        f"{counted(migrations, 'migration')} by the controller, {len(guard)} by the guard\n"
+        f"{counted(outcome.cycles, 'cycle')}, {share}{outcome.lost} without a command; "
+        f"{counted(outcome.migrations, 'migration')} by the controller, "
+        f"{outcome.guard_moves} by the guard\n"
     )
-    if phases:
-        typer.echo(f"{_table(phases)}\n")
-    for warning in run.meta["warnings"]:
+    if outcome.phases:
+        typer.echo(f"{_phase_table(outcome.phases)}\n")
+    for warning in warnings:
         typer.echo(f"warning: {warning}", err=True)
     typer.echo(f"run: {folder}")
-    typer.echo(f"report: {report}" if report else "no report: the run ended within its warm-up")
+    typer.echo(f"report: {outcome.report}" if outcome.report else outcome.instead)
 
 
-def _table(phases: Sequence[PhaseRow]) -> str:
+def _phase_table(phases: Sequence[PhaseRow]) -> str:
     head = ("phase", "from", "to", "V_D", "L95", "lost", "moves", "guard", "error", "", "placed")
     rows = [
         (

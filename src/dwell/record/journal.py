@@ -18,11 +18,11 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from dwell.errors import RunError, UnwritableError
 from dwell.model.table_columns import TABLES
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 JOURNAL = "journal.bin"
 
 Rows: TypeAlias = Mapping[str, Sequence[Sequence[Any]]]
+T = TypeVar("T")
 
 NUMBERED = tuple(name for name, table in TABLES.items() if table.numbered)
 TYPES = ("Int64", "Float64", "Boolean", "String")
@@ -106,6 +107,14 @@ class _Scan:
         """Bytes after the last whole frame."""
         return len(self.data) - self.end
 
+    def lost(self) -> dict[str, int]:
+        """Return how much was torn and damaged, while the data can be read."""
+        return {
+            "torn_bytes": self.torn_bytes,
+            "damaged_bytes": sum(end - begin for begin, end in self.damaged),
+            "damaged_places": len(self.damaged),
+        }
+
 
 def _content(text: bytes) -> dict[str, Any]:
     content = json.loads(text)
@@ -115,16 +124,16 @@ def _content(text: bytes) -> dict[str, Any]:
 
 
 class _Table:
-    """Rows of one table as they come, kept as columns."""
+    """Rows of one table as they come, kept as columns; as they are where they are not packed."""
 
-    def __init__(self, name: str, columns: Types) -> None:
-        self.name, self.columns = name, columns
+    def __init__(self, name: str, columns: Types, *, packed: bool) -> None:
+        self.name, self.columns, self.packed = name, columns, packed
         self.rows: list[Sequence[object]] = []
         self.chunks: list[pl.DataFrame] = []
 
     def add(self, rows: Sequence[Sequence[object]]) -> None:
         self.rows += rows
-        if len(self.rows) >= CHUNK_ROWS:
+        if self.packed and len(self.rows) >= CHUNK_ROWS:
             self._pack()
 
     def _pack(self) -> None:
@@ -150,6 +159,14 @@ class _Table:
             frame = frame.unique(number, keep="last", maintain_order=True).sort(number)
         return frame
 
+    def plain(self) -> dict[str, list[Any]]:
+        """Return the same as plain columns, of rows that are not packed."""
+        rows: Sequence[Sequence[Any]] = self.rows
+        if self.name in NUMBERED:
+            last = {row[0]: row for row in rows}
+            rows = [last[number] for number in sorted(last)]
+        return {name: [row[i] for row in rows] for i, name in enumerate(self.columns)}
+
 
 @dataclass(slots=True)
 class _Contents:
@@ -162,6 +179,7 @@ class _Contents:
     following: dict[str, int] = field(default_factory=dict)
     opened: int = 0
     keep: bool = True
+    packed: bool = True
 
     def take(self, frame: Mapping[str, Any]) -> None:
         if "run" in frame:
@@ -182,14 +200,19 @@ class _Contents:
         if self.run is None:
             self.run = str(frame["run"])
             self.columns = frame["columns"]
-            self.tables = {name: _Table(name, kinds) for name, kinds in self.columns.items()}
+            self.tables = {
+                name: _Table(name, kinds, packed=self.packed)
+                for name, kinds in self.columns.items()
+            }
         elif self.run != frame["run"] or self.columns != frame["columns"]:
             raise RunError("its headers contradict one another")
         self.opened = max(self.opened, int(frame["opened"]))
 
 
-def _read(data: bytes | mmap.mmap, *, keep: bool = True) -> tuple[_Contents, _Scan]:
-    contents, scan = _Contents(keep=keep), _Scan(data)
+def _read(
+    data: bytes | mmap.mmap, *, keep: bool = True, packed: bool = True
+) -> tuple[_Contents, _Scan]:
+    contents, scan = _Contents(keep=keep, packed=packed), _Scan(data)
     for frame in scan.frames():
         contents.take(frame)
     return contents, scan
@@ -211,32 +234,11 @@ def read_journal(
     RunError
         If there is none, or nothing of it can be read.
     """
-    file = Path(folder) / JOURNAL
-    try:
-        with file.open("rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            if size == 0:
-                raise RunError(f"{file}: empty; the run was killed before it began")
-            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                contents, scan = _read(data)
-                torn_bytes = scan.torn_bytes
-        tables = {name: table.frame() for name, table in contents.tables.items()}
-    except FileNotFoundError:
-        raise RunError(f"{folder}: no journal there") from None
-    except OSError as error:
-        raise RunError(f"{file}: cannot be read ({error.strerror})") from None
-    except RunError as error:
-        raise RunError(f"{file}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise RunError(f"{file}: no journal of a run ({error!r})") from None
-    if contents.run is None:
-        raise RunError(f"{file}: nothing in it can be read; the run was killed before it began")
+    contents, lost, tables = _parsed(Path(folder) / JOURNAL, _Table.frame, packed=True)
     recovered = {
         "sealed": False,
         "opened": contents.opened,
-        "torn_bytes": torn_bytes,
-        "damaged_bytes": sum(end - begin for begin, end in scan.damaged),
-        "damaged_places": len(scan.damaged),
+        **lost,
         **{
             f"missing_{name}": contents.following.get(name, 0) - len(tables[name])
             for name in NUMBERED
@@ -245,6 +247,72 @@ def read_journal(
     }
     windows = len(tables["windows"]) if "windows" in tables else 0
     return {"windows": windows, **contents.meta, "recovered": recovered}, tables
+
+
+def read_plain_journal(
+    folder: str | os.PathLike[str],
+) -> tuple[dict[str, Any], dict[str, dict[str, list[Any]]]]:
+    """Read what a folder's journal holds, where Polars is not installed.
+
+    Returns
+    -------
+    meta : dict
+        Metadata that the writer gave the run.
+    tables : dict of str to dict of str to list
+        Columns of each table.
+
+    Raises
+    ------
+    RunError
+        If there is none, or nothing of it can be read.
+    """
+    contents, _, tables = _parsed(Path(folder) / JOURNAL, _Table.plain, packed=False)
+    return contents.meta, tables
+
+
+def _parsed(
+    file: Path, made: Callable[[_Table], T], *, packed: bool
+) -> tuple[_Contents, dict[str, int], dict[str, T]]:
+    """Put a journal's frames together; returns what was lost, and what each table was made."""
+    try:
+        with file.open("rb") as stream:
+            if os.fstat(stream.fileno()).st_size == 0:
+                raise RunError("empty; the run was killed before it began")
+            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                contents, scan = _read(data, packed=packed)
+                lost = scan.lost()
+        tables = {name: made(table) for name, table in contents.tables.items()}
+    except FileNotFoundError:
+        raise RunError(f"{file.parent}: no journal there") from None
+    except OSError as error:
+        raise RunError(f"{file}: cannot be read ({error.strerror})") from None
+    except RunError as error:
+        raise RunError(f"{file}: {error}") from None
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise RunError(f"{file}: no journal of a run ({error!r})") from None
+    if contents.run is None:
+        raise RunError(f"{file}: nothing in it can be read; the run was killed before it began")
+    return contents, lost, tables
+
+
+def note_in_journal(folder: str | os.PathLike[str], **meta: object) -> None:
+    """Say something more of a run that has ended, and stays a journal.
+
+    Raises
+    ------
+    RunError
+        If somebody is writing it, or it cannot be written.
+    """
+    file = Path(folder) / JOURNAL
+    try:
+        with file.open("r+b") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _, scan = _read(stream.read(), keep=False)
+            stream.truncate(scan.end)
+            stream.seek(scan.end)
+            stream.write(_frame({"meta": meta}))
+    except OSError as error:
+        raise RunError(f"{file}: cannot be written ({error.strerror})") from None
 
 
 class Journal:

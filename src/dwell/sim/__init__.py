@@ -1,8 +1,15 @@
 """The simulator: scenario to realisation, realisation through the kernels, kernels to a Run."""
 
-from dwell.sim.engine import describe, simulate, simulate_realisation
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from dwell.sim.random_draws import draw
 from dwell.sim.realisation import LinkSegment, NodeChange, Phase, Realisation
+
+if TYPE_CHECKING:
+    from dwell.sim.engine import describe, simulate, simulate_realisation
 
 __all__ = [
     "LinkSegment",
@@ -14,3 +21,10 @@ __all__ = [
     "simulate",
     "simulate_realisation",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the engine where it is asked for (PEP 562): drawing needs no compiler."""
+    if name not in __all__:
+        raise AttributeError(f"module 'dwell.sim' has no attribute {name!r}")
+    return getattr(import_module("dwell.sim.engine"), name)

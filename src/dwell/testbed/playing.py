@@ -18,6 +18,7 @@ from dwell.live.hosting import clock_of
 from dwell.model import Disturbance, Problem
 from dwell.model.document import disturbance_document
 from dwell.record import Run, open_run, seal_run
+from dwell.record.journal import read_plain_journal
 from dwell.testbed.conditions import Conditions
 from dwell.testbed.testbed import Testbed
 from dwell.testbed.timeline import Change, Timeline, first_ns, last_ns, step_ns
@@ -97,12 +98,16 @@ class Played:
         **more
             To be said of it as well.
         """
-        notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
         span = begun(open_run(folder)) if span is None else span
+        return seal_run(folder, **self.notes(span), **more)
+
+    def notes(self, span: tuple[int, int] | None) -> dict[str, object]:
+        """Return what is noted in a run with this first and last release, where it has any."""
+        notes: dict[str, object] = {"scenario": self.scenario, "seed": self.seed}
         if span is not None:
             items = (self._as_played(item, *span) for item in self.timeline.items)
             notes["played"] = [item for item in items if item is not None]
-        return seal_run(folder, **notes, **more)
+        return notes
 
     def _as_played(
         self, item: Disturbance, origin_ns: int, end_ns: int
@@ -318,8 +323,17 @@ def require_run(out: Path) -> Path:
 
 def longest_run(runs: Path) -> Path | None:
     """Return the longest of the runs in a folder; None where there is none."""
+    return _longest(runs, lambda folder: int(open_run(folder).meta.get("windows", 0)))
+
+
+def longest_journal(runs: Path) -> Path | None:
+    """Return the longest of the runs that stay journals, where Polars is not installed."""
+    return _longest(runs, lambda folder: len(read_plain_journal(folder)[1]["windows"]["window"]))
+
+
+def _longest(runs: Path, windows_of: Callable[[Path], int]) -> Path | None:
     lengths: list[tuple[int, Path]] = []
     for folder in sorted(runs.iterdir()) if runs.is_dir() else ():
         with suppress(DwellError):
-            lengths.append((int(open_run(folder).meta.get("windows", 0)), folder))
+            lengths.append((windows_of(folder), folder))
     return max(lengths)[1] if lengths else None
