@@ -297,7 +297,15 @@ def test_a_folder_that_cannot_be_written_is_a_failure(
 
 
 def test_names_that_are_no_file_names(cell: Path) -> None:
-    cell.write_text(SMALL.replace("name: small", "name: ../a b/c"), encoding="utf-8")
+    cell.write_text(SMALL.replace("name: small", "name: 'S\u00fcd x:y'"), encoding="utf-8")
     assert read_json(call("run", cell, "--windows", "2", "--json"))["run"] == (
-        "runs/.._a_b_c-baseline-dtp-1"
+        "runs/S\u00fcd_x_y-baseline-dtp-1"
     )
+
+
+@pytest.mark.parametrize("name", ["../../evil", "a?b"])
+def test_a_cell_whose_name_is_none_is_refused(cell: Path, name: str) -> None:
+    cell.write_text(SMALL.replace("name: small", f"name: {name}"), encoding="utf-8")
+    for command in ("check", "run", "live run", "live status --cell"):
+        assert_refused(call(*command.split(), cell), f"name: '{name}' is not a name")
+    assert sorted(path.name for path in cell.parent.iterdir()) == [cell.name]
