@@ -11,7 +11,7 @@ PACKAGE = TESTS.parent / "src" / "dwell"
 #: through the module that uses them, or they only declare. The list may only become shorter.
 WITHOUT = {
     "live": """
-        node role_process
+        node
     """,
     "sim": """
         arrays

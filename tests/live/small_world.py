@@ -15,7 +15,7 @@ from dwell.live.keys import CONTROLLER, Keys
 from dwell.live.messages import Ask, Order, encode
 from dwell.live.recording import RunRecorder
 from dwell.live.role import RolePlace
-from dwell.live.run_rows import Resume, Rows
+from dwell.live.run_rows import Resume, Rows, columns_of
 from dwell.live.sink import Sink
 from dwell.live.stage import Message
 from dwell.live.stamper import Stamper, StamperState
@@ -354,6 +354,14 @@ class World:
     def stamper(self) -> Stamper:
         return next(role for role in reversed(self.roles.values()) if isinstance(role, Stamper))
 
+    @property
+    def sink(self) -> Sink:
+        return next(role for role in reversed(self.roles.values()) if isinstance(role, Sink))
+
+    def note(self, who: str) -> str:
+        """What a process says in its beats, by the controller."""
+        return str(self.status["processes"][who]["note"])
+
     def worker(self, who: str) -> Worker:
         bench = self.roles[who]
         assert isinstance(bench, Bench)
@@ -363,6 +371,13 @@ class World:
     def cycles(self) -> list[int]:
         """Cycles that were actuated, in order."""
         return [cycle for cycle, _ in self.arm.applied]
+
+
+def column(world: World, table: str, name: str) -> list[Any]:
+    """Return a column of a run that is kept in memory; of rows that came again, the last."""
+    place = list(columns_of(world.cell.controller)[table]).index(name)
+    rows = {row[0]: row for row in world.recorder.rows.get(table, [])}
+    return [rows[number][place] for number in sorted(rows)]  # type: ignore[type-var]
 
 
 class Recorded(World):

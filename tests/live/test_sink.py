@@ -1,13 +1,16 @@
-"""Clocks of nodes that are set back while a cell runs."""
+"""The sink: actuators that raise, its watchdog, and clocks that are set back while a cell runs."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 
 import dwell
 from dwell.live.hosting import Hosted
 from dwell.live.sink import Sink
-from tests.live.small_world import MS, World
+from dwell.live.stage import Message
+from tests.live.small_world import MS, Arm, World, canonical, column
 
 HOUR_NS = 3_600_000 * MS
 
@@ -50,3 +53,89 @@ def test_nobody_sleeps_until_a_clock_that_was_set_back_is_where_it_was(
     assert hosted.rest_ns() > 0
     now_ns -= HOUR_NS
     assert hosted.rest_ns() <= 0
+
+
+class Refusing(Arm):
+    """An actuator that raises while it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.refuses = ""
+
+    def apply(self, command: Message) -> None:
+        if self.refuses == "apply":
+            raise OSError("the bus is off")
+        super().apply(command)
+
+    def hold(self) -> None:
+        super().hold()
+        if self.refuses == "hold":
+            raise OSError("the bus is off")
+
+
+@pytest.fixture
+def arm() -> Refusing:
+    return Refusing()
+
+
+@pytest.fixture
+def refused(arm: Refusing) -> World:
+    cell = canonical(20, fallbacks=("LOC", "HYB", "SO"), estimator="profile")
+    made = World(replace(cell, live=replace(cell.live, max_age_ms=200)), policy="LOC")
+    made.sink.actuator = arm
+    made.run(3_000)
+    return made
+
+
+def test_a_command_that_the_actuator_refuses_is_not_applied(refused: World, arm: Refusing) -> None:
+    arm.refuses = "apply"
+    refused.run(1_000)
+    assert "apply() raised OSError: the bus is off" in refused.note("sink.control@R2")
+    arm.refuses = ""
+    refused.run(2_000)
+    outcomes, missed = (column(refused, "cycles", name) for name in ("outcome", "missed"))
+    told = [place for place, outcome in enumerate(outcomes) if outcome == "not_applied"]
+    assert len(told) == 1_000 // refused.problem.pipeline.period_ms
+    assert told == list(range(told[0], told[-1] + 1))
+    assert all(missed[place] for place in told)
+    assert not any(column(refused, "cycles", "actuated")[place] for place in told)
+    assert max(column(refused, "windows", "violation_rate")) > 0.9
+    # Every placement ends there: neither the guard nor the policy has a reason to move.
+    assert max(column(refused, "windows", "seen_violation_rate")) == 0.0
+    assert not refused.stamper.moves
+
+
+def test_an_actuator_that_refuses_commands_is_told_to_hold(refused: World, arm: Refusing) -> None:
+    before = arm.silences
+    arm.refuses = "apply"
+    refused.run(150)
+    assert arm.silences == before
+    refused.run(300)
+    assert arm.silences > before
+
+
+def test_a_hold_that_raises_is_repeated_until_the_next_command(
+    refused: World, arm: Refusing
+) -> None:
+    before = arm.silences
+    arm.refuses = "hold"
+    cut = refused.network.cut("*", "sink.control@R2", key="**/sink/**")
+    refused.run(1_300)
+    assert arm.silences - before in (5, 6)
+    assert refused.sink.counts["silences"] == 1
+    assert "hold() raised OSError: the bus is off" in refused.note("sink.control@R2")
+    refused.network.heal(cut)
+    refused.run(1_000)
+    assert arm.silences - before in (5, 6)
+
+
+def test_a_hold_that_has_been_heard_is_not_repeated(refused: World, arm: Refusing) -> None:
+    arm.refuses = "hold"
+    cut = refused.network.cut("*", "sink.control@R2", key="**/sink/**")
+    refused.run(500)
+    arm.refuses = ""
+    refused.run(300)
+    told = arm.silences
+    refused.run(1_000)
+    assert arm.silences == told
+    refused.network.heal(cut)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import fnmatch
 import os
 import shutil
-import signal
 import sys
 import threading
 import time
@@ -110,13 +109,15 @@ def agent(
     of = _by_process("--cpus-of", cpus_of, there, lambda text: _cpus(text, "--cpus-of", wanted))
     platform = ctx.find_object(Platform) or Platform()
     priorities = _by_process("--realtime", realtime, there, _priority)
+    hurried = threading.Event()
     run_agent(
         problem,
         node,
         folder,
         server(cell.resolve(), platform.program, owner),
         lambda who: words(cell.resolve(), who, folder, of.get(who), priorities.get(who)),
-        _until_told(owner),
+        _until_told(owner, hurried.set),
+        hurried=hurried,
         cpus=wanted,
         accelerator=read,
         environment=environment(keys, insecure=insecure),
@@ -159,7 +160,7 @@ def controller(
         os.sched_setaffinity(0, wanted)
     problems = [dwell.load(file) for file in cell]
     folders = run_controller(
-        *(problems, out, _until_told(owner)),
+        *(problems, out, _until_told(owner, lambda: os._exit(ExitCode.FAILED))),
         policy=policy,
         name=name,
         jobs=jobs,
@@ -454,12 +455,12 @@ def _state_folder() -> Path:
     return (Path(home) if home else Path.home() / ".local" / "state") / "dwell"
 
 
-def _until_told(owner: int | None) -> threading.Event:
+def _until_told(owner: int | None, at_once: Callable[[], None]) -> threading.Event:
     """Return an event that is set when this process is told to end, or its owner has ended."""
+    from dwell.cli.ending import end_when_told
     from dwell.live.parent_death import end_with_owner
 
     stopped = threading.Event()
     end_with_owner(stopped, owner)
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.set())
+    end_when_told(stopped, at_once)
     return stopped

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
 import threading
 from collections.abc import Iterable, Sequence
@@ -15,6 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dwell.cli.ending import end_when_told
+from dwell.cli.exit_codes import ExitCode
 from dwell.errors import DwellError, missing_package
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     try:
         if options.serve:
             return _serve(options.cell, options.owner, platform)
-        _run(options, platform)
+        return _run(options, platform)
     except DwellError as error:
         print(error, file=sys.stderr)
         return 2
@@ -95,7 +96,6 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
             raise
         print(missing, file=sys.stderr)
         return 2
-    return 0
 
 
 def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
@@ -114,12 +114,11 @@ def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
     return main(words if owner is None else [*words, "--owner", str(owner)], platform)
 
 
-def _run(options: argparse.Namespace, platform: Platform | None) -> None:
+def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     _name(options.who)
     _schedule(options.who, options.cpus, options.realtime)
     stopped = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopped.set())
+    end_when_told(stopped, lambda: os._exit(ExitCode.FAILED))
     # The user's stages lie beside their cell file.
     sys.path.insert(0, str(options.cell.resolve().parent))
 
@@ -133,7 +132,9 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> None:
     escape_output()
     keep_memory()
     end_with_owner(stopped, options.owner)
-    run_process(load_without_traces(options.cell), options.who, options.state, stopped, platform)
+    problem = load_without_traces(options.cell)
+    in_order = run_process(problem, options.who, options.state, stopped, platform)
+    return ExitCode.DONE if in_order else ExitCode.FAILED
 
 
 def _name(who: str) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control import Evidence, Instants
-from dwell.live.messages import Completion, Hop, Stamp
+from dwell.live.messages import ACTUATED, NOT_APPLIED, Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
@@ -159,10 +159,17 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     def actuated(self) -> bool:
         """Whether all its commands were applied, as far as is known."""
         reports = self.reports.values()
-        return bool(reports) and all(done.outcome == "actuated" for done in reports)
+        return bool(reports) and all(done.outcome == ACTUATED for done in reports)
+
+    @property
+    def refused(self) -> bool:
+        """Whether a sink has said that the actuator did not apply its command."""
+        return any(done.outcome == NOT_APPLIED for done in self.reports.values())
 
     def missed(self, deadline_ns: int) -> bool:
-        """Whether it was later than D, or unfinished when its window closed."""
+        """Whether it was later than D, unfinished when its window closed, or not applied."""
+        if self.refused:
+            return True
         age_ns = NEVER_NS - 1 if self.close_ns is None else self.close_ns - self.at_ns
         return self.latency_ns > min(deadline_ns, age_ns)
 

@@ -104,9 +104,10 @@ class Hosted:
             transport.subscribe(key, self._receive)
 
     def _receive(self, sample: Arrival) -> None:
-        if self.stopped.is_set():
-            return
         with self.lock:
+            # Also where it has waited for the last that was done: nothing follows that.
+            if self.stopped.is_set():
+                return
             wanted_ns = self._taken(sample)
             sooner = wanted_ns is not None and wanted_ns < self._due_ns
             if sooner and wanted_ns is not None:

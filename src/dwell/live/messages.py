@@ -17,6 +17,8 @@ from dwell.model.instants import NEVER_NS
 #: Longer headers and control messages are refused before anything of them is read.
 MAX_HEADER_BYTES = 16_384
 MAX_CONTROL_BYTES = 262_144
+#: Outcomes of a command that the gate lets through: the actuator took it, or raised.
+ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
 #: Signatures stand before what they are of (Ed25519).
 SIGNATURE_BYTES = 64
 
@@ -158,9 +160,9 @@ class Completion(_Array, frozen=True):
     done_ns : int
         When the command was handed to the actuator, on the sink's clock.
     outcome : str
-        ``actuated``, ``behind`` (a later cycle had been actuated), ``stale`` (older than
-        `max_age_ms`); ``shadow`` where a shadow ended; ``replaced`` where a later cycle took its
-        place.
+        ``actuated``, ``not_applied`` (the actuator raised), ``behind`` (a later cycle had been
+        actuated), ``stale`` (older than `max_age_ms`); ``shadow`` where a shadow ended;
+        ``replaced`` where a later cycle took its place.
     node : str
         Node of the sink, or where a shadow stopped.
     group_ns : int

@@ -39,6 +39,7 @@ def run_agent(
     words: Callable[[str], Sequence[str]],
     stopped: threading.Event,
     *,
+    hurried: threading.Event | None = None,
     cpus: Iterable[int] | None = None,
     accelerator: Callable[[], float] | None = None,
     environment: Mapping[str, str] | None = None,
@@ -53,6 +54,8 @@ def run_agent(
         Command of the process that the others are forked from (`ForkServer`).
     words : callable
         Returns the words that start a process, by the process's name.
+    hurried : Event, optional
+        Has its processes end at once, and not in order, once it is told to stop.
     accelerator : callable, optional
         Returns the utilisation of the node's accelerator, a share from 0 to 1.
     environment : mapping of str to str, optional
@@ -65,7 +68,7 @@ def run_agent(
     ------
     LiveError
         If there is no such node, or its ports or its folder cannot be had, or it leaves this
-        computer without keys.
+        computer without keys; or if an actuator could not be stopped at the end.
     TrustError
         If the keys are not the node's.
     """
@@ -95,10 +98,13 @@ def run_agent(
         keep_collections_short()
         hosted.run()
     finally:
-        supervisor.stop()
+        failed = supervisor.stop(hurried=hurried)
         transport.close()
         # Those that have been killed could not remove theirs.
         remove_orphans()
+    moving = [f"{who} {why}" for who, why in failed.items() if who.startswith("sink.")]
+    if moving:
+        raise LiveError(f"{'; '.join(moving)}: its actuator may not have stopped")
 
 
 def _cpu_count(problem: Problem, node: str, say: Callable[[str], None]) -> CpuCount:

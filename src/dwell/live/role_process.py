@@ -16,7 +16,7 @@ from dwell.live.log import Log
 from dwell.live.messages import Header
 from dwell.live.role import Pulse, RoleLogic, RolePlace
 from dwell.live.security import Security
-from dwell.live.sink import Sink
+from dwell.live.sink import Rest, Sink
 from dwell.live.stage import Actuator, load_actuator, load_stage
 from dwell.live.stamper import Stamper
 from dwell.live.state_files import BookFile, HighestFile, InFlight, make_folder
@@ -26,6 +26,10 @@ from dwell.live.wiring import wire
 from dwell.live.worker import Job, Worker
 from dwell.model import Problem
 
+#: What an actuator is told at its process's orderly end, and for how long it is told again.
+ENDING: tuple[Rest, ...] = ("zero", "stop")
+ENDING_S = 2.0
+
 
 def run_process(
     problem: Problem,
@@ -33,8 +37,10 @@ def run_process(
     folder: Path,
     stopped: threading.Event,
     platform: Platform | None = None,
-) -> None:
-    """Run one process of a cell until it is told to end.
+) -> bool:
+    """Run one process of a cell until it is told to end; returns whether it has ended in order.
+
+    A sink tells its actuator to stop; where that raises to the last, the end is not in order.
 
     Parameters
     ----------
@@ -57,14 +63,14 @@ def run_process(
     transport = platform.transport(security, who, node)
     place = security.place(who, node, transport, Log(_print))
     try:
-        _run(entry.role, place, make_folder(folder), stopped, clock)
+        return _run(entry.role, place, make_folder(folder), stopped, clock)
     finally:
         transport.close()
 
 
 def _run(
     role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
-) -> None:
+) -> bool:
     problem = place.problem
     # A stage that computes must not keep a beat waiting for long.
     sys.setswitchinterval(0.0005)
@@ -72,26 +78,49 @@ def _run(
     group = own_group() if problem.fabric.nodes[role.node].quota is not None else None
     if role.kind not in ("stamper", "sink"):
         _work(role, place, folder, stopped, clock, group)
-        return
-    hosted: Stamper | Sink
+        return True
     if role.kind == "stamper":
         book = BookFile(folder / f"{role.who}.book")
-        hosted = Stamper(place, book, time.time_ns(), clock())
-    else:
-        actuator = _actuator(problem, role.task)
-        highest = HighestFile(folder / f"{role.who}.highest")
-        expected = getattr(actuator, "inputs", {}).get(role.task)
-        hosted = Sink(place, role.task, actuator, highest, expected)
+        stamper = Stamper(place, book, time.time_ns(), clock())
+        if group is not None:
+            stamper.group_clock = group.taken_ns
+        _host(stamper, place, stopped, clock)
+        return True
+    actuator = _actuator(problem, role.task)
+    highest = HighestFile(folder / f"{role.who}.highest")
+    expected = getattr(actuator, "inputs", {}).get(role.task)
+    sink = Sink(place, role.task, actuator, highest, expected)
     if group is not None:
-        hosted.group_clock = group.taken_ns
-    _host(hosted, place, stopped, clock)
+        sink.group_clock = group.taken_ns
+    hosted = _host(sink, place, stopped, clock)
+    # A command that is being applied comes first; the role takes no other one.
+    with hosted.lock:
+        return bring_to_rest(sink)
 
 
-def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Clock) -> None:
+def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Clock) -> Hosted:
     """Run a role in this thread until the process is told to end."""
     hosted = Hosted(role, place.transport, clock, stopped=stopped, complain=place.complain)
     keep_collections_short()
     hosted.run()
+    return hosted
+
+
+def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:
+    """Have an actuator stop for good: `zero`, then `stop`; returns whether neither raised at last.
+
+    What raises is called again every `max_age_ms` until patience ends.
+    """
+    until_s = time.monotonic() + patience_s
+    rests = True
+    for how in ENDING:
+        while not (told := sink.rest(how)):
+            left_s = until_s - time.monotonic()
+            if left_s <= 0:
+                break
+            time.sleep(min(sink.max_age_ns / 1e9, left_s))
+        rests &= told
+    return rests
 
 
 def _actuator(problem: Problem, task: str) -> Actuator:
@@ -150,7 +179,7 @@ def _work(
 
 
 def _print(line: str) -> None:
-    print(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {line}", file=sys.stderr, flush=True)
+    print(f"{time.strftime('%Y-%m-%dT%H:%M:%S%z')} {line}", file=sys.stderr, flush=True)
 
 
 class _Broken:

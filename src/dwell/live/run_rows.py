@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from dwell.control import Controller, final_l95_ms
 from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.loads import ProcessLoads
+from dwell.live.messages import NOT_APPLIED
 from dwell.live.offsets import UNBOUNDED_NS
 from dwell.model.instants import NEVER_NS
 from dwell.record import Columns, Feature, Row, Values, column_types, row_of
@@ -227,6 +228,8 @@ class RunRows:
         return {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
 
     def _outcome(self, cycle: LiveCycle) -> str:
+        if cycle.refused:
+            return NOT_APPLIED
         if self._ledger.complete(cycle) or cycle.told:
             return "done"
         if cycle.replaced:

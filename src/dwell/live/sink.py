@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import Literal, Protocol, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.control_group import UNKNOWN
-from dwell.live.messages import Completion, Header
+from dwell.live.messages import ACTUATED, NOT_APPLIED, Completion, Header
 from dwell.live.payloads import read_payload
 from dwell.live.role import Pulse, RolePlace
 from dwell.live.stage import Actuator, Message
 from dwell.live.transport.transport import Arrival
 from dwell.live.wiring import longest_bytes
+
+#: Methods of an actuator that bring it to rest.
+Rest: TypeAlias = Literal["hold", "zero", "stop"]
 
 
 class Highest(Protocol):
@@ -54,8 +57,9 @@ class Sink:
         #: What its node has taken, where something counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.pulse = Pulse(place, self._state)
-        self.counts = {"actuated": 0, "behind": 0, "stale": 0, "silences": 0}
-        self.trouble = ""
+        self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, "stale": 0, "silences": 0}
+        # Of the last command, and of the last silence: what the actuator has raised.
+        self.trouble = self._restless = ""
         self._alarm_ns: int | None = None
         # One that takes over from another is as impatient for the next command as that one was.
         self._takes_over = self.newest >= (0, 0)
@@ -80,10 +84,9 @@ class Sink:
             return
         group_ns = self.group_clock()
         outcome = self._gate(header, now_ns)
+        if outcome == ACTUATED and not self._apply(header, sample.payload, now_ns):
+            outcome = NOT_APPLIED
         self.counts[outcome] += 1
-        if outcome == "actuated":
-            self._alarm_ns = now_ns + self.max_age_ns
-            self._apply(header, sample.payload, now_ns)
         ways = header.hops, self.place.node, group_ns
         done = Completion(header.stamp, self.task, now_ns, outcome, *ways)
         self.place.put_twice(self.place.keys.done(self.task), done)
@@ -101,39 +104,63 @@ class Sink:
             return "stale"
         self.newest = cycle
         self._highest.store(*cycle)
-        return "actuated"
+        return ACTUATED
 
-    def _apply(self, header: Header, payload: bytes, now_ns: int) -> None:
+    def _apply(self, header: Header, payload: bytes, now_ns: int) -> bool:
+        """Hand a command to the actuator; returns whether it took it.
+
+        One that it did not take is no command to the watchdog, which begins with the first.
+        """
         stamp = header.stamp
+        alarm_ns = now_ns + self.max_age_ns
+        self._alarm_ns = self._alarm_ns or alarm_ns
         age_ms = self.age_ns(header, now_ns) / 1e6
         try:
             command = read_payload(header.kind, payload, self._expected)
             released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
             self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms))
-            self.trouble = ""
         except Exception as error:  # the user's code
-            what = f"cycle {stamp.cycle}: apply() raised {type(error).__name__}: {error}"
-            self.trouble = f"sink of {self.task} on {self.place.node}: {what}"
-            self.place.complain(LiveError(self.trouble))
+            self.trouble = self._complain(f"cycle {stamp.cycle}: apply()", error)
+            return False
+        self.trouble = self._restless = ""
+        self._alarm_ns = alarm_ns
+        return True
+
+    def rest(self, how: Rest) -> bool:
+        """Tell the actuator to hold, or to stop; returns whether it did not raise.
+
+        An actuator need not have a method `stop`.
+        """
+        try:
+            getattr(self.actuator, how, lambda: None)()
+        except (Exception, SystemExit) as error:  # the user's code
+            self._restless = self._complain(f"{how}()", error)
+            return False
+        self._restless = ""
+        return True
+
+    def _complain(self, what: str, error: BaseException) -> str:
+        where = f"sink of {self.task} on {self.place.node}"
+        trouble = f"{where}: {what} raised {type(error).__name__}: {error}"
+        self.place.complain(LiveError(trouble))
+        return trouble
 
     def _state(self) -> tuple[bool, str]:
-        return True, self.trouble
+        return True, "; ".join(filter(None, (self._restless, self.trouble)))
 
     def wake(self, now_ns: int) -> int:
-        """Beat, and call the watchdog where no command came; returns when something is due."""
+        """Beat, and call the watchdog where no command came; returns when something is due.
+
+        An actuator that raises is told again after the same time, until the next command.
+        """
         if self._takes_over:
             self._takes_over = False
             self._alarm_ns = self._alarm_ns or now_ns + self.max_age_ns
         # An alarm further off than it was ever set: the clock has been set back.
         back = self._alarm_ns is not None and self._alarm_ns > now_ns + self.max_age_ns
         if self._alarm_ns is not None and (back or now_ns >= self._alarm_ns):
-            self._alarm_ns = None
-            self.counts["silences"] += 1
-            silence = self.place.problem.live.silence
-            try:
-                self.actuator.zero() if silence == "zero" else self.actuator.hold()
-            except Exception as error:  # the user's code
-                self.trouble = f"{silence}() raised {type(error).__name__}: {error}"
-                self.place.complain(LiveError(self.trouble))
+            self.counts["silences"] += not self._restless
+            rests = self.rest("zero" if self.place.problem.live.silence == "zero" else "hold")
+            self._alarm_ns = None if rests else now_ns + self.max_age_ns
         due_ns = self.pulse.wake(now_ns)
         return due_ns if self._alarm_ns is None else min(due_ns, self._alarm_ns)

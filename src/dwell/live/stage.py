@@ -74,7 +74,11 @@ class Stateful(Protocol):
 
 
 class Actuator(Protocol):
-    """Applies commands; it is called behind the gate."""
+    """Applies commands; it is called behind the gate.
+
+    It may also have ``stop()``, which is called after `zero` where its process is told to end.
+    What raises is called again (docs/deploy.md).
+    """
 
     def apply(self, command: Message) -> None:
         """Apply a command."""

@@ -15,6 +15,7 @@ from dwell.live.control_group import UNKNOWN
 from dwell.live.keys import CONTROLLER
 from dwell.live.latencies import Intervals
 from dwell.live.messages import (
+    HANDED_OVER,
     Accepted,
     Beat,
     Completion,
@@ -198,8 +199,9 @@ class Stamper:
                 self._probes.discard(stamp.cycle)
                 self.probation.completed(stamp.cycle, now_ns)
             return
-        actuated = done.outcome == "actuated" and done.sink in self._sinks
-        if not actuated or stamp.cycle < self.guard.newest:
+        # What the actuator refused has come as far as under any other placement.
+        handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
+        if not handed_over or stamp.cycle < self.guard.newest:
             return
         sinks = self._partial.setdefault(stamp.cycle, set())
         if done.sink in sinks:

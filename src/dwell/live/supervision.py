@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 import signal
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,6 +24,10 @@ from dwell.live.state_files import InFlight, open_own
 
 #: Waits between two starts of a process that keeps dying.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
+#: Time in which processes end by themselves when told to: an actuator may take two seconds of it.
+STOP_S = 3.5
+#: Time between two looks whether they have, or whether they shall end at once.
+LOOK_S = 0.1
 #: A process that lived so long has recovered.
 HEALTHY_S = 10.0
 #: Deaths of one message before it is put aside.
@@ -277,24 +282,45 @@ class Supervisor:
         notes += [child.growth for child in self.children if child.growth]
         return "; ".join(notes)[:2000]
 
-    def stop(self, patience_s: float = 2.0) -> None:
-        """End all processes; those that do not listen are killed."""
+    def stop(
+        self, patience_s: float = STOP_S, *, hurried: threading.Event | None = None
+    ) -> dict[str, str]:
+        """End all processes; those that do not listen are killed.
+
+        Parameters
+        ----------
+        hurried : Event, optional
+            Has them killed at once.
+
+        Returns
+        -------
+        dict of str to str
+            How processes ended that did not end in order.
+        """
         running = [
             psutil.Process(c.pid) for c in self.children if c.pid and psutil.pid_exists(c.pid)
         ]
         for process in running:
             _signal(process, signal.SIGTERM)
             _signal(process, signal.SIGCONT)
-        _, alive = psutil.wait_procs(running, timeout=patience_s)
+        deadline_s = time.monotonic() + patience_s
+        alive = running
+        while alive and time.monotonic() < deadline_s and not (hurried and hurried.is_set()):
+            _, alive = psutil.wait_procs(alive, timeout=min(LOOK_S, patience_s))
         for process in alive:
             _signal(process, signal.SIGKILL)
         psutil.wait_procs(alive, timeout=patience_s)
+        failed = {}
         for child in self.children:
             child.mark.unlink(missing_ok=True)
             if child.process is not None:
-                child.process.wait()
+                code = child.process.wait()
+                if code not in (0, UNKNOWN_CODE):
+                    last = _last_line(child.log)
+                    failed[child.who] = f"{_reason(code)}{f': {last}' if last else ''}"
             child.process = None
         self._launcher.stop()
+        return failed
 
 
 def _signal(process: psutil.Process, number: int) -> None:

@@ -92,7 +92,7 @@ CYCLES = (
     Column(
         "missed",
         "Boolean",
-        "Later than D, or unfinished when its window closed, which is no earlier.",
+        "Later than D, or unfinished when its window closed, which is no earlier; or not applied.",
     ),
     Column("outcome", "outcome", "What became of it."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),

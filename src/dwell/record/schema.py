@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 
 #: What became of a cycle or a job. Their order is that of the kernels' codes.
-OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down")
+OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied")
 OUTCOME_SENTENCES: Mapping[str, str] = {
     "done": "it was completed",
     "dropped": "a message or an input was lost",
     "replaced": "a newer one took its place",
     "node_down": "a node was down",
+    "not_applied": "its command was ready, and the actuator raised",
     "in_flight": "unfinished at the end",
 }
 #: Why it was decided so, by the rule that made the decision.

@@ -14,6 +14,7 @@ from typing import TypeVar
 from dwell.errors import LiveError
 from dwell.live.keys import MAIN, Keys
 from dwell.live.messages import (
+    HANDED_OVER,
     MAX_HEADER_BYTES,
     Accepted,
     Completion,
@@ -226,7 +227,7 @@ class Judge:
 
     def _done(self, done: Completion) -> Iterable[str]:
         """Hold where the jobs of a cycle ran against its stamp."""
-        if done.outcome not in ("actuated", "behind", "stale"):
+        if done.outcome not in (*HANDED_OVER, "behind", "stale"):
             return
         stamp = done.stamp
         candidate = self.problem.candidates.get(stamp.placement)

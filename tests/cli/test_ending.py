@@ -1,0 +1,68 @@
+"""Signals that end a process: in order, and at once."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+#: Says that it waits, then that it ends in order; a second signal keeps it from that.
+PROGRAM = """
+import os, signal, sys, threading
+from dwell.cli.ending import end_when_told
+if "nohup" in sys.argv:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+stopped = threading.Event()
+end_when_told(stopped, lambda: os._exit(9))
+print("waits", flush=True)
+stopped.wait()
+print("ends", flush=True)
+sys.stdin.readline()
+print("has ended", flush=True)
+"""
+
+
+def start(*words: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert said(process) == "waits"
+    return process
+
+
+def said(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_the_first_signal_ends_it_in_order(number: int) -> None:
+    with start() as process:
+        process.send_signal(number)
+        assert said(process) == "ends"
+        # Another one of these is no second signal.
+        process.send_signal(signal.SIGHUP)
+        assert process.communicate("\n", timeout=20)[0] == "has ended\n"
+        assert process.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_the_second_signal_ends_it_at_once(number: int) -> None:
+    with start() as process:
+        process.send_signal(signal.SIGTERM)
+        assert said(process) == "ends"
+        process.send_signal(number)
+        assert process.wait(20) == 9
+
+
+def test_who_shall_outlive_its_terminal_does() -> None:
+    with start("nohup") as process:
+        process.send_signal(signal.SIGHUP)
+        process.send_signal(signal.SIGTERM)
+        assert said(process) == "ends"
+        process.kill()
