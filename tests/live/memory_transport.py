@@ -324,6 +324,12 @@ class Network:
             for message in held:
                 self._forward(path, message)
 
+    def set_clock(self, node: str, clock: Clock) -> None:
+        """Have a node's processes read another clock from now on."""
+        for end in self._transports.values():
+            if end.node == node:
+                end.clock = clock
+
     def freeze(self, who: str, *, waiting: int = STALLED_MESSAGES) -> None:
         """Stop a process as SIGSTOP does: it is not called, and its newest messages wait."""
         end = self._transports[who]

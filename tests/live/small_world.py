@@ -373,11 +373,13 @@ class World:
         return [cycle for cycle, _ in self.arm.applied]
 
 
-def column(world: World, table: str, name: str) -> list[Any]:
-    """Return a column of a run that is kept in memory; of rows that came again, the last."""
-    place = list(columns_of(world.cell.controller)[table]).index(name)
-    rows = {row[0]: row for row in world.recorder.rows.get(table, [])}
-    return [rows[number][place] for number in sorted(rows)]  # type: ignore[type-var]
+def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
+    """Columns of a table's rows, later rows of a number in the place of earlier ones."""
+    order = list(columns_of(world.cell.controller)[table])
+    rows = world.recorder.rows[table]
+    if table != "decisions":
+        rows = list({row[0]: row for row in rows}.values())
+    return [tuple(row[order.index(name)] for name in names) for row in rows]
 
 
 class Recorded(World):

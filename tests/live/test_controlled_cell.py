@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import pytest
 from msgspec.structs import replace as replaced
@@ -14,7 +13,8 @@ from dwell.live.messages import Answer, Ask, Order, decode, encode
 from dwell.live.run_rows import Rows
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
-from tests.live.small_world import Alternating, World, canonical
+from tests.live.memory_transport import Clock
+from tests.live.small_world import MS, Alternating, World, canonical, columns
 
 CONTROLLER = "controller@E"
 
@@ -41,17 +41,6 @@ def ask(world: World, what: str, about: str = "") -> str:
     world.network.reach = reach
     visitor.close()
     return heard[-1]
-
-
-def columns(world: World, table: str, *names: str) -> list[tuple[Any, ...]]:
-    """Columns of a table's rows, later rows of a number in the place of earlier ones."""
-    from dwell.live.run_rows import columns_of
-
-    order = list(columns_of(world.cell.controller)[table])
-    rows = world.recorder.rows[table]
-    if table != "decisions":
-        rows = list({row[0]: row for row in rows}.values())
-    return [tuple(row[order.index(name)] for name in names) for row in rows]
 
 
 def test_every_order_takes_effect_and_no_cycle_is_lost(problem: Problem) -> None:
@@ -371,3 +360,47 @@ def test_it_says_how_long_the_guard_rests_after_its_own_move(problem: Problem) -
             seen.append(said)
     assert seen == [False, True, False]
     assert world.stamper.guard.on_fallback
+
+
+@pytest.mark.parametrize("estimator", ["profile", "corrected"])
+@pytest.mark.parametrize("node", ["R1", "E", "R2"])
+@pytest.mark.parametrize("jump_s", [-3_600.0, -5.0, -0.2, 5.0])
+def test_a_clock_that_is_set_ends_no_controller(estimator: str, node: str, jump_s: float) -> None:
+    """Windows whose intervals cannot be are unproven; then the clock is known again."""
+    cell = canonical(20, fallbacks=("LOC", "HYB", "SO"), estimator=estimator)
+    world = World(cell, policy="dtp")
+    world.run(4_000)
+    before = len(columns(world, "windows", "window"))
+    world.network.set_clock(node, Clock(round(jump_s * 1e3) * MS))
+    world.run(10_000)
+    decided = columns(world, "windows", "cost", "unproven", "seen_l95_ms")[before:]
+    assert len(decided) > 10
+    assert [unproven for _, unproven, _ in decided[-5:]] == [False] * 5
+    assert all(cost is not None for cost, _, _ in decided[-5:])
+    # No latency is what the clock was set by, and none is negative. By the stamper's all are stale
+    # at first.
+    longest_ms = cell.censor_ms if node == "R1" else 2 * cell.pipeline.period_ms
+    assert all(l95_ms is None or 0 < l95_ms <= longest_ms for _, _, l95_ms in decided)
+    status = world.cell.status(world.network.now_ns + round(jump_s * 1e3) * MS * (node == "E"))
+    assert not [who for who, one in status["processes"].items() if not one["heard"]]
+    assert status["health"] in ("ok", "degraded")
+
+
+def test_cycles_that_ended_while_the_controller_was_deaf_are_not_missed(problem: Problem) -> None:
+    world = World(problem, policy="LOC")
+    world.run(4_000)
+    before = len(columns(world, "windows", "window"))
+    cuts = [world.network.cut("*", CONTROLLER), world.network.cut("*", "agent@E")]
+    world.run(7 * problem.pipeline.period_ms)
+    for cut in cuts:
+        world.network.heal(cut)
+    world.run(3_000)
+    assert world.cycles == list(range(world.cycles[0], world.cycles[-1] + 1))
+    names = "heard", "violation_rate", "seen_violation_rate", "unproven", "l95_ms"
+    windows = columns(world, "windows", *names)[before - 1 :]
+    deaf = [window for window in windows if window[0] < problem.window_cycles]
+    assert deaf
+    assert all(unproven for *_, unproven, _ in deaf)
+    assert {(rate, seen) for _, rate, seen, _, _ in windows} == {(0.0, 0.0)}
+    assert all(l95_ms < problem.pipeline.deadline_ms for *_, l95_ms in windows)
+    assert not any(missed for (missed,) in columns(world, "cycles", "missed"))

@@ -56,3 +56,17 @@ def test_who_is_silent_for_long_is_forgotten() -> None:
     detector.forget(1_000 * MS, 500 * MS)
     assert [who for who, _, _ in detector.everybody(1_000 * MS)] == ["see@R1"]
     assert detector.last("plan@E") is None
+
+
+def test_whose_clock_is_set_back_is_heard_again_over_the_detour_alone() -> None:
+    detector = FailureDetector("controller@E", 100 * MS)
+    detector.hear(beat(9_000), 10 * MS, direct=False)
+    heard = [detector.hear(beat(10 + i), (20 + i) * MS, direct=False) for i in range(6)]
+    assert heard == [False] * 4 + [True] * 2
+
+
+def test_what_was_heard_before_ones_own_clock_was_set_back_ages_since() -> None:
+    detector = FailureDetector("arm@R2", 100 * MS)
+    detector.hear(beat(0), 5_000 * MS)
+    assert detector.age_ns("plan@E", 10 * MS) == 0
+    assert detector.age_ns("plan@E", 30 * MS) == 20 * MS

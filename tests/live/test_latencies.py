@@ -9,8 +9,7 @@ from dwell.live.messages import Beat, Completion, Heard, Stamp
 from dwell.live.run_rows import columns_of
 from dwell.model import Problem
 from tests.live.memory_transport import Clock, NetworkConditions
-from tests.live.small_world import World, canonical
-from tests.live.test_controlled_cell import columns
+from tests.live.small_world import World, canonical, columns
 
 MS, S = 1_000_000, 1_000_000_000
 CLOCKS = {"R1": Clock(7 * S), "E": Clock(50 * S, 80.0), "R2": Clock(900 * S, -60.0)}

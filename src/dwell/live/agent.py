@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
+from dwell.live.continuity import SetbackDetector
 from dwell.live.control_group import ControlGroup
 from dwell.live.failures import start_thread
 from dwell.live.keys import TWICE
@@ -129,6 +130,7 @@ class Agent:
         self._gather_ns = self._beats_ns = 0
         self._beat_prefix = place.keys.relay(place.keys.beat("", "").removesuffix("/"))
         self._relay_prefix = f"{place.keys.root}/relay/"
+        self._setback = SetbackDetector()
         self._read: dict[str, int] = {}
         self._spent: dict[str, int] = {"own": 0, "shadow": 0}
 
@@ -160,6 +162,10 @@ class Agent:
 
     def wake(self, now_ns: int) -> int:
         """Look after the processes, report the load, beat; returns what is due next."""
+        if self._setback.back_ns(now_ns):
+            self._look_ns = self._load_ns = self._housekeeping_ns = now_ns
+            self._gather_ns = self._beats_ns = now_ns
+            self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
         if now_ns >= self._look_ns:
             self.supervisor.step()
             self._look_ns = now_ns + LOOK_NS

@@ -10,11 +10,15 @@ another, and none between them went on from what was believed.
 
 `OvershootDetector`: a life or an instant may be any time ahead, as a computer may have slept. But
 where `CONFIRMATIONS` in a row grow behind the one that is believed, that one was false.
+
+`SetbackDetector`: what was due on a clock that has been set back would be due too late.
 """
 
 from __future__ import annotations
 
 from typing import TypeAlias
+
+from dwell.model.instants import NEVER_NS
 
 #: Cycle numbers that the stamper reserves at a time; after a restart the rest of them stays unused.
 RESERVED = 1_024
@@ -111,6 +115,20 @@ class Continuity:
     def _follows(self, before: Cycle, heard_ns: int, cycle: Cycle, now_ns: int) -> bool:
         step = cycle[1] - before[1]
         return cycle[0] == before[0] and 0 < step <= self._ahead(heard_ns, now_ns)
+
+
+class SetbackDetector:
+    """Notices that the clock of its own node has been set back."""
+
+    __slots__ = ("_seen_ns",)
+
+    def __init__(self) -> None:
+        self._seen_ns = -NEVER_NS
+
+    def back_ns(self, now_ns: int) -> int:
+        """Return by how much the clock has gone back since the last call; 0 where it has not."""
+        seen_ns, self._seen_ns = self._seen_ns, now_ns
+        return max(seen_ns - now_ns, 0)
 
 
 class OvershootDetector:

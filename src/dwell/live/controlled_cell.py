@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 from dwell.control import Controller
 from dwell.errors import LiveError
 from dwell.live.agent import AGENT_BEAT
-from dwell.live.continuity import Continuity
+from dwell.live.continuity import Continuity, SetbackDetector
 from dwell.live.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.live_windows import LiveWindows
 from dwell.live.messages import (
@@ -115,6 +115,7 @@ class ControlledCell:
         self.drained: set[str] = set()
         self._move: _Move | None = None
         self._number = now_ns
+        self._setback = SetbackDetector()
         self._began_ns: int | None = None
         self._ask_ns = 0
         self.guard_moves = self.migrations = 0
@@ -136,6 +137,7 @@ class ControlledCell:
 
     def receive(self, sample: Arrival, now_ns: int) -> int:
         """Take a message in; returns what is due next."""
+        self._follow_clock(now_ns)
         self._take(sample, now_ns)
         return self._due_ns(now_ns)
 
@@ -146,6 +148,21 @@ class ControlledCell:
             due_ns = min(due_ns, self._move.sent_ns + RESEND_NS)
         close_ns = None if self.windows is None else self.windows.due_ns(now_ns)
         return due_ns if close_ns is None else min(due_ns, close_ns)
+
+    def _follow_clock(self, now_ns: int) -> None:
+        """Put what is due, and what was heard, back with a clock that has been set back."""
+        back_ns = self._setback.back_ns(now_ns)
+        if not back_ns:
+            return
+        self._ask_ns -= back_ns
+        self._window_ns -= back_ns
+        if self._began_ns is not None:
+            self._began_ns -= back_ns
+        if self._move is not None:
+            self._move.since_ns -= back_ns
+            self._move.sent_ns -= back_ns
+        if self.windows is not None:
+            self.windows.set_back(back_ns)
 
     def _take(self, sample: Arrival, now_ns: int) -> None:
         keys = self._keys
@@ -478,6 +495,7 @@ class ControlledCell:
 
     def wake(self, now_ns: int) -> int:
         """Close the windows that are due, push a migration on, beat; returns what is due next."""
+        self._follow_clock(now_ns)
         if self._began_ns is None:
             self._began_ns = now_ns
         windows, unwritten = self.windows, self._unwritten

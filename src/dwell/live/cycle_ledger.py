@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control import Evidence, Instants
-from dwell.live.messages import ACTUATED, NOT_APPLIED, Completion, Hop, Stamp
+from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
@@ -77,6 +77,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         From its release to its last completion, by the stamper's clock alone.
     told : bool
         Whether its latency is that, because its sinks' own words have not come here.
+    deaf : bool
+        Whether nothing was heard of it, or of the next one: it may have completed unheard.
     row : int
         In the record; -1 while it is in no closed window.
     close_ns : int or None
@@ -103,6 +105,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     interval_ns: int | None = None
     stamper_interval_ns: int | None = None
     told: bool = False
+    deaf: bool = False
     row: int = -1
     window: int | None = None
     close_ns: int | None = None
@@ -155,20 +158,35 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
             self.heard_ns[completion.sink] = at_ns
         return True
 
+    def heard_before(self, back_ns: int) -> None:
+        """Put what was heard back, with the controller's clock."""
+        if self.stamped_ns is not None:
+            self.stamped_ns -= back_ns
+        self.heard_ns = {sink: at_ns - back_ns for sink, at_ns in self.heard_ns.items()}
+
     @property
     def actuated(self) -> bool:
         """Whether all its commands were applied, as far as is known."""
         reports = self.reports.values()
         return bool(reports) and all(done.outcome == ACTUATED for done in reports)
 
+    def came_to(self, *outcomes: str) -> bool:
+        """Whether a sink has said that a command of it came to one of these."""
+        return any(done.outcome in outcomes for done in self.reports.values())
+
     @property
-    def refused(self) -> bool:
-        """Whether a sink has said that the actuator did not apply its command."""
-        return any(done.outcome == NOT_APPLIED for done in self.reports.values())
+    def untold(self) -> bool:
+        """Whether nobody knows whether it has completed."""
+        return self.deaf and not (self.reports or self.replaced or self.told)
 
     def missed(self, deadline_ns: int) -> bool:
-        """Whether it was later than D, unfinished when its window closed, or not applied."""
-        if self.refused:
+        """Whether it was later than D, unfinished when its window closed, or not applied.
+
+        Of one that the gate found stale the clocks may say something else.
+        """
+        if self.untold:
+            return False
+        if self.came_to(NOT_APPLIED, STALE):
             return True
         age_ns = NEVER_NS - 1 if self.close_ns is None else self.close_ns - self.at_ns
         return self.latency_ns > min(deadline_ns, age_ns)
@@ -220,6 +238,8 @@ class Ledger:
             return
         cycle.told = False
         reports = cycle.reports.values()
+        for done in reports:
+            self._doubt(cycle, done)
         ends = [(self._since_origin(cycle, done.node, done.done_ns), done) for done in reports]
         done_ns, last = max(ends, key=lambda pair: pair[0])
         if cycle.stamped_ns is not None and len(cycle.heard_ns) == len(reports):
@@ -245,6 +265,49 @@ class Ledger:
             found = self._offsets.to_reference(node, instant_ns)
             shift = cycle.shifts[node] = Shift(found.instant_ns - instant_ns, found.bound_ns)
         return instant_ns + shift.by_ns - cycle.origin_ns
+
+    def _doubt(self, cycle: LiveCycle, done: Completion) -> None:
+        """Take clocks for not compared by which a cycle's instants cannot be.
+
+        Nothing of a cycle ends before its release, or after that was heard; no message arrives
+        before it was sent, and no job ends before it is ready. Where that is so, beyond the bounds,
+        a clock has been set since it was compared last.
+        """
+        known = [(done.node, done.done_ns)]
+        hops = {hop.task: hop for hop in done.hops}
+        for hop in hops.values():
+            if hop.ended_ns != UNKNOWN:
+                known.append((hop.node, hop.ended_ns))
+                if hop.ended_ns < hop.arrived_ns:
+                    self._disbelieve(cycle, hop.node)
+            for source, arrived_ns in hop.inputs:
+                sender = hops.get(source)
+                if sender is None or sender.node == hop.node or sender.ended_ns == UNKNOWN:
+                    continue
+                sent, arrived = (
+                    self._within(cycle, node, at_ns)
+                    for node, at_ns in ((sender.node, sender.ended_ns), (hop.node, arrived_ns))
+                )
+                if arrived[1] < sent[0]:
+                    self._disbelieve(cycle, sender.node, hop.node)
+        latest_ns = NEVER_NS
+        if cycle.reports.get(done.sink) is done and done.sink in cycle.heard_ns:
+            heard_ns = cycle.heard_ns[done.sink]
+            _, latest_ns = self._within(cycle, self._offsets.node, heard_ns)
+        for node, instant_ns in known:
+            from_ns, until_ns = self._within(cycle, node, instant_ns)
+            if until_ns < cycle.at_ns or from_ns > latest_ns:
+                self._disbelieve(cycle, node)
+
+    def _within(self, cycle: LiveCycle, node: str, instant_ns: int) -> tuple[int, int]:
+        """Earliest and latest that an instant of a node's clock can have been, since the origin."""
+        at_ns = self._since_origin(cycle, node, instant_ns)
+        bound_ns = cycle.shifts[node].bound_ns
+        return at_ns - bound_ns, at_ns + bound_ns
+
+    def _disbelieve(self, cycle: LiveCycle, *nodes: str) -> None:
+        for node in nodes:
+            cycle.shifts[node] = Shift(cycle.shifts[node].by_ns, UNBOUNDED_NS)
 
     def span_ns(self, node: str, first: LiveCycle, close_ns: int) -> tuple[int, int]:
         """Begin and end of a window on a node's clock."""
@@ -396,12 +459,14 @@ class Ledger:
                 through[row] = self._codes[cycle.shadow]
                 apart = self._diverging(cycle)
                 for report in cycle.shadows:
+                    self._doubt(cycle, report)
                     self._enter(of_shadows, row, cycle, report.hops, apart)
                     # What both went through, should the cycle itself not have come so far.
                     self._enter(known, row, cycle, report.hops, self._every - apart)
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
+                self._doubt(cycle, report)
                 self._enter(known, row, cycle, report.hops, self._every)
-            if cycle.heard and not (cycle.reports or cycle.replaced or cycle.told):
+            if cycle.heard and not (cycle.deaf or cycle.reports or cycle.replaced or cycle.told):
                 self._mark_lost(known, row, cycle)
         for group in (known, of_shadows):
             for instants in (group.ready_ns, group.end_ns, group.arrived_ns):

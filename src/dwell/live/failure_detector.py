@@ -22,6 +22,11 @@ class _HeardProcess:
     direct_beat_ns: int = 0
     overshoot: OvershootDetector = field(default_factory=OvershootDetector)
 
+    def age_ns(self, now_ns: int) -> int:
+        """Time since it was heard; where the clock has been set back, since then."""
+        self.at_ns = min(self.at_ns, now_ns)
+        return now_ns - self.at_ns
+
 
 class FailureDetector:
     """Beats as one process has heard them.
@@ -51,11 +56,12 @@ class FailureDetector:
                 process.overshoot.advanced()
                 process.beat, process.at_ns = beat, now_ns
             elif (
-                direct
+                (direct or process.direct_ns is None)
                 and order < (last[0], last[1] - LATENESS_NS)
                 and process.overshoot.behind(*order)
             ):
-                # A connection keeps the order: what was believed was false.
+                # A connection keeps the order, and so does the detour where all comes over it:
+                # what was believed was false, or its node's clock has been set back.
                 process.beat, process.at_ns = beat, now_ns
             elif not news:
                 return False
@@ -71,7 +77,7 @@ class FailureDetector:
     def age_ns(self, who: str, now_ns: int) -> int | None:
         """Time since a process was last heard; None if never."""
         process = self._processes.get(who)
-        return now_ns - process.at_ns if process is not None else None
+        return process.age_ns(now_ns) if process is not None else None
 
     def fresh(self, who: str, now_ns: int, patience_ns: int | None = None) -> bool:
         """Whether a process was heard within the patience."""
@@ -94,4 +100,4 @@ class FailureDetector:
 
     def everybody(self, now_ns: int) -> list[tuple[str, Beat, int]]:
         """Return who was heard: name, last beat, and its age."""
-        return [(who, v.beat, now_ns - v.at_ns) for who, v in self._processes.items()]
+        return [(who, v.beat, v.age_ns(now_ns)) for who, v in self._processes.items()]

@@ -7,8 +7,9 @@ the placement changes before W cycles are there, or while an order is under way,
 starts at the first cycle stamped anew; the cycles before it are lead, and belong to no window.
 
 Messages are lost, late, and come twice. A cycle is known by its stamp or by its completion; one of
-which neither was heard, between two that are known, is taken to have been released between them,
-and never to have completed. Numbers that a restarted stamper has left out were never cycles: there,
+which neither was heard, between two that are known, is taken to have been released between them.
+Nobody knows whether it has completed, nor the one before it: it counts for neither, and its window
+is unproven. Numbers that a restarted stamper has left out were never cycles: there,
 fewer periods have passed than numbers.
 """
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Iterable
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +29,7 @@ from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows
+from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows, told
 from dwell.model import Problem
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.
@@ -193,6 +195,14 @@ class LiveWindows:
         self.record.newest_done = min(self.record.newest_done, (run, cycle - 1))
         self._beginning = None
 
+    def set_back(self, back_ns: int) -> None:
+        """The controller's clock has been set back: what was heard by it was heard before that."""
+        for cycle in self._line:
+            cycle.heard_before(back_ns)
+        if self._newest is not None:
+            newest, heard_ns = self._newest
+            self._newest = newest, None if heard_ns is None else heard_ns - back_ns
+
     def _note(self, stamp: Stamp, at_ns: int | None) -> LiveCycle | None:
         key = stamp.key
         known = self._by_key.get(key)
@@ -339,15 +349,17 @@ class LiveWindows:
         self._ordered = False
         cycles = self._line[: self._size]
         close_ns = self._close_ns(0)
-        for cycle in cycles:
+        for cycle, following in pairwise(self._line[: self._size + 1]):
             self._ledger.settle(cycle)
             cycle.window, cycle.close_ns = self._next_window, close_ns
+            cycle.deaf = not (cycle.heard and following.heard)
         self._take_off(self._size)
         release_ns = np.array([cycle.at_ns for cycle in cycles], np.int64)
         shadows = sends_shadows(self._controller)
+        known = told(cycles)
         closed = ClosedWindow(
-            latency_ns=np.array([cycle.latency_ns for cycle in cycles], np.int64),
-            release_ns=release_ns,
+            latency_ns=np.array([cycle.latency_ns for cycle in known], np.int64),
+            release_ns=np.array([cycle.at_ns for cycle in known], np.int64),
             close_ns=close_ns,
             open_ns=int(release_ns[0]),
             core_ns=self._core_ns(cycles, close_ns),
@@ -361,7 +373,7 @@ class LiveWindows:
             lead=self._lead,
             heard=sum(cycle.heard for cycle in cycles),
             bound_ns=bound_ns,
-            unproven=bound_ns > self._proven_ns,
+            unproven=bound_ns > self._proven_ns or any(cycle.untold for cycle in cycles),
             used=self._controller.utilisation(closed),
             closed_unix_ns=unix_ns,
         )

@@ -19,6 +19,8 @@ MAX_HEADER_BYTES = 16_384
 MAX_CONTROL_BYTES = 262_144
 #: Outcomes of a command that the gate lets through: the actuator took it, or raised.
 ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
+#: Outcome of one that it keeps back, because it may be older than `max_age_ms`.
+STALE = "stale"
 #: Signatures stand before what they are of (Ed25519).
 SIGNATURE_BYTES = 64
 

@@ -64,7 +64,7 @@ class LiveWindow:
     bound_ns : int
         Bound of the error of its latencies, by the clocks; `UNBOUNDED_NS` where it is not known.
     unproven : bool
-        Whether that is more than 20 % of D.
+        Whether that is more than 20 % of D, or nobody knows of a cycle whether it has completed.
     used : float64 array, shape (3, nodes)
         Busy, own and shadow share of the cores.
     """
@@ -78,6 +78,11 @@ class LiveWindow:
     unproven: bool
     used: NDArray[np.float64]
     closed_unix_ns: int | None
+
+
+def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
+    """Return the cycles of a window whose end is known; all where there are none."""
+    return [cycle for cycle in cycles if not cycle.untold] or cycles
 
 
 def sends_shadows(controller: Controller) -> bool:
@@ -228,7 +233,7 @@ class RunRows:
         return {name: [row_of(self._columns[name], of) for of in values[name]] for name in values}
 
     def _outcome(self, cycle: LiveCycle) -> str:
-        if cycle.refused:
+        if cycle.came_to(NOT_APPLIED):
             return NOT_APPLIED
         if self._ledger.complete(cycle) or cycle.told:
             return "done"
@@ -270,7 +275,8 @@ class RunRows:
         place = window.number - self._first_window
         seen = log.seen[place] if place < len(log.seen) else (None, None, None)
         seen_l95_ms, seen_violation_rate, cost = map(_known, seen)
-        latency_ns = np.array([cycle.latency_ns for cycle in cycles], np.int64)
+        known = told(cycles)
+        latency_ns = np.array([cycle.latency_ns for cycle in known], np.int64)
         values: dict[str, object] = {
             "window": window.number,
             "first_cycle": cycles[0].row,
@@ -278,7 +284,7 @@ class RunRows:
             "placement": cycles[0].placement,
             "mixed": any(cycle.placement != cycles[0].placement for cycle in cycles),
             "l95_ms": float(final_l95_ms(latency_ns)),
-            "violation_rate": sum(c.missed(self._deadline_ns) for c in cycles) / len(cycles),
+            "violation_rate": sum(c.missed(self._deadline_ns) for c in known) / len(known),
             "seen_l95_ms": seen_l95_ms,
             "seen_violation_rate": seen_violation_rate,
             **{f"u_{node}": share for node, share in zip(nodes, busy, strict=True)},

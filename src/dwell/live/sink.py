@@ -7,7 +7,7 @@ from typing import Literal, Protocol, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.control_group import UNKNOWN
-from dwell.live.messages import ACTUATED, NOT_APPLIED, Completion, Header
+from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Header
 from dwell.live.payloads import read_payload
 from dwell.live.role import Pulse, RolePlace
 from dwell.live.stage import Actuator, Message
@@ -57,7 +57,7 @@ class Sink:
         #: What its node has taken, where something counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.pulse = Pulse(place, self._state)
-        self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, "stale": 0, "silences": 0}
+        self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, STALE: 0, "silences": 0}
         # Of the last command, and of the last silence: what the actuator has raised.
         self.trouble = self._restless = ""
         self._alarm_ns: int | None = None
@@ -101,7 +101,7 @@ class Sink:
         if cycle <= self.newest:
             return "behind"
         if self.age_ns(header, now_ns) > self.max_age_ns:
-            return "stale"
+            return STALE
         self.newest = cycle
         self._highest.store(*cycle)
         return ACTUATED

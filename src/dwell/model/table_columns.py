@@ -92,7 +92,8 @@ CYCLES = (
     Column(
         "missed",
         "Boolean",
-        "Later than D, or unfinished when its window closed, which is no earlier; or not applied.",
+        "Later than D, or unfinished when its window closed, which is no earlier; or its "
+        "command was not applied. False where a live run's controller could not hear of it.",
     ),
     Column("outcome", "outcome", "What became of it."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
@@ -151,7 +152,12 @@ WINDOWS = (
     Column("lead", "Int64", "Cycles before it that belong to no window.", of=LIVE),
     Column("heard", "Int64", "Cycles of which anything was heard.", of=LIVE),
     Column("bound_ms", "Float64", "The largest bound of its cycles.", "ms", UNCOMPARED, LIVE),
-    Column("unproven", "Boolean", "Whether that is over 20 % of D.", of=LIVE),
+    Column(
+        "unproven",
+        "Boolean",
+        "Whether that is over 20 % of D, or it could not be heard how a cycle ended.",
+        of=LIVE,
+    ),
     Column("closed_unix_ns", "Int64", "Time of day of its close.", "ns", of=LIVE),
 )
 DECISIONS = (
