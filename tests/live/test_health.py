@@ -12,7 +12,8 @@ from dwell.live.health import diagnose, silent_after_ns, window_late_ns
 from dwell.live.stage import Message
 from dwell.live.wiring import roles
 from dwell.model import Problem
-from tests.live.small_world import MS, Passing, World, canonical
+from tests.live.memory_transport import Clock
+from tests.live.small_world import MS, Arm, Passing, World, canonical, on
 
 
 class Raising(Passing):
@@ -165,3 +166,147 @@ def test_a_headline_names_a_few_and_counts_the_others(problem: Problem) -> None:
     _, headline = diagnose(world.problem, found)
     assert headline is not None
     assert f"and {len(workers) - 3} more" in headline
+
+
+# ------------------------------------------------------------------- what the cycles say
+
+
+class Refusing(Arm):
+    """An actuator that raises."""
+
+    def apply(self, command: Message) -> None:
+        raise OSError("the bus is off")
+
+
+class Fifth(Passing):
+    """A stage that raises in one cycle of five."""
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        if next(iter(inputs.values())).cycle % 5 == 0:
+            raise ValueError("too dark")
+        return super().process(inputs)
+
+
+def two_windows(world: World) -> None:
+    """Let two windows close, whenever the last one did."""
+    cell = world.problem
+    world.run(3 * cell.window_cycles * cell.pipeline.period_ms + cell.controller.close_grace_ms)
+
+
+def told(world: World) -> tuple[str, str]:
+    found = world.status
+    return found["health"], found["headline"] or ""
+
+
+def test_an_actuator_that_refuses_every_command_degrades_the_cell(problem: Problem) -> None:
+    world = running(problem)
+    arm, world.sink.actuator = world.sink.actuator, Refusing()
+    world.run(500)
+    health, headline = told(world)
+    assert health == "degraded"
+    assert "sink.control@R2 has applied nothing since" in headline
+    assert "apply() raised OSError: the bus is off" in headline
+    two_windows(world)
+    health, headline = told(world)
+    assert health == "degraded"
+    assert "V_D is 100% in the last 3 windows" in headline
+    assert world.status["window"]["violation_rate"] == 1.0
+    world.sink.actuator = arm
+    two_windows(world)
+    assert told(world) == ("ok", "")
+    assert world.status["guard_moves"] == world.status["migrations"] == 0
+
+
+@pytest.mark.parametrize(("degraded_at", "health"), [(0.1, "degraded"), (0.3, "ok")])
+def test_a_stage_that_fails_now_and_then_degrades_the_cell(
+    problem: Problem, degraded_at: float, health: str
+) -> None:
+    live = replace(problem.live, degraded_at=degraded_at)
+    world = running(replace(problem, live=live), stages={"perception": Fifth})
+    found, headline = told(world)
+    assert found == health
+    if health == "degraded":
+        assert "V_D is 20% in the last 3 windows: perception on R1: " in headline
+        assert "process() raised ValueError: too dark" in headline
+        world.worker("perception@R1").stage = Passing("perception")
+        two_windows(world)
+        assert told(world) == ("ok", "")
+
+
+def test_commands_that_are_stale_by_a_clock_degrade_the_cell(problem: Problem) -> None:
+    cell = replace(problem, live=replace(problem.live, clock="system"))
+    world = running(cell, clocks={"R2": Clock(5_000 * MS)})
+    assert not world.cycles
+    health, headline = told(world)
+    assert health == "degraded"
+    assert "sink.control@R2 has applied nothing since" in headline
+    assert "older than max_age_ms" in headline
+    assert world.status["window"]["violation_rate"] == 1.0
+    world.network.set_clock("R2", Clock())
+    two_windows(world)
+    assert told(world) == ("ok", "")
+
+
+def test_images_that_do_not_arrive_are_named(problem: Problem) -> None:
+    cell = replace(on(problem, "SO"), controller=replace(problem.controller, initial="SO"))
+    world = World(replace(cell, controller=replace(cell.controller, fallbacks=())), policy="SO")
+    world.run(5_000)
+    assert told(world) == ("ok", "")
+    # Beats get through.
+    cut = world.network.cut("sensing@R1", "perception@E", key="**/in/**")
+    world.run(700)
+    assert told(world)[0] == "degraded"
+    two_windows(world)
+    health, headline = told(world)
+    assert health == "stalled"
+    assert "images of sensing@R1 do not reach perception@E" in headline
+    world.network.heal(cut)
+    two_windows(world)
+    assert told(world) == ("ok", "")
+
+
+def test_a_candidate_whose_shadows_all_fail_is_named(problem: Problem) -> None:
+    settings = replace(problem.controller, estimator="shadow", shadow_fraction=0.2)
+    world = running(replace(problem, controller=settings))
+    assert told(world) == ("ok", "")
+    cut = world.network.cut("sensing@R1", "perception@E.shadow", key="**/in/**")
+    world.run(2_000)
+    health, headline = told(world)
+    assert health == "degraded"
+    for name in ("SO", "HYB"):
+        assert f"the last 4 shadows through {name} have failed: images of sensing@R1" in headline
+    assert "do not reach perception@E" in headline
+    world.network.heal(cut)
+    world.run(2_000)
+    assert told(world) == ("ok", "")
+
+
+def test_a_shadows_stage_that_fails_is_the_reason(problem: Problem) -> None:
+    settings = replace(problem.controller, estimator="shadow", shadow_fraction=0.2)
+    world = running(replace(problem, controller=settings))
+    world.worker("planning@E.shadow").stage = Raising("planning")
+    world.run(2_000)
+    health, headline = told(world)
+    assert health == "degraded"
+    assert "planning@E.shadow" in headline or "the last 4 shadows through SO" in headline
+    assert "no light" in headline
+
+
+def test_nothing_is_said_of_cycles_before_the_first_window_is_due(problem: Problem) -> None:
+    world = World(problem, policy="LOC")
+    world.sink.actuator = Refusing()
+    window_ms = problem.window_cycles * problem.pipeline.period_ms
+    world.run(window_ms)
+    assert told(world) == ("ok", "")
+    world.run(window_ms)
+    assert told(world)[0] == "degraded"
+
+
+def test_a_cell_that_starts_slowly_lacks_no_window_yet(problem: Problem) -> None:
+    """Its last process comes late: there has been no cycle until then."""
+    world = World(problem, policy="LOC")
+    world.kill("perception@R1")
+    world.run(window_late_ns(world.problem) / MS - 500)
+    world.start("perception@R1")
+    world.run(1_000)
+    assert told(world) == ("ok", "")

@@ -708,6 +708,10 @@ class LiveEntry(Entry):
     checkpoint_cycles: Annotated[int, Number(bounds.CHECKPOINT_CYCLES)] | None = optional(
         "Cycles between copies of a state to its fallback; default 25, 0: none."
     )
+    degraded_at: Annotated[float, Number(bounds.DEGRADED_AT)] | None = optional(
+        "Share of missed cycles in the last three windows above which the cell is degraded; "
+        "default 0.1."
+    )
     actuators: dict[str, str] | None = optional(
         "What applies the commands of a sink task, as `package.module:Name`."
     )

@@ -587,18 +587,18 @@ class ControlledCell:
 
     def _shown(self, last: LiveWindow) -> dict[str, Any]:
         """Return the last window as people look at it."""
-        log, names = self.controller.log, tuple(self.place.problem.candidates)
-        l95_ms, violation_rate, cost = log.seen[-1]
+        log, problem = self.controller.log, self.place.problem
+        l95_ms, _, cost = log.seen[-1]
         decision = dict(zip(self.controller.decision_columns, log.decisions[-1], strict=True))
         used = last.used[0].tolist()
         return {
             "number": last.number,
             "placement": last.cycles[0].placement,
             "l95_ms": l95_ms,
-            "violation_rate": violation_rate,
+            "violation_rate": last.violation_rate(round(problem.pipeline.deadline_ms * 1e6)),
             "cost": cost,
             "reason": decision["reason"],
-            "estimates": {name: decision[f"j_{name}"] for name in names},
+            "estimates": {name: decision[f"j_{name}"] for name in problem.candidates},
             "utilisation": dict(zip(self.controller.nodes, used, strict=True)),
         }
 
@@ -663,10 +663,12 @@ class ControlledCell:
         held, move = self.held, self._move
         began_ns = now_ns if self._began_ns is None else self._began_ns
         age_ms = round((now_ns - self._window_ns) / 1e6, 1)
+        joined_ns = self.pulse.detector.joined_age_ns(now_ns)
         status = {
             "cell": self.place.problem.name,
             "controller": self.name,
             "up_ms": round((now_ns - began_ns) / 1e6, 1),
+            "joined_ms": round((now_ns - began_ns if joined_ns is None else joined_ns) / 1e6, 1),
             "mode": self.place.problem.live.mode,
             "run": held.run if held is not None else None,
             "term": held.term if held is not None else None,
@@ -684,6 +686,7 @@ class ControlledCell:
             "disbelieved": self.continuity.leaps,
             "window": {**self._window, "age_ms": age_ms} if self._window else {},
             **(self.windows.status() if self.windows is not None else {}),
+            **(self.windows.symptoms(now_ns) if self.windows is not None else {}),
             "processes": self._processes(now_ns),
             **self._missing(now_ns),
             "complaints": dict(list(self.place.complaints.items())[-10:]),

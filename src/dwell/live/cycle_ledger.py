@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dwell.control import Evidence, Instants
 from dwell.live.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Hop, Stamp
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
+from dwell.live.wiring import lane_of
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 from dwell.record import Values
@@ -521,6 +522,37 @@ class Ledger:
                 if known.end_ns[row, source] < 0:
                     known.end_ns[row, source] = cycle.at_ns
                 return
+
+    def unreached(self, cycle: LiveCycle, through: str) -> tuple[str, str] | None:
+        """Return source and target of the first message that is not known to have arrived.
+
+        Only those to other nodes count, and an image before all others: beats, which small messages
+        share their lane with, say nothing of it.
+
+        Parameters
+        ----------
+        through : str
+            Its placement, or the candidate that its shadow goes through.
+        """
+        nodes = self._candidates[through]
+        hops = [*cycle.hops, *(hop for done in cycle.shadows for hop in done.hops)]
+        there = {
+            (source, hop.task)
+            for hop in hops
+            if nodes[hop.task] == hop.node
+            for source, _ in hop.inputs
+        }
+        missing = [
+            flow
+            for flow in self._forward
+            if nodes[flow.source] != nodes[flow.target] and (flow.source, flow.target) not in there
+        ]
+        images = (flow for flow in missing if lane_of(flow.payload_bytes) == "images")
+        flow = next(images, None) or next(iter(missing), None)
+        if flow is None:
+            return None
+        source, target = (f"{task}@{nodes[task]}" for task in (flow.source, flow.target))
+        return source, target
 
     def _diverging(self, cycle: LiveCycle) -> frozenset[str]:
         """Tasks that a cycle does not share with its shadow."""

@@ -41,6 +41,7 @@ class FailureDetector:
         self.who = who
         self.patience_ns = patience_ns
         self._processes: dict[str, _HeardProcess] = {}
+        self._joined_ns: int | None = None
 
     def hear(self, beat: Beat, now_ns: int, *, direct: bool = True) -> bool:
         """Take a beat in; False if it is no news: an older one, or its second copy."""
@@ -49,6 +50,7 @@ class FailureDetector:
         process, order = self._processes.get(beat.who), (beat.life, beat.sent_ns)
         if process is None:
             process = self._processes[beat.who] = _HeardProcess(beat, now_ns)
+            self._joined_ns = now_ns
         else:
             last = process.beat.life, process.beat.sent_ns
             news = order > ((last[0], process.direct_beat_ns) if direct else last)
@@ -78,6 +80,13 @@ class FailureDetector:
         """Time since a process was last heard; None if never."""
         process = self._processes.get(who)
         return process.age_ns(now_ns) if process is not None else None
+
+    def joined_age_ns(self, now_ns: int) -> int | None:
+        """Time since somebody was heard for the first time; None if nobody was."""
+        if self._joined_ns is None:
+            return None
+        self._joined_ns = min(self._joined_ns, now_ns)
+        return now_ns - self._joined_ns
 
     def fresh(self, who: str, now_ns: int, patience_ns: int | None = None) -> bool:
         """Whether a process was heard within the patience."""

@@ -4,7 +4,8 @@
 ``health``    what it means
 ============  ====================================================================================
 ``ok``        all processes are heard and ready, windows close, and cycles are completed
-``degraded``  windows close, but a process is silent, not ready, or has another cell file or version
+``degraded``  windows close, but a process is silent, not ready, or has another cell file or
+              version, too many cycles miss, a sink applies nothing, or a candidate's shadows fail
 ``stalled``   no window has closed for too long, or no cycle of the last one was completed
 ``silent``    the controller hears no process of the cell
 ``absent``    no controller answers; only who asks can tell (`dwell.live.operator_client`)
@@ -19,8 +20,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 from dwell.live.agent import AGENT_BEAT
-from dwell.live.wiring import Role, roles
+from dwell.live.messages import STALE
+from dwell.live.wiring import Role, lane_of, roles
 from dwell.model import Problem
+from dwell.model.bounds import counted
 
 Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
 
@@ -74,6 +77,8 @@ def diagnose(problem: Problem, status: Mapping[str, Any]) -> tuple[Health, str |
     stalled = _no_window(problem, status) or _no_cycle(status)
     faults = [] if deaf else list(_faults(status, members))
     faults += status["strangers"].values()
+    if not deaf and _window_was_due(problem, status):
+        faults += _symptoms(problem, status, members)
     if status["record"]:
         faults.append(f"the run is not kept: {status['record']}")
     more = len(faults) - NAMED
@@ -100,19 +105,88 @@ def _hears_nobody(
 
 
 def _no_window(problem: Problem, status: Mapping[str, Any]) -> str | None:
-    window = status["window"]
-    age_ms = window["age_ms"] if window else status["up_ms"]
+    window, begun_ms = status["window"], status.get("begun_ms")
+    if window:
+        age_ms = window["age_ms"]
+    else:
+        # A cell that starts has as long from its first cycle on, and to that from its last process.
+        age_ms = status["joined_ms"] if begun_ms is None else begun_ms
     if age_ms * 1e6 <= window_late_ns(problem):
         return None
     return f"no window since {_time(age_ms)}"
 
 
+def _window_was_due(problem: Problem, status: Mapping[str, Any]) -> bool:
+    """Whether the first window has closed, or ought to have."""
+    if status["window"]:
+        return True
+    window_ms = problem.window_cycles * problem.pipeline.period_ms
+    due_ms = window_ms + problem.controller.close_grace_ms
+    return bool((status.get("begun_ms") or 0.0) > due_ms)
+
+
 def _no_cycle(status: Mapping[str, Any]) -> str | None:
-    window = status["window"]
-    if not window or status["done_cycles"]:
+    if not status["window"] or status["done_cycles"] or not status["heard_cycles"]:
         return None
     notes = [one["note"] for one in status["processes"].values() if one["heard"] and one["note"]]
     return f"no cycle of the last window was completed{_because(notes[:1])}"
+
+
+def _symptoms(
+    problem: Problem, status: Mapping[str, Any], members: Sequence[Role]
+) -> Iterator[str]:
+    """Yield what the cell's cycles say, though its processes may be well."""
+    sinks = [role for role in members if role.kind == "sink"]
+    patience_ms = (problem.controller.guard_cycles + 1) * problem.pipeline.period_ms
+    limit_ms = max(patience_ms, problem.max_age_ms)
+    for role in sinks:
+        sink = status["sinks"][role.task]
+        age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
+        if _heard(status, role) and age_ms > limit_ms:
+            why = [*_notes(status, [role.who]), *_kept_back(problem, sink["outcome"])]
+            yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
+    recent, limit = status["recent"], problem.live.degraded_at
+    rates = recent["violation_rates"]
+    # What is over shall not count for as long as it lasted.
+    if rates and min(sum(rates) / len(rates), rates[-1]) > limit:
+        placed = problem.candidates[status["placement"]].items()
+        names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
+        why = [*_notes(status, names), *_unreached(problem, status, recent["unreached"])]
+        rate = sum(rates) / len(rates)
+        yield f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}{_because(why)}"
+    for name, found in status["failing"].items():
+        placed = problem.candidates[name].items()
+        why = [
+            *_notes(status, [f"{task}@{node}.shadow" for task, node in placed]),
+            *_unreached(problem, status, found["unreached"]),
+        ]
+        yield f"the last {found['shadows']} shadows through {name} have failed{_because(why)}"
+
+
+def _notes(status: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    """Return what some processes say of themselves, of those that are heard."""
+    known = [status["processes"][who] for who in names if who in status["processes"]]
+    return [one["note"] for one in known if one["heard"] and one["note"]]
+
+
+def _kept_back(problem: Problem, outcome: str | None) -> Iterator[str]:
+    """Yield why the gate lets no command through, where it has let the last one not."""
+    if outcome == STALE:
+        oldest = f"max_age_ms ({problem.max_age_ms:g})"
+        yield f"by the clocks, commands are older than {oldest} when they come"
+
+
+def _unreached(
+    problem: Problem, status: Mapping[str, Any], ways: tuple[str, str] | None
+) -> Iterator[str]:
+    """Yield which messages do not arrive; where an end is not heard, its own fault says so."""
+    heard = status["processes"]
+    if ways is None or not all(who in heard and heard[who]["heard"] for who in ways):
+        return
+    source, target = (who.partition("@")[0] for who in ways)
+    (flow,) = (one for one in problem.pipeline.inputs(target) if one.source == source)
+    what = "images" if lane_of(flow.payload_bytes) == "images" else "messages"
+    yield f"{what} of {ways[0]} do not reach {ways[1]}"
 
 
 def _faults(status: Mapping[str, Any], members: Sequence[Role]) -> Iterator[str]:

@@ -30,6 +30,7 @@ from dwell.live.loads import NodeLoad, ProcessLoads
 from dwell.live.messages import Completion, Load, Stamp, Stamped
 from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows, told
+from dwell.live.symptoms import Symptoms
 from dwell.model import Problem
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.
@@ -76,6 +77,7 @@ class LiveWindows:
         self.last: LiveWindow | None = None
         self.ignored = 0
         self._ledger = Ledger(problem, offsets)
+        self._symptoms = Symptoms(problem, self._ledger)
         self._loads = {node: NodeLoad() for node in problem.fabric.nodes}
         self._processes = ProcessLoads()
         self._keeps_jobs = resume.jobs
@@ -110,6 +112,8 @@ class LiveWindows:
             When this was heard, on the controller's clock.
         """
         cycle = self._note(stamp, at_ns)
+        if at_ns is not None:
+            self._symptoms.begun(at_ns)
         if cycle is not None and cycle.stamped_ns is None:
             cycle.stamped_ns = at_ns
             if isinstance(stamp, Stamped):
@@ -135,6 +139,8 @@ class LiveWindows:
         cycle = self._note(completion.stamp, at_ns)
         if cycle is None or not cycle.take(completion, at_ns):
             return
+        if at_ns is not None and completion.sink in cycle.heard_ns:
+            self._symptoms.completed(completion, at_ns)
         if self._ledger.complete(cycle):
             self.record.newest_done = max(self.record.newest_done, cycle.key)
         # Before its window closes, rather than all at once then, where the clocks' bound allows.
@@ -199,6 +205,7 @@ class LiveWindows:
         """The controller's clock has been set back: what was heard by it was heard before that."""
         for cycle in self._line:
             cycle.heard_before(back_ns)
+        self._symptoms.set_back(back_ns)
         if self._newest is not None:
             newest, heard_ns = self._newest
             self._newest = newest, None if heard_ns is None else heard_ns - back_ns
@@ -378,6 +385,7 @@ class LiveWindows:
             closed_unix_ns=unix_ns,
         )
         self.record.close(self.last)
+        self._symptoms.closed(self.last)
         self._next_window += 1
         self._lead = 0
         return closed
@@ -415,6 +423,10 @@ class LiveWindows:
             used[:, column] = max(busy_ns, capacity * accelerator_ns), own_ns, shadow_ns
             load.forget(begin_ns)
         return used
+
+    def symptoms(self, now_ns: int) -> dict[str, object]:
+        """Return what the cycles say of the cell's health, as plain values (see `Symptoms`)."""
+        return self._symptoms.status(reversed(self._by_key.values()), now_ns)
 
     def status(self) -> dict[str, object]:
         """Return how the windows are, as plain values."""

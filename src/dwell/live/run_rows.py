@@ -79,6 +79,11 @@ class LiveWindow:
     used: NDArray[np.float64]
     closed_unix_ns: int | None
 
+    def violation_rate(self, deadline_ns: int) -> float:
+        """V_D: share of its cycles that missed, of those whose end is known."""
+        known = told(self.cycles)
+        return sum(cycle.missed(deadline_ns) for cycle in known) / len(known)
+
 
 def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
     """Return the cycles of a window whose end is known; all where there are none."""
@@ -275,8 +280,7 @@ class RunRows:
         place = window.number - self._first_window
         seen = log.seen[place] if place < len(log.seen) else (None, None, None)
         seen_l95_ms, seen_violation_rate, cost = map(_known, seen)
-        known = told(cycles)
-        latency_ns = np.array([cycle.latency_ns for cycle in known], np.int64)
+        latency_ns = np.array([cycle.latency_ns for cycle in told(cycles)], np.int64)
         values: dict[str, object] = {
             "window": window.number,
             "first_cycle": cycles[0].row,
@@ -284,7 +288,7 @@ class RunRows:
             "placement": cycles[0].placement,
             "mixed": any(cycle.placement != cycles[0].placement for cycle in cycles),
             "l95_ms": float(final_l95_ms(latency_ns)),
-            "violation_rate": sum(c.missed(self._deadline_ns) for c in known) / len(known),
+            "violation_rate": window.violation_rate(self._deadline_ns),
             "seen_l95_ms": seen_l95_ms,
             "seen_violation_rate": seen_violation_rate,
             **{f"u_{node}": share for node, share in zip(nodes, busy, strict=True)},

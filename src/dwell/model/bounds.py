@@ -151,6 +151,7 @@ TARGET_PERIOD_S = Bound(1e-5, LARGEST)
 PORT = Bound(1024, 65_000, whole=True)
 AGE_MS = Bound(0, LARGEST, above=True)
 CHECKPOINT_CYCLES = Bound(0, MAX_COUNT, whole=True)
+DEGRADED_AT = Bound(0, 1)
 STANDBY = Bound(0, 1, whole=True)
 HANDED_MS = Bound(0, 1e6)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from dwell.model.bounds import AGE_MS, CHECKPOINT_CYCLES, PORT, require
+from dwell.model.bounds import AGE_MS, CHECKPOINT_CYCLES, DEGRADED_AT, PORT, require
 from dwell.model.frozen import FrozenDict
 
 RELEASES = ("timer", "frames")
@@ -74,6 +74,8 @@ class LiveSettings:
         What the actuator is told when no command comes.
     checkpoint_cycles : int
         Cycles between two copies of a task's state to its fallback; 0 for none.
+    degraded_at : float
+        Share of the cycles of the last windows that may miss before the cell is degraded.
     actuators : mapping of str to str
         ``module:Name`` of what applies the commands of each sink task.
     observer : str, optional
@@ -89,6 +91,7 @@ class LiveSettings:
     max_age_ms: float | None = None
     silence: str = "hold"
     checkpoint_cycles: int = 25
+    degraded_at: float = 0.1
     actuators: Mapping[str, str] = field(default_factory=FrozenDict)
     observer: str | None = None
 
@@ -100,6 +103,7 @@ class LiveSettings:
         if self.max_age_ms is not None:
             AGE_MS.check("live.max_age_ms", self.max_age_ms)
         CHECKPOINT_CYCLES.check("live.checkpoint_cycles", self.checkpoint_cycles)
+        DEGRADED_AT.check("live.degraded_at", self.degraded_at)
         for task, name in self.actuators.items():
             require_callable_name(f"live.actuators.{task}", name)
         if self.observer is not None:

@@ -1,0 +1,125 @@
+"""Symptoms: what the cycles of a live cell say of its health, beside what its processes say.
+
+A beat travels apart from the images, and comes from a worker whose stage fails all the same: what
+counts here is what arrived, was applied, and came in time.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from itertools import islice
+from typing import Any
+
+from dwell.live.cycle_ledger import SHADOW, Ledger, LiveCycle
+from dwell.live.messages import ACTUATED, Completion
+from dwell.live.run_rows import LiveWindow
+from dwell.model import Problem
+
+#: Closed windows whose V_D counts.
+RECENT = 3
+#: Windows' worth of cycles without a shadow through a candidate, after which those before it that
+#: failed say nothing more.
+SILENT_WINDOWS = 2
+
+
+class Symptoms:
+    """See the module; instants are of the controller's clock."""
+
+    def __init__(self, problem: Problem, ledger: Ledger) -> None:
+        self._ledger, self._size = ledger, problem.window_cycles
+        self._guard_cycles = problem.controller.guard_cycles
+        self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
+        self._begun_ns: int | None = None
+        self._recent: deque[LiveWindow] = deque(maxlen=RECENT)
+        # By sink: when a command was heard to be applied last, and what came of the last command.
+        self._applied_ns: dict[str, int] = {}
+        self._outcomes: dict[str, str] = {}
+
+    def begun(self, at_ns: int) -> None:
+        """A cycle was heard of."""
+        if self._begun_ns is None:
+            self._begun_ns = at_ns
+
+    def completed(self, completion: Completion, at_ns: int) -> None:
+        """A sink has had a command."""
+        self._outcomes[completion.sink] = completion.outcome
+        if completion.outcome == ACTUATED:
+            self._applied_ns[completion.sink] = at_ns
+
+    def closed(self, window: LiveWindow) -> None:
+        """A window has closed."""
+        self._recent.append(window)
+
+    def set_back(self, back_ns: int) -> None:
+        """Go on by a clock that has been set back."""
+        if self._begun_ns is not None:
+            self._begun_ns -= back_ns
+        self._applied_ns = {sink: at_ns - back_ns for sink, at_ns in self._applied_ns.items()}
+
+    def status(self, newest: Iterable[LiveCycle], now_ns: int) -> dict[str, Any]:
+        """Return them as plain values.
+
+        Parameters
+        ----------
+        newest : iterable of LiveCycle
+            Cycles, the last one first.
+
+        Returns
+        -------
+        dict
+            ``begun_ms``: time since the first cycle was heard of, None before. ``recent``: V_D of
+            the last windows, and the message that most of their lost cycles lack. ``sinks``: age of
+            the last command that was applied, or None, and what came of the last one. ``failing``:
+            by candidate, how many of its last shadows failed in a row, at most g + 1, and the
+            message that the last one lacks. Messages are source and target, as ``task@node``.
+        """
+        begun_ns = self._begun_ns
+        return {
+            "begun_ms": None if begun_ns is None else round((now_ns - begun_ns) / 1e6, 1),
+            "recent": {
+                "violation_rates": [
+                    window.violation_rate(self._deadline_ns) for window in self._recent
+                ],
+                "unreached": self._mostly_unreached(),
+            },
+            "sinks": {sink: self._sink(sink, now_ns) for sink in sorted(self._ledger.sinks)},
+            "failing": dict(self._failing(newest)),
+        }
+
+    def _sink(self, sink: str, now_ns: int) -> dict[str, Any]:
+        at_ns = self._applied_ns.get(sink)
+        age_ms = None if at_ns is None else round((now_ns - at_ns) / 1e6, 1)
+        return {"applied_age_ms": age_ms, "outcome": self._outcomes.get(sink)}
+
+    def _mostly_unreached(self) -> tuple[str, str] | None:
+        lost = (
+            cycle
+            for window in self._recent
+            for cycle in window.cycles
+            if cycle.missed(self._deadline_ns) and not (self._ledger.complete(cycle) or cycle.told)
+        )
+        unreached = (self._ledger.unreached(cycle, cycle.placement) for cycle in lost)
+        counts = Counter(ways for ways in unreached if ways is not None)
+        return max(counts, key=counts.__getitem__, default=None)
+
+    def _failing(self, newest: Iterable[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield candidates whose last shadows all failed; cycles within g of the newest may not."""
+        most = self._guard_cycles + 1
+        fails: dict[str, list[LiveCycle]] = {}
+        succeeded = set()
+        for place, cycle in enumerate(islice(newest, self._guard_cycles, None)):
+            if not cycle.shadow or cycle.shadow in succeeded:
+                continue
+            known = fails.get(cycle.shadow)
+            if known is None and place >= SILENT_WINDOWS * self._size:
+                continue
+            if any(s.outcome == SHADOW and s.sink in self._ledger.sinks for s in cycle.shadows):
+                succeeded.add(cycle.shadow)
+            elif known is None:
+                fails[cycle.shadow] = [cycle]
+            elif len(known) < most:
+                known.append(cycle)
+        for name, cycles in fails.items():
+            if len(cycles) == most:
+                yield name, {"shadows": most, "unreached": self._ledger.unreached(cycles[0], name)}
