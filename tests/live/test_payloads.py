@@ -20,6 +20,15 @@ class Spot(msgspec.Struct):
     column: float
 
 
+class Track(msgspec.Struct):
+    """A struct with everything that a struct can hold."""
+
+    label: object
+    scores: list[object]
+    spots: dict[str, object]
+    origin: Spot
+
+
 NUMBERS = st.one_of(
     arrays.integer_dtypes(),
     arrays.unsigned_integer_dtypes(),
@@ -79,7 +88,7 @@ def test_a_struct_that_is_another_one_is_refused_by_name() -> None:
         x: float
 
     kind, data = write_payload(Pose(1.0))
-    with pytest.raises(LiveError, match="no Pose: Object missing required field `row`"):
+    with pytest.raises(LiveError, match=r"a Pose where Spot is wanted .* missing .* `row`"):
         read_payload(kind, bytes(data), Spot)
 
 
@@ -91,12 +100,81 @@ def test_a_struct_that_is_another_one_is_refused_by_name() -> None:
         (np.array([object()]), "an array of object cannot be sent; send numbers"),
         (np.array(["a"]), "an array of <U1 cannot be sent"),
         (np.zeros((1,) * 9), "an array of 9 dimensions; at most 8"),
+        (np.ma.array([1.0], mask=[True]), "a masked array cannot be sent"),
     ],
 )
 def test_what_cannot_be_sent_is_named(payload: object, words: str) -> None:
     with pytest.raises(LiveError) as caught:
         write_payload(payload)
     assert words in str(caught.value)
+
+
+SCALARS = st.one_of(
+    st.booleans().map(np.bool_),
+    *(
+        st.integers(np.iinfo(kind).min, np.iinfo(kind).max).map(kind)
+        for kind in (np.int8, np.uint8, np.int32, np.uint32, np.int64, np.uint64)
+    ),
+    st.floats(width=16, allow_nan=False).map(np.float16),
+    st.floats(width=32, allow_nan=False).map(np.float32),
+    st.floats(allow_nan=False).map(np.float64),
+    st.floats(allow_nan=False).map(np.longdouble),
+)
+
+
+@given(SCALARS, st.lists(SCALARS, max_size=3))
+def test_scalars_of_numpy_in_a_struct_arrive_as_numbers(
+    number: np.generic, others: list[np.generic]
+) -> None:
+    spot = Spot(number, number)  # type: ignore[arg-type]
+    kind, data = write_payload(Track(number, [*others, [number]], {"a": spot}, spot))
+    found = read_payload(kind, bytes(data))
+    assert isinstance(found, dict)
+    assert found["label"] == number
+    assert type(found["label"]) in (bool, int, float)
+    assert found["scores"] == [*others, [number]]
+    assert found["spots"]["a"] == found["origin"] == {"row": number, "column": number}
+
+
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [
+        (np.zeros(3), "ndarray"),
+        (2**64, "int"),
+        (-(2**63) - 1, "int"),
+        (np.datetime64("2026-01-01"), "datetime64"),
+        (np.timedelta64(1, "s"), "timedelta64"),
+        (np.complex128(1j), "complex128"),
+        ("\ud800", "str"),
+        (object(), "object"),
+    ],
+)
+def test_what_a_struct_cannot_hold_is_named_with_its_field(value: object, kind: str) -> None:
+    spot = Spot(1.0, 2.0)
+    for track, field in (
+        (Track(value, [], {}, spot), "Track.label"),
+        (Track("", [1, [value]], {}, spot), "Track.scores[1][0]"),
+        (Track("", [], {"a": Spot(value, 1.0)}, spot), "Track.spots['a'].row"),  # type: ignore[arg-type]
+        (Track("", [], {}, Spot(0.0, value)), "Track.origin.column"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(LiveError) as caught:
+            write_payload(track)
+        assert str(caught.value).startswith(f"{field}: a {kind} cannot be sent in a struct")
+
+
+def test_a_struct_that_holds_itself_is_refused() -> None:
+    scores: list[object] = []
+    scores.append(scores)
+    with pytest.raises(LiveError, match=r"Track\.scores"):
+        write_payload(Track("", scores, {}, Spot(0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    "view", [np.arange(6, dtype=np.uint8)[::2], np.arange(3, dtype=">i4"), np.zeros((0, 3))]
+)
+def test_any_view_arrives_as_its_bytes(view: np.ndarray) -> None:
+    kind, data = write_payload(memoryview(view))  # type: ignore[arg-type]
+    assert read_payload(kind, bytes(data)) == view.tobytes()
 
 
 @pytest.mark.parametrize(

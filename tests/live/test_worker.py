@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,6 +27,10 @@ PATIENCE_S = 20.0
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     return canonical(fallbacks=("LOC",))
+
+
+class Detection(msgspec.Struct):
+    score: object
 
 
 class Moody(Passing):
@@ -48,6 +53,7 @@ class Moody(Passing):
         (b"bytes", "process() returned a bytes, not a Message"),
         (Message("text"), "a str cannot be sent; send bytes, an array, or a msgspec.Struct"),
         (Message(np.array([None])), "an array of object cannot be sent"),
+        (Message(Detection(np.zeros(2))), "Detection.score: a ndarray cannot be sent in a struct"),
     ],
 )
 def test_a_stage_that_fails_costs_its_cycle_and_is_named(

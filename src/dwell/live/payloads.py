@@ -3,13 +3,15 @@
 A payload travels raw, beside its header, and the header says its kind: ``none``, ``bytes``,
 ``array:<dtype>:<shape>`` or ``struct:<name>``. An array is read where it arrived, without a copy.
 A struct is MessagePack; it becomes the type that the stage declares, and plain values otherwise.
+NumPy's scalars in its fields travel as the numbers that they are.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Any, TypeAlias
+from collections.abc import Iterator
+from typing import Any, TypeAlias, cast
 
 import msgspec
 import numpy as np
@@ -22,6 +24,8 @@ Payload: TypeAlias = "bytes | NDArray[Any] | msgspec.Struct | dict[str, Any] | l
 #: Kinds of numbers that arrays may hold: no objects, no records.
 NUMBERS = "biufc"
 MAX_DIMENSIONS = 8
+#: Levels of a struct down to which it is said what cannot be sent.
+MAX_DEPTH = 16
 #: A description of an array as `write_payload` makes it. NumPy reads much more as a dtype, some of
 #: it as Python.
 ARRAY = re.compile(r"([<>|=]?[biufc][0-9]{1,2}|\?):((?:[0-9]{1,18}(?:x[0-9]{1,18})*)?)")
@@ -46,7 +50,11 @@ def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
     if isinstance(payload, bytes):
         return "bytes", payload
     if isinstance(payload, bytearray | memoryview):
-        return "bytes", memoryview(payload).cast("B")
+        return "bytes", _flat(memoryview(payload))
+    if isinstance(payload, np.ma.MaskedArray):
+        raise LiveError(
+            "a masked array cannot be sent; send payload.filled(), and the mask beside it"
+        )
     if isinstance(payload, np.ndarray):
         if payload.dtype.kind not in NUMBERS:
             raise LiveError(f"an array of {payload.dtype} cannot be sent; send numbers")
@@ -56,9 +64,64 @@ def write_payload(payload: object) -> tuple[str, bytes | memoryview]:
         data = np.ascontiguousarray(payload).reshape(-1).view(np.uint8)
         return f"array:{payload.dtype.str}:{shape}", data.data
     if isinstance(payload, msgspec.Struct):
-        return f"struct:{type(payload).__name__}", msgspec.msgpack.encode(payload)
+        return f"struct:{type(payload).__name__}", _encoded(payload)
     what = type(payload).__name__
     raise LiveError(f"a {what} cannot be sent; send bytes, an array, or a msgspec.Struct")
+
+
+def _flat(view: memoryview) -> bytes | memoryview:
+    """Return a view's bytes, without a copy where they lie one after another."""
+    try:
+        return view.cast("B")
+    except (TypeError, ValueError):  # with gaps, empty, or of another byte order
+        return view.tobytes()
+
+
+def _encoded(payload: msgspec.Struct) -> bytes:
+    try:
+        return msgspec.msgpack.encode(payload, enc_hook=_number)
+    except Exception as error:  # the user's objects
+        raise LiveError(_unsendable(payload, error)) from None
+
+
+def _number(value: object) -> bool | int | float:
+    """Return the number that a scalar of NumPy's is."""
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, np.integer) and not isinstance(value, np.timedelta64):
+        return int(value)
+    if isinstance(value, np.floating):
+        return float(value)
+    raise TypeError
+
+
+def _unsendable(payload: msgspec.Struct, error: Exception) -> str:
+    """Return which part of a struct cannot be sent."""
+    place, value = type(payload).__name__, cast("object", payload)
+    for _ in range(MAX_DEPTH):
+        for name, part in _parts(value):
+            try:
+                msgspec.msgpack.encode(part, enc_hook=_number)
+            except Exception as deeper:  # the user's objects
+                place, value, error = place + name, part, deeper
+                break
+        else:
+            break
+    why = f" ({error})" if str(error) else ""
+    return f"{place}: a {type(value).__name__} cannot be sent in a struct{why}; send plain values"
+
+
+def _parts(value: object) -> Iterator[tuple[str, object]]:
+    """Yield what a value of a struct consists of, by its place there."""
+    if isinstance(value, msgspec.Struct):
+        for name in type(value).__struct_fields__:
+            yield f".{name}", getattr(value, name, None)
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            yield f"[{key!r:.40}]", part
+    elif isinstance(value, list | tuple):
+        for number, part in enumerate(value):
+            yield f"[{number}]", part
 
 
 def read_payload(kind: str, data: bytes, expected: type | None = None) -> Payload:
@@ -91,7 +154,12 @@ def read_payload(kind: str, data: bytes, expected: type | None = None) -> Payloa
         plain: dict[str, Any] | list[Any] = msgspec.msgpack.decode(data)
         return plain
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
-        raise LiveError(f"no {rest or 'struct'}: {error}") from None
+        wanted = "" if expected is None else f" where {_name(expected)} is wanted"
+        raise LiveError(f"a {rest or 'struct'}{wanted} cannot be read: {error}") from None
+
+
+def _name(kind: type) -> str:
+    return kind.__name__ if isinstance(kind, type) else str(kind)
 
 
 def _read_array(description: str, data: bytes) -> NDArray[Any]:
