@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dwell.live.messages import Order, State, encode
+from dwell.live.messages import Completion, Order, Stamp, State, encode
 from dwell.live.stage import Message
 from dwell.live.transport.transport import Arrival
 from dwell.model import Problem
@@ -253,6 +253,23 @@ def test_rule_5_what_shadows_fail_through_is_not_whole(problem: Problem) -> None
     world.run(1_000)
     assert [name for _, name, _ in stamper.moves] == ["HYB"]
     assert lost(world) <= problem.controller.guard_cycles + 1
+
+
+def test_rule_5_a_cycle_of_the_placement_before_says_nothing_of_this_one(problem: Problem) -> None:
+    world = running(problem, "SO")
+    world.network.cut(key="**/in/**")
+    while world.stamper.placement == "SO":
+        world.run(1)
+    world.run(1.5 * problem.pipeline.period_ms)
+    stamper = world.stamper
+    cycle = stamper.cycle - 1
+    for placement, carries in (("SO", False), (stamper.placement, True)):
+        stamp = Stamp(stamper.run, cycle, stamper.term, placement, world.network.now_ns)
+        done = Completion(stamp, "control", world.network.now_ns, "actuated", (), "R2")
+        arrival = Arrival(world.keys.done("control"), encode(done))
+        stamper._partial.clear()
+        stamper.receive(arrival, world.network.now_ns)
+        assert stamper.guard.carries == carries
 
 
 def test_rule_5_holds_without_a_controller(problem: Problem) -> None:

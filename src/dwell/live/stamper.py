@@ -208,13 +208,19 @@ class Stamper:
             return
         sinks.add(done.sink)
         if sinks == self._sinks:
-            self.guard.completed(stamp.cycle, now_ns)
-            if stamp.placement in self._names:
-                self.failures.completed(stamp.placement, stamp.cycle)
-            self.probation.healthy()
+            self._complete(stamp, now_ns)
         if len(self._partial) > MAX_PARTIAL:
             for cycle in sorted(self._partial)[: MAX_PARTIAL // 2]:
                 del self._partial[cycle]
+
+    def _complete(self, stamp: Stamp, now_ns: int) -> None:
+        """All sinks have had a cycle's command."""
+        if stamp.placement in self._names:
+            self.failures.completed(stamp.placement, stamp.cycle)
+        # One that was sent a cycle early, before a move, says nothing of the placement that holds.
+        if stamp.placement == self.placement:
+            self.guard.completed(stamp.cycle, now_ns)
+            self.probation.healthy()
 
     # ------------------------------------------------------------------------- orders
 
