@@ -28,8 +28,8 @@ def test_what_cannot_be_done_here_is_left_out(problem: Problem) -> None:
 
 
 def test_only_stages_that_know_of_it_are_told_to_fail(problem: Problem) -> None:
-    assert any(fault.how == "fail" for fault in faults_of(problem))
-    assert not any(fault.how == "fail" for fault in faults_of(problem, stages=False))
+    assert any(fault.kind == "fail" for fault in faults_of(problem))
+    assert not any(fault.kind == "fail" for fault in faults_of(problem, stages=False))
 
 
 def test_images_do_not_fit_through_a_link_that_is_slow(problem: Problem) -> None:
@@ -57,7 +57,9 @@ def test_images_do_not_fit_through_a_link_that_is_slow(problem: Problem) -> None
         ("slow R1->E", 4, 4),
         ("fail perception@E", 4, 4),
         ("fail planning@R2", 4, 8),
+        ("fail the actuator of sink.control@R2", 4, 4),
         ("jump +5000 ms E", 4, 4),
+        ("jump -5000 ms E", 4, 4),
         ("jump +5000 ms R2", None, None),
         ("drift +80 ppm R1", 4, 4),
         ("drift +2000 ppm R1", None, None),
@@ -87,8 +89,8 @@ def test_every_kind_has_its_turn_in_every_round(problem: Problem) -> None:
     assert {one.fault.kind for one in first} == kinds
     assert kinds == {
         *("kill", "kill node", "freeze", "freeze node", "cut", "cut one way", "relay"),
-        *("slow", "fail"),
-        *("jump", "drift", "starve", "fill", "hog"),
+        *("slow", "fail", "refuse"),
+        *("jump", "jump back", "drift", "starve", "fill", "hog"),
     }
 
 

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import polars as pl
 import pytest
 
+import dwell
+from dwell.testbed.chaos.faults import Fault, faults_of
+from dwell.testbed.chaos.stages import APPLY, HOLD
 from dwell.testbed.chaos.strike import Outcome, beyond
+from tests.live.real_cell import RealCell
+from tests.waiting import wait_until
 
 
 @pytest.mark.parametrize(
@@ -27,3 +38,72 @@ def test_more_cycles_than_the_bound_are_said(
 ) -> None:
     outcome = Outcome("kill all of E", 1, 0.5, lost=lost, lost_after=lost_after, bound=bound)
     assert beyond(outcome) == said
+
+
+# ------------------------------------------------------------------------- real processes
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCell]:
+    """A cell that keeps to its period on two CPUs."""
+    if len(os.sched_getaffinity(0)) < 2:
+        pytest.skip("twenty processes that must keep to a period of 40 ms need two CPUs")
+    with RealCell("LOC", tmp_path_factory.mktemp("cell")) as made:
+        yield made
+
+
+def fault(cell: RealCell, name: str) -> Fault:
+    return next(one for one in faults_of(cell.problem) if one.name == name)
+
+
+def test_an_actuator_that_raises_is_told_and_moves_nothing(cell: RealCell) -> None:
+    refuses = fault(cell, "fail the actuator of sink.control@R2")
+    moves = cell.status()["guard_moves"]
+    begin_ns = cell.begin(refuses, time.monotonic_ns())
+    wait_until(lambda: "told to fail" in str(cell.status().get("headline")))
+    status = cell.status()
+    assert status["health"] == "degraded"
+    assert "apply() raised RuntimeError: told to fail" in status["headline"]
+    calls = [seen.what for seen in cell.actuations.since(begin_ns)]
+    assert calls.count(APPLY) > 3
+    wait_until(lambda: HOLD in [seen.what for seen in cell.actuations.since(begin_ns)])
+    cell.end(refuses)
+    cell.wait_for("the whole cell at home", cell.at_home, 30.0)
+    wait_until(lambda: cell.status().get("health") == "ok")
+    assert cell.status()["guard_moves"] == moves
+    assert cell.ended(refuses) == []
+
+
+def test_a_clock_that_goes_back_ends_nobody(cell: RealCell) -> None:
+    back = fault(cell, "jump -5000 ms R2")
+    cell.begin(back, time.monotonic_ns())
+    windows = cell.status()["windows"]
+    wait_until(lambda: cell.status().get("windows", 0) > windows + 10)
+    cell.wait_for("the whole cell at home", cell.at_home, 30.0)
+    wait_until(lambda: cell.status().get("unproven") is False)
+    assert cell.ended(back) == []
+
+
+def test_a_process_that_ends_by_itself_is_told(cell: RealCell) -> None:
+    drifts = fault(cell, "drift +80 ppm E")
+    cell.begin(drifts, time.monotonic_ns())
+    assert cell.ended(drifts) == []
+    os.kill(cell.pid("planning@E"), signal.SIGKILL)
+    wait_until(lambda: cell.ended(drifts) == ["planning@E has ended by itself"])
+    assert cell.ended(fault(cell, "kill planning@E")) == []
+    cell.end(drifts)
+    cell.wait_for("the whole cell at home", cell.at_home, 30.0)
+
+
+def test_the_end_of_a_terminal_completes_the_run(cell: RealCell) -> None:
+    """Goes on from the tests before."""
+    controller = cell.testbed.processes.running["controller@E"]
+    controller.send_signal(signal.SIGHUP)
+    assert controller.wait(30) == 0
+    (folder,) = cell.runs
+    assert (folder / "run.json").is_file()
+    cycles = dwell.open_run(folder).cycles
+    refused = cycles.filter(pl.col("outcome") == "not_applied")
+    assert len(refused) > 3
+    assert refused["missed"].all()
+    assert not refused["actuated"].any()

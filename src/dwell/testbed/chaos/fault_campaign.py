@@ -254,7 +254,8 @@ class FaultCampaign:
             _settle(cell, one.rests_s, outcome)
             outcome.wrong += observer.look()
             judge = observer.judge
-            placement = judge.terms[max(judge.terms)].placement
+            term = max(judge.terms)
+            placement = judge.terms[term].placement
             lasts = max(round(one.lasts_s * 1e9 / cell.period_ns), 1)
             strike(
                 *(cell, fault, stalls),
@@ -265,8 +266,11 @@ class FaultCampaign:
                 outcome=outcome,
             )
             time.sleep(HEARD_S)
+            outcome.wrong += cell.ended(fault)
+            if fault.kind == "refuse" and judge.moved_by_guard(term):
+                outcome.late.append("the guard has moved, though each placement ends at that sink")
         except DwellError as error:
-            outcome.wrong.append(str(error))
+            outcome.wrong += [str(error), *cell.ended(fault)]
             outcome.stall_ms = stalls.worst_ms(outcome.begin_ns, time.monotonic_ns())
             usable = False
         outcome.wrong += observer.look()

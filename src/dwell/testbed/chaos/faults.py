@@ -85,6 +85,9 @@ def faults_of(problem: Problem, *, disks: bool = True, stages: bool = True) -> I
         for role in everybody:
             if role.kind == "worker" and len(problem.pipeline.tasks[role.task].on) > 1:
                 yield Fault(f"fail {role.who}", "fail", (role.who,))
+    for role in everybody:
+        if role.kind == "sink":
+            yield Fault(f"fail the actuator of {role.who}", "fail", (role.who,), kind="refuse")
     yield from _clocks(nodes)
     for node in nodes:
         yield Fault(f"starve {node}", "starve", (node,))
@@ -118,7 +121,8 @@ def _slow_links(problem: Problem) -> Iterator[Fault]:
 def _clocks(nodes: Sequence[str]) -> Iterator[Fault]:
     for node in nodes:
         for ms in (jump * sign for jump in JUMPS_MS for sign in (1, -1)):
-            yield Fault(f"jump {ms:+g} ms {node}", "jump", (node,), ms)
+            kind = "jump" if ms > 0 else "jump back"
+            yield Fault(f"jump {ms:+g} ms {node}", "jump", (node,), ms, kind)
         for ppm in (rate * sign for rate in (WITHIN_PPM, BEYOND_PPM) for sign in (1, -1)):
             yield Fault(f"drift {ppm:+g} ppm {node}", "drift", (node,), ppm)
 

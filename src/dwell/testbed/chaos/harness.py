@@ -76,6 +76,7 @@ class Harness(Started):
         self._burner: Burner | None = None
         self._stressed = ""
         self._usual: dict[str, Conditions] = {}
+        self._living: dict[str, int] = {}
 
     @property
     def problem(self) -> Problem:
@@ -151,6 +152,26 @@ class Harness(Started):
         if pid is None:
             raise LiveError(f"{who} does not run")
         return pid
+
+    def _running(self) -> dict[str, int]:
+        """Return the process ids of all that run, the controller included."""
+        ours = self.testbed.processes.running
+        everybody = {who for node in self.problem.fabric.nodes for who in self._all_of(node)}
+        running = {}
+        for who in everybody - {who for who, one in ours.items() if one.poll() is not None}:
+            with suppress(LiveError):
+                running[who] = self.pid(who)
+        return running
+
+    def ended(self, fault: Fault) -> list[str]:
+        """Return the processes that have ended since a fault began, and that it has not ended."""
+        running = self._running()
+        struck = self.names(fault) if fault.how == "kill" else []
+        return [
+            f"{who} has ended by itself"
+            for who, pid in self._living.items()
+            if who not in struck and running.get(who) != pid
+        ]
 
     def signal(self, names: Sequence[str], number: int) -> None:
         """Send a signal to processes, all at once."""
@@ -256,6 +277,7 @@ class Harness(Started):
 
     def begin(self, fault: Fault, at_ns: int) -> int:
         """Have a fault begin at an instant of the true clock; returns when it did."""
+        self._living = self._running()
         if fault.how == "cut":
             ways = [way.split("->") for way in fault.whom]
             return min(self.testbed.cut(source, target, at_ns) for source, target in ways)

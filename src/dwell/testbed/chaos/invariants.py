@@ -190,6 +190,10 @@ class Judge:
         self._looked = max(self.terms, default=-1)
         return violations
 
+    def moved_by_guard(self, after: int) -> bool:
+        """Whether a term later than one is the guard's."""
+        return any(term > after and one.ordered is False for term, one in self.terms.items())
+
     def ordered_since(self, at_ns: int) -> int | None:
         """Return the instant of the first stamp from `at_ns` on that an order stands behind.
 

@@ -20,7 +20,7 @@ from dwell.live.stage import Actuator, Message, load_actuator
 
 #: Variable with what the processes are told: ``observed`` (file), ``exec_ms`` (by task and node),
 #: ``actuators`` (by task, those that are called behind the witness), ``failing`` (file with the
-#: workers whose stages raise, while it is there).
+#: processes whose stages or actuators raise, while it is there).
 TOLD = "DWELL_CHAOS"
 
 #: Cycle and release as the source saw them; where perception and planning ran (index of node).
@@ -37,6 +37,13 @@ def _where() -> str:
     return sys.argv[sys.argv.index("--who") + 1]
 
 
+def _fail_where_told(told: Path) -> None:
+    """Raise a RuntimeError where a file names this process."""
+    with suppress(FileNotFoundError):
+        if _where() in told.read_text(encoding="utf-8").split():
+            raise RuntimeError("told to fail")
+
+
 class _Timed(ABC):
     """A stage that takes as long as the cell file says, and leaves the CPU to others."""
 
@@ -51,9 +58,7 @@ class _Timed(ABC):
     def process(self, inputs: Mapping[str, Message]) -> Message:
         """Take the time that it takes; raise where it is told to."""
         (message,) = inputs.values()
-        with suppress(FileNotFoundError):
-            if _where() in self._failing.read_text(encoding="utf-8").split():
-                raise RuntimeError("told to fail")
+        _fail_where_told(self._failing)
         begin = time.monotonic()
         output = self.turn(message)
         time.sleep(max(self.seconds - (time.monotonic() - begin), 0.0))
@@ -109,19 +114,22 @@ class Witness:
     """
 
     def __init__(self, behind: Actuator | None = None) -> None:
-        path = json.loads(os.environ[TOLD])["observed"]
-        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        told = json.loads(os.environ[TOLD])
+        self._file = os.open(told["observed"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        self._failing = Path(told["failing"])
         self._behind = behind
         self.inputs = getattr(behind, "inputs", {})
         self._write(START)
 
     def apply(self, command: Message) -> None:
-        """Write down the command, and apply it."""
+        """Write down the command, and apply it; raise instead where it is told to."""
         if self._behind is None:
             cycle, released_ns, perception, planning = SAID.unpack(command.payload)
             self._write(APPLY, perception, planning, command.cycle, cycle, released_ns)
+            _fail_where_told(self._failing)
             return
         self._write(APPLY, 0, 0, command.cycle, command.cycle, command.released_ns)
+        _fail_where_told(self._failing)
         self._behind.apply(command)
 
     def hold(self) -> None:
@@ -135,6 +143,10 @@ class Witness:
         self._write(ZERO)
         if self._behind is not None:
             self._behind.zero()
+
+    def stop(self) -> None:
+        """Have what is behind it stop, where it can."""
+        getattr(self._behind, "stop", lambda: None)()
 
     def _write(self, what: int, *about: int) -> None:
         perception, planning, cycle, said, released_ns = about or (0, 0, 0, 0, 0)
