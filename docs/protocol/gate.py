@@ -1,7 +1,8 @@
 """Cycle numbers and the sink's gate (rules 1, 7) as a model: `python -m docs.protocol.gate`.
 
 A stamper that numbers cycles, and a sink before an actuator; both die and start again. What was
-stamped once may reach the sink as a command at any time later, any number of times, or never.
+stamped once may reach the sink as a command at any time later, any number of times, or never. The
+actuator may raise, at a command and when it is told to hold, and has been told in the end.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ RULES = {
     "before": "a command is remembered before it is applied, not after",
     "age": "a command that is too old is dropped",
     "run": "a stamper whose book is gone begins a later run",
+    "refused": "a command that the actuator has refused is not applied again",
+    "again": "an actuator that raises when it is told to hold is told again",
 }
 
 #: Run and cycle.
@@ -36,7 +39,7 @@ class Limits:
     cycles : int
         Numbers that are used.
     crashes : int
-        Processes that die and start again.
+        Processes that die and start again, and calls at which the actuator raises.
     losses : int
         Times that the stamper's book is gone, too.
     block : int
@@ -71,7 +74,10 @@ class State(NamedTuple):
     under_way : tuple
         Command that has passed the gate and is not yet applied (or remembered).
     actuated : tuple
-        What the actuator has done last.
+        What the actuator has had last.
+    watch : str
+        Whether the actuator is to be told to hold when no command comes: ``armed``; ``rests`` where
+        it has been told, or never moved; ``gone`` where it has not, and nobody will tell it.
     crashes, losses : int
         How many there have been.
     """
@@ -84,6 +90,7 @@ class State(NamedTuple):
     book: Number = NONE
     under_way: Number = NONE
     actuated: Number = NONE
+    watch: str = "rests"
     crashes: int = 0
     losses: int = 0
 
@@ -94,8 +101,8 @@ def initial() -> State:
 
 
 def good(state: State) -> bool:
-    """Whether the actuator has done what was stamped last, or no further cycle may come."""
-    over = len(state.stamped) == LIMITS.cycles
+    """Whether the actuator has had the last cycle, or rests where none may come any more."""
+    over = len(state.stamped) == LIMITS.cycles and state.watch == "rests"
     return over or (bool(state.stamped) and state.actuated == state.stamped[-1])
 
 
@@ -110,8 +117,25 @@ def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Ite
                 if rules.holds("before"):
                     seen = seen._replace(book=number)
                 yield Step(f"the gate lets {number} through", seen)
+        yield from _silence(state, rules, limits)
     else:
         yield _apply(state, rules, limits)
+        if state.crashes < limits.crashes:
+            # It may have moved all the same.
+            had = state._replace(actuated=state.under_way, watch="armed", crashes=state.crashes + 1)
+            refused = had._replace(under_way=NONE) if rules.holds("refused") else had
+            yield Step(f"the actuator refuses {state.under_way}", refused, fault=True)
+
+
+def _silence(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
+    """No command comes for too long."""
+    if state.watch != "armed":
+        return
+    yield Step("it is told to hold", state._replace(watch="rests"))
+    if state.crashes < limits.crashes:
+        watch = "armed" if rules.holds("again") else "gone"
+        raised = state._replace(watch=watch, crashes=state.crashes + 1)
+        yield Step("it is told to hold, and raises", raised, fault=True)
 
 
 def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]:
@@ -127,7 +151,8 @@ def _faults(state: State, rules: Rules, limits: Limits) -> Iterator[Step[State]]
         fresh = once._replace(run=run, cycle=0, reserved=0, losses=state.losses + 1)
         yield Step("the stamper starts again without its book", fresh, fault=True)
     known = state.book if rules.holds("memory") else NONE
-    reborn = once._replace(newest=known, under_way=NONE)
+    watch = "rests" if known == NONE else "armed"
+    reborn = once._replace(newest=known, under_way=NONE, watch=watch)
     yield Step("the sink starts again", reborn, fault=True)
     if state.under_way != NONE and not rules.holds("before"):
         applied = reborn._replace(actuated=state.under_way)
@@ -168,6 +193,7 @@ def _apply(state: State, rules: Rules, limits: Limits) -> Step[State]:
     elif not rules.holds("age") and _old(state, limits, number):
         wrong = "an old command is applied"
     after = state._replace(under_way=NONE, book=max(state.book, number), actuated=number)
+    after = after._replace(watch="armed")
     return Step(f"{number} is applied", after, wrong=wrong)
 
 

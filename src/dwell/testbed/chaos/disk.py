@@ -44,7 +44,7 @@ class SmallDisk:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        _run(["mount", "-t", "tmpfs", "-o", f"size={ROOMY_BYTES}", NAME, str(folder)])
+        _run(["mount", "-t", "tmpfs", "-o", f"size={ROOMY_BYTES},mode=700", NAME, str(folder)])
 
     def fill(self) -> None:
         """Leave no room: not by filling it, but by making it as small as what is on it."""
