@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
 
 import dwell
 from dwell.live.cycle_ledger import UNKNOWN, Ledger, LiveCycle
 from dwell.live.messages import Completion, Hop, Stamp
-from dwell.live.offsets import Offsets
+from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 
@@ -149,3 +152,45 @@ def test_of_a_shadow_what_it_did_not_share_is_told_apart(ledger: Ledger, problem
     flows = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
     assert sent == 1
     assert bytes_ == flows["sensing", "perception"] + flows["planning", "control"]
+
+
+INSTANTS = ("arrived_ns", "started_ns", "ended_ns", "inputs", "done_ns")
+PROBLEM = dwell.load("examples/canonical.yaml")
+
+
+@given(
+    place=st.integers(0, len(JOBS) - 1),
+    first=st.sampled_from(INSTANTS),
+    set_ms=st.integers(-4_000, 4_000),
+)
+def test_a_clock_that_is_set_within_a_cycle_leaves_no_interval_that_cannot_be(
+    place: int, first: str, set_ms: int
+) -> None:
+    """From some instant of a job on, its node shows another time."""
+    ledger = Ledger(PROBLEM, Offsets("E", PROBLEM.stamper_node, system_bound_ns=MS))
+    by_ns, since = set_ms * MS, INSTANTS.index(first)
+    told = list(hops())
+    struck = told[place]
+    told[place] = replace(struck, **{n: getattr(struck, n) + by_ns for n in INSTANTS[since:3]})
+    for later in range(place + 1, len(told)):
+        if told[later].node == struck.node:
+            inputs = tuple((source, at_ns + by_ns) for source, at_ns in told[later].inputs)
+            hop = replace(told[later], inputs=inputs)
+            moved = {name: getattr(hop, name) + by_ns for name in INSTANTS[:3]}
+            told[later] = replace(hop, **moved)
+    one = cycle()
+    one.stamped_ns = RELEASE_NS + MS
+    done = completion(one)
+    done_ns = done.done_ns + (by_ns if struck.node == "R2" else 0)
+    one.take(replace(done, hops=tuple(told), done_ns=done_ns), RELEASE_NS + 27 * MS)
+    ledger.settle(one)
+    true_ns = round(25.5 * MS)
+    known = one.bound_ns < UNBOUNDED_NS
+    assert one.latency_ns == 26 * MS or (known and abs(one.latency_ns - true_ns) <= 28 * MS)
+    assert one.latency_ns >= 0
+    ledger.jobs(one)
+    release_ns = np.array([RELEASE_NS])
+    shown = ledger.evidence([one], release_ns, RELEASE_NS + 60 * MS, shadows=False).cycles
+    # The stamp of a source may have been there before the release.
+    for instants in (shown.ready_ns[:, 1:], shown.end_ns, shown.arrived_ns):
+        assert ((instants == UNKNOWN) | (instants >= RELEASE_NS - MS)).all()

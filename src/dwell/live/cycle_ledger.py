@@ -308,7 +308,8 @@ class Ledger:
 
     def _disbelieve(self, cycle: LiveCycle, *nodes: str) -> None:
         for node in nodes:
-            cycle.shifts[node] = Shift(cycle.shifts[node].by_ns, UNBOUNDED_NS)
+            known = cycle.shifts.get(node)
+            cycle.shifts[node] = Shift(0 if known is None else known.by_ns, UNBOUNDED_NS)
 
     def span_ns(self, node: str, first: LiveCycle, close_ns: int) -> tuple[int, int]:
         """Begin and end of a window on a node's clock."""
