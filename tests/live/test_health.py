@@ -226,7 +226,7 @@ def test_a_stage_that_fails_now_and_then_degrades_the_cell(
     found, headline = told(world)
     assert found == health
     if health == "degraded":
-        assert "V_D is 20% in the last 3 windows: perception on R1: " in headline
+        assert "V_D is 20% in the last 3 windows: messages of perception@R1 do not" in headline
         assert "process() raised ValueError: too dark" in headline
         world.worker("perception@R1").stage = Passing("perception")
         two_windows(world)
@@ -290,6 +290,23 @@ def test_a_shadows_stage_that_fails_is_the_reason(problem: Problem) -> None:
     assert health == "degraded"
     assert "planning@E.shadow" in headline or "the last 4 shadows through SO" in headline
     assert "no light" in headline
+
+
+def test_shadows_through_a_node_that_is_drained_may_fail(problem: Problem) -> None:
+    settings = replace(problem.controller, estimator="shadow", shadow_fraction=0.2)
+    world = running(replace(problem, controller=settings))
+    world.cell.drained.add("E")
+    for who in ("perception@E.shadow", "planning@E.shadow"):
+        world.kill(who)
+    world.run(2_000)
+    assert told(world) == ("ok", "")
+
+
+def test_a_cell_whose_stamps_nobody_hears_is_watched_all_the_same(problem: Problem) -> None:
+    world = World(problem, policy="LOC")
+    world.network.cut("stamper@R1", "controller@E", key="**/stamped")
+    world.run(5_000)
+    assert told(world) == ("ok", "")
 
 
 def test_nothing_is_said_of_cycles_before_the_first_window_is_due(problem: Problem) -> None:

@@ -143,7 +143,7 @@ def _symptoms(
         sink = status["sinks"][role.task]
         age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
         if _heard(status, role) and age_ms > limit_ms:
-            why = [*_notes(status, [role.who]), *_kept_back(problem, sink["outcome"])]
+            why = [*_kept_back(problem, sink["outcome"]), *_notes(status, [role.who])]
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent, limit = status["recent"], problem.live.degraded_at
     rates = recent["violation_rates"]
@@ -151,14 +151,16 @@ def _symptoms(
     if rates and min(sum(rates) / len(rates), rates[-1]) > limit:
         placed = problem.candidates[status["placement"]].items()
         names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
-        why = [*_notes(status, names), *_unreached(problem, status, recent["unreached"])]
+        why = [*_unreached(problem, status, recent["unreached"]), *_notes(status, names)]
         rate = sum(rates) / len(rates)
         yield f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}{_because(why)}"
     for name, found in status["failing"].items():
         placed = problem.candidates[name].items()
+        if not {node for _, node in placed}.isdisjoint(status["drained"]):
+            continue
         why = [
-            *_notes(status, [f"{task}@{node}.shadow" for task, node in placed]),
             *_unreached(problem, status, found["unreached"]),
+            *_notes(status, [f"{task}@{node}.shadow" for task, node in placed]),
         ]
         yield f"the last {found['shadows']} shadows through {name} have failed{_because(why)}"
 
@@ -215,8 +217,9 @@ def _heard(status: Mapping[str, Any], role: Role) -> bool:
 
 
 def _because(notes: Sequence[str]) -> str:
-    """Return the first line of a note, as a reason."""
-    return next((f": {note.splitlines()[0][:200]}" for note in notes if note.strip()), "")
+    """Return the first lines of the first two notes, as a reason."""
+    lines = [note.splitlines()[0][:200] for note in notes if note.strip()]
+    return f": {', '.join(lines[:2])}" if lines else ""
 
 
 def _time(ms: float) -> str:

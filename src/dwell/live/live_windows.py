@@ -112,8 +112,6 @@ class LiveWindows:
             When this was heard, on the controller's clock.
         """
         cycle = self._note(stamp, at_ns)
-        if at_ns is not None:
-            self._symptoms.begun(at_ns)
         if cycle is not None and cycle.stamped_ns is None:
             cycle.stamped_ns = at_ns
             if isinstance(stamp, Stamped):
@@ -234,6 +232,8 @@ class LiveWindows:
         self.record.touch(cycle)
 
     def _append(self, stamp: Stamp, at_ns: int | None) -> LiveCycle:
+        if at_ns is not None:
+            self._symptoms.begun(at_ns)
         if self.origin_ns is None or (self._newest is None and stamp.released_ns < self.origin_ns):
             # A clock that is behind the run's beginning has begun anew since.
             self.origin_ns = stamp.released_ns
