@@ -18,7 +18,7 @@ from contextlib import suppress
 from dwell.live.failures import start_thread
 
 #: Open files of this process, by number.
-_OPEN = "/dev/fd"
+OPEN = "/dev/fd"
 _ON_FOR = "ii"
 _OFF = struct.pack(_ON_FOR, 0, 0)
 #: A connection is given up after a session's lease of silence, which is longer. Looking whenever
@@ -50,7 +50,7 @@ class Connections:
     def wait_for_nobody(self) -> None:
         """Disable the lingering of all present connections."""
         known = set()
-        for number in map(int, os.listdir(_OPEN)):
+        for number in map(int, os.listdir(OPEN)):
             try:
                 about = os.fstat(number)
             except OSError:
@@ -62,26 +62,35 @@ class Connections:
         self._known = known
 
 
+def internet_stream(number: int) -> socket.socket | None:
+    """Return a copy of a TCP socket by its descriptor; None where it is another one, or gone."""
+    try:
+        # A number of our own: the other may be closed at any time, and mean something else then.
+        copy = os.dup(number)
+    except OSError:
+        return None
+    try:
+        connection = socket.socket(fileno=copy)
+    except OSError:
+        os.close(copy)
+        return None
+    internet = connection.family in {socket.AF_INET, socket.AF_INET6}
+    if internet and connection.type == socket.SOCK_STREAM:
+        return connection
+    connection.close()
+    return None
+
+
 def _released(number: int) -> bool:
     """Disable a connection's lingering; return whether it need not be looked at again.
 
     A connection that is still being made lingers only once it is there, which takes as long as its
     peer is out of reach.
     """
-    try:
-        # A number of our own: the other may be closed at any time, and mean something else then.
-        copy = os.dup(number)
-    except OSError:
-        return False
-    try:
-        connection = socket.socket(fileno=copy)
-    except OSError:
-        os.close(copy)
-        return False
+    connection = internet_stream(number)
+    if connection is None:
+        return True
     with connection:
-        internet = connection.family in {socket.AF_INET, socket.AF_INET6}
-        if not internet or connection.type != socket.SOCK_STREAM:
-            return True
         asked = connection.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, len(_OFF))
         waits = bool(struct.unpack(_ON_FOR, asked)[0])
         if waits:

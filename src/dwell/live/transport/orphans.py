@@ -14,14 +14,20 @@ from contextlib import suppress
 from pathlib import Path
 
 SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where Linux keeps it
+_FILES = "*.zenoh"
 #: A file that young may be without its lock yet.
 YOUNG_S = 0.5
+
+
+def is_shared_memory(path: str) -> bool:
+    """Whether a file is shared memory of Zenoh's."""
+    return Path(path).match(f"{SHARED_MEMORY}/{_FILES}")
 
 
 def remove_orphans(folder: Path = SHARED_MEMORY) -> int:
     """Remove this user's files of Zenoh's that no process holds; returns how many."""
     removed = 0
-    for path in folder.glob("*.zenoh"):
+    for path in folder.glob(_FILES):
         with suppress(OSError):
             removed += _remove(path)
     return removed

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
 from dwell.live.local_addresses import why_not_listen
+from dwell.live.transport.forked import SessionDescriptors
 from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
 from dwell.live.wiring import Session, WiringEntry, session_of
@@ -144,6 +145,7 @@ class ZenohTransport:
         self._zenoh = zenoh
         self._closed = False
         self._connections = Connections()
+        self._descriptors = SessionDescriptors(entry)
         #: Messages that arrived under another key than they were put under.
         self.misled = 0
         #: Messages that nobody could handle.
@@ -203,6 +205,7 @@ class ZenohTransport:
         with self._locks["control"], self._locks["images"]:
             self._closed = True
             self._connections.stop()
+            self._descriptors.stop()
             sessions, self._sessions = self._sessions, {}
             routes, self._routes = self._routes, {}
         with self._growing:
