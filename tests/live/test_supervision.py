@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -14,9 +15,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from dwell.errors import LiveError
 from dwell.live import supervision
 from dwell.live.state_files import InFlight
-from dwell.live.supervision import SupervisedProcess, Supervisor
+from dwell.live.supervision import SupervisedProcess, Supervisor, claim, marked_group
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
 from tests.waiting import wait_until
 
@@ -289,3 +291,185 @@ def test_a_log_does_not_grow_for_ever(tmp_path: Path) -> None:
     assert older.stat().st_size > 100_000
     # What is appended after the cut follows no hole.
     assert child.log.read_bytes()[:1] != b"\0"
+
+
+# ------------------------------------------------------------------- what it leaves behind
+
+#: Forks a helper in its group and one in a session of its own, which say who they are.
+WITH_HELPERS = """
+import os, subprocess, sys, time
+from pathlib import Path
+folder = Path({folder!r})
+if not (folder / "helpers").exists():
+    sleeps = [sys.executable, "-c", "import time; time.sleep(60)"]
+    forked = os.fork()
+    if not forked:
+        time.sleep(60)
+        os._exit(0)
+    apart = subprocess.Popen(sleeps, start_new_session=True)
+    near = subprocess.Popen(sleeps)
+    (folder / "helpers.new").write_text(f"{{forked}} {{near.pid}} {{apart.pid}}")
+    (folder / "helpers.new").rename(folder / "helpers")
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def helpers(tmp_path: Path) -> Iterator[Callable[[], list[int]]]:
+    """Process ids of two helpers in a process's group, and of one with a session of its own."""
+    file = tmp_path / "helpers"
+
+    def read() -> list[int]:
+        wait_until(file.exists)
+        return [int(pid) for pid in file.read_text().split()]
+
+    yield read
+    for pid in read():
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def runs(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def test_what_a_dead_process_leaves_is_ended_before_it_is_started_again(
+    supervisor: Supervisor, tmp_path: Path, helpers: Callable[[], list[int]]
+) -> None:
+    child = keep(supervisor, "worker@E", WITH_HELPERS.format(folder=str(tmp_path)))
+    supervisor.step()
+    *near, apart = helpers()
+    assert child.pid is not None
+    assert [os.getpgid(pid) for pid in near] == [child.pid, child.pid]
+    os.kill(child.pid, signal.SIGKILL)
+    left_at_start: list[int] = []
+
+    def started_again() -> bool:
+        if child.starts == 2 and not left_at_start:
+            left_at_start.extend(pid for pid in near if runs(pid))
+        return child.starts == 2
+
+    until(supervisor, started_again)
+    assert not left_at_start
+    assert runs(apart)
+
+
+def test_the_next_agent_ends_what_a_worker_has_left_that_died_without_one(
+    tmp_path: Path, helpers: Callable[[], list[int]], said: list[str]
+) -> None:
+    first = Supervisor(tmp_path, said.append)
+    child = keep(first, "worker@E", WITH_HELPERS.format(folder=str(tmp_path)))
+    first.step()
+    *near, apart = helpers()
+    # The agent's death alone ends nothing.
+    assert all(runs(pid) for pid in (*near, apart))
+    assert child.process is not None
+    os.kill(child.process.pid, signal.SIGKILL)
+    child.process.wait()
+    second = Supervisor(tmp_path, said.append)
+    again = keep(second, "worker@E", "import time; time.sleep(60)")
+    try:
+        until(second, lambda: again.starts == 1)
+        assert not any(runs(pid) for pid in near)
+        assert runs(apart)
+    finally:
+        second.stop()
+
+
+def test_helpers_end_with_their_process_at_an_orderly_end(
+    tmp_path: Path, helpers: Callable[[], list[int]], said: list[str]
+) -> None:
+    supervisor = Supervisor(tmp_path, said.append)
+    keep(supervisor, "worker@E", WITH_HELPERS.format(folder=str(tmp_path)))
+    supervisor.step()
+    *near, apart = helpers()
+    supervisor.stop()
+    assert not any(runs(pid) for pid in near)
+    assert runs(apart)
+
+
+def test_a_group_of_somebody_else_is_left_alone(tmp_path: Path, said: list[str]) -> None:
+    other = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], process_group=0)
+    try:
+        started = psutil.Process(other.pid).create_time()
+        session = os.getsid(other.pid)
+        # The mark's process had this id before, or the group has another session.
+        for began, its in ((started - 100, session), (started, session + 1)):
+            mark = {"pid": other.pid, "started": began, "session": its}
+            (tmp_path / "stamper@R1.pid").write_text(json.dumps(mark))
+            group = marked_group(tmp_path / "stamper@R1.pid")
+            assert group is not None
+            assert group.kill() == 0
+            assert other.poll() is None
+    finally:
+        other.kill()
+        other.wait()
+
+
+def test_the_last_words_are_those_of_the_life_that_has_ended(
+    supervisor: Supervisor, said: list[str]
+) -> None:
+    child = keep(supervisor, "worker@E", "raise SystemExit('no camera here')")
+    until(supervisor, lambda: child.failures >= 1)
+    child.command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    until(supervisor, lambda: child.pid is not None and child.starts == 2)
+    assert child.pid is not None
+    os.kill(child.pid, signal.SIGKILL)
+    until(supervisor, lambda: len(said) >= 2)
+    assert "was killed by SIGKILL" in said[1]
+    assert "camera" not in said[1]
+
+
+def test_a_process_that_dies_at_ten_starts_makes_its_agent_not_ready(
+    supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervision, "LONGEST_WAIT_S", 0.05)
+    child = keep(supervisor, "worker@E", "raise SystemExit('cannot open its session')")
+    until(supervisor, lambda: child.failures == supervision.MOST_TRIES - 1)
+    assert not supervisor.stuck()
+    until(supervisor, lambda: child.failures >= supervision.MOST_TRIES)
+    assert supervisor.stuck()
+    assert supervisor.notes().startswith("worker@E ended with exit code 1: cannot open its session")
+    child.command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    starts = child.starts
+    until(supervisor, lambda: child.starts > starts and child.pid is not None)
+    # Once it has lived for a while.
+    child.started_s -= supervision.HEALTHY_S
+    assert not supervisor.stuck()
+    assert supervisor.notes() == ""
+
+
+def test_what_was_put_aside_is_told_for_a_while(supervisor: Supervisor, tmp_path: Path) -> None:
+    child = keep(supervisor, "worker@E", "import time; time.sleep(60)")
+    until(supervisor, lambda: child.pid is not None)
+    for _ in range(supervision.POISONOUS):
+        InFlight(child.inflight).begin(b"poison")
+        starts, pid = child.starts, child.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGKILL)
+        until(supervisor, lambda starts=starts: child.starts > starts)  # type: ignore[misc]
+    child.started_s -= supervision.HEALTHY_S
+    assert "has killed it twice" in supervisor.notes()
+    child.told_s -= supervision.TOLD_S
+    assert supervisor.notes() == ""
+
+
+def test_a_process_marks_itself_and_is_there_once(tmp_path: Path, said: list[str]) -> None:
+    # Its agent has died between the fork and the mark.
+    code = (
+        "import time; from pathlib import Path; from dwell.live.supervision import claim\n"
+        f"claim(Path({str(tmp_path)!r}), 'worker@E.shadow'); time.sleep(60)\n"
+    )
+    first = subprocess.Popen([sys.executable, "-c", code], process_group=0)
+    try:
+        wait_until((tmp_path / "worker@E.shadow.pid").exists)
+        with pytest.raises(LiveError, match=f"runs already \\(process {first.pid}\\)"):
+            claim(tmp_path, "worker@E.shadow")
+        supervisor = Supervisor(tmp_path, said.append)
+        assert keep(supervisor, "worker@E.shadow", "raise SystemExit").pid == first.pid
+    finally:
+        first.kill()
+        first.wait()

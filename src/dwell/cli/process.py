@@ -102,7 +102,7 @@ def _serve(cell: Path, owner: int | None, platform: Platform | None) -> int:
     """Import what every process needs, and fork; in a forked process, run it."""
     from dwell.calibration import memory  # noqa: F401
     from dwell.cellfile import load_without_traces
-    from dwell.live import parent_death, role_process  # noqa: F401
+    from dwell.live import parent_death, role_process, supervision  # noqa: F401
     from dwell.live.launcher import serve
 
     load_without_traces(cell)
@@ -126,14 +126,20 @@ def _run(options: argparse.Namespace, platform: Platform | None) -> int:
     from dwell.cellfile import load_without_traces
     from dwell.live.log import escape_output
     from dwell.live.parent_death import end_with_owner
+    from dwell.live.process_group import end_helpers
     from dwell.live.role_process import run_process
+    from dwell.live.supervision import claim
 
     # What a user's code prints, and its exceptions, are shown on terminals.
     escape_output()
     keep_memory()
     end_with_owner(stopped, options.owner)
+    claim(options.state, options.who)
     problem = load_without_traces(options.cell)
-    in_order = run_process(problem, options.who, options.state, stopped, platform)
+    try:
+        in_order = run_process(problem, options.who, options.state, stopped, platform)
+    finally:
+        end_helpers()
     return ExitCode.DONE if in_order else ExitCode.FAILED
 
 

@@ -158,7 +158,8 @@ class Agent:
 
     def _state(self) -> tuple[bool, str]:
         trouble = "" if self._accelerator is None else self._accelerator.trouble()
-        return True, "; ".join(note for note in (trouble, self.supervisor.notes()) if note)
+        notes = self.supervisor.notes(), trouble
+        return not self.supervisor.stuck(), "; ".join(note for note in notes if note)
 
     def wake(self, now_ns: int) -> int:
         """Look after the processes, report the load, beat; returns what is due next."""

@@ -320,9 +320,12 @@ def _fork(channel: socket.socket) -> list[str] | None:
         return None
     if pid:
         os.close(log)
-        os.setpgid(pid, pid)
+        with suppress(OSError):
+            os.setpgid(pid, pid)
         _tell(channel, {"forked": pid})
         return None
+    # Both do it: the server may be dead by now.
+    os.setpgid(0, 0)
     for descriptor in (sys.stdout.fileno(), sys.stderr.fileno()):
         os.dup2(log, descriptor)
     os.close(log)

@@ -12,14 +12,17 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import psutil
 
+from dwell.errors import LiveError
 from dwell.files import write_whole
 from dwell.live.launcher import UNKNOWN_CODE, Launcher, Running, Survivor
 from dwell.live.log import printable
+from dwell.live.process_group import ProcessGroup
 from dwell.live.state_files import InFlight, open_own
 
 #: Waits between two starts of a process that keeps dying.
@@ -35,8 +38,10 @@ POISONOUS = 2
 #: A process has warmed up after this time; it is reported when it has gained this much since, and
 #: has more than twice what it had then.
 WARM_S, GROWTH_BYTES = 30.0, 128 << 20
-#: How long it is told that a process has died for want of memory.
-STARVED_S = 60.0
+#: How long it is told that a process has died for want of memory, or what has been put aside.
+TOLD_S = 60.0
+#: An agent is not ready while a process of its node has died so often, one start after another.
+MOST_TRIES = 10
 #: Of a process that an agent before has started, nobody knows what it died of.
 ENDED = "has ended"
 #: Where the kernel counts the processes that it has killed because there was no memory left.
@@ -59,9 +64,14 @@ class SupervisedProcess:
     next_s: float = 0.0
     note: str = ""
     deaths: Counter[str] = field(default_factory=Counter)
-    #: What it died of last where that was its memory, and when.
-    starved: str = ""
-    starved_s: float = -math.inf
+    #: What is told of it for a while though it may run again, and since when.
+    told: str = ""
+    told_s: float = -math.inf
+    #: Where the output of its present life begins in its log.
+    log_begins: int = 0
+    group: ProcessGroup | None = None
+    #: Helpers that have outlived it and are not gone yet.
+    helpers: int = 0
     has_bytes: int = 0
     watched: psutil.Process | None = None
     warm_bytes: int | None = None
@@ -71,6 +81,12 @@ class SupervisedProcess:
     def pid(self) -> int | None:
         """Id of the running process; None where none runs."""
         return self.process.pid if self.process is not None else None
+
+    @property
+    def ails(self) -> bool:
+        """Whether it has died more than once, and not lived long enough since."""
+        lives_s = time.monotonic() - self.started_s if self.process is not None else 0.0
+        return self.failures > 1 and lives_s < HEALTHY_S
 
     @property
     def inflight(self) -> Path:
@@ -123,18 +139,38 @@ class Supervisor:
     def keep(self, who: str, command: Sequence[str]) -> SupervisedProcess:
         """Have a process run from now on."""
         child = SupervisedProcess(who, command, self.folder)
-        if (process := survivor(child.mark)) is not None:
-            child.process = Survivor(process.pid)
-            self._say(f"{who}: goes on (process {process.pid})")
-            child.started_s = time.monotonic()
+        child.group = marked_group(child.mark)
+        if not self._adopts(child):
+            self._end_group(child)
         self.children.append(child)
         return child
+
+    def _adopts(self, child: SupervisedProcess) -> bool:
+        """Take a process over that somebody before has started, if it runs."""
+        if (process := survivor(child.mark)) is None:
+            return False
+        child.process, child.group = Survivor(process.pid), marked_group(child.mark)
+        self._say(f"{child.who}: goes on (process {process.pid})")
+        child.started_s = time.monotonic()
+        return True
+
+    def _end_group(self, child: SupervisedProcess) -> bool:
+        """End what a process that has died has left of its group; whether nothing is left."""
+        left = 0 if child.group is None else child.group.kill()
+        if left > child.helpers:
+            self._say(f"{child.who}: {left} of its helpers have outlived it, and are ended")
+        child.helpers = left
+        if not left:
+            child.group = None
+        return not left
 
     def step(self) -> None:
         """Look after every process once."""
         ready = self._launcher.ready()
         for child in self.children:
-            if not self._alive(child) and ready and time.monotonic() >= child.next_s:
+            if self._alive(child) or not self._end_group(child):
+                continue
+            if ready and time.monotonic() >= child.next_s and not self._adopts(child):
                 self._start(child)
 
     def _alive(self, child: SupervisedProcess) -> bool:
@@ -149,10 +185,10 @@ class Supervisor:
     def _died(self, child: SupervisedProcess, reason: str) -> None:
         now_s = time.monotonic()
         lived_s = now_s - child.started_s
-        last = _last_line(child.log)
+        last = _last_line(child.log, child.log_begins)
         if starved := self._starved(child, reason, last):
             reason = starved
-            child.starved, child.starved_s = f"{child.who} {starved}", now_s
+            child.told, child.told_s = f"{child.who} {starved}", now_s
         child.failures = 1 if lived_s > HEALTHY_S else child.failures + 1
         wait_s = min(FIRST_WAIT_S * 2 ** (child.failures - 1), LONGEST_WAIT_S)
         child.next_s = now_s + (wait_s if child.failures > 1 else 0.0)
@@ -196,6 +232,7 @@ class Supervisor:
         kept = quarantine / f"{child.who}-{name}.bin"
         kept.write_bytes(content)
         child.note = f"{child.who}: a message has killed it twice ({reason}); it is kept in {kept}"
+        child.told, child.told_s = child.note, time.monotonic()
         self._say(child.note)
 
     def _start(self, child: SupervisedProcess) -> None:
@@ -214,24 +251,22 @@ class Supervisor:
         """Write who runs; the mark of somebody before it must not stay."""
         try:
             child.mark.unlink(missing_ok=True)
-            started = psutil.Process(child.pid).create_time()
-            mark = json.dumps({"pid": child.pid, "started": started})
-            # Nobody waits for a slow disk: after a loss of power no process runs.
-            write_whole(child.mark, mark, durable=False)
+            write_mark(child.mark, child.group)
         except OSError as error:
             self._say(f"{child.who}: its mark cannot be written ({error.strerror})")
-        except psutil.NoSuchProcess:
-            return
 
     def _run(self, child: SupervisedProcess) -> None:
         with open(child.log, "ab", opener=open_own) as log:
+            child.log_begins = log.tell()
             child.process = self._launcher.start(child.command, log)
+            child.group = ProcessGroup.of(child.process.pid)
 
     def tend(self) -> None:
         """Look how much memory the processes have taken, and how much they have printed."""
         self._oom_kills = _oom_kills()
         for child in self.children:
-            _shorten(child.log, self._log_bytes)
+            if _shorten(child.log, self._log_bytes):
+                child.log_begins = 0
             if child.process is not None and not child.mark.exists():
                 self._write_mark(child)  # there was no room for it
             self._weigh(child)
@@ -274,13 +309,19 @@ class Supervisor:
             seconds[child.who] = times.user + times.system
         return seconds
 
+    def stuck(self) -> bool:
+        """Return whether a process has died at so many starts that somebody has to look."""
+        return any(child.failures >= MOST_TRIES and child.ails for child in self.children)
+
     def notes(self) -> str:
         """Return the last troubles of processes that keep dying or growing, or died for memory."""
-        since_s = time.monotonic() - STARVED_S
-        notes = [child.starved for child in self.children if child.starved_s > since_s]
-        notes += [child.note for child in self.children if child.failures > 1]
+        since_s = time.monotonic() - TOLD_S
+        ailing = [child for child in self.children if child.ails]
+        ailing.sort(key=lambda child: -child.failures)
+        notes = [child.note for child in ailing]
+        notes += [child.told for child in self.children if child.told_s > since_s]
         notes += [child.growth for child in self.children if child.growth]
-        return "; ".join(notes)[:2000]
+        return "; ".join(dict.fromkeys(notes))[:2000]
 
     def stop(
         self, patience_s: float = STOP_S, *, hurried: threading.Event | None = None
@@ -312,15 +353,25 @@ class Supervisor:
         psutil.wait_procs(alive, timeout=patience_s)
         failed = {}
         for child in self.children:
-            child.mark.unlink(missing_ok=True)
             if child.process is not None:
                 code = child.process.wait()
                 if code not in (0, UNKNOWN_CODE):
-                    last = _last_line(child.log)
+                    last = _last_line(child.log, child.log_begins)
                     failed[child.who] = f"{_reason(code)}{f': {last}' if last else ''}"
             child.process = None
+        self._end_groups(patience_s)
+        for child in self.children:
+            child.mark.unlink(missing_ok=True)
         self._launcher.stop()
         return failed
+
+    def _end_groups(self, patience_s: float) -> None:
+        """End what the processes have left; a helper that the kernel keeps is not waited for."""
+        deadline = time.monotonic() + patience_s
+        while {self._end_group(child) for child in self.children} - {True}:
+            if time.monotonic() > deadline:
+                return
+            time.sleep(0.01)
 
 
 def _signal(process: psutil.Process, number: int) -> None:
@@ -330,15 +381,50 @@ def _signal(process: psutil.Process, number: int) -> None:
         return
 
 
-def survivor(mark: Path) -> psutil.Process | None:
-    """Return the process that a mark tells of, if it is still that one."""
+def write_mark(mark: Path, group: ProcessGroup | None) -> None:
+    """Write who runs, for the next agent.
+
+    Raises
+    ------
+    OSError
+        If there is no room.
+    """
+    if group is not None:
+        # Nobody waits for a slow disk: after a loss of power no process runs.
+        write_whole(mark, json.dumps(asdict(group)), durable=False)
+
+
+def claim(folder: Path, who: str) -> None:
+    """Mark this process as the one of its name on its node: its agent may be dead by now.
+
+    Raises
+    ------
+    LiveError
+        If another one runs.
+    """
+    mark = folder / f"{who}.pid"
+    other = survivor(mark)
+    if other is not None and other.pid != os.getpid():
+        raise LiveError(f"{who}: runs already (process {other.pid})")
+    # Where there is no room, its agent will try again.
+    with suppress(OSError):
+        write_mark(mark, ProcessGroup.of(os.getpid()))
+
+
+def marked_group(mark: Path) -> ProcessGroup | None:
+    """Return the group of the process that a mark tells of, whether that runs or not."""
     try:
         content = json.loads(mark.read_text())
-        process = psutil.Process(int(content["pid"]))
-        same = abs(process.create_time() - float(content["started"])) < 0.05
-        return process if same and process.status() != psutil.STATUS_ZOMBIE else None
-    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
+        pid, started = int(content["pid"]), float(content["started"])
+        return ProcessGroup(pid, started, int(content.get("session", -1)))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def survivor(mark: Path) -> psutil.Process | None:
+    """Return the process that a mark tells of, if it is still that one."""
+    group = marked_group(mark)
+    return None if group is None else group.leader()
 
 
 def _reason(code: int) -> str:
@@ -361,22 +447,24 @@ def _oom_kills() -> int:
         return 0
 
 
-def _shorten(path: Path, longest: int) -> None:
+def _shorten(path: Path, longest: int) -> bool:
     """Begin a log anew that is too long; its process goes on appending to the same file."""
     try:
         if path.stat().st_size <= longest:
-            return
+            return False
         older = path.with_suffix(".log.1")
         write_whole(older, lambda draft: shutil.copyfile(path, draft), durable=False)
         os.truncate(path, 0)
     except OSError:
-        return
+        return False
+    return True
 
 
-def _last_line(path: Path) -> str:
+def _last_line(path: Path, begins: int) -> str:
+    """Return the last line of a log behind a place."""
     try:
         with path.open("rb") as file:
-            file.seek(max(file.seek(0, os.SEEK_END) - 2_000, 0))
+            file.seek(max(file.seek(0, os.SEEK_END) - 2_000, begins))
             lines = file.read().decode(errors="replace").strip().split("\n")
     except OSError:
         return ""
