@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -522,10 +523,76 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     worker = world.worker("planning@E")
     run, cycle = worker.state_at
     late = State(run, cycle - 5, "planning", "R2", number=7)
-    key = world.stamper.place.keys.state("planning", "E")
+    key = world.stamper.place.keys.state("planning", "E", "R2")
     worker.receive(Arrival(key, b"3", encode(late)), world.network.now_ns)
     world.run(1_000)
     require_whole(world)
+
+
+def false_state(world: World, to: str, source: str, ahead: int, number: int) -> None:
+    """Have a node send a state that nobody has asked it for, of a cycle so far ahead."""
+    stamper = world.stamper
+    state = State(stamper.run, stamper.cycle + ahead, "planning", source, number)
+    arrival = Arrival(world.keys.state("planning", to, source), b"1000000", encode(state))
+    world.worker(f"planning@{to}").receive(arrival, world.network.now_ns)
+
+
+@pytest.mark.parametrize("ahead", [-1, 0, 1_000_000])
+def test_rule_8_a_state_that_nobody_asked_for_is_not_taken(problem: Problem, ahead: int) -> None:
+    world = counting(problem, "LOC")
+    world.run(2_000)
+    for number in (1, 7, 10**6):
+        false_state(world, "R2", "E", ahead, number)
+        world.run(200)
+    require_whole(world)
+    assert world.cycles[-1] >= world.stamper.cycle - 3
+    world.pin("SO")
+    world.run(2_000)
+    assert world.stamper.placement == "SO"
+    require_whole(world)
+
+
+@pytest.mark.parametrize(("source", "ahead"), [("R1", 0), ("R2", 1_000_000)])
+def test_rule_8_a_state_is_of_who_was_asked_and_of_no_cycle_beyond_the_newest(
+    problem: Problem, source: str, ahead: int
+) -> None:
+    tasks = dict(problem.pipeline.tasks)
+    planning = tasks["planning"]
+    tasks["planning"] = replace(planning, on={**planning.on, "R1": planning.on["R2"]})
+    wider = replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
+    world = far_apart(wider, 60)
+    world.run(1_000)
+    world.pin("SO")
+    target = world.worker("planning@E")
+    while target._awaited is None:
+        world.run(1)
+    false_state(world, "E", source, ahead, target._awaited.number)
+    world.run(3_000)
+    assert world.stamper.placement == "SO"
+    require_whole(world)
+
+
+@pytest.mark.parametrize("ahead", [-1, 1_000_000])
+@pytest.mark.parametrize("run", [0, 1])
+def test_rule_8_no_false_checkpoint_keeps_a_good_one_from_being_used(
+    problem: Problem, ahead: int, run: int
+) -> None:
+    world = counting(problem, "SO")
+    world.run(3_000)
+    stamper, every = world.stamper, problem.live.checkpoint_cycles
+    state = State(stamper.run + run, stamper.cycle + ahead, "planning", "E")
+    if (run, ahead) == (0, -1):
+        state = msgspec.structs.replace(state, node="R1")
+    key = world.keys.state("planning", "R2", "E")
+    world.worker("planning@R2").receive(
+        Arrival(key, b"1000000", encode(state)), world.network.now_ns
+    )
+    world.run((every + 1) * problem.pipeline.period_ms)
+    kill(*EDGE)(world)
+    world.run(1_000)
+    assert world.stamper.placement == "LOC"
+    cycle, count = world.arm.counts[-1]
+    assert cycle + 1 - 2 * every <= count <= cycle + 1
 
 
 @pytest.mark.parametrize("state_bytes", [100, 100_000])

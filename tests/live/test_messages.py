@@ -91,7 +91,8 @@ def keys_of(world: World) -> list[str]:
           for kind in ("main", "shadow")),
         *(keys.command("control"), keys.done("control"), keys.ended(), keys.stamped()),
         *(keys.beat("E", "agent@E"), keys.frame(), keys.order(), keys.accepted()),
-        *(keys.load("E"), keys.snapshot("planning", "E"), keys.state("planning", "E")),
+        *(keys.load("E"), keys.snapshot("planning", "E")),
+        keys.state("planning", "E", "R2"),
         *(keys.restored(), keys.ask(), keys.carried()),
     ]  # fmt: skip
     return [*plain, *(keys.detour(key) for key in plain), *(keys.relay(key) for key in plain)]

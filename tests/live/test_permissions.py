@@ -50,7 +50,8 @@ def test_who_may_put_what_in_the_canonical_cell(problem: Problem) -> None:
     for task, nodes in (("perception", both), ("planning", {"E", "R2"})):
         for node in nodes:
             expected[f"snapshot/{task}/{node}"] = {CONTROLLER}
-            expected[f"state/{task}/{node}"] = nodes - {node}
+            for source in nodes - {node}:
+                expected[f"state/{task}/{node}/{source}"] = {source}
     for node in ("R1", "E", "R2"):
         expected[f"load/{node}"] = {node}
     for role in roles(problem):

@@ -467,7 +467,9 @@ class ControlledCell:
             number = self._next_number()
             move.awaited[number] = task
             asked = Snapshot(number, task, old[task], to, held.run, held.cycle)
-            self.place.put(keys.snapshot(task, old[task]), asked)
+            # Where it goes, a state is taken for what is known to have been asked for alone.
+            for node in (to, old[task]):
+                self.place.put(keys.snapshot(task, node), asked)
 
     def _restored(self, restored: Restored, now_ns: int) -> None:
         move = self._move

@@ -59,9 +59,9 @@ class Keys:
         """Requests to a worker for its state."""
         return f"{self.root}/snapshot/{task}/{node}"
 
-    def state(self, task: str, node: str) -> str:
-        """States on their way to a worker."""
-        return f"{self.root}/state/{task}/{node}"
+    def state(self, task: str, node: str, source: str = "*") -> str:
+        """States on their way to a worker from the one on another node; ``*`` for all nodes."""
+        return f"{self.root}/state/{task}/{node}/{source}"
 
     def restored(self) -> str:
         """Reports that a state has arrived."""

@@ -336,7 +336,7 @@ class Load(_Array, frozen=True):
 
 
 class Snapshot(_Array, frozen=True):
-    """Request to a task's worker to send its state to another node's.
+    """Request to a task's worker to send its state to another node's, who is told of it, too.
 
     Parameters
     ----------

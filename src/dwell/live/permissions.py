@@ -65,7 +65,8 @@ def _of_stages(problem: Problem, keys: Keys) -> dict[str, frozenset[str]]:
             restored.update(task.on)
             for node in task.on:
                 by_key[keys.snapshot(name, node)] = frozenset([CONTROLLER])
-                by_key[keys.state(name, node)] = frozenset(task.on) - {node}
+                for source in set(task.on) - {node}:
+                    by_key[keys.state(name, node, source)] = frozenset([source])
     if restored:
         by_key[keys.restored()] = frozenset(restored)
     return by_key

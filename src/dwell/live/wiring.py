@@ -319,8 +319,8 @@ def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
     Parameters
     ----------
     key : str
-        ``dwell/CELL/in/TASK/NODE/...`` or ``dwell/CELL/state/TASK/NODE`` where the lane is
-        `images`: what stays on the node goes through `local`.
+        ``dwell/CELL/in/TASK/NODE/...`` or ``dwell/CELL/state/TASK/NODE/...`` where the lane
+        is `images`: what stays on the node goes through `local`.
 
     Returns
     -------

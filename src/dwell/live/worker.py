@@ -185,6 +185,7 @@ class Worker:
         self._input_bytes = {f.source: f.payload_bytes for f in problem.pipeline.inputs(task)}
         self._output_bytes = {f.target: f.payload_bytes for f in problem.pipeline.outputs(task)}
         self._state_bytes = problem.pipeline.tasks[task].state_bytes
+        self._nodes = frozenset(problem.pipeline.tasks[task].on)
         sources = frozenset(self._input_bytes) or frozenset([STAMPER])
         #: Whether its stage's frames begin the cycles: those of the first source do.
         first = next(name for name in problem.pipeline.tasks if not problem.pipeline.inputs(name))
@@ -207,8 +208,12 @@ class Worker:
         self._source = _Source(place, self.offsets, offset_ns) if STAMPER in sources else None
         self._stateful = isinstance(stage, Stateful) and not shadow
         self._asked: Snapshot | None = None
-        self._checkpoint: tuple[State, bytes] | None = None
-        self._restoring: tuple[State, bytes] | None = None
+        #: The state that shall come here, and by its node what has come, with a number and without.
+        self._awaited: Snapshot | None = None
+        self._answers: dict[str, tuple[State, bytes]] = {}
+        self._checkpoints: dict[str, tuple[State, bytes]] = {}
+        #: Run and cycle of the newest stamp that has come with an input.
+        self._newest = (-1, -1)
         # What came because the state comes here, too; of that, what is to be worked on.
         self._forked: deque[Job] = deque(maxlen=MAX_JOINS)
         self._replay: deque[Job] = deque(maxlen=MAX_JOINS)
@@ -272,6 +277,8 @@ class Worker:
         header = self.place.header(sample)
         if header is None:
             return
+        if header.stamp.term:  # a guess is nobody's word
+            self._newest = max(self._newest, header.stamp.key)
         if header.source == STAMPER and self._source is not None:
             self._source.stamped(header, now_ns)
             return
@@ -322,18 +329,37 @@ class Worker:
 
     def _about_state(self, sample: Arrival) -> None:
         if "/snapshot/" in sample.key:
-            self._asked = self.place.read(sample, Snapshot, lambda _: CONTROLLER)
+            self._asked_for(self.place.read(sample, Snapshot, lambda _: CONTROLLER))
             return
         state = decode(sample.header, State)
         if state.task != self.task:
             raise LiveError(f"a state of {state.task} came to {self.task}")
+        if not sample.key.endswith(f"/{state.node}") or state.node not in self._nodes:
+            raise LiveError(f"{sample.key}: a state of {state.task} on {state.node}")
         length, longest = len(sample.payload), longest_bytes(self._state_bytes)
         if length > longest:
             raise LiveError(f"{self.task}: a state of {length} bytes; at most {longest} are taken")
-        if state.number:
-            self._restoring = state, sample.payload
-        elif self._checkpoint is None or state.key > self._checkpoint[0].key:
-            self._checkpoint = state, sample.payload
+        kept = self._answers if state.number else self._checkpoints
+        kept[state.node] = state, sample.payload
+
+    def _asked_for(self, asked: Snapshot) -> None:
+        """Take note that a state is to go from here, or to come here."""
+        if asked.task == self.task and asked.node == self.place.node:
+            self._asked = asked
+        elif asked.task == self.task and asked.to == self.place.node:
+            self._awaited = asked
+
+    @property
+    def _restoring(self) -> tuple[State, bytes] | None:
+        """What has come of the state that is awaited, once its last cycle is known here.
+
+        The inputs of that cycle are forked, and come by themselves.
+        """
+        asked = self._awaited
+        found = None if asked is None else self._answers.get(asked.node)
+        if asked is None or found is None or found[0].number != asked.number:
+            return None
+        return found if (asked.run, asked.cycle - 1) <= found[0].key <= self._newest else None
 
     def next_chore(self) -> Snapshot | tuple[State, bytes] | None:
         """Return what to do with the state before the next job; `do_chore` has to follow."""
@@ -343,7 +369,9 @@ class Worker:
         if asked is not None and self.state_at >= (asked.run, asked.cycle - 1):
             self._asked = None
             return asked
-        chore, self._restoring = self._restoring, None
+        if (chore := self._restoring) is not None:
+            self._awaited = None
+            self._answers.clear()
         return chore
 
     def do_chore(self, chore: Snapshot | tuple[State, bytes]) -> None:
@@ -387,7 +415,8 @@ class Worker:
             return
         header = encode(State(run, cycle, self.task, place.node, number))
         lane = lane_of(self._state_bytes)
-        place.transport.put(place.keys.state(self.task, to), data, header, lane=lane)
+        key = place.keys.state(self.task, to, place.node)
+        place.transport.put(key, data, header, lane=lane)
 
     def _take_over(self, state: State, data: bytes) -> str:
         """Restore a state; returns what went wrong, or nothing."""
@@ -403,14 +432,18 @@ class Worker:
 
     def _recover(self, job: Job) -> int:
         """After a failover: the last checkpoint, if it is newer than this state; its age."""
-        if self._checkpoint is None:
+        if not self._checkpoints:
             return UNKNOWN
-        (state, data), self._checkpoint = self._checkpoint, None
-        if state.key <= self.state_at or state.key >= job.order:
+        kept, self._checkpoints = self._checkpoints.values(), {}
+        # Of this run, and of no cycle beyond its stamp: no other one can be where this job begins.
+        past = (max(self.state_at, (job.header.stamp.run, -1)), job.order)
+        fit = [(state, data) for state, data in kept if past[0] < state.key < past[1]]
+        if not fit:
             return UNKNOWN
+        state, data = max(fit, key=lambda one: one[0].key)
         if self._take_over(state, data):
             return UNKNOWN
-        return job.header.stamp.cycle - state.cycle if state.run == job.header.stamp.run else 0
+        return job.header.stamp.cycle - state.cycle
 
     def _checkpoint_due(self, job: Job) -> None:
         """Copy the state to the fallbacks' nodes every so many cycles."""
@@ -540,6 +573,7 @@ class Worker:
         if runs_here and self._stateful:
             self._worked_at = max(self._worked_at, job.order)
             self._follows = False
+            self._awaited = None
             self._forked.clear()
         # Until it is known that there is something to send.
         self._failed_in_a_row, self._failed_ns = self._failed_in_a_row + 1, ended_ns

@@ -35,7 +35,8 @@ _LOG = logging.getLogger(__name__)
 def target_of(key: str) -> str | None:
     """Return the node that a message is for, by its key; None where several nodes hear it.
 
-    ``dwell/CELL/in/TASK/NODE/KIND``, ``state/TASK/NODE`` and ``snapshot/TASK/NODE`` are for one.
+    ``dwell/CELL/in/TASK/NODE/KIND``, ``state/TASK/NODE/SOURCE`` and ``snapshot/TASK/NODE`` are for
+    one.
     """
     chunks = key.split("/")
     return chunks[4] if len(chunks) > 4 and chunks[2] in _FOR_ONE_NODE else None
