@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import os
+import resource
 import shutil
+import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -50,6 +56,10 @@ class SecureCell(RealCell):
     def as_(self, name: str, *words: str) -> tuple[int, str]:
         code, stdout, stderr = invoke(*words, "--cell", self.file, "--keys", self.host / name)
         return code, stdout + stderr
+
+    def pid(self, who: str) -> int:
+        mark = self.state(who.rpartition("@")[2].partition(".")[0]) / f"{who}.pid"
+        return int(json.loads(mark.read_text())["pid"])
 
     @property
     def logs(self) -> str:
@@ -126,8 +136,12 @@ def test_an_agent_without_keys_says_so_loudly(abroad: Path) -> None:
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureCell]:
     made = SecureCell(tmp_path_factory.mktemp("secure"))
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
+        # As a shell gives it to them, whatever strangers can do with their ports.
+        resource.setrlimit(resource.RLIMIT_NOFILE, (1_024, most))
         made.begin()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
         yield made
     finally:
         made.close()
@@ -215,6 +229,35 @@ def test_false_stamps_with_the_stampers_keys_end_no_decisions(cell: SecureCell) 
     assert cell.as_("operator", "live", "pin", "LOC")[0] == 0
     cell.until(lambda status: status["placement"] == "LOC")
     assert "are believed (damaged, or made up)" in cell.logs
+
+
+def test_bare_connections_end_nothing_and_keep_nobody_out_once_they_have_gone(
+    cell: SecureCell,
+) -> None:
+    before = cell.until(lambda status: status["window"] and not status["silent"])
+    entries = [wire(cell.problem).entry(who) for who in ("agent@E", "stamper@R1", "perception@E")]
+    pids = {who: cell.pid(who) for who in ("stamper@R1", "perception@E")}
+    with ExitStack() as stack:
+        for entry in entries:
+            port = entry.listen["control"].port
+            for _ in range(1_500):
+                bare = socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+                stack.enter_context(bare)
+        # No descriptor is left, and a process dies.
+        victim = cell.pid("planning@E.shadow")
+        os.kill(victim, signal.SIGKILL)
+        cell.until(lambda status: status["window"]["number"] > before["window"]["number"])
+    for entry in entries:
+        with Intruder(entry.listen["control"].port, tls(cell.host / "operator")) as visitor:
+            limit_s = time.monotonic() + PATIENCE_S / 6
+            while not visitor.peers["control"] and time.monotonic() < limit_s:
+                time.sleep(0.02)
+            assert visitor.peers["control"] == 1, entry.role.who
+    after = cell.until(lambda status: status["headline"] is None)
+    assert after["run"] == before["run"]
+    assert pids == {who: cell.pid(who) for who in pids}
+    assert cell.pid("planning@E.shadow") != victim
+    assert all(process.poll() is None for process in cell.processes.values())
 
 
 def test_the_run_is_a_run_and_no_log_has_a_secret(cell: SecureCell) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 
 import psutil
 
+from dwell.errors import LiveError
 from dwell.live.continuity import SetbackDetector
 from dwell.live.control_group import ControlGroup
 from dwell.live.failures import start_thread
@@ -19,6 +20,7 @@ from dwell.live.messages import Carried, Load, encode
 from dwell.live.relay_batch import MOST_MESSAGES, RelayBatch
 from dwell.live.role import Pulse, RolePlace
 from dwell.live.supervision import Supervisor
+from dwell.live.transport.abandoned import OUT_OF_FILES
 from dwell.live.transport.transport import Arrival
 from dwell.model.instants import NEVER_NS
 
@@ -168,13 +170,13 @@ class Agent:
             self._gather_ns = self._beats_ns = now_ns
             self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
         if now_ns >= self._look_ns:
-            self.supervisor.step()
+            self._try(self.supervisor.step)
             self._look_ns = now_ns + LOOK_NS
         if now_ns >= self._housekeeping_ns:
-            self.supervisor.tend()
+            self._try(self.supervisor.tend)
             self._housekeeping_ns = now_ns + HOUSEKEEPING_NS
         if now_ns >= self._load_ns:
-            self._report(now_ns)
+            self._try(self._report, now_ns)
             self._load_ns = now_ns + LOAD_NS
         if now_ns >= self._carry_ns:
             self._carry_ns = NEVER_NS
@@ -186,6 +188,16 @@ class Agent:
                 self._gather_ns = now_ns + self.place.period_ns
             wakes.append(self._gather_ns)
         return min(wakes)
+
+    def _try(self, chore: Callable[..., None], *arguments: object) -> None:
+        """Do a chore, or leave it for the next time where strangers hold all descriptors."""
+        try:
+            chore(*arguments)
+        except OSError as error:
+            if error.errno not in OUT_OF_FILES:
+                raise
+            who = self.place.who
+            self.place.complain(LiveError(f"{who}: no file can be opened ({error.strerror})"))
 
     def _tell(self, now_ns: int) -> None:
         """Tell the controller what came over the detour; of beats the last, and less often."""

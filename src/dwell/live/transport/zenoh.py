@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from dwell.errors import LiveError, installing
 from dwell.live.failures import described, start_thread
 from dwell.live.local_addresses import why_not_listen
+from dwell.live.transport.abandoned import AbandonedConnections
 from dwell.live.transport.forked import SessionDescriptors
 from dwell.live.transport.no_linger import Connections
 from dwell.live.transport.transport import Arrival, Lane, Receive, require_expression, require_key
@@ -146,6 +147,9 @@ class ZenohTransport:
         self._closed = False
         self._connections = Connections()
         self._descriptors = SessionDescriptors(entry)
+        ports = (end.port for end in entry.listen.values())
+        self._abandoned = AbandonedConnections(ports, self._renew)
+        self._subscribed: list[tuple[str, Receive]] = []
         #: Messages that arrived under another key than they were put under.
         self.misled = 0
         #: Messages that nobody could handle.
@@ -167,6 +171,7 @@ class ZenohTransport:
             self.close()
             raise
         self._connections.start()
+        self._abandoned.start()
         if "local" in self._sessions:
             self._pool = _Pool.of()
 
@@ -189,15 +194,19 @@ class ZenohTransport:
     def subscribe(self, key: str, receive: Receive) -> None:
         """Have `receive` called with every message under a key expression (``*``, ``**``)."""
         require_expression(key)
+        self._subscribed.append((key, receive))
         for name, session in list(self._sessions.items()):
-            deliver = self._deliver(receive, "control" if name == "control" else "images")
-            # Called in the thread that read the message: one hand-over less, and a receiver that
-            # is behind makes its senders drop instead of growing a queue here.
-            session.declare_subscriber(
-                key,
-                self._zenoh.handlers.Callback(self._logging_failures(deliver), indirect=False),
-                allowed_origin=self._zenoh.Locality.REMOTE,
-            )
+            self._declare(name, session, key, receive)
+
+    def _declare(self, name: Session, session: zenoh.Session, key: str, receive: Receive) -> None:
+        deliver = self._deliver(receive, "control" if name == "control" else "images")
+        # Called in the thread that read the message: one hand-over less, and a receiver that
+        # is behind makes its senders drop instead of growing a queue here.
+        session.declare_subscriber(
+            key,
+            self._zenoh.handlers.Callback(self._logging_failures(deliver), indirect=False),
+            allowed_origin=self._zenoh.Locality.REMOTE,
+        )
 
     def close(self) -> None:
         """Send and deliver nothing more; safe to call twice."""
@@ -205,6 +214,7 @@ class ZenohTransport:
         with self._locks["control"], self._locks["images"]:
             self._closed = True
             self._connections.stop()
+            self._abandoned.stop()
             self._descriptors.stop()
             sessions, self._sessions = self._sessions, {}
             routes, self._routes = self._routes, {}
@@ -214,6 +224,37 @@ class ZenohTransport:
             sender.stop()
         for session in sessions.values():
             session.close()
+
+    def _renew(self, port: int) -> None:
+        """Open the session that listens on a port anew, which closes all its connections.
+
+        What is put meanwhile is lost; its peers connect again at once.
+        """
+        (name,) = (name for name, end in self.entry.listen.items() if end.port == port)
+        with self._locks["control"], self._locks["images"]:
+            session = self._sessions.pop(name, None)
+        if session is None:
+            return
+        _LOG.warning(
+            "%s: many connections to port %d were abandoned; it is opened anew",
+            *(self.entry.role.who, port),
+        )
+        with self._growing:
+            gone = [at for at in list(self._routes) if session_of(self.entry, at[1], at[0]) == name]
+            routes = [self._routes.pop(at) for at in gone]
+        for route in routes:
+            route.closed = True
+            if route.sender is not None:
+                route.sender.stop()
+        session.close()
+        session = self._open(name)
+        for key, receive in self._subscribed:
+            self._declare(name, session, key, receive)
+        with self._locks["control"], self._locks["images"]:
+            if not self._closed:
+                self._sessions[name] = session
+                return
+        session.close()
 
     @property
     def peers(self) -> Mapping[Session, int]:
@@ -286,7 +327,7 @@ class ZenohTransport:
         try:
             route.put(content, attachment=route.mark + header)
         except self._zenoh.ZError:
-            if not self._closed:
+            if not (self._closed or route.closed):
                 raise
 
     def _deliver(self, receive: Receive, lane: Lane) -> Callable[[zenoh.Sample], None]:
@@ -354,6 +395,8 @@ class _Route:
     #: Once there is one, everything goes through it, so that the order stays.
     sender: _Sender | None = None
     mark: bytes = b""
+    #: Whether its session has been closed.
+    closed: bool = False
 
     def content(self, data: bytes) -> Any:
         """Return a payload as Zenoh is handed it: in shared memory, or as it is."""
