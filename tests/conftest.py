@@ -23,6 +23,7 @@ settings.load_profile("dwell")
 HERE = Path(__file__).parent
 ALONE = (
     "testbed/chaos",
+    "cli/test_background.py",
     "cli/test_live.py",
     "cli/test_live_run.py",
     "cli/test_testbed.py",

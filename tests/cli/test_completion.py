@@ -39,6 +39,12 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("runs/first").mkdir(parents=True)
     Path("runs/first/run.json").write_text("{}")
     Path("runs/more").mkdir()
+    # What processes have printed stands in another folder: this one is looked through for cells.
+    state = tmp_path.with_name(f"{tmp_path.name}-state")
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    for log in ("dwell/hall/agent@R1.log", "other/hall/E/plan@E.log"):
+        (state / log).parent.mkdir(parents=True, exist_ok=True)
+        (state / log).touch()
 
 
 @pytest.mark.parametrize(
@@ -66,6 +72,10 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("live pin --cell hall.yaml S", ["SO"]),
         ("live drain --cell hall.yaml R", ["R1", "R2"]),
         ("testbed campaign hall.yaml --policies dtp,at", ["dtp,atp", "dtp,atp-thresholds"]),
+        ("live up hall.yaml --node R", ["R1", "R2"]),
+        ("live down ha", ["hall.yaml"]),
+        ("live log a", ["agent@R1"]),
+        ("live log --state $XDG_STATE_HOME/other p", ["plan@E"]),
         ("new mine --from ", ["canonical", "live"]),
         ("completion ", list(Shell)),
         ("run hall.yaml --out ", [FILES]),
@@ -74,7 +84,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_line_is_offered_what_fits_there(line: str, wanted: list[str]) -> None:
-    assert offered(line) == wanted
+    assert offered(os.path.expandvars(line)) == wanted
 
 
 @pytest.mark.parametrize(

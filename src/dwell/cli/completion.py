@@ -334,6 +334,12 @@ def _files_with(key: str) -> Offer:
     return _paths(wanted)
 
 
+def _logged(line: _Line, begun: str) -> list[str]:
+    from dwell.cli.state_folder import logs, state_root
+
+    return list(logs(state_root(*map(Path, line.given.get("state", ())))))
+
+
 #: Folders of runs, studies and campaigns.
 _results = _paths(lambda path: any((path / name).is_file() for name in RESULTS))
 
@@ -352,6 +358,7 @@ OFFERS: Mapping[str, Offer] = {
     "estimator": _estimators,
     "candidate": lambda line, _: line.keys("candidates"),
     "node": lambda line, _: line.keys("nodes"),
+    "log process": _logged,
     "new origin": lambda *_: ("canonical", "live"),
     "shell": lambda *_: tuple(Shell),
 }

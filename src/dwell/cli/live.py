@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import os
+import shlex
 import shutil
 import sys
 import threading
@@ -27,6 +28,7 @@ from dwell.cli.options import (
     require_held,
 )
 from dwell.cli.output import json_text, print_json, say
+from dwell.cli.state_folder import state_root
 from dwell.display import milliseconds
 
 if TYPE_CHECKING:
@@ -101,7 +103,7 @@ def agent(
     problem = load_without_traces(cell)
     for caution in lint(problem):
         say(f"warning: {caution}")
-    folder = state or _state_folder() / problem.name / node
+    folder = state or state_root() / problem.name / node
     sys.path.insert(0, str(cell.resolve().parent))
     read = None if accelerator is None else load_function(accelerator, "--accelerator")
     wanted = _cpus(cpus)
@@ -322,6 +324,117 @@ def run(
     )
 
 
+Root = Annotated[
+    Path | None,
+    typer.Option(
+        "--state",
+        metavar="FOLDER",
+        help="Has a folder for each cell; by default below ~/.local.",
+    ),
+]
+
+
+@live.command()
+def up(
+    cell: CellArgument,
+    node: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Node of the cell that this computer is; may repeat. If not given, those whose "
+            "address is this computer's."
+        ),
+    ] = None,
+    policy: Policy = None,
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the runs' folders go.")] = Path(
+        "runs"
+    ),
+    state: Root = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+) -> None:
+    """Start a cell's part on this computer in the background: agents, and its controller here."""
+    from dwell.cellfile import load, load_without_traces
+    from dwell.cli import background
+
+    problem = load_without_traces(cell)
+    nodes = background.nodes_here(problem, node or ())
+    if problem.controller_node in nodes:
+        problem = load(cell)
+    folder = state_root(state) / problem.name
+    names = background.up(
+        cell,
+        problem,
+        folder,
+        out.resolve(),
+        nodes=nodes,
+        environment=environment(keys, insecure=insecure),
+        policy=policy,
+    )
+    typer.echo(f"{problem.name} is up: {', '.join(names)}; logs in {folder}")
+
+
+@live.command()
+def down(cell: CellArgument, state: Root = None) -> None:
+    """End what `up` has started, in order: the robot's actuators are told to stop."""
+    from dwell.cellfile import load_without_traces
+    from dwell.cli import background
+
+    problem = load_without_traces(cell)
+    names = background.down(problem, state_root(state) / problem.name)
+    ended = f"is down: {', '.join(names)}" if names else "does not run here"
+    typer.echo(f"{problem.name} {ended}")
+
+
+@live.command()
+def log(
+    process: Annotated[
+        str, typer.Argument(metavar="PROCESS", help="As agent@R1, controller@E, perception@E.")
+    ],
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Go on with what is added, until interrupted.")
+    ] = False,
+    cell: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Its cell's file, where there are several cells."),
+    ] = None,
+    state: Root = None,
+) -> None:
+    """Print what a process of a cell on this computer has printed."""
+    from dwell.cellfile import load_without_traces
+    from dwell.cli import background
+
+    name = None if cell is None else load_without_traces(cell).name
+    background.print_log(background.log_of(state_root(state), process, name), follow=follow)
+
+
+@live.command()
+def units(
+    cell: CellArgument,
+    node: Annotated[str, typer.Option(help="Node of the cell that this computer is.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Where the units go; made where it is missing.")
+    ] = Path("units"),
+    user: Annotated[
+        str | None, typer.Option(help="User of the services; this one if not given.")
+    ] = None,
+    keys: Keys = None,
+    insecure: Insecure = False,
+) -> None:
+    """Write the systemd units of a node: of its agent, and of the controller where it is there."""
+    from dwell.cellfile import load_without_traces
+    from dwell.cli.units import write_units
+
+    problem = load_without_traces(cell)
+    files = write_units(problem, node, cell, out, user=user, keys=keys, insecure=insecure)
+    copied = " ".join(shlex.quote(str(file)) for file in files)
+    names = " ".join(file.stem for file in files)
+    typer.echo(
+        f"sudo cp {copied} /etc/systemd/system/\n"
+        "sudo systemctl daemon-reload\n"
+        f"sudo systemctl enable --now {names}"
+    )
+
+
 @live.command("demo", hidden=True, context_settings={"ignore_unknown_options": True})
 def former_demo(words: Former = None) -> None:
     """Say what has taken its place."""
@@ -448,11 +561,6 @@ def _cpus(
     if not cpus or not cpus <= available:
         raise typer.BadParameter(f"{option}: {text} cannot be had; there are {sorted(available)}")
     return cpus
-
-
-def _state_folder() -> Path:
-    home = os.environ.get("XDG_STATE_HOME")
-    return (Path(home) if home else Path.home() / ".local" / "state") / "dwell"
 
 
 def _until_told(owner: int | None, at_once: Callable[[], None]) -> threading.Event:

@@ -16,10 +16,10 @@ import dwell
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
-from dwell.errors import LiveError, absent, installing, missing_package
+from dwell.errors import LiveError, absent, installing
+from dwell.live.stage_modules import require_stages
 from dwell.model import Problem, Scenario
 from dwell.model.bounds import counted
-from dwell.model.user_classes import import_user_module
 from dwell.record import Run, open_run, seal_run
 from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
@@ -76,7 +76,7 @@ def run_live(
     scenario = scenario or _first_that_disturbs(problem)
     seconds = seconds or _length_s(problem.scenario(scenario))
     timeline = timeline_of(problem, scenario, seed=seed, seconds=seconds)
-    _require_stages(problem, file)
+    require_stages(problem, file, problem.fabric.nodes)
     out = out or Path("live-out", problem.name)
     reported, told = _announce_left_out()
     make_folder(out, MARK, "a live run's")
@@ -127,29 +127,6 @@ def _announce_left_out() -> tuple[bool, bool]:
         err=True,
     )
     return False, tables
-
-
-def _require_stages(problem: Problem, cell: Path) -> None:
-    """Refuse a cell that lacks a stage for some task, or whose stages cannot be imported here.
-
-    A node starts a worker that failed again and again, so such a cell would never come up.
-    """
-    without = [name for name, task in problem.pipeline.tasks.items() if task.run is None]
-    if without:
-        raise LiveError(
-            f"{cell}: nothing to run for {', '.join(without)}; a live cell needs `run: "
-            "module:Name` for every task (docs/live-tutorial.md)"
-        )
-    names = {f"tasks.{name}.run": task.run for name, task in problem.pipeline.tasks.items()}
-    names |= {f"live.actuators.{task}": name for task, name in problem.live.actuators.items()}
-    for where, name in names.items():
-        module = str(name).partition(":")[0]
-        try:
-            import_user_module(module, problem.folder, f"{where} ({name})", LiveError)
-        except LiveError as error:
-            cause = error.__cause__
-            missing = missing_package(cause) if isinstance(cause, ModuleNotFoundError) else None
-            raise missing or error from cause
 
 
 def _first_that_disturbs(problem: Problem) -> str:

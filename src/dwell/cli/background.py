@@ -1,0 +1,384 @@
+"""`dwell live up`, `down` and `log`: a cell's agents and controller in the background.
+
+Each is a process in a session of its own, so that it outlives the terminal, with two files in the
+cell's folder below the state folder: ``agent@R1.pid`` says which process it is, ``agent@R1.log``
+has what it prints.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import typer
+
+from dwell.cli.state_folder import logs
+from dwell.errors import LiveError, ProblemError
+from dwell.files import write_whole
+from dwell.live.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
+from dwell.live.log import printable
+from dwell.live.security import Security
+from dwell.live.stage_modules import require_stages
+from dwell.live.state_files import make_folder, open_own
+from dwell.live.supervision import survivor
+from dwell.live.transport.orphans import remove_orphans
+from dwell.live.wiring import Role, Wiring, wire
+from dwell.model import Problem
+
+#: How long a process has to listen, and to end after it was told to: an actuator is told to stop
+#: for two seconds, and a controller completes its run's folder.
+START_S, END_S = 30.0, 30.0
+LOOK_S = 0.1
+#: A log that is longer begins anew when its process is started.
+LOG_BYTES = 8 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """A cell's part on this computer.
+
+    Parameters
+    ----------
+    folder : Path
+        The cell's, with a folder for each node.
+    """
+
+    problem: Problem
+    folder: Path
+
+    def running(self) -> dict[str, psutil.Process]:
+        """Return the agents and the controller that run, by name."""
+        return _survivors(self.folder.glob("*.pid"))
+
+    def leftovers(self, wiring: Wiring) -> dict[str, psutil.Process]:
+        """Return the processes of agents that have died, by name."""
+        listening = listening_ports()
+        marks: list[Path] = []
+        for node in self.folder.iterdir() if self.folder.is_dir() else ():
+            entry = wiring.entries.get(f"agent@{node.name}")
+            if entry is None or entry.listen["control"].port not in listening:
+                marks += node.glob("*.pid")
+        return _survivors(marks)
+
+
+def _survivors(marks: Iterable[Path]) -> dict[str, psutil.Process]:
+    found = {mark.stem: survivor(mark) for mark in sorted(marks)}
+    return {who: process for who, process in found.items() if process is not None}
+
+
+def _named(processes: Mapping[str, psutil.Process]) -> str:
+    return ", ".join(f"{who} (process {process.pid})" for who, process in processes.items())
+
+
+# ------------------------------------------------------------------------- up
+
+
+def nodes_here(problem: Problem, named: Sequence[str]) -> list[str]:
+    """Return the nodes that this computer is: those named, or those whose address is its own.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such node, or none is this computer.
+    """
+    known = problem.fabric.nodes
+    for node in named:
+        if node not in known:
+            raise ProblemError(
+                f"no node {node!r} in cell {problem.name!r}; there are {', '.join(known)}"
+            )
+    here = [
+        node
+        for node, host in problem.live.hosts.items()
+        if (node in named if named else is_here(host.address))
+    ]
+    if not here:
+        places = ", ".join(f"{node} at {host.address}" for node, host in problem.live.hosts.items())
+        raise ProblemError(
+            f"no node of cell {problem.name!r} is this computer ({places}); correct live.hosts"
+        )
+    return here
+
+
+def up(
+    file: Path,
+    problem: Problem,
+    folder: Path,
+    out: Path,
+    *,
+    nodes: Sequence[str],
+    environment: Mapping[str, str],
+    policy: str | None = None,
+) -> list[str]:
+    """Start the agents of some nodes, and the controller where it is on one of them.
+
+    Nothing is left of what was started where something cannot be.
+
+    Returns
+    -------
+    list of str
+        Names of what runs now.
+
+    Raises
+    ------
+    ProblemError
+        If the cell cannot run.
+    LiveError
+        If some of it runs already, ports are taken, or something does not start.
+    TrustError
+        If the keys are not those of the nodes.
+    """
+    wiring, background = wire(problem), Background(problem, folder)
+    here = [
+        role for node in nodes for role in wiring.on(node) if role.kind in ("agent", "controller")
+    ]
+    for role in here:
+        Security.of(problem, role, environment)
+    require_stages(problem, file, nodes)
+    _require_down(background, wiring, file)
+    _require_ports(problem, wiring, nodes)
+    commands = {role.who: _command(role, file, folder, out, policy) for role in here}
+    with _Start(folder, out, environment) as start:
+        # Somebody else may have been faster.
+        _require_down(background, wiring, file)
+        for who, command in commands.items():
+            start.run(who, command)
+        start.wait({who: wiring.entry(who).listen["control"].port for who in commands})
+    return list(commands)
+
+
+def _command(role: Role, file: Path, folder: Path, out: Path, policy: str | None) -> list[str]:
+    words = [sys.executable, "-m", "dwell", role.kind, "--cell", str(file.resolve())]
+    if role.kind == "agent":
+        return [*words, "--node", role.node, "--state", str(folder / role.node)]
+    return [*words, "--out", str(out), *(() if policy is None else ("--policy", policy))]
+
+
+def _require_down(background: Background, wiring: Wiring, file: Path) -> None:
+    """Refuse what runs already, or is left of it."""
+    name, remedy = background.problem.name, f"dwell live down {shlex.quote(str(file))}"
+    if running := background.running():
+        raise LiveError(f"{name} is up already: {_named(running)}; this ends it: {remedy}")
+    if left := background.leftovers(wiring):
+        raise LiveError(
+            f"an agent of {name} has died, and its processes still run: {_named(left)}; this ends "
+            f"them: {remedy}"
+        )
+
+
+def _require_ports(problem: Problem, wiring: Wiring, nodes: Sequence[str]) -> None:
+    """Refuse what cannot listen where the cell file says."""
+    hosts = problem.live.hosts
+    away = [
+        f"live.hosts.{node}: {why_not_listen(hosts[node].address, 0)}"
+        for node in nodes
+        if not is_here(hosts[node].address)
+    ]
+    if away:
+        raise LiveError("\n".join(away))
+    whose = [role.who for node in nodes for role in wiring.on(node)]
+    ends = [end for who in whose for end in wiring.entry(who).listen.values()]
+    taken = {end.port for end in ends if why_not_listen(end.address, end.port)}
+    if taken:
+        whom = taken_ports(taken) or ", ".join(map(str, sorted(taken)))
+        raise LiveError(
+            f"of the ports of {problem.name} are taken: {whom}; end it, or give the nodes in "
+            "live.hosts other ports"
+        )
+
+
+class _Start:
+    """Processes that are started together: all of them, or none is left."""
+
+    def __init__(self, folder: Path, out: Path, environment: Mapping[str, str]) -> None:
+        self.folder, self._out, self._environment = folder, out, environment
+        self._was = {path: path.exists() for path in (*folder.parents, folder, out)}
+        self._started: dict[str, subprocess.Popen[bytes]] = {}
+        self._logs: list[Path] = []
+        self._lock = -1
+
+    def __enter__(self) -> _Start:
+        self._lock = os.open(make_folder(self.folder), os.O_RDONLY)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(self._lock)
+            raise LiveError(f"{self.folder}: another `dwell live up` is at work there") from None
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            if kind is not None:
+                self._undo()
+        finally:
+            os.close(self._lock)
+
+    def run(self, who: str, command: Sequence[str]) -> None:
+        """Start a process, in a session of its own."""
+        path = self.folder / f"{who}.log"
+        if not path.exists():
+            self._logs.append(path)
+        elif path.stat().st_size > LOG_BYTES:
+            path.replace(path.with_suffix(".log.1"))
+        with open(path, "ab", opener=open_own) as log:
+            process = subprocess.Popen(  # noqa: S603 - our own command
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=dict(self._environment),
+                start_new_session=True,
+            )
+        self._started[who] = process
+        started = psutil.Process(process.pid).create_time()
+        mark = json.dumps({"pid": process.pid, "started": started})
+        write_whole(self.folder / f"{who}.pid", mark, durable=False)
+
+    def wait(self, ports: Mapping[str, int]) -> None:
+        """Return when all listen.
+
+        Raises
+        ------
+        LiveError
+            If one of them has ended, or does not listen.
+        """
+        until_s = time.monotonic() + START_S
+        while True:
+            for who, process in self._started.items():
+                if (code := process.poll()) is not None:
+                    raise LiveError(f"{who} has ended with exit code {code}: {self._last(who)}")
+            listening = listening_ports()
+            silent = [who for who, port in ports.items() if port not in listening]
+            if not silent:
+                return
+            if time.monotonic() > until_s:
+                who = silent[0]
+                raise LiveError(f"{who} does not listen after {START_S:.0f} s: {self._last(who)}")
+            time.sleep(LOOK_S)
+
+    def _last(self, who: str) -> str:
+        lines = (self.folder / f"{who}.log").read_text(errors="replace").strip().splitlines()
+        return printable(lines[-1]).removeprefix("error: ") if lines else "it has printed nothing"
+
+    def _undo(self) -> None:
+        """End what was started, and remove what was made."""
+        for process in self._started.values():
+            process.terminate()
+        for process in self._started.values():
+            try:
+                process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        for who in self._started:
+            (self.folder / f"{who}.pid").unlink(missing_ok=True)
+        for log in self._logs:
+            log.unlink(missing_ok=True)
+        if not self._was[self.folder]:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        for path in (self._out, *self.folder.parents):
+            if not self._was[path]:
+                with suppress(OSError):
+                    path.rmdir()
+
+
+# ------------------------------------------------------------------------- down
+
+
+def down(problem: Problem, folder: Path) -> list[str]:
+    """End a cell's agents and controller on this computer, and what dead agents have left.
+
+    The controller goes first, so that its run does not end with an outage.
+
+    Returns
+    -------
+    list of str
+        Names of what was ended.
+
+    Raises
+    ------
+    LiveError
+        If something had to be killed.
+    """
+    background = Background(problem, folder)
+    running = background.running()
+    controllers = {who: one for who, one in running.items() if who.startswith("controller@")}
+    killed = _end(controllers)
+    killed += _end({who: one for who, one in running.items() if who not in controllers})
+    left = background.leftovers(wire(problem))
+    killed += _end(left)
+    if left or killed:
+        remove_orphans()
+    for mark in folder.glob("*.pid"):
+        mark.unlink(missing_ok=True)
+    if killed:
+        raise LiveError(
+            f"{', '.join(killed)} did not end within {END_S:.0f} s, and was killed; see its log"
+        )
+    return [*running, *left]
+
+
+def _end(processes: Mapping[str, psutil.Process]) -> list[str]:
+    """Tell processes to end; returns the names of those that had to be killed."""
+    for process in processes.values():
+        for number in (signal.SIGTERM, signal.SIGCONT):
+            with suppress(psutil.NoSuchProcess):
+                process.send_signal(number)
+    _, alive = psutil.wait_procs(list(processes.values()), timeout=END_S)
+    for process in alive:
+        with suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(alive, timeout=END_S)
+    return [who for who, process in processes.items() if process in alive]
+
+
+# ------------------------------------------------------------------------- log
+
+
+def log_of(root: Path, who: str, cell: str | None) -> Path:
+    """Return the log of a process.
+
+    Raises
+    ------
+    ProblemError
+        If there is none, or several cells have one.
+    """
+    known = {
+        name: paths
+        for name, of in logs(root).items()
+        if (paths := {one: path for one, path in of.items() if cell in (None, one)})
+    }
+    if who not in known:
+        there = f"there are {', '.join(known)}" if known else f"there is no log in {root}"
+        raise ProblemError(f"no process {who!r}; {there}")
+    if len(known[who]) > 1:
+        cells = ", ".join(known[who])
+        raise ProblemError(f"{who} is a process of several cells, {cells}: say which by --cell")
+    (path,) = known[who].values()
+    return path
+
+
+def print_log(path: Path, *, follow: bool) -> None:
+    """Print a log; `follow` goes on with what is added, until interrupted."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        while True:
+            if text := file.read():
+                typer.echo(printable(text, keep="\n\t"), nl=False)
+            if not follow:
+                return
+            time.sleep(LOOK_S)
+            # Its agent has begun it anew.
+            if path.stat().st_size < file.tell():
+                file.seek(0)

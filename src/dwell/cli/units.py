@@ -1,0 +1,193 @@
+"""`dwell live units`: the systemd units of a node."""
+
+from __future__ import annotations
+
+import getpass
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from dwell.cli.output import say, write_file
+from dwell.errors import ProblemError
+from dwell.model import Problem
+
+#: Files and connections that a process of a cell may have open: what only connects, and says
+#: nothing, must not keep it from its work.
+MOST_FILES = 65_536
+
+AGENT = """\
+[Unit]
+Description={description}
+Wants=network-online.target time-sync.target
+After=network-online.target time-sync.target
+
+[Service]
+User={user}
+StateDirectory=dwell
+{environment}ExecStart={command}
+Restart=always
+RestartSec=1
+# The agent ends its processes itself. Should it die alone, they work on, and the next agent takes
+# them over: systemd must not end them.
+KillMode=process
+TimeoutStopSec=15
+LimitNOFILE={most_files}
+# For --realtime.
+LimitRTPRIO=50
+# The agent starts again what is killed for want of memory, and says so; by default systemd would
+# end it, too. An end for stages that leak, and the CPUs of the whole node, as:
+# MemoryMax=4G
+# CPUAffinity=2-5
+OOMPolicy=continue
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+CONTROLLER = """\
+[Unit]
+Description={description}
+Wants=network-online.target
+After=network-online.target
+
+[Service]
+User={user}
+StateDirectory=dwell
+{environment}ExecStart={command}
+Restart=always
+RestartSec=1
+TimeoutStopSec=60
+LimitNOFILE={most_files}
+
+[Install]
+WantedBy=multi-user.target
+"""
+
+
+def unit_texts(
+    problem: Problem,
+    node: str,
+    cell: Path,
+    *,
+    user: str,
+    keys: Path | None = None,
+    insecure: bool = False,
+    program: Sequence[str] = (sys.executable, "-m", "dwell"),
+) -> dict[str, str]:
+    """Return the units of a node by the names of their files.
+
+    Parameters
+    ----------
+    cell : Path
+        The cell file, as the services shall read it.
+    user : str
+        Name of the user that the services run as.
+    program : sequence of str
+        Command that is `dwell`.
+
+    Raises
+    ------
+    ProblemError
+        If the cell has no such node.
+    """
+    if node not in problem.fabric.nodes:
+        known = ", ".join(problem.fabric.nodes)
+        raise ProblemError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
+    settings = {} if keys is None else {"DWELL_KEYS": str(keys)}
+    settings |= {"DWELL_INSECURE": "1"} if insecure else {}
+    environment = "".join(
+        f"Environment={_quoted(f'{name}={value}')}\n" for name, value in settings.items()
+    )
+
+    def unit(text: str, description: str, *words: str) -> str:
+        command = " ".join(_quoted(word, command=True) for word in (*program, *words))
+        return text.format(
+            description=_escaped(description),
+            user=user,
+            environment=environment,
+            command=command,
+            most_files=MOST_FILES,
+        )
+
+    state = f"{STATE}/{problem.name}"
+    agent = ("agent", "--node", node, "--cell", str(cell), "--state", f"{state}/{node}")
+    units = {
+        "dwell-agent.service": unit(
+            AGENT, f"Dwell agent of node {node} of cell {problem.name}", *agent
+        )
+    }
+    if node == problem.controller_node:
+        words = ("controller", "--cell", str(cell), "--out", f"{STATE}/runs")
+        units["dwell-controller.service"] = unit(
+            CONTROLLER, f"Dwell controller of cell {problem.name}", *words
+        )
+    return units
+
+
+#: Where systemd puts the folder that StateDirectory= names.
+STATE = "${STATE_DIRECTORY}"
+#: Signs that end a word, or mean something in one.
+SPECIAL = frozenset(" \t\"'\\;")
+
+
+def _escaped(text: str) -> str:
+    """Return a text in which systemd expands no specifier."""
+    return text.replace("%", "%%")
+
+
+def _quoted(word: str, *, command: bool = False) -> str:
+    """Return a word as a unit has it: one word, whatever signs it has (systemd.syntax(7))."""
+    text = _escaped(word)
+    if command:
+        text = text.replace("$", "$$").replace(f"${STATE}", STATE)
+    if text and SPECIAL.isdisjoint(text):
+        return text
+    text = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{text}"'
+
+
+def write_units(
+    problem: Problem,
+    node: str,
+    cell: Path,
+    out: Path,
+    *,
+    user: str | None,
+    keys: Path | None,
+    insecure: bool,
+) -> list[Path]:
+    """Write the units of a node, and have systemd look at them where there is one.
+
+    Raises
+    ------
+    ProblemError
+        If the cell has no such node.
+    """
+    texts = unit_texts(
+        problem,
+        node,
+        cell.resolve(),
+        user=user or getpass.getuser(),
+        keys=None if keys is None else keys.resolve(),
+        insecure=insecure,
+    )
+    files = []
+    for name, text in texts.items():
+        write_file(out / name, text)
+        files.append(out / name)
+    for line in verify(files):
+        say(f"warning: systemd-analyze verify: {line}")
+    return files
+
+
+def verify(files: Sequence[Path]) -> list[str]:
+    """Return what systemd has to say against units; nothing where it is not installed."""
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        return []
+    done = subprocess.run(  # noqa: S603 - found by its name
+        [program, "verify", *map(str, files)], capture_output=True, text=True, check=False
+    )
+    return [line for line in done.stderr.splitlines() if any(file.name in line for file in files)]

@@ -1,0 +1,43 @@
+"""Modules of a cell's stages: looked at before any process is started."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from dwell.errors import LiveError, missing_package
+from dwell.model import Problem
+from dwell.model.user_classes import import_user_module
+
+
+def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None:
+    """Refuse a cell that lacks a stage for a task of some nodes, or whose stages are not here.
+
+    A node starts a worker that failed again and again, so such a cell would never come up.
+
+    Raises
+    ------
+    DwellError
+        With the task, and what is missing.
+    """
+    tasks = [
+        task for task in problem.pipeline.tasks.values() if not task.on.keys().isdisjoint(nodes)
+    ]
+    if without := [task.name for task in tasks if task.run is None]:
+        raise LiveError(
+            f"{cell}: nothing to run for {', '.join(without)}; a live cell needs `run: "
+            "module:Name` for every task (docs/live-tutorial.md)"
+        )
+    actuators = problem.live.actuators
+    names = {f"tasks.{task.name}.run": task.run for task in tasks}
+    names |= {f"live.actuators.{task.name}": actuators.get(task.name) for task in tasks}
+    for where, name in names.items():
+        if name is None:
+            continue
+        module = name.partition(":")[0]
+        try:
+            import_user_module(module, problem.folder, f"{where} ({name})", LiveError)
+        except LiveError as error:
+            cause = error.__cause__
+            missing = missing_package(cause) if isinstance(cause, ModuleNotFoundError) else None
+            raise missing or error from cause

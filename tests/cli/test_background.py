@@ -1,0 +1,203 @@
+"""`dwell live up`, `down` and `log`: real agents and a real controller in the background."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+
+from dwell.live.local_addresses import taken_ports
+from dwell.live.supervision import survivor
+from dwell.live.wiring import wire
+from tests.cli.live_cell import PATIENCE_S, RealCell
+from tests.cli.small_cell import environment
+from tests.waiting import wait_until
+
+#: An address for documentation (RFC 5737), which no computer has.
+AWAY = "192.0.2.7"
+
+
+class Cell:
+    """The example's cell, run in the background by the command line."""
+
+    def __init__(self, folder: Path) -> None:
+        self.cell = RealCell(folder)
+        self.file, self.problem = self.cell.file, self.cell.problem
+        self.root, self.out = folder / "background", folder / "runs"
+        self.folder = self.root / self.problem.name
+
+    def dwell(self, *words: str | Path) -> tuple[int, str, str]:
+        done = subprocess.run(
+            [sys.executable, "-m", "dwell", "live", *map(str, words), "--state", str(self.root)],
+            cwd=self.cell.folder,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=2 * PATIENCE_S,
+            check=False,
+        )
+        assert "Traceback" not in done.stderr
+        return done.returncode, done.stdout, done.stderr
+
+    def up(self, *more: str | Path) -> tuple[int, str, str]:
+        return self.dwell("up", "--out", self.out, *more, self.file)
+
+    def down(self) -> tuple[int, str, str]:
+        return self.dwell("down", self.file)
+
+    def running(self, pattern: str) -> dict[str, psutil.Process]:
+        found = {mark.stem: survivor(mark) for mark in self.folder.glob(pattern)}
+        return {who: process for who, process in found.items() if process is not None}
+
+    def taken(self) -> str:
+        entries = wire(self.problem).entries.values()
+        return taken_ports(end.port for entry in entries for end in entry.listen.values())
+
+    def assert_nothing_is_there(self) -> None:
+        assert self.taken() == ""
+        assert not self.root.exists()
+        assert not self.out.exists()
+
+    def change(self, **live: object) -> None:
+        document = yaml.safe_load(self.file.read_text())
+        document["live"] |= live
+        self.file.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Iterator[Cell]:
+    made = Cell(tmp_path)
+    text = made.file.read_text()
+    yield made
+    made.file.write_text(text)
+    made.down()
+
+
+def test_a_cell_comes_up_is_looked_at_and_goes_down(cell: Cell) -> None:
+    code, told, _ = cell.up()
+    assert code == 0
+    agents = {f"agent@{node}" for node in cell.problem.fabric.nodes}
+    names = {*agents, "controller@E"}
+    assert all(name in told for name in names)
+    running = cell.running("*.pid")
+    assert running.keys() == names
+    # A session of their own: what ends the terminal does not reach them.
+    assert all(os.getsid(process.pid) == process.pid for process in running.values())
+    cell.cell.until(lambda status: status["window"] and not status["silent"])
+
+    code, _, error = cell.up()
+    assert code == 1
+    assert "is up already" in error
+    assert cell.running("*.pid") == running
+
+    code, _, error = cell.dwell("log", "nobody@E")
+    assert code == 2
+    assert "no process 'nobody@E'; there are agent@E, " in error
+    assert "sink.control@R2" in error
+    code, told, _ = cell.dwell("log", "controller@E", "--cell", cell.file)
+    assert code == 0
+    assert "the run is kept in" in told
+    follows_until_interrupted(cell, "sink.control@R2")
+
+    code, told, _ = cell.down()
+    assert code == 0
+    assert all(name in told for name in names)
+    assert cell.running("**/*.pid") == {}
+    assert cell.taken() == ""
+    # The controller was told to end, too: its run is complete.
+    assert len(list(cell.out.glob("*/run.json"))) == 1
+    code, told, _ = cell.down()
+    assert code == 0
+    assert "does not run here" in told
+
+
+def follows_until_interrupted(cell: Cell, who: str) -> None:
+    words = [sys.executable, "-m", "dwell", "live", "log", who, "-f", "--state", str(cell.root)]
+    with subprocess.Popen(
+        words, env=environment(), stdout=subprocess.PIPE, text=True, bufsize=1
+    ) as following:
+        assert following.stdout is not None
+        assert len([following.stdout.readline() for _ in range(3)]) == 3
+        before = (cell.folder / "R2" / f"{who}.log").read_text()
+        # More comes than there was when it began.
+        while following.stdout.readline().strip() in before:
+            pass
+        following.send_signal(signal.SIGINT)
+        following.stdout.read()
+    assert following.returncode == 130
+
+
+def test_what_dead_agents_have_left_is_named_and_ended(cell: Cell) -> None:
+    assert cell.up()[0] == 0
+    cell.cell.until(lambda status: status["window"])
+    for process in cell.running("*.pid").values():
+        process.send_signal(signal.SIGKILL)
+    wait_until(lambda: not cell.running("*.pid"))
+    left = cell.running("*/*.pid")
+    assert "sink.control@R2" in left
+    code, _, error = cell.up()
+    assert code == 1
+    assert "an agent of light-follower has died, and its processes still run" in error
+    assert "sink.control@R2" in error
+    assert cell.running("*.pid") == {}
+    assert cell.running("*/*.pid") == left
+    code, told, _ = cell.down()
+    assert code == 0
+    assert "sink.control@R2" in told
+    assert cell.running("**/*.pid") == {}
+    assert cell.taken() == ""
+
+
+def test_a_taken_port_is_named_and_nothing_is_started(cell: Cell) -> None:
+    port = wire(cell.problem).entry("perception@E").listen["control"].port
+    with socket.create_server(("127.0.0.1", port)):
+        code, _, error = cell.up()
+        assert code == 1
+        assert f"of the ports of light-follower are taken: {port} by " in error
+    cell.assert_nothing_is_there()
+
+
+@pytest.mark.parametrize(
+    ("live", "options", "code", "words"),
+    [
+        ({"silence": "shout"}, (), 2, "live.silence"),
+        ({"actuators": {"control": "nowhere:Drive"}}, (), 1, "there is no module 'nowhere'"),
+        ({}, ("--node", "R9"), 2, "no node 'R9' in cell 'light-follower'; there are R1, E, R2"),
+        ({"hosts": "away"}, (), 2, "no node of cell 'light-follower' is this computer"),
+        ({"hosts": "away"}, ("--node", "E"), 1, "is beyond this computer, and without keys"),
+        (
+            {"hosts": "away"},
+            ("--node", "E", "--insecure"),
+            1,
+            f"live.hosts.E: {AWAY} is no address of this computer",
+        ),
+    ],
+)
+def test_what_cannot_run_is_said_and_nothing_is_started(
+    cell: Cell, live: dict[str, object], options: tuple[str, ...], code: int, words: str
+) -> None:
+    if "hosts" in live:
+        places = {"R1": 7450, "E": 7500, "R2": 7550}
+        live = {"hosts": {node: {"address": AWAY, "port": port} for node, port in places.items()}}
+    cell.change(**live)
+    found, _, error = cell.up(*options)
+    assert (found, words in error) == (code, True), error
+    cell.assert_nothing_is_there()
+
+
+def test_what_has_been_started_is_ended_where_something_does_not_start(cell: Cell) -> None:
+    cell.out.write_text("no folder")
+    code, _, error = cell.up("--out", cell.out / "runs")
+    assert code == 1
+    assert "controller@E has ended with exit code 1" in error
+    assert "cannot be made" in error
+    cell.out.unlink()
+    cell.assert_nothing_is_there()

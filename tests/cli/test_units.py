@@ -1,0 +1,84 @@
+"""`dwell live units`: what systemd is given, and what it says to that."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import dwell
+from dwell.cli.units import unit_texts, verify
+from tests.cli.small_cell import ROOT, assert_refused, call
+
+CELL = ROOT / "examples" / "live" / "cell.yaml"
+PROBLEM = dwell.load(CELL)
+HAS_SYSTEMD = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed"
+)
+
+
+def values(text: str, key: str) -> list[str]:
+    return re.findall(rf"^{key}=(.*)$", text, re.MULTILINE)
+
+
+def test_a_node_has_an_agent_and_where_it_decides_a_controller(tmp_path: Path) -> None:
+    for node, names in {
+        "R1": ["dwell-agent.service"],
+        "E": ["dwell-agent.service", "dwell-controller.service"],
+    }.items():
+        out = tmp_path / node
+        done = call("live", "units", CELL, "--node", node, "--out", out, "--user", "robot")
+        assert done.exit_code == 0
+        assert sorted(path.name for path in out.iterdir()) == names
+        assert "systemctl enable --now dwell-agent" in done.stdout
+        for name in names:
+            text = (out / name).read_text()
+            assert values(text, "User") == ["robot"]
+            assert values(text, "Restart") == ["always"]
+            (most,) = values(text, "LimitNOFILE")
+            assert int(most) > 1_024
+            assert str(CELL) in values(text, "ExecStart")[0]
+
+
+@HAS_SYSTEMD
+def test_systemd_takes_units_whose_paths_have_odd_signs(tmp_path: Path) -> None:
+    folder = tmp_path / 'a "b" $c %d \\e'
+    shutil.copytree(CELL.parent, folder)
+    keys = tmp_path / "my keys"
+    words = ("--node", "E", "--out", tmp_path / "units", "--keys", keys)
+    done = call("live", "units", folder / "cell.yaml", *words)
+    assert (done.exit_code, done.stderr) == (0, "")
+    agent = tmp_path / "units" / "dwell-agent.service"
+    text = agent.read_text()
+    assert values(text, "Environment") == [f'"DWELL_KEYS={keys}"']
+    quoted = str(folder / "cell.yaml").replace("\\", "\\\\").replace('"', '\\"')
+    quoted = quoted.replace("$", "$$").replace("%", "%%")
+    assert f' --cell "{quoted}" ' in text
+    # It does look at them.
+    agent.write_text(text.replace(f'"{quoted}"', f'"{quoted}'))
+    assert verify([agent])
+
+
+def test_an_unknown_node_is_refused(tmp_path: Path) -> None:
+    refused = call("live", "units", CELL, "--node", "R9", "--out", tmp_path / "units")
+    assert_refused(refused, "no node 'R9' in cell 'light-follower'; there are R1, E, R2")
+    assert not (tmp_path / "units").exists()
+
+
+def test_the_manual_shows_these_units() -> None:
+    page = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^```ini\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    made = {
+        node: unit_texts(
+            PROBLEM,
+            node,
+            Path("/etc/dwell/cell.yaml"),
+            user="robot",
+            keys=Path("/etc/dwell/keys"),
+            program=("/opt/dwell/bin/dwell",),
+        )
+        for node in ("R1", "E")
+    }
+    assert shown == [made["R1"]["dwell-agent.service"], made["E"]["dwell-controller.service"]]
