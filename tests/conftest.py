@@ -33,6 +33,7 @@ ALONE = (
     "testbed/test_execution.py",
     "testbed/test_netns_testbed.py",
     "testbed/test_run.py",
+    "test_two_computers.py",
 )
 
 

@@ -37,10 +37,11 @@ LimitNOFILE={most_files}
 # For --realtime.
 LimitRTPRIO=50
 # The agent starts again what is killed for want of memory, and says so; by default systemd would
-# end it, too. An end for stages that leak, and the CPUs of the whole node, as:
+# end it, too.
+OOMPolicy=continue
+# An end for stages that leak, and CPUs of the whole node (--cpus-of pins single processes):
 # MemoryMax=4G
 # CPUAffinity=2-5
-OOMPolicy=continue
 
 [Install]
 WantedBy=multi-user.target
