@@ -21,9 +21,9 @@ __all__ = [
     "TraceError",
     "TrustError",
     "UnwritableError",
-    "absent",
     "installing",
     "missing_package",
+    "not_installed",
 ]
 
 #: Name of the distribution: `dwell` on the package index is somebody else's.
@@ -152,7 +152,7 @@ def installing(extra: str) -> str:
     return f"pip install '{DISTRIBUTION}[{extra}]'"
 
 
-def absent(*extras: str) -> list[str]:
+def not_installed(*extras: str) -> list[str]:
     """Return the packages of some extras that are not installed."""
     return [
         package

@@ -7,6 +7,7 @@ has what it prints.
 
 from __future__ import annotations
 
+import codecs
 import fcntl
 import json
 import os
@@ -43,6 +44,8 @@ START_S, END_S = 30.0, 30.0
 LOOK_S = 0.1
 #: A log that is longer begins anew when its process is started.
 LOG_BYTES = 8 << 20
+#: How much of the log of a process that does not start is shown.
+LAST_LINES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +209,8 @@ class _Start:
         self.folder, self._out, self._environment = folder, out, environment
         self._was = {path: path.exists() for path in (*folder.parents, folder, out)}
         self._started: dict[str, subprocess.Popen[bytes]] = {}
-        self._logs: list[Path] = []
+        #: How long each log was before; None where there was none.
+        self._logs: dict[str, int | None] = {}
         self._lock = -1
 
     def __enter__(self) -> _Start:
@@ -228,10 +232,11 @@ class _Start:
     def run(self, who: str, command: Sequence[str]) -> None:
         """Start a process, in a session of its own."""
         path = self.folder / f"{who}.log"
-        if not path.exists():
-            self._logs.append(path)
-        elif path.stat().st_size > LOG_BYTES:
+        length = path.stat().st_size if path.exists() else None
+        if length is not None and length > LOG_BYTES:
             path.replace(path.with_suffix(".log.1"))
+            length = 0
+        self._logs[who] = length
         with open(path, "ab", opener=open_own) as log:
             process = subprocess.Popen(  # noqa: S603 - our own command
                 command,
@@ -269,8 +274,11 @@ class _Start:
             time.sleep(LOOK_S)
 
     def _last(self, who: str) -> str:
-        lines = (self.folder / f"{who}.log").read_text(errors="replace").strip().splitlines()
-        return printable(lines[-1]).removeprefix("error: ") if lines else "it has printed nothing"
+        """Return the last lines that a process has printed since it was started."""
+        data = (self.folder / f"{who}.log").read_bytes()[self._logs[who] or 0 :]
+        lines = data.decode(errors="replace").strip().splitlines()[-LAST_LINES:]
+        told = "\n".join(map(printable, lines)).removeprefix("error: ")
+        return told or "it has printed nothing"
 
     def _undo(self) -> None:
         """End what was started, and remove what was made."""
@@ -283,9 +291,12 @@ class _Start:
                 process.kill()
                 process.wait()
         for who in self._started:
+            # An agent that had to be killed has left its processes.
+            _end(_survivors((self.folder / who.partition("@")[2]).glob("*.pid")))
             (self.folder / f"{who}.pid").unlink(missing_ok=True)
-        for log in self._logs:
-            log.unlink(missing_ok=True)
+        for who, length in self._logs.items():
+            if length is None:
+                (self.folder / f"{who}.log").unlink(missing_ok=True)
         if not self._was[self.folder]:
             shutil.rmtree(self.folder, ignore_errors=True)
         for path in (self._out, *self.folder.parents):
@@ -372,9 +383,10 @@ def log_of(root: Path, who: str, cell: str | None) -> Path:
 
 def print_log(path: Path, *, follow: bool) -> None:
     """Print a log; `follow` goes on with what is added, until interrupted."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    decoder = codecs.getincrementaldecoder("utf-8")("replace")
+    with path.open("rb") as file:
         while True:
-            if text := file.read():
+            if text := decoder.decode(file.read()):
                 typer.echo(printable(text, keep="\n\t"), nl=False)
             if not follow:
                 return

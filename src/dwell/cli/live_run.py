@@ -16,7 +16,7 @@ import dwell
 from dwell.cli.exit_codes import ExitCode
 from dwell.cli.live_view import CellState, View, live_view
 from dwell.cli.output import aligned, print_json, working, write_file
-from dwell.errors import LiveError, absent, installing
+from dwell.errors import LiveError, installing, not_installed
 from dwell.live.stage_modules import require_stages
 from dwell.model import Problem, Scenario
 from dwell.model.bounds import counted
@@ -116,7 +116,7 @@ def _announce_left_out() -> tuple[bool, bool]:
     tuple of bool
         Whether there will be a report, and whether there will be tables.
     """
-    lacking = absent("sim", "report")
+    lacking = not_installed("sim", "report")
     if not lacking:
         return True, True
     tables = "Polars" not in lacking

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from dwell.errors import LiveError
+from dwell.live.state_files import make_folder
 from dwell.testbed.chaos.disk import DiskHog, SmallDisk, limit_file_size, may_mount
 
 WRITER = """
@@ -50,6 +51,7 @@ def test_a_process_whose_files_may_not_grow(tmp_path: Path) -> None:
 def test_a_small_disk_is_full_until_it_is_cleared(tmp_path: Path) -> None:
     folder = tmp_path / "disk"
     with SmallDisk(folder) as disk:
+        assert make_folder(folder) == folder
         (folder / "kept").write_bytes(b"x" * 10_000)
         disk.fill()
         with pytest.raises(OSError, match="No space left"), (folder / "more").open("wb") as file:
