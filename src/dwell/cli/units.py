@@ -34,6 +34,8 @@ RestartSec=1
 KillMode=process
 TimeoutStopSec=15
 LimitNOFILE={most_files}
+# Shared memory for images is locked; without, they are copied through sockets.
+LimitMEMLOCK=infinity
 # For --realtime.
 LimitRTPRIO=50
 # The agent starts again what is killed for want of memory, and says so; by default systemd would

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
+import shutil
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -229,6 +232,18 @@ def test_no_pool_where_there_is_no_room_for_it(monkeypatch: pytest.MonkeyPatch) 
     assert _Pool.of(1 << 50) is None
     monkeypatch.setattr("dwell.live.transport.zenoh._SHARED_MEMORY", "/nowhere/at/all")
     assert _Pool.of() is None
+
+
+def test_a_user_who_may_lock_little_memory_sends_through_sockets() -> None:
+    code = "from dwell.live.transport.zenoh import _Pool; print(_Pool.of())"
+    command = ["prlimit", "--memlock=1000000", sys.executable, "-c", code]
+    if os.geteuid() == 0:  # whom no limit holds
+        command[2:2] = ["setpriv", "--bounding-set=-ipc_lock"]
+    if missing := [name for name in ("prlimit", "setpriv") if shutil.which(name) is None]:
+        pytest.skip(f"{', '.join(missing)} is not installed")
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "None\n"
+    assert "images are copied through sockets" in done.stderr
 
 
 def test_the_killed_leave_no_shared_memory_behind(mesh: ZenohMesh) -> None:

@@ -468,7 +468,19 @@ class _Pool:
                 2 * pool_bytes,
             )
             return None
-        return cls(pool_bytes)
+        from zenoh import ZError
+
+        try:
+            return cls(pool_bytes)
+        except ZError as error:
+            # Zenoh locks it into memory, of which a user may lock 8 MB only by default.
+            _LOG.warning(
+                "no %d bytes of shared memory can be had (%s; LimitMEMLOCK, ulimit -l): images are "
+                "copied through sockets",
+                pool_bytes,
+                error,
+            )
+            return None
 
     def filled(self, payload: bytes) -> Any:
         """Return the payload in shared memory, or as it is where there is no room."""
