@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Under nohup, and in the background of a shell, SIGINT is ignored, and so it would be by all
-# processes that tests start and interrupt.
+# Under nohup, and in the background of a shell, these are ignored, and so they would be by all
+# processes that tests start and signal.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
 
 settings.register_profile("dwell", deadline=None)
 settings.load_profile("dwell")

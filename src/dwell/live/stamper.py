@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 
 from dwell.control import Failures, Guard, Presence, Probation, shadow_stamps
 from dwell.errors import LiveError
-from dwell.live.continuity import RESERVED
+from dwell.live.continuity import RESERVED, SetbackDetector
 from dwell.live.control_group import UNKNOWN
 from dwell.live.keys import CONTROLLER
 from dwell.live.latencies import Intervals
@@ -99,7 +99,7 @@ class Stamper:
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
         self._framed_ns = now_ns - place.period_ns
-        self._woken_ns = now_ns
+        self._setback = SetbackDetector()
         # A run that goes on does so at once; a new one waits until its placement is there.
         self._begun, self._since_ns = entry.reserved > 0, now_ns
         # Sources on other nodes get their stamps a cycle early.
@@ -344,9 +344,8 @@ class Stamper:
         """Release the cycle that is due, let the guard look, beat; returns what is due next."""
         if not self._begun and not self._begin(now_ns):
             return min(self.pulse.wake(now_ns), now_ns + self.place.period_ns)
-        if now_ns < self._woken_ns - self.place.period_ns // 4:
+        if self._setback.back_ns(now_ns) > self.place.period_ns // 4:
             self._begin_anew(now_ns)
-        self._woken_ns = now_ns
         fallback = self.guard.check(now_ns, *self._guards_view(now_ns))
         if fallback is not None:
             self._move(fallback, by_guard=True)
