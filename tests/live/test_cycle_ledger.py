@@ -194,3 +194,19 @@ def test_a_clock_that_is_set_within_a_cycle_leaves_no_interval_that_cannot_be(
     # The stamp of a source may have been there before the release.
     for instants in (shown.ready_ns[:, 1:], shown.end_ns, shown.arrived_ns):
         assert ((instants == UNKNOWN) | (instants >= RELEASE_NS - MS)).all()
+
+
+@pytest.mark.parametrize(
+    ("stamped_ms", "stamper_ms", "latency_ms"), [(1, 30, 26), (None, 30, 30), (None, None, None)]
+)
+def test_where_clocks_cannot_be_believed_one_alone_counts(
+    ledger: Ledger, stamped_ms: int | None, stamper_ms: int | None, latency_ms: int | None
+) -> None:
+    one = cycle()
+    one.stamped_ns = None if stamped_ms is None else RELEASE_NS + stamped_ms * MS
+    one.stamper_interval_ns = None if stamper_ms is None else stamper_ms * MS
+    done = completion(one)
+    one.take(replace(done, done_ns=done.done_ns - 1_000 * MS), RELEASE_NS + 27 * MS)
+    ledger.settle(one)
+    assert one.bound_ns >= UNBOUNDED_NS
+    assert one.latency_ns == (NEVER_NS if latency_ms is None else latency_ms * MS)

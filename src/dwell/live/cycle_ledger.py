@@ -252,9 +252,10 @@ class Ledger:
         if cycle.bound_ns < UNBOUNDED_NS:
             cycle.latency_ns = max(done_ns - cycle.at_ns, 0)
             cycle.parts_ns = self._split(cycle, last)
-        elif cycle.interval_ns is not None:
-            # Clocks have not been compared: what the controller's own shows is all there is.
-            cycle.latency_ns = cycle.interval_ns
+        else:
+            # Clocks have not been compared: what one alone shows is all there is.
+            own_ns = (cycle.interval_ns, cycle.stamper_interval_ns, cycle.latency_ns)
+            cycle.latency_ns = next(ns for ns in own_ns if ns is not None)
 
     def _since_origin(self, cycle: LiveCycle, node: str, instant_ns: int) -> int:
         """Put an instant of a node's clock on the stamper's, since the origin.
