@@ -98,6 +98,18 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(LiveError, match="file/inside: cannot be made"):
         make_folder(tmp_path / "file" / "inside")
+    with pytest.raises(LiveError, match="file: cannot be made"):
+        make_folder(tmp_path / "file")
+
+
+def test_a_folder_and_those_above_that_are_made_for_it_are_the_user_s_own(tmp_path: Path) -> None:
+    before = os.umask(0o002)
+    try:
+        make_folder(tmp_path / "dwell" / "cell" / "R1")
+    finally:
+        os.umask(before)
+    for folder in ("dwell", "dwell/cell", "dwell/cell/R1"):
+        assert make_folder(tmp_path / folder).stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o1777, 0o770])

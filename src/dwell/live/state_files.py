@@ -36,7 +36,11 @@ def make_folder(path: Path) -> Path:
         If it cannot be made or written to, or belongs to another user, or others may write to it.
     """
     try:
-        path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        # `parents=True` would leave those above open to the group where the umask is 002.
+        for folder in reversed(path.parents):
+            if not folder.exists():
+                folder.mkdir(exist_ok=True, mode=0o700)
+        path.mkdir(exist_ok=True, mode=0o700)
     except OSError as error:
         raise LiveError(f"{path}: cannot be made ({error.strerror})") from None
     if not os.access(path, os.W_OK):
