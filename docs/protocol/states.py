@@ -29,6 +29,8 @@ RULES = {
     "newest": "an order does not move the cell if a later one has come",
     "own": "a state does not replace one that has worked on later cycles by order",
     "later": "a state does not replace a later one that was taken over",
+    "asked": "a state is taken for the snapshot that its target knows to be asked for",
+    "stamped": "a state waits for the stamp of its last cycle",
     "past": "what the state is past is not worked on",
     "suppress": "the output of a cycle is sent where it is stamped only",
 }
@@ -52,6 +54,8 @@ class Limits:
         Times that the controller says that it is there while it moves the task.
     early : bool
         Whether a stamp may be drawn before its cycle is released.
+    lies : int
+        States of cycles to come that somebody makes up, the node that is asked for one included.
     """
 
     cycles: int = 2
@@ -60,6 +64,7 @@ class Limits:
     crashes: int = 0
     hellos: int = 0
     early: bool = False
+    lies: int = 0
 
 
 class Input(NamedTuple):
@@ -89,6 +94,8 @@ class Worker(NamedTuple):
         Number and first cycle that is forked, of a snapshot that it is asked for.
     excused : bool
         Whether it has died since it last worked.
+    awaits : int
+        Number of the snapshot whose state shall come here.
     """
 
     held: int = 0
@@ -98,6 +105,7 @@ class Worker(NamedTuple):
     follows: bool = False
     asked: tuple[int, int] = (0, 0)
     excused: bool = False
+    awaits: int = 0
 
 
 class Message(NamedTuple):
@@ -107,7 +115,7 @@ class Message(NamedTuple):
     ----------
     kind : str
         ``order`` (also one that only forks, or only says hello), ``ask`` for a snapshot, ``state``,
-        ``ready``.
+        ``lie`` for one that is made up, ``ready``.
     number : int
     to : str
         Node: whither an order forks, or whose message it is; nothing where nothing is forked.
@@ -163,7 +171,7 @@ class State(NamedTuple):
     said : frozenset of Message
     lost : int
         Cycles that faults have cost the state, as an omniscient observer knows.
-    moves, fires, crashes, hellos : int
+    moves, fires, crashes, hellos, lies : int
         How many there have been.
     """
 
@@ -184,6 +192,7 @@ class State(NamedTuple):
     fires: int = 0
     crashes: int = 0
     hellos: int = 0
+    lies: int = 0
 
 
 ALL, LIMITS = Rules(), Limits()
@@ -193,7 +202,10 @@ CASES = (
     Limits(cycles=2, hellos=1, early=True),
     Limits(cycles=2, fires=1, crashes=1),
     Limits(cycles=3, moves=2),
+    Limits(cycles=3, lies=1),
 )
+#: Number of a state that nobody has asked for.
+NOBODYS = 1_000
 
 
 def initial() -> State:
@@ -203,7 +215,12 @@ def initial() -> State:
 
 def good(state: State) -> bool:
     """Whether no migration is under way, or it has reached its end, or waits for a next cycle."""
-    return state.move is None or state.active == state.move.to or state.by_guard
+    move = state.move
+    if move is None or state.active == move.to or state.by_guard:
+        return True
+    index = NODES.index(move.to)
+    unheard = _heard(state.workers[index]) < state.cycle - 1
+    return state.fork == move.to and unheard and not state.inputs[index]
 
 
 def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Iterator[Step[State]]:
@@ -226,6 +243,16 @@ def _faults(state: State, limits: Limits) -> Iterator[Step[State]]:
             gone = (*state.inputs[:index], (), *state.inputs[index + 1 :])
             after = reborn._replace(inputs=gone, crashes=state.crashes + 1)
             yield Step(f"the worker on {name} starts again", after, fault=True)
+
+    if state.lies < limits.lies:
+        # Who is asked is believed, but for what cannot be; who is not, knows the newest stamp.
+        ahead, newest = (4 << state.cycle) - 2, 1 << (state.cycle - 1) & ~1
+        asked = {one.number: ahead for one in state.said if one.kind == "ask"}
+        for name in NODES:
+            for number, held in {NOBODYS: newest, **asked}.items():
+                made_up = Message("lie", number, name, held=held)
+                lied = _say(state, made_up)._replace(lies=state.lies + 1)
+                yield Step(f"somebody makes up state {number} for {name}", lied, fault=True)
 
 
 def _set(state: State, index: int, worker: Worker) -> State:
@@ -309,12 +336,15 @@ def _worker(state: State, rules: Rules, index: int) -> Iterator[Step[State]]:
         yield Step(f"{name} hands its state out", _say(told, answer))
     for message in state.said:
         if message.to != name:
+            if message.kind == "ask":
+                knows = worker._replace(awaits=message.number)
+                yield Step(f"{name} knows that it is asked for", _set(state, index, knows))
             continue
         answered = any(one.kind == "state" and one.number == message.number for one in state.said)
         if message.kind == "ask" and not answered:
             asked = worker._replace(asked=(message.number, message.cycle))
             yield Step(f"{name} is asked for its state", _set(state, index, asked))
-        elif message.kind == "state":
+        elif message.kind in ("state", "lie"):
             yield _restores(state, rules, index, message)
 
 
@@ -343,9 +373,14 @@ def _works(state: State, rules: Rules, index: int, one: Input) -> Step[State]:
     if not wrong and before & ~worker.held & ~state.lost:
         wrong = "a state lacks an input"
     done = worker._replace(
-        held=worker.held | bit, own=one.cycle, log=0, follows=False, excused=False
+        held=worker.held | bit, own=one.cycle, log=0, follows=False, excused=False, awaits=0
     )
     return Step(label, _set(state, index, done), wrong=wrong)
+
+
+def _heard(worker: Worker) -> int:
+    """Return the last cycle whose stamp has come to a worker with an input."""
+    return max(worker.own, _newest(worker.log), _newest(worker.held))
 
 
 def _muddled(worker: Worker, cycle: int) -> str:
@@ -357,6 +392,10 @@ def _muddled(worker: Worker, cycle: int) -> str:
 def _restores(state: State, rules: Rules, index: int, message: Message) -> Step[State]:
     name, worker = NODES[index], state.workers[index]
     label = f"state {message.number} reaches {name}"
+    if message.number != worker.awaits and rules.holds("asked"):
+        return Step(f"{label}, which does not await it", state)
+    if _newest(message.held) > _heard(worker) and rules.holds("stamped"):
+        return Step(f"{label}, which has not heard of its last cycle", state)
     if _newest(message.held) < worker.own and rules.holds("own"):
         return Step(f"{label}, which has worked on more", state)
     ready = Message("ready", message.number, name)
@@ -366,7 +405,9 @@ def _restores(state: State, rules: Rules, index: int, message: Message) -> Step[
     if rules.holds("replay"):
         held |= worker.log & ~((2 << _newest(held)) - 1)
     restored = worker._replace(held=held, taken=_newest(message.held), follows=True)
-    return Step(label, _say(_set(state, index, restored), ready))
+    restored = restored._replace(awaits=0)
+    wrong = "a state has a cycle that nobody has stamped" if message.held >> state.cycle else ""
+    return Step(label, _say(_set(state, index, restored), ready), wrong=wrong)
 
 
 # ------------------------------------------------------------------------------ controller

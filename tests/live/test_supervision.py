@@ -18,7 +18,7 @@ import pytest
 from dwell.errors import LiveError
 from dwell.live import supervision
 from dwell.live.state_files import InFlight
-from dwell.live.supervision import SupervisedProcess, Supervisor, claim, marked_group
+from dwell.live.supervision import SupervisedProcess, Supervisor, claim
 from dwell.testbed.chaos.disk import SmallDisk, may_mount
 from tests.waiting import wait_until
 
@@ -389,24 +389,6 @@ def test_helpers_end_with_their_process_at_an_orderly_end(
     supervisor.stop()
     assert not any(runs(pid) for pid in near)
     assert runs(apart)
-
-
-def test_a_group_of_somebody_else_is_left_alone(tmp_path: Path, said: list[str]) -> None:
-    other = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], process_group=0)
-    try:
-        started = psutil.Process(other.pid).create_time()
-        session = os.getsid(other.pid)
-        # The mark's process had this id before, or the group has another session.
-        for began, its in ((started - 100, session), (started, session + 1)):
-            mark = {"pid": other.pid, "started": began, "session": its}
-            (tmp_path / "stamper@R1.pid").write_text(json.dumps(mark))
-            group = marked_group(tmp_path / "stamper@R1.pid")
-            assert group is not None
-            assert group.kill() == 0
-            assert other.poll() is None
-    finally:
-        other.kill()
-        other.wait()
 
 
 def test_the_last_words_are_those_of_the_life_that_has_ended(

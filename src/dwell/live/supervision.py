@@ -368,10 +368,10 @@ class Supervisor:
     def _end_groups(self, patience_s: float) -> None:
         """End what the processes have left; a helper that the kernel keeps is not waited for."""
         deadline = time.monotonic() + patience_s
-        while {self._end_group(child) for child in self.children} - {True}:
-            if time.monotonic() > deadline:
-                return
+        left = [child for child in self.children if not self._end_group(child)]
+        while left and time.monotonic() < deadline:
             time.sleep(0.01)
+            left = [child for child in left if not self._end_group(child)]
 
 
 def _signal(process: psutil.Process, number: int) -> None:
