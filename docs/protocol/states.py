@@ -219,8 +219,7 @@ def good(state: State) -> bool:
     if move is None or state.active == move.to or state.by_guard:
         return True
     index = NODES.index(move.to)
-    unheard = _heard(state.workers[index]) < state.cycle - 1
-    return state.fork == move.to and unheard and not state.inputs[index]
+    return state.fork == move.to and _heard(state, index) < state.cycle - 1
 
 
 def successors(state: State, rules: Rules = ALL, limits: Limits = LIMITS) -> Iterator[Step[State]]:
@@ -378,9 +377,11 @@ def _works(state: State, rules: Rules, index: int, one: Input) -> Step[State]:
     return Step(label, _set(state, index, done), wrong=wrong)
 
 
-def _heard(worker: Worker) -> int:
-    """Return the last cycle whose stamp has come to a worker with an input."""
-    return max(worker.own, _newest(worker.log), _newest(worker.held))
+def _heard(state: State, index: int) -> int:
+    """Return the last cycle whose stamp may have come to a worker, with an input that waits."""
+    worker = state.workers[index]
+    waiting = (one.cycle for one in state.inputs[index])
+    return max(worker.own, _newest(worker.log), _newest(worker.held), *waiting)
 
 
 def _muddled(worker: Worker, cycle: int) -> str:
@@ -394,7 +395,7 @@ def _restores(state: State, rules: Rules, index: int, message: Message) -> Step[
     label = f"state {message.number} reaches {name}"
     if message.number != worker.awaits and rules.holds("asked"):
         return Step(f"{label}, which does not await it", state)
-    if _newest(message.held) > _heard(worker) and rules.holds("stamped"):
+    if _newest(message.held) > _heard(state, index) and rules.holds("stamped"):
         return Step(f"{label}, which has not heard of its last cycle", state)
     if _newest(message.held) < worker.own and rules.holds("own"):
         return Step(f"{label}, which has worked on more", state)
