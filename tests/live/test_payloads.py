@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from contextlib import suppress
 
 import msgspec
@@ -211,3 +213,15 @@ KINDS = ("none", "bytes", "array:<f8:3", "array:|u1:2x2", "struct:Spot", "array:
 def test_any_bytes_are_read_or_refused(kind: str, data: bytes, expected: type | None) -> None:
     with suppress(LiveError):
         read_payload(kind, data, expected)
+
+
+def test_a_first_payload_loads_no_further_part_of_numpy() -> None:
+    """What takes a tenth of a second costs the first cycles of a cell."""
+    program = (
+        "import sys, msgspec, numpy\n"
+        "from dwell.live.payloads import write_payload\n"
+        "class Spot(msgspec.Struct):\n    row: object\n"
+        "for payload in (b'', numpy.zeros(3), Spot(numpy.int64(3))):\n    write_payload(payload)\n"
+        "sys.exit('numpy.ma' in sys.modules)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
