@@ -16,7 +16,15 @@ import polars as pl
 import pytest
 
 import dwell
-from dwell.control import ClosedWindow, Controller, Guard, Presence, Probation
+from dwell.control import (
+    ClosedWindow,
+    Controller,
+    Failures,
+    FallbackRound,
+    Guard,
+    Presence,
+    Probation,
+)
 from dwell.display import Displayed, milliseconds
 from dwell.estimators import Evidence, Instants
 from dwell.estimators import by_name as estimator_by_name
@@ -134,6 +142,7 @@ def objects(
         *(policy_by_name(name, canonical) for name in policies),
         *(estimator_by_name(name, canonical) for name in ("profile", "shadow", "scaling")),
         *(controller, controller.estimator, controller.log, Presence.of(canonical)),
+        *(FallbackRound(["LOC"]), Failures.of(canonical)),
         Guard(["LOC"], placement="SO", **guard),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3))),

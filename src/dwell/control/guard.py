@@ -103,6 +103,10 @@ class FallbackRound:
         self._failed: dict[str, None] = {}
         self._tried: set[str] = set()
 
+    def __repr__(self) -> str:
+        tried = ", ".join(sorted(self._tried))
+        return f"FallbackRound({', '.join(self.fallbacks)}; tried: {tried or 'none'})"
+
     @property
     def begun(self) -> bool:
         """Whether any has been tried."""
@@ -487,6 +491,9 @@ class Failures:
     def __init__(self, candidates: Iterable[str], in_a_row: int, patience_ns: int) -> None:
         self.in_a_row = in_a_row
         self._through = {name: _Silence(patience_ns, kept=in_a_row) for name in candidates}
+
+    def __repr__(self) -> str:
+        return f"<Failures of {len(self._through)} candidates, {self.in_a_row} in a row>"
 
     @classmethod
     def of(cls, problem: Problem) -> Failures:
