@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import codecs
 import fcntl
-import json
 import os
 import shlex
 import shutil
@@ -27,13 +26,13 @@ import typer
 
 from dwell.cli.state_folder import logs
 from dwell.errors import LiveError, ProblemError
-from dwell.files import write_whole
 from dwell.live.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
 from dwell.live.log import printable
+from dwell.live.process_group import ProcessGroup
 from dwell.live.security import Security
 from dwell.live.stage_modules import require_stages
 from dwell.live.state_files import make_folder, open_own
-from dwell.live.supervision import survivor
+from dwell.live.supervision import LOG_BYTES, survivor, write_mark
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wiring import Role, Wiring, wire
 from dwell.model import Problem
@@ -42,8 +41,6 @@ from dwell.model import Problem
 #: for two seconds, and a controller completes its run's folder.
 START_S, END_S = 30.0, 30.0
 LOOK_S = 0.1
-#: A log that is longer begins anew when its process is started.
-LOG_BYTES = 8 << 20
 #: How much of the log of a process that does not start is shown.
 LAST_LINES = 5
 
@@ -96,12 +93,8 @@ def nodes_here(problem: Problem, named: Sequence[str]) -> list[str]:
     ProblemError
         If there is no such node, or none is this computer.
     """
-    known = problem.fabric.nodes
     for node in named:
-        if node not in known:
-            raise ProblemError(
-                f"no node {node!r} in cell {problem.name!r}; there are {', '.join(known)}"
-            )
+        problem.require_node(node)
     here = [
         node
         for node, host in problem.live.hosts.items()
@@ -247,9 +240,7 @@ class _Start:
                 start_new_session=True,
             )
         self._started[who] = process
-        started = psutil.Process(process.pid).create_time()
-        mark = json.dumps({"pid": process.pid, "started": started})
-        write_whole(self.folder / f"{who}.pid", mark, durable=False)
+        write_mark(self.folder / f"{who}.pid", ProcessGroup.of(process.pid))
 
     def wait(self, ports: Mapping[str, int]) -> None:
         """Return when all listen.

@@ -11,7 +11,7 @@ import typer
 
 from dwell.cli.live import environment
 from dwell.cli.output import aligned, print_json
-from dwell.errors import Fault, LiveError, ProblemError, TrustError, installing
+from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.lint import lint
 from dwell.live.security import Security, exposed
 from dwell.live.stage import Stage, Stateful, load_actuator, load_stage
@@ -38,9 +38,7 @@ def check_node(
     bool
         Whether nothing is.
     """
-    if node not in problem.fabric.nodes:
-        known = ", ".join(problem.fabric.nodes)
-        raise ProblemError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
+    problem.require_node(node)
     # As the worker's process does: the user's stages lie beside their cell file.
     sys.path.insert(0, str(cell.resolve().parent))
     wiring, faults = _wiring(problem)

@@ -298,6 +298,18 @@ class Problem(Displayed):
         source = next(name for name in pipeline.tasks if not pipeline.inputs(name))
         return self.candidates[self.initial][source]
 
+    def require_node(self, name: str) -> None:
+        """Refuse a node that the cell does not have.
+
+        Raises
+        ------
+        ProblemError
+            With the nodes that there are.
+        """
+        if name not in self.fabric.nodes:
+            known = ", ".join(self.fabric.nodes)
+            raise ProblemError(f"no node {name!r} in cell {self.name!r}; there are {known}")
+
     def scenario(self, name: str) -> Scenario:
         """Disturbances of a scenario.
 
