@@ -10,18 +10,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dwell.cli.output import say, write_file
-from dwell.errors import ProblemError
 from dwell.model import Problem
 
 #: Files and connections that a process of a cell may have open: what only connects, and says
 #: nothing, must not keep it from its work.
 MOST_FILES = 65_536
 
-AGENT = """\
+UNIT = """\
 [Unit]
 Description={description}
-Wants=network-online.target time-sync.target
-After=network-online.target time-sync.target
+Wants=network-online.target{beside}
+After=network-online.target{beside}
 
 [Service]
 User={user}
@@ -29,11 +28,17 @@ StateDirectory=dwell
 {environment}ExecStart={command}
 Restart=always
 RestartSec=1
+{settings}
+[Install]
+WantedBy=multi-user.target
+"""
+#: Settings of each service beside those that both have.
+AGENT = f"""\
 # The agent ends its processes itself. Should it die alone, they work on, and the next agent takes
 # them over: systemd must not end them.
 KillMode=process
 TimeoutStopSec=15
-LimitNOFILE={most_files}
+LimitNOFILE={MOST_FILES}
 # Shared memory for images is locked; without, they are copied through sockets.
 LimitMEMLOCK=infinity
 # For --realtime.
@@ -44,29 +49,15 @@ OOMPolicy=continue
 # An end for stages that leak, and CPUs of the whole node (--cpus-of pins single processes):
 # MemoryMax=4G
 # CPUAffinity=2-5
-
-[Install]
-WantedBy=multi-user.target
 """
-
-CONTROLLER = """\
-[Unit]
-Description={description}
-Wants=network-online.target
-After=network-online.target
-
-[Service]
-User={user}
-StateDirectory=dwell
-{environment}ExecStart={command}
-Restart=always
-RestartSec=1
+CONTROLLER = f"""\
 TimeoutStopSec=60
-LimitNOFILE={most_files}
-
-[Install]
-WantedBy=multi-user.target
+LimitNOFILE={MOST_FILES}
 """
+#: Where systemd puts the folder that StateDirectory= names.
+STATE = "${STATE_DIRECTORY}"
+#: Signs that end a word, or mean something in one.
+SPECIAL = frozenset(" \t\"'\\;")
 
 
 def unit_texts(
@@ -95,44 +86,32 @@ def unit_texts(
     ProblemError
         If the cell has no such node.
     """
-    if node not in problem.fabric.nodes:
-        known = ", ".join(problem.fabric.nodes)
-        raise ProblemError(f"no node {node!r} in cell {problem.name!r}; there are {known}")
-    settings = {} if keys is None else {"DWELL_KEYS": str(keys)}
-    settings |= {"DWELL_INSECURE": "1"} if insecure else {}
+    problem.require_node(node)
+    variables = {} if keys is None else {"DWELL_KEYS": str(keys)}
+    variables |= {"DWELL_INSECURE": "1"} if insecure else {}
     environment = "".join(
-        f"Environment={_quoted(f'{name}={value}')}\n" for name, value in settings.items()
+        f"Environment={_quoted(f'{name}={value}')}\n" for name, value in variables.items()
     )
 
-    def unit(text: str, description: str, *words: str) -> str:
-        command = " ".join(_quoted(word, command=True) for word in (*program, *words))
-        return text.format(
+    def unit(description: str, words: Sequence[str], settings: str, *, beside: str = "") -> str:
+        return UNIT.format(
             description=_escaped(description),
+            beside=beside,
             user=user,
             environment=environment,
-            command=command,
-            most_files=MOST_FILES,
+            command=" ".join(_quoted(word, command=True) for word in (*program, *words)),
+            settings=settings,
         )
 
-    state = f"{STATE}/{problem.name}"
-    agent = ("agent", "--node", node, "--cell", str(cell), "--state", f"{state}/{node}")
-    units = {
-        "dwell-agent.service": unit(
-            AGENT, f"Dwell agent of node {node} of cell {problem.name}", *agent
-        )
-    }
+    state = f"{STATE}/{problem.name}/{node}"
+    agent = ("agent", "--node", node, "--cell", str(cell), "--state", state)
+    called = f"Dwell agent of node {node} of cell {problem.name}"
+    units = {"dwell-agent.service": unit(called, agent, AGENT, beside=" time-sync.target")}
     if node == problem.controller_node:
-        words = ("controller", "--cell", str(cell), "--out", f"{STATE}/runs")
-        units["dwell-controller.service"] = unit(
-            CONTROLLER, f"Dwell controller of cell {problem.name}", *words
-        )
+        controller = ("controller", "--cell", str(cell), "--out", f"{STATE}/runs")
+        called = f"Dwell controller of cell {problem.name}"
+        units["dwell-controller.service"] = unit(called, controller, CONTROLLER)
     return units
-
-
-#: Where systemd puts the folder that StateDirectory= names.
-STATE = "${STATE_DIRECTORY}"
-#: Signs that end a word, or mean something in one.
-SPECIAL = frozenset(" \t\"'\\;")
 
 
 def _escaped(text: str) -> str:
