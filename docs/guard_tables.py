@@ -5,7 +5,7 @@ The canonical cell under three policies, four seeds of 300 windows each, with an
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -63,8 +63,10 @@ def moves(run: dwell.Run, *, guard: bool) -> int:
     return len(run.decisions.filter(pl.col("migrated") & (by_guard if guard else ~by_guard)))
 
 
-def played(problem: Problem, scenario: str, *, guard: bool) -> Iterator[dwell.Run]:
-    for policy in POLICIES:
+def played(
+    problem: Problem, scenario: str, *, guard: bool, policies: Sequence[str] = POLICIES
+) -> Iterator[dwell.Run]:
+    for policy in policies:
         for seed in SEEDS:
             yield dwell.simulate(
                 problem, scenario=scenario, policy=policy, seed=seed, windows=WINDOWS, guard=guard
@@ -90,13 +92,7 @@ def fault_row(problem: Problem, name: str) -> str:
 def scenario_row(problem: Problem, name: str) -> str:
     """Write what the guard does under DTP where nothing is down."""
     without, with_guard = (
-        [
-            dwell.simulate(
-                problem, scenario=name, policy="dtp", seed=seed, windows=WINDOWS, guard=guard
-            )
-            for seed in SEEDS
-        ]
-        for guard in (False, True)
+        list(played(problem, name, guard=guard, policies=["dtp"])) for guard in (False, True)
     )
     own = sum(moves(run, guard=True) for run in with_guard)
     orders = (sum(moves(run, guard=False) for run in runs) for runs in (without, with_guard))

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from dwell.errors import LiveError
+from dwell.live.continuity import SetbackDetector
 from dwell.live.failures import described, end_process, start_thread
 from dwell.live.role import RoleLogic
 from dwell.live.security import Security
@@ -99,7 +100,8 @@ class Hosted:
         self.hurry = hurry or threading.Event()
         self._heard, self._complain = heard, complain
         self.news = threading.Semaphore(0)
-        self._due_ns = self._seen_ns = 0
+        self._due_ns = 0
+        self._setback = SetbackDetector()
         for key in role.subscriptions():
             transport.subscribe(key, self._receive)
 
@@ -134,10 +136,9 @@ class Hosted:
     def rest_ns(self) -> int:
         """Time until the role is due; negative where it is late."""
         now_ns = self.clock()
-        if now_ns < self._seen_ns:
-            # The clock has been set back, and what is due with it: nobody knows for how long.
+        if self._setback.back_ns(now_ns):
+            # And what is due with it: nobody knows for how long.
             self._due_ns = now_ns
-        self._seen_ns = now_ns
         return self._due_ns - now_ns
 
     def wake(self) -> None:

@@ -29,6 +29,7 @@ class Symptoms:
     def __init__(self, problem: Problem, ledger: Ledger) -> None:
         self._ledger, self._size = ledger, problem.window_cycles
         self._guard_cycles = problem.controller.guard_cycles
+        self._failures = problem.controller.failures_in_a_row
         self._deadline_ns = round(problem.pipeline.deadline_ms * 1e6)
         self._begun_ns: int | None = None
         self._recent: deque[LiveWindow] = deque(maxlen=RECENT)
@@ -105,7 +106,7 @@ class Symptoms:
 
     def _failing(self, newest: Iterable[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
         """Yield candidates whose last shadows all failed; cycles within g of the newest may not."""
-        most = self._guard_cycles + 1
+        most = self._failures
         fails: dict[str, list[LiveCycle]] = {}
         succeeded = set()
         for place, cycle in enumerate(islice(newest, self._guard_cycles, None)):

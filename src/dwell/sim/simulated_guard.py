@@ -156,7 +156,7 @@ class SimulatedGuard:
         """Whether it is too early to move: the guard rests, or its own node has been away."""
         cell, own = tables.cells[0], self._outages.of(self.problem.stamper_node)
         back_ns = max((up for down, up in own if down <= now), default=0)
-        if self._own is not None and self._carries(tables, now, first):
+        if self._carries(tables, now, first):
             self._round.over()
             self._spent_until = None
             cell[k.WAITED] = max(cell[k.WAITED], cell[k.RESTED])
