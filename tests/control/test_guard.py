@@ -362,18 +362,22 @@ class Cell:
 
     def play(self, cycles: int = 1) -> None:
         for _ in range(cycles):
-            now = len(self.done) * P
-            for quarter in range(4):
-                self._look(now + quarter * P // 4)
             cycle = len(self.done)
+            now = cycle * P
             self.done.append(False)
-            self.resting.append(self.guard.resting and self.guard._spent_ns is not None)
             self._look(now)
+            self.resting.append(self._rests)
             self.guard.released(cycle, now)
             if self.guard.placement in self.able:
                 heapq.heappush(self._ends, (now + self.latency, cycle))
             for quarter in range(1, 5):
                 self._look(now + quarter * P // 4 - 1)
+
+    @property
+    def _rests(self) -> bool:
+        """Whether a cycle that is released is not waited for: a fallback carries, or all failed."""
+        mine = self.guard
+        return mine.resting and (mine.carries or mine._spent_ns is not None)
 
     def _look(self, now: int) -> None:
         while self._ends and self._ends[0][0] <= now:
