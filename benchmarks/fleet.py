@@ -12,8 +12,8 @@ from benchmarks.canonical import CELL
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, ratios, shared_core, took
 from dwell import Realisation
+from dwell.kernels.arrays import Arrays, lay_out
 from dwell.model import Problem
-from dwell.sim.arrays import Arrays, lay_out
 from dwell.sim.engine import play
 
 SIZES = (1, 8, 64)

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
     AR1,
     Bursts,
@@ -41,7 +42,6 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.objective import Tier
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
 MS = 1_000_000
 # Turns are those of threads on one core with a quota that is noticed at ticks.

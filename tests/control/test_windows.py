@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import dwell
-from dwell.control import final_l95_ms, window_close_ns
+from dwell.control import final_l95_ms
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.model import Constant, Execution, Node, Task
 from dwell.model.instants import NEVER_NS
+from dwell.model.window_close import window_close_ns
 from dwell.sim import draw
 from tests.cells.generated import make_problem
 

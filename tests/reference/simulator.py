@@ -21,8 +21,8 @@ from typing import Any
 import simpy
 
 from dwell.control import Failures, Guard, Presence, Probation
+from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000

@@ -22,8 +22,12 @@ import dwell
 from dwell.control import Controller
 from dwell.control import guard as control_guard
 from dwell.estimators import Evidence, Instants
+from dwell.kernels import arrays as sim_arrays
 from dwell.kernels import streams
+from dwell.kernels.arrays import lay_out, ordered_flows
 from dwell.kernels.layout import FINISHED
+from dwell.kernels.random_draws import draw_shadows
+from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
     Constant,
     ControllerSettings,
@@ -35,12 +39,8 @@ from dwell.model import (
     QoS,
     Task,
 )
-from dwell.sim import arrays as sim_arrays
 from dwell.sim import tables as sim_tables
-from dwell.sim.arrays import lay_out, ordered_flows
 from dwell.sim.engine import play as advance_to_end
-from dwell.sim.random_draws import draw_shadows
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from dwell.sim.tables import make_tables
 from tests.cells.generated import (
     MS,

@@ -8,6 +8,7 @@ from fractions import Fraction
 
 import pytest
 
+from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
     Constant,
     Execution,
@@ -18,7 +19,6 @@ from dwell.model import (
     Problem,
     Task,
 )
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import Result, Split, attempt_uniform, simulate, transmission_ns
 

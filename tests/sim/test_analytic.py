@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from scipy.stats import t as student
 
 import dwell
+from dwell.kernels.realisation import NodeChange, Realisation
 from dwell.model import (
     Constant,
     Execution,
@@ -29,7 +30,6 @@ from dwell.model import (
     Task,
     Uniform,
 )
-from dwell.sim.realisation import NodeChange, Realisation
 from tests.cells.generated import MS, make_problem, make_realisation
 
 Floats = NDArray[np.float64]

@@ -13,8 +13,8 @@ import polars as pl
 import pytest
 
 import dwell
+from dwell.kernels.realisation import LinkSegment, NodeChange
 from dwell.model import Constant, ControllerSettings, Execution, Flow, Link, Node, Problem, Task
-from dwell.sim.realisation import LinkSegment, NodeChange
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import attempt_uniform, control
 from tests.reference.test_against import Case, Played, Replay, differences, make_case

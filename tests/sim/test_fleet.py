@@ -10,6 +10,8 @@ import pytest
 
 import dwell
 from dwell.kernels import layout as k
+from dwell.kernels.arrays import lay_out
+from dwell.kernels.realisation import Realisation
 from dwell.model import (
     Execution,
     Exponential,
@@ -25,9 +27,7 @@ from dwell.model import (
     Task,
     Weights,
 )
-from dwell.sim.arrays import lay_out
 from dwell.sim.engine import play
-from dwell.sim.realisation import Realisation
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 import dwell
 from dwell.control import shadow_stamps
 from dwell.estimators import Evidence
+from dwell.kernels.random_draws import draw_shadows
+from dwell.kernels.realisation import NodeChange
 from dwell.model import (
     AR1,
     Constant,
@@ -34,8 +36,6 @@ from dwell.model import (
     QoS,
     Task,
 )
-from dwell.sim.random_draws import draw_shadows
-from dwell.sim.realisation import NodeChange
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import ITSELF, SHADOW, shadow_stamp, simulate
 from tests.reference.test_against import (

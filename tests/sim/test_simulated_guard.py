@@ -13,6 +13,8 @@ import pytest
 
 import dwell
 from dwell.control import guard as control_guard
+from dwell.kernels.arrays import back_ns
+from dwell.kernels.realisation import LinkSegment, NodeChange
 from dwell.model import (
     Constant,
     ControllerSettings,
@@ -25,8 +27,6 @@ from dwell.model import (
     Task,
 )
 from dwell.sim import simulate_realisation
-from dwell.sim.realisation import LinkSegment, NodeChange
-from dwell.sim.simulated_guard import back_ns
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.reference.simulator import way_back
 from tests.reference.test_against import Case, Played, Replay, differences

@@ -10,8 +10,8 @@ import pytest
 
 import dwell
 from dwell.errors import RunError
+from dwell.kernels.realisation import NodeChange
 from dwell.model import Constant, Execution, Node, Problem, Task
-from dwell.sim.realisation import NodeChange
 from tests.cells.generated import MS, make_problem, make_realisation
 from tests.cells.two_nodes import Script
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import dwell
-from dwell.sim.random_draws import drawn_scenario
+from dwell.kernels.random_draws import drawn_scenario
 from dwell.testbed.inventory import load_inventory
 from dwell.testbed.real_hosts import run_on_hosts
 from tests.cells.light import write_cell

@@ -11,9 +11,9 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.errors import LiveError
+from dwell.kernels.random_draws import drawn_scenario
 from dwell.model import Disturbance, Problem
 from dwell.record import open_run
-from dwell.sim.random_draws import drawn_scenario
 from dwell.testbed.playing import Played
 from dwell.testbed.run import MARK, length_s, require_machine, run_once, spans_of
 from dwell.testbed.timeline import Timeline, timeline_of

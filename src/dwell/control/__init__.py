@@ -11,7 +11,7 @@ from dwell.control.guard import (
     rest_cycles,
 )
 from dwell.control.shadows import shadow_stamps
-from dwell.control.windows import final_l95_ms, window_close_ns
+from dwell.control.windows import final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.policies import MinimalPolicy
 
@@ -33,5 +33,4 @@ __all__ = [
     "rest_cycles",
     "shadow_stamps",
     "static_columns",
-    "window_close_ns",
 ]

@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import ClosedWindow, Controller, window_close_ns
+from dwell.control import ClosedWindow, Controller
 from dwell.errors import LiveError
 from dwell.live.cycle_ledger import Ledger, LiveCycle
 from dwell.live.loads import NodeLoad, ProcessLoads
@@ -32,6 +32,7 @@ from dwell.live.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.run_rows import LiveWindow, Resume, RunRows, sends_shadows, told
 from dwell.live.symptoms import Symptoms
 from dwell.model import Problem
+from dwell.model.window_close import window_close_ns
 
 #: A window whose latencies may be off by more than this share of D is marked unproven.
 PROVEN_SHARE = 0.2

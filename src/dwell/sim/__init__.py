@@ -1,12 +1,12 @@
-"""The simulator: scenario to realisation, realisation through the kernels, kernels to a Run."""
+"""The simulator: a realisation through the kernels, beside a policy, to a Run."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from dwell.sim.random_draws import draw
-from dwell.sim.realisation import LinkSegment, NodeChange, Phase, Realisation
+from dwell.kernels.random_draws import draw, draw_changes, drawn_scenario
+from dwell.kernels.realisation import LinkSegment, NodeChange, NodeChanges, Phase, Realisation
 
 if TYPE_CHECKING:
     from dwell.sim.engine import describe, simulate, simulate_realisation
@@ -14,10 +14,13 @@ if TYPE_CHECKING:
 __all__ = [
     "LinkSegment",
     "NodeChange",
+    "NodeChanges",
     "Phase",
     "Realisation",
     "describe",
     "draw",
+    "draw_changes",
+    "drawn_scenario",
     "simulate",
     "simulate_realisation",
 ]

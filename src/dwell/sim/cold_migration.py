@@ -5,8 +5,8 @@ from __future__ import annotations
 from dwell.kernels import layout as k
 from dwell.kernels.heaps import post_event
 from dwell.kernels.links import send_state
+from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
-from dwell.sim.realisation import Realisation
 
 # The cycle field of an event: number of the migration, attempt, whether it is ready.
 NUMBER_SHIFT = 20

@@ -26,15 +26,15 @@ from dwell.control import (
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.kernels.advance import advance
+from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
 from dwell.kernels.compiled import COMPILED
+from dwell.kernels.random_draws import draw, draw_shadows
+from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.table_columns import require_apart
 from dwell.record import Run
-from dwell.sim.arrays import Arrays, lay_out, ordered_flows
 from dwell.sim.cold_migration import ColdMigration
-from dwell.sim.random_draws import draw, draw_shadows
-from dwell.sim.realisation import NodeChanges, Realisation
 from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 

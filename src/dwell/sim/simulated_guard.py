@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -19,30 +18,9 @@ from dwell.control import (
 from dwell.kernels import layout as k
 from dwell.kernels.far_instants import LAST_NS
 from dwell.kernels.heaps import post_event
-from dwell.model import Placement, Problem
+from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
+from dwell.model import Problem
 from dwell.model.instants import EVIDENCE_NS, HORIZON_NS
-from dwell.sim.realisation import LinkSegments, NodeChanges, Realisation
-
-
-def back_ns(problem: Problem, placement: Placement) -> int:
-    """Time from a completion until the guard hears of it, nanoseconds.
-
-    A completion is a small message that takes whichever way is shortest: the least sum of mean
-    delays from the sink's node to the stamper's, of the sink that is farthest; 0 where no links
-    lead there.
-    """
-    pipeline, links = problem.pipeline, problem.fabric.links.values()
-    sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
-    to_ms = {problem.stamper_node: 0.0}
-    reached = [(0.0, problem.stamper_node)]
-    while reached:
-        ms, node = heapq.heappop(reached)
-        for link in links:
-            further_ms = ms + link.delay_ms.expectation
-            if link.target == node and further_ms < to_ms.get(link.source, np.inf):
-                to_ms[link.source] = further_ms
-                heapq.heappush(reached, (further_ms, link.source))
-    return round(max(to_ms.get(node, 0.0) for node in sinks) * 1e6)
 
 
 class SimulatedGuard:

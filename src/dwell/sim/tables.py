@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from dwell.control import ClosedWindow, Controller, final_l95_ms, static_columns
 from dwell.kernels import layout as k
+from dwell.kernels.arrays import Arrays
+from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.record import OUTCOMES, Feature, frame_of
-from dwell.sim.arrays import Arrays
-from dwell.sim.realisation import Realisation
 
 if TYPE_CHECKING:
     import polars as pl

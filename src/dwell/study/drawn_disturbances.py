@@ -5,7 +5,7 @@ from __future__ import annotations
 from dwell.errors import TraceError
 from dwell.model import Problem, Scenario
 from dwell.record import Run
-from dwell.sim.random_draws import drawn_scenario
+from dwell.sim import drawn_scenario
 
 
 def disturbances_of(run: Run) -> Scenario:

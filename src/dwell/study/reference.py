@@ -27,12 +27,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control.windows import seen_l95_ms, window_close_ns
+from dwell.control.windows import seen_l95_ms
 from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
+from dwell.model.window_close import window_close_ns
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.script import Script
 from dwell.study.summary import busiest_nodes, mean_of

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dwell.control import window_close_ns
 from dwell.errors import PolicyError
 from dwell.model import Problem, QoS
 from dwell.model.bounds import counted
+from dwell.model.window_close import window_close_ns
 
 if TYPE_CHECKING:
     from dwell.sim import Realisation
@@ -79,7 +79,7 @@ def _seen_closes(script: Script, problem: Problem, realisation: Realisation) -> 
     When a window closes depends on the migrations before it: after each, the next window begins
     with the first cycle that the order reaches.
     """
-    from dwell.sim.realisation import NodeChanges
+    from dwell.sim import NodeChanges
 
     changes = NodeChanges.of(realisation.node_changes)
     mine = [i for i, node in enumerate(changes.nodes) if node == problem.controller_node]

@@ -96,7 +96,7 @@ def timeline_of(
     written = problem.scenario(scenario)
     if not written:
         return Timeline()
-    from dwell.sim.random_draws import draw_changes
+    from dwell.sim import draw_changes
 
     window_s = problem.window_cycles * problem.pipeline.period_ms / 1e3
     windows = math.floor(seconds / window_s) + 1

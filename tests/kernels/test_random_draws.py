@@ -12,6 +12,8 @@ import pytest
 
 import dwell
 from dwell.errors import ProblemError
+from dwell.kernels.random_draws import drawn_scenario
+from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
     Bursts,
     Constant,
@@ -30,8 +32,6 @@ from dwell.model import (
 )
 from dwell.model.scenario import MAX_LAYERS, RAMP_STEPS
 from dwell.sim import draw
-from dwell.sim.random_draws import drawn_scenario
-from dwell.sim.realisation import LinkSegment, NodeChange, Realisation
 from tests.cells.dynamic import dynamic_problem
 from tests.cells.generated import MS, make_problem
 

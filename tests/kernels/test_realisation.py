@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.kernels.realisation import LinkSegments, NodeChanges
 from dwell.sim import LinkSegment, NodeChange
-from dwell.sim.realisation import LinkSegments, NodeChanges
 
 CHANGES = st.lists(
     st.builds(

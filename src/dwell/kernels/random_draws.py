@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
 from dwell.kernels.compiled import COMPILED
+from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
+from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
 from dwell.kernels.streams import ar1_path, nanoseconds, standard_normals
 from dwell.model import (
     AR1,
@@ -32,8 +34,6 @@ from dwell.model import (
 from dwell.model.bounds import short
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-from dwell.sim.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
-from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]

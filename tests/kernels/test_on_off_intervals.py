@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.model import Constant, Exponential, LogNormal, Process, Uniform
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
-from dwell.sim.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 
 S = 1_000_000_000
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from dwell.control import window_close_ns
 from dwell.errors import SimulationError
 from dwell.kernels import layout as k
 from dwell.kernels.far_instants import LAST_NS
+from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.model.instants import NEVER_NS
-from dwell.sim.realisation import LinkSegments, NodeChanges, Phase, Realisation
-from dwell.sim.simulated_guard import back_ns
+from dwell.model.window_close import window_close_ns
 
 SCHEDULER_CODE = {"fair": k.FAIR, "fifo": k.FIFO, "priority": k.PRIORITY}
 RING_START = 64
@@ -471,6 +471,27 @@ def _announce_first(tables: k.Tables) -> None:
     for i, (at, key) in enumerate(sorted(first)):
         tables.event_t[i], tables.event_key[i] = at, key
     tables.clock[k.N_EVENTS] = len(first)
+
+
+def back_ns(problem: Problem, placement: Placement) -> int:
+    """Time from a completion until the guard hears of it, nanoseconds.
+
+    A completion is a small message that takes whichever way is shortest: the least sum of mean
+    delays from the sink's node to the stamper's, of the sink that is farthest; 0 where no links
+    lead there.
+    """
+    pipeline, links = problem.pipeline, problem.fabric.links.values()
+    sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
+    to_ms = {problem.stamper_node: 0.0}
+    reached = [(0.0, problem.stamper_node)]
+    while reached:
+        ms, node = heapq.heappop(reached)
+        for link in links:
+            further_ms = ms + link.delay_ms.expectation
+            if link.target == node and further_ms < to_ms.get(link.source, np.inf):
+                to_ms[link.source] = further_ms
+                heapq.heappush(reached, (further_ms, link.source))
+    return round(max(to_ms.get(node, 0.0) for node in sinks) * 1e6)
 
 
 def ordered_flows(pipeline: Pipeline) -> list[Flow]:

@@ -1,0 +1,43 @@
+"""When a window closes."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dwell.model.problem import Problem
+
+Ints: TypeAlias = NDArray[np.int64]
+
+
+def window_close_ns(
+    problem: Problem, last_ns: Ints | int, beyond_ns: Ints | int
+) -> NDArray[np.int64]:
+    """Instant at which a window closes: `close_grace_ms` after it, and no deadline of it is open.
+
+    Releases never decrease from cycle to cycle, and so neither do the closes of windows that follow
+    each other, however short the windows are.
+
+    Parameters
+    ----------
+    last_ns : int, or int64 array of shape (...)
+        Release of the window's last cycle.
+    beyond_ns : int, or int64 array of shape (...)
+        Release of the first cycle beyond it.
+
+    Returns
+    -------
+    int64 array, shape (...)
+        The later of `beyond_ns` + `close_grace_ms` and `last_ns` + D. Where releases are P apart
+        and D is at most P, that is the first, also where P is no whole number of nanoseconds: a
+        deadline between two of them is over after the first.
+    """
+    grace_ns = round(problem.controller.close_grace_ms * 1e6)
+    # 28.6 ms are 28600000 ns, though their product in floating point may be a little less.
+    deadline_ns = math.floor(round(problem.pipeline.deadline_ms * 1e6, 3))
+    close_ns: Ints = np.maximum(beyond_ns + grace_ns, last_ns + deadline_ns)
+    return close_ns
