@@ -6,13 +6,17 @@ UV := $(BIN)/uv
 # The folders that hold Python.
 CODE := $(shell find src tests examples benchmarks docs reproduction -name '*.py' 2>/dev/null | cut -d/ -f1 | sort -u)
 
+# The compiled kernel, and what it is made of.
+KERNEL := src/dwell/kernels/libdwell_kernel.so
+SOURCES := $(wildcard $(addprefix src/dwell/kernels/,*.cpp *.h compile_flags.txt library_file.py))
+
 # uv installs exactly what a lock file says; `sync` also removes what it does not say.
 SYNC := $(UV) pip sync --quiet --python $(BIN)/python --require-hashes
 COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python-version 3.11 \
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test check bench paper deadlines faults chaos soak fuzz audit sbom lock clean
+.PHONY: help env demo test check bench paper deadlines faults chaos soak fuzz audit sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-9s %s\n", $$1, $$2}' Makefile
@@ -32,10 +36,18 @@ $(VENV)/.uv: requirements/uv.txt
 		-r requirements/uv.txt
 	@touch $@
 
-$(VENV)/.installed: $(VENV)/.uv requirements/dev.txt pyproject.toml
+# A machine without a C++20 compiler gets one for the kernel.
+$(VENV)/.pinned: $(VENV)/.uv requirements/dev.txt requirements/zig.txt
 	$(SYNC) requirements/dev.txt
+	@$(BIN)/python hatch_build.py 2>/dev/null || $(UV) pip install --quiet --python $(BIN)/python \
+		--require-hashes -r requirements/zig.txt || true
+	@touch $@
+
+# Compiles the kernel; where that is not possible, says so, and tries again the next time.
+$(VENV)/.installed: $(VENV)/.pinned pyproject.toml hatch_build.py $(SOURCES) $(if $(wildcard $(KERNEL)),,again)
 	$(UV) pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
 	$(UV) pip check --quiet --python $(BIN)/python
+	@test -f $(KERNEL) || $(BIN)/python hatch_build.py || true
 	@touch $@
 
 demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)
@@ -101,8 +113,9 @@ lock: $(VENV)/.uv ## Pin the dependencies of pyproject.toml again (UPGRADE=1: to
 		--output-file requirements/dev.txt
 	$(COMPILE) --group fuzz --output-file requirements/fuzz.txt
 	$(COMPILE) --group release --output-file requirements/release.txt
+	$(COMPILE) --group zig --output-file requirements/zig.txt
 	@! grep -nE '://|^ *--(index|extra-index|find-links|trusted-host)' requirements/*.txt
 
 clean: ## Remove everything that make made
-	rm -rf $(VENV) build dist demo-out fuzz-corpus .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(KERNEL) build dist demo-out fuzz-corpus .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find $(CODE) -name __pycache__ -prune -exec rm -rf {} +

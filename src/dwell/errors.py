@@ -9,6 +9,7 @@ from importlib.util import find_spec
 __all__ = [
     "DwellError",
     "Fault",
+    "KernelError",
     "LiveError",
     "MeasurementError",
     "MetricError",
@@ -121,6 +122,10 @@ class PolicyError(DwellError, ValueError):
 
 class SimulationError(DwellError, RuntimeError):
     """A simulation was asked for something it cannot do."""
+
+
+class KernelError(DwellError, RuntimeError):
+    """The compiled kernel is missing, damaged, of other sources or for another processor."""
 
 
 class RunError(DwellError, ValueError):

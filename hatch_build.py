@@ -1,0 +1,139 @@
+"""Builds the compiled kernel with the package: src/dwell/kernels/*.cpp, as one library.
+
+An editable install has the library beside its sources, a wheel gets it from `build/`. The compiler
+is $CXX, else the first of the system's that knows C++20, else that of the package `ziglang`, which
+isolated builds then ask for. DWELL_WHEEL_PLATFORM=manylinux_2_17_aarch64 has ziglang build a wheel
+for that platform (docs/releasing.md).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+KERNELS = Path(__file__).resolve().parent / "src" / "dwell" / "kernels"
+FILE = runpy.run_path(str(KERNELS / "library_file.py"))
+
+ZIG = (sys.executable, "-m", "ziglang", "c++")
+#: A library that nothing is taken from, such as that of C++, is not needed later.
+LINK = ("-shared", "-static-libgcc", "-Wl,--as-needed", "-Wl,-z,defs", "-Wl,-s")
+PROBE = "#include <bit>\n#include <concepts>\nstatic_assert(std::integral<int>);\n"
+
+NO_COMPILER = "no C++20 compiler was found"
+NO_KERNEL = (
+    f"{NO_COMPILER}: Dwell cannot simulate without its kernel; apt-get install g++ && make env"
+)
+NO_WHEEL = f"{NO_COMPILER}: a wheel cannot be built without its kernel; apt-get install g++"
+
+
+class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
+    """Builds the library before a wheel or an editable install is put together."""
+
+    def dependencies(self) -> list[str]:
+        """Ask for ziglang where there is no other compiler."""
+        return [] if find_compiler() else list(self.metadata.config["dependency-groups"]["zig"])
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        """Build the library; without a compiler a wheel fails, an editable install goes on."""
+        compiler = find_compiler()
+        if version == "editable":
+            if compiler:
+                build(compiler, KERNELS / FILE["NAME"])
+            else:
+                self.app.display_warning(NO_KERNEL)
+            return
+        if not compiler:
+            raise SystemExit(NO_WHEEL)
+        platform = os.environ.get("DWELL_WHEEL_PLATFORM") or sysconfig.get_platform()
+        tag = re.sub(r"[-.]", "_", platform)
+        library = Path(self.root, "build", tag, FILE["NAME"])
+        build(compiler, library)
+        build_data["force_include"][str(library)] = f"dwell/kernels/{library.name}"
+        build_data.update(pure_python=False, tag=f"py3-none-{tag}")
+
+
+def find_compiler() -> list[str]:
+    """Return the command of the first compiler that makes a C++20 library; empty without one."""
+    if platform := os.environ.get("DWELL_WHEEL_PLATFORM"):
+        _, major, minor, machine = platform.split("_", 3)
+        commands = [[*ZIG, "-target", f"{machine}-linux-gnu.{major}.{minor}"]]
+    elif named := os.environ.get("CXX"):
+        commands = [shlex.split(named)]
+    else:
+        commands = [["c++"], ["g++"], ["clang++"], [*ZIG, "-mcpu=baseline"]]
+    with TemporaryDirectory() as folder:
+        probe = Path(folder, "probe.cpp")
+        probe.write_text(PROBE, encoding="utf-8")
+        for command in commands:
+            there = find_spec("ziglang") if "ziglang" in command else shutil.which(command[0])
+            if there and not compile_library(
+                command, [probe], ["-std=c++20"], Path(folder, "made")
+            ):
+                return command
+    return []
+
+
+def build(compiler: Sequence[str], library: Path, options: Sequence[str] = ()) -> None:
+    """Compile the kernel, but for where the same library is there already.
+
+    Parameters
+    ----------
+    compiler : sequence of str
+        Its command.
+    library : Path
+        What to make; its place has the old library until the new one is done.
+    options : sequence of str
+        Options of the compiler beside those of the kernel.
+    """
+    version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, text=True)
+    name = " ".join([version.stdout.splitlines()[0], *options])
+    digest = FILE["source_digest"](KERNELS)
+    if library.is_file() and FILE["is_of"](library.read_bytes(), digest, name):
+        return
+    flags = (KERNELS / FILE["FLAGS"]).read_text(encoding="utf-8").split()
+    flags += [*options, f'-DDWELL_DIGEST="{digest}"', f'-DDWELL_COMPILER="{name}"']
+    library.parent.mkdir(parents=True, exist_ok=True)
+    if errors := compile_library(compiler, sorted(KERNELS.glob("*.cpp")), flags, library):
+        raise SystemExit(errors)
+
+
+def compile_library(
+    compiler: Sequence[str], sources: Iterable[Path], flags: Sequence[str], library: Path
+) -> str:
+    """Compile and link sources; return what the compiler says where it fails."""
+    # For a link that names it, Zig builds the library of C++ first: half a minute for nothing.
+    link = [*LINK, "-nostdlib++"] if "ziglang" in compiler else LINK
+    with TemporaryDirectory(dir=library.parent, prefix=".build-") as folder:
+        objects = {source: Path(folder, f"{source.stem}.o") for source in sources}
+        commands = [[*compiler, *flags, "-c", s, "-o", o] for s, o in objects.items()]
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            errors = "".join(threads.map(_errors, commands))
+        made = Path(folder, library.name)
+        errors = errors or _errors([*compiler, *flags, *link, *objects.values(), "-o", made])
+        if not errors:
+            made.replace(library)
+    return errors
+
+
+def _errors(command: Sequence[str | Path]) -> str:
+    """Run a compiler; return what it says where it fails."""
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    return done.stderr or f"{command} failed" if done.returncode else ""
+
+
+if __name__ == "__main__":
+    sys.exit(None if find_compiler() else NO_KERNEL)

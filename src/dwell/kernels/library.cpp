@@ -1,0 +1,15 @@
+// What the library says of itself. The loader compares the digest with the sources beside it.
+
+#include "export.h"
+
+// The build hook (hatch_build.py) defines both; without it the library is nobody's.
+#ifndef DWELL_DIGEST
+#define DWELL_DIGEST ""
+#endif
+#ifndef DWELL_COMPILER
+#define DWELL_COMPILER ""
+#endif
+
+DWELL_EXPORT const char* dwell_digest() noexcept { return DWELL_DIGEST; }
+
+DWELL_EXPORT const char* dwell_compiler() noexcept { return DWELL_COMPILER; }

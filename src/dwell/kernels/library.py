@@ -1,0 +1,87 @@
+"""The compiled kernel, a library of C functions: found beside its sources, checked, and opened.
+
+Python's lock is not held during a call (`ctypes.CDLL`); two threads may call at once, since the
+library has no state of its own. The build hook (`hatch_build.py`) makes the file.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import shlex
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import Final, cast
+
+from dwell.errors import DISTRIBUTION, KernelError
+from dwell.kernels.library_file import NAME, is_of, read_header, source_digest
+
+#: The line that builds the library in a checkout.
+BUILD: Final = "apt-get install g++ && make env"
+#: The line that mends an installed package.
+INSTALL_AGAIN: Final = f"pip install --force-reinstall {DISTRIBUTION}"
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Return the library that was built of the sources beside this module.
+
+    Raises
+    ------
+    KernelError
+        If it is missing, damaged, of other sources or for another processor.
+    """
+    return load(files(__package__))
+
+
+def digest() -> str:
+    """Return the SHA-256 of the sources that the library was built of."""
+    return _text(library().dwell_digest)
+
+
+def compiler() -> str:
+    """Return the name and version of the compiler that built the library."""
+    return _text(library().dwell_compiler)
+
+
+def load(folder: Traversable) -> ctypes.CDLL:
+    """Check the library in a folder against the sources there, and open it.
+
+    It is checked before it is mapped into memory, where reading a part that the file does not have
+    would end the process.
+    """
+    file = folder.joinpath(NAME)
+    checkout = folder.joinpath("../../../hatch_build.py").is_file()
+    try:
+        content = file.read_bytes()
+        flaw = _flaw(content, source_digest(folder))
+        if not flaw:
+            return ctypes.CDLL(str(file))
+        remedy = f"rm {shlex.quote(str(file))} && make env"
+    except FileNotFoundError:
+        flaw, remedy = "is missing", BUILD
+    except OSError as error:
+        flaw, remedy = f"cannot be opened: {error.strerror or error}", BUILD
+    raise KernelError(f"the compiled kernel {file} {flaw}; {remedy if checkout else INSTALL_AGAIN}")
+
+
+def _flaw(content: bytes, digest: str) -> str:
+    """Return what is wrong with a library; empty where nothing is."""
+    header, machine = read_header(content), platform.machine()
+    if header is None:
+        return "is no library"
+    if header.machine != machine:
+        return f"is for {header.machine}, this computer is {machine}"
+    if len(content) < header.n_bytes:
+        return f"is cut short: {len(content)} of {header.n_bytes} bytes"
+    if not is_of(content, digest):
+        return "was built of other sources than those beside it"
+    return ""
+
+
+def _text(function: Callable[[], object]) -> str:
+    """Call a function that returns a string of C."""
+    function.restype = ctypes.c_char_p  # type: ignore[attr-defined]
+    return cast(bytes, function()).decode()
