@@ -14,8 +14,8 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, shared_core, took
 from dwell.control import ClosedWindow, Controller
 from dwell.kernels.arrays import lay_out
+from dwell.kernels.event_loop import play
 from dwell.model import Problem
-from dwell.sim.engine import play
 
 COUNTS = (1, 3, 6, 12, 24)
 

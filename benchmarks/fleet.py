@@ -13,8 +13,8 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, ratios, shared_core, took
 from dwell import Realisation
 from dwell.kernels.arrays import Arrays, lay_out
+from dwell.kernels.event_loop import play
 from dwell.model import Problem
-from dwell.sim.engine import play
 
 SIZES = (1, 8, 64)
 SHARED = "E"

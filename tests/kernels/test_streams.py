@@ -2,33 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from dwell.kernels.compiled import kernel
-from dwell.kernels.streams import ar1_path, attempt_uniform, nanoseconds, standard_normals
-
-
-@kernel
-def fill_attempts(key: np.uint64, out: NDArray[np.float64]) -> None:
-    """Draw what only kernels call."""
-    for cycle in range(out.shape[0]):
-        for attempt in range(out.shape[1]):
-            out[cycle, attempt] = attempt_uniform(key, cycle, attempt)
-
-
-def test_an_attempt_is_a_uniform_number_that_only_its_counters_decide() -> None:
-    key = np.uint64(0x1234_5678_9ABC_DEF0)
-    drawn, fewer = np.empty((2_000, 3)), np.empty((1_000, 2))
-    fill_attempts(key, drawn)
-    fill_attempts(key, fewer)
-    np.testing.assert_array_equal(fewer, drawn[:1_000, :2])
-    assert drawn.min() >= 0
-    assert drawn.max() < 1
-    assert np.unique(drawn).size == drawn.size
-    counts, _ = np.histogram(drawn, bins=20, range=(0, 1))
-    # 300 a bin, standard deviation 17: five of them.
-    assert abs(counts - 300).max() < 85
-    assert abs(np.corrcoef(drawn[:, 0], drawn[:, 1])[0, 1]) < 0.1
+from dwell.kernels.streams import ar1_path, nanoseconds, standard_normals
 
 
 def test_a_path_in_blocks_is_the_path_in_one() -> None:

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from random import Random
-from typing import cast
 
-import numba
 import numpy as np
 import polars as pl
 import pytest
@@ -23,9 +21,9 @@ from dwell.control import Controller
 from dwell.control import guard as control_guard
 from dwell.estimators import Evidence, Instants
 from dwell.kernels import arrays as sim_arrays
-from dwell.kernels import streams
 from dwell.kernels.arrays import lay_out, ordered_flows
-from dwell.kernels.layout import FINISHED
+from dwell.kernels.codes import Status
+from dwell.kernels.event_loop import play as advance_to_end
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
@@ -40,7 +38,6 @@ from dwell.model import (
     Task,
 )
 from dwell.sim import tables as sim_tables
-from dwell.sim.engine import play as advance_to_end
 from dwell.sim.tables import make_tables
 from tests.cells.generated import (
     MS,
@@ -50,6 +47,7 @@ from tests.cells.generated import (
     random_problem,
     random_stamps,
 )
+from tests.kernels.parts import attempt_uniform as kernel_uniform
 from tests.reference.simulator import (
     ITSELF,
     NEAR_NS,
@@ -497,8 +495,7 @@ def play_stamped(
     codes[None] = -1
     arrays.tables.stamps[0] = [codes[name] for name in stamps]
     arrays.tables.stamps[1] = [codes[name] for name in others]
-    with np.errstate(over="ignore"):
-        assert advance_to_end(arrays) == FINISHED
+    assert advance_to_end(arrays) == Status.FINISHED
     controller = Controller(problem, problem.initial)
     first = np.arange(real.windows) * problem.window_cycles
     tables = make_tables(
@@ -823,16 +820,8 @@ def test_equal_on_cases_made_by_hand(name: str) -> None:
     assert examine(BY_HAND[name], 0) == []
 
 
-def kernel_uniform(key: np.uint64, cycle: int, attempt: int) -> float:
-    return streams.attempt_uniform(key, cycle, attempt)
-
-
 def test_attempts_draw_the_same_numbers() -> None:
-    # The kernels' function can be called from compiled code only.
-    compiled = cast(Callable[[np.uint64, int, int], float], numba.njit(kernel_uniform))
     rng = Random(1)
     for _ in range(200):
         key, cycle, attempt = rng.getrandbits(64), rng.getrandbits(20), rng.getrandbits(6)
-        with np.errstate(over="ignore"):
-            found = compiled(np.uint64(key), cycle, attempt)
-        assert found == attempt_uniform(key, cycle, attempt)
+        assert kernel_uniform(key, cycle, attempt) == attempt_uniform(key, cycle, attempt)

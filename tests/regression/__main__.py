@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.regression import commands, paper, runs
+from tests.regression import commands, exact, paper, runs
 
 
 def _write_commands() -> None:
@@ -27,12 +27,15 @@ KINDS: dict[str, Callable[[], None]] = {"commands": _write_commands, "runs": _wr
 
 USAGE = f"""\
 usage: python -m tests.regression {{{",".join(KINDS)}}}...
-       python -m tests.regression paper|paper-full FOLDER     of `make paper`"""
+       python -m tests.regression paper|paper-full FOLDER     of `make paper`
+       python -m tests.regression exact FILE                  to compare two versions"""
 
 if __name__ == "__main__":
     words = sys.argv[1:]
     if len(words) == 2 and words[0] in ("paper", "paper-full"):
         _write_paper(words[1], paper.QUICK if words[0] == "paper" else paper.FULL)
+    elif len(words) == 2 and words[0] == "exact":
+        print(exact.write(Path(words[1])))
     elif words and KINDS.keys() >= set(words):
         for kind in words:
             KINDS[kind]()

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import dwell
-from dwell.kernels import layout as k
 from dwell.kernels.arrays import lay_out
+from dwell.kernels.codes import Outcome, Status
+from dwell.kernels.event_loop import play
 from dwell.kernels.realisation import Realisation
+from dwell.kernels.tables import Tables
 from dwell.model import (
     Execution,
     Exponential,
@@ -27,7 +29,6 @@ from dwell.model import (
     Task,
     Weights,
 )
-from dwell.sim.engine import play
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -59,9 +60,9 @@ def problem_of(chains: tuple[str, ...], scheduler: str = "fair") -> Problem:
     )
 
 
-def played(cells: list[tuple[Problem, Realisation]], shared: set[str]) -> k.Tables:
+def played(cells: list[tuple[Problem, Realisation]], shared: set[str]) -> Tables:
     arrays = lay_out(cells, shared=shared)
-    assert play(arrays) == k.FINISHED
+    assert play(arrays) == Status.FINISHED
     return arrays.tables
 
 
@@ -94,7 +95,7 @@ def test_cells_that_share_nothing_do_not_notice_each_other() -> None:
         alone = played([cell], set())
         cycles = cell[1].cycles
         # The cell that ends first still sees its last cycles through while the other goes on.
-        settled = alone.outcome[0] != k.IN_FLIGHT
+        settled = alone.outcome[0] != Outcome.IN_FLIGHT
         assert settled.mean() > 0.99
         for table in ("latency_ns", "compute_ns", "network_ns", "outcome"):
             found, expected = getattr(together, table)[i, :cycles], getattr(alone, table)[0]
@@ -109,7 +110,7 @@ def test_own_work_of_a_cell_is_its_own() -> None:
         cells.append((one, dwell.draw(one, seed=5, windows=10)))
     arrays = lay_out(cells, shared={"E"})
     play(arrays)
-    e = arrays.nodes.index("E")
+    e = arrays.nodes[0].index("E")
     busy, own = arrays.tables.closed[:, -1, 0, e], arrays.tables.closed[:, -1, 1, e]
     assert busy[0] == busy[1]
     assert own.sum() == pytest.approx(busy[0], rel=1e-12)

@@ -1,71 +1,92 @@
-"""Lay cells and their realisations out as the arrays that the kernels work on."""
+"""Lay cells and their realisations out as the tables that the kernel works on."""
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.kernels import layout as k
-from dwell.kernels.far_instants import LAST_NS
+from dwell.kernels import codes
+from dwell.kernels.codes import LAST_NS, Kind, Scheduler, ShadowPart, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
+from dwell.kernels.tables import Ints, Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.model.instants import NEVER_NS
 from dwell.model.window_close import window_close_ns
 
-SCHEDULER_CODE = {"fair": k.FAIR, "fifo": k.FIFO, "priority": k.PRIORITY}
+SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
 RING_START = 64
+#: Events after which a call of the kernel ends for a moment: some 20 ms.
+BUDGET = 200_000
 #: What a core draws on the pool of a quota at a time (sched_cfs_bandwidth_slice_us), and the least
 #: run time of a turn (sched_base_slice of two CPUs; eight and more have twice as much), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
-#: What a server counts in time of its core (`_counted_ns`).
-COUNTED = k.QUOTA_NS, k.STRESSED_NS, k.SLACK_NS, k.LEAST_NS, k.DRAWN_NS
+#: What a quota counts in time of its core (`_counted_ns`).
+COUNTED = "quota_ns", "stressed_ns", "slack_ns", "least_ns", "drawn_ns"
 
 
 class Arrays:
-    """The kernels' tables, with the names of their rows.
+    """The kernel's tables, with the names of their rows.
 
     Attributes
     ----------
     tables : Tables
-        Arguments of `advance`; replaced as a whole when a part of it grows.
-    nodes : tuple of str
-        Columns of the snapshots, as ``E`` or, in a fleet, ``cell/R1``.
+        What the kernel works on; replaced as a whole when a part of it grows.
+    nodes : tuple of tuple of str
+        By cell: its nodes, in the order of the snapshots' columns.
+    close_ns : tuple of int64 array, shape (N,)
+        By cell: the close of the window that a cycle is the last of.
+    address : int
+        What the kernel is handed.
     """
 
-    def __init__(self, tables: k.Tables, nodes: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        tables: Tables,
+        nodes: tuple[tuple[str, ...], ...],
+        close_ns: tuple[Ints, ...],
+        behind: Sequence[Ints],
+    ) -> None:
+        self.nodes, self.close_ns = nodes, close_ns
+        # Rows have addresses in these.
+        self._behind = behind
+        self._use(tables)
+
+    def _use(self, tables: Tables) -> None:
         self.tables = tables
-        self.nodes = nodes
+        self._addresses = tables.addresses()
+        self.address = self._addresses.ctypes.data
 
     def grow_events(self) -> None:
-        """Double the room of the event heap."""
-        t = self.tables
-        self.tables = t._replace(
-            event_t=np.concatenate((t.event_t, np.zeros_like(t.event_t))),
-            event_key=np.concatenate((t.event_key, np.zeros_like(t.event_key))),
-        )
+        """Double the room of the queue of events."""
+        events = self.tables.events
+        self._use(self.tables._replace(events=np.concatenate((events, np.zeros_like(events)))))
 
     def grow_ring(self) -> None:
         """Double the number of cycles that may be in flight, and move those that are."""
         t = self.tables
-        ring = t.ring
-        cells = len(t.cells)
-        jobs = np.zeros((2 * len(t.jobs), k.N_JOB), np.int64)
-        slots = np.zeros((2 * len(t.slots), k.N_SLOT), np.int64)
-        attempts = np.zeros((2 * len(t.slots), t.attempts.shape[1]), np.int64)
-        stride = t.stride
-        old = np.arange(cells * ring)
+        clock = t.clock[0]
+        n_slots, cells = int(clock["n_slots"]), len(t.cells)
+        old = np.arange(cells * n_slots)
         # A slot that was never used names cycle 0; only one of them can be its slot.
-        old = old[t.slots[:, k.CYCLE] % ring == old % ring]
-        cycle = t.slots[old, k.CYCLE]
-        new = (old // ring) * 2 * ring + (cycle & (2 * ring - 1))
-        slots[new] = t.slots[old]
-        attempts[new] = t.attempts[old]
-        jobs.reshape(-1, stride, k.N_JOB)[new] = t.jobs.reshape(-1, stride, k.N_JOB)[old]
-        self.tables = t._replace(ring=2 * ring, jobs=jobs, slots=slots, attempts=attempts)
+        old = old[t.slots["cycle"] % n_slots == old % n_slots]
+        cycle = t.slots["cycle"][old]
+        new = (old // n_slots) * 2 * n_slots + (cycle & (2 * n_slots - 1))
+
+        def larger(table: NDArray[Any]) -> NDArray[Any]:
+            by_slot = table.reshape(len(t.slots), -1)
+            moved = np.zeros((2 * len(by_slot), by_slot.shape[1]), table.dtype)
+            moved[new] = by_slot[old]
+            return moved.reshape(-1, *table.shape[1:])
+
+        clock["n_slots"] = 2 * n_slots
+        rings = {"slots": t.slots, "jobs": t.jobs, "attempts": t.attempts}
+        self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
 def lay_out(
@@ -103,35 +124,29 @@ class _Layout:
         self.cells, self.shared, self.log = cells, frozenset(shared), log
         self.shadows = shadows
         self.reals = [real for _, real in cells]
-        self.single = len(cells) == 1
         self.cycles = max(real.cycles for _, real in cells)
         self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
         self.max_flows = max(len(problem.pipeline.flows) for problem, _ in cells)
-        self.node_row: dict[str, int] = {}
-        self.server_row: dict[tuple[str, str | None], int] = {}
+        self.max_nodes = max(len(problem.fabric.nodes) for problem, _ in cells)
+        self.node_row: dict[tuple[int, str], int] = {}
+        self.server_row: dict[tuple[int, str | None], int] = {}
         self.server_workers: list[int] = []
-        self.cell_rows: list[list[int]] = []
-        self.close_ns: list[k.Ints] = []
-        self.tasks: list[list[int]] = []
-        self.flows: list[list[int]] = []
-        self.out_flows: list[int] = []
-        self.sites: list[list[int]] = []
-        self.servers: list[list[int]] = []
-        self.servers_f: list[list[float]] = []
-        self.hops: list[list[int]] = []
-        self.links: list[list[int]] = []
-        self.layer_rows: list[dict[int, int]] = []
+        self.rows: dict[str, list[dict[str, Any]]] = {
+            name: [] for name, kind in row_types().items() if kind.names
+        }
+        self.behind: list[Ints] = []
+        self.close_ns: list[Ints] = []
+        self.outputs: list[int] = []
+        self.cell_nodes: list[int] = []
+        self.layers: list[dict[int, int]] = []
+        self.segments: list[Rows] = []
+        self.rates: list[Rows] = []
         self.n_segments = 0
-        self.segments = [np.empty((0, k.N_SEGMENT), np.int64)]
-        self.segments_f = [np.empty((0, k.N_SEGMENT_F))]
         self.site_of: list[list[int]] = []
         self.route: list[list[int]] = []
         self.back_ns: list[int] = []
-        self.shadow_parts: list[list[int]] = []
-        self.changes = [np.empty((0, k.N_CHANGE), np.int64)]
-        self.paces: list[list[int]] = []
-        self.paces_f: list[float] = []
-        self.extra_rows = 0
+        self.shadow_parts: list[list[ShadowPart]] = []
+        self.changes: list[Rows] = []
 
     def arrays(self) -> Arrays:
         for index, (problem, real) in enumerate(self.cells):
@@ -141,107 +156,153 @@ class _Layout:
             ((problem, _),) = self.cells
             self._add_shadow(problem, self.shadows)
         self._check_keys()
-        return Arrays(self._tables(), tuple(self.node_row))
+        nodes = tuple(tuple(problem.fabric.nodes) for problem, _ in self.cells)
+        return Arrays(self._tables(), nodes, tuple(self.close_ns), self.behind)
 
-    def _node_key(self, index: int, name: str) -> str:
-        return name if self.single or name in self.shared else f"{index}/{name}"
+    def _addresses(self, table: Ints) -> list[int]:
+        """Return the address of every row of a realisation's table."""
+        kept = np.ascontiguousarray(table, np.int64)
+        self.behind.append(kept)
+        first, stride = kept.ctypes.data, kept.strides[0]
+        return [first + row * stride for row in range(len(kept))]
 
     def _add_nodes(self, index: int, problem: Problem, real: Realisation) -> None:
         new = []
         for name, node in problem.fabric.nodes.items():
-            key = self._node_key(index, name)
-            if key in self.node_row:
+            if name in self.shared and (0, name) in self.node_row:
+                self.node_row[index, name] = self.node_row[0, name]
                 continue
             new.append(name)
-            self.node_row[key] = len(self.node_row)
-            scheduler = SCHEDULER_CODE[node.scheduler]
-            cpu = self._add_server(key, None, scheduler, node.cores)
-            of = self.servers_f[-1]
-            of[k.SPARE], of[k.BACKGROUND] = node.spare, node.background
-            of[k.BESIDE], of[k.PACE] = 1.0 / node.interference, node.pace
-            of[k.SPEED] = node.pace * (1.0 if node.scheduler == "fair" else node.spare / node.cores)
-            cpu[k.QUOTA_T] = -1
-            if node.quota is not None:
-                period_ns = round(node.quota.period_ms * 1e6)
-                cpu[k.PERIOD_NS] = period_ns
-                for column, value in zip(COUNTED, _counted_ns(node, node.quota), strict=True):
-                    cpu[column] = value
-                cpu[k.TICK_NS] = round(node.quota.tick_ms * 1e6)
-                pooled = cpu[k.SLACK_NS] or cpu[k.TICK_NS]
-                cpu[k.POOL_NS if pooled else k.LEFT_NS] = cpu[k.QUOTA_NS]
-                if cpu[k.TICK_NS]:
-                    cpu[k.SCHEDULER] = k.TURNS
-                    of_node = real.phases.get(name, Phase())
-                    cpu[k.PERIOD_AGO], cpu[k.TICK_AGO] = of_node.period_ago_ns, of_node.tick_ago_ns
-                    cpu[k.WAKE_KEY], wakes_hz = of_node.wakes, node.background_hz
-                    if wakes_hz:
-                        of[k.WAKE_GAP_NS] = 1e9 / wakes_hz
-                    else:
-                        cpu[k.WAKE_T] = LAST_NS
+            row = self.node_row[index, name] = len(self.rows["nodes"])
+            servers = {"server_0": len(self.rows["servers"])}
+            self.rows["nodes"].append({**servers, "n_servers": 1 + len(node.accelerators)})
+            self._add_cpu(row, node, real.phases.get(name, Phase()))
             for kind, count in node.accelerators.items():
-                self._add_server(key, kind, k.FIFO, count)
+                self._add_server(row, kind, Scheduler.FIFO, count)
         for name in new:
             self._add_paces(index, problem.fabric.nodes[name])
+
+    def _add_cpu(self, row: int, node: Node, phase: Phase) -> None:
+        """Add the CPU of a node, with its quota."""
+        quota, scheduler = node.quota, SCHEDULERS[node.scheduler]
+        if quota is not None and round(quota.tick_ms * 1e6):
+            scheduler = Scheduler.TURNS
+        cpu = self._add_server(row, None, scheduler, node.cores)
+        speed = node.pace * (1.0 if node.scheduler == "fair" else node.spare / node.cores)
+        cpu |= {
+            "spare": node.spare,
+            "background": node.background,
+            "beside": 1.0 / node.interference,
+            "pace": node.pace,
+            "speed": speed,
+        }
+        if quota is None:
+            return
+        cpu["quota"] = len(self.rows["quotas"])
+        counted = dict(zip(COUNTED, _counted_ns(node, quota), strict=True))
+        ticks = scheduler == Scheduler.TURNS
+        pooled = counted["slack_ns"] or ticks
+        new: dict[str, Any] = {
+            **counted,
+            "looks_ns": -1,
+            "period_ns": round(quota.period_ms * 1e6),
+            "tick_ns": round(quota.tick_ms * 1e6),
+            "pool_ns" if pooled else "left_ns": counted["quota_ns"],
+        }
+        if ticks:
+            hz = node.background_hz
+            new |= {
+                "period_ago_ns": phase.period_ago_ns,
+                "tick_ago_ns": phase.tick_ago_ns,
+                "wake_key": phase.wakes,
+                "wake_gap_ns": 1e9 / hz if hz else 0.0,
+                "wakes_ns": 0 if hz else LAST_NS,
+            }
+        self.rows["quotas"].append(new)
 
     def _add_paces(self, index: int, node: Node) -> None:
         """Add how fast a node is while others on its CPUs have foreign threads."""
         if node.quota is None or not node.contention_stressed:
             return
-        server = self.server_row[self._node_key(index, node.name), None]
         others = {
-            self.server_row[self._node_key(index, other), None]: share
+            self.server_row[self.node_row[index, other], None]: share
             for other, share in node.contention_stressed.items()
         }
+        server = self.server_row[self.node_row[index, node.name], None]
         for other, share in ({-1: node.contention} | others).items():
             of = replace(node, contention=share)
-            self.paces.append([server, other, *_counted_ns(of, node.quota)])
-            self.paces_f.append(of.pace)
+            counted = zip(COUNTED, _counted_ns(of, node.quota), strict=True)
+            self.rows["paces"].append(
+                {"server": server, "other": other, "pace": of.pace, **dict(counted)}
+            )
 
-    def _add_server(self, node: str, kind: str | None, scheduler: int, cores: int) -> list[int]:
-        row = [0] * k.N_SERVER
-        row[k.SCHEDULER], row[k.CORES] = scheduler, cores
-        row[k.NODE_OF], row[k.IS_CPU], row[k.NEXT_KEY] = self.node_row[node], int(not kind), -1
-        self.server_row[node, kind] = len(self.servers)
-        self.servers.append(row)
-        self.servers_f.append([0.0] * k.N_SERVER_F)
-        self.servers_f[-1][k.BESIDE] = self.servers_f[-1][k.PACE] = 1.0
-        self.servers_f[-1][k.SPEED], self.servers_f[-1][k.SPARE] = 1.0, float(cores)
+    def _add_server(
+        self, node: int, kind: str | None, scheduler: Scheduler, cores: int
+    ) -> dict[str, Any]:
+        row: dict[str, Any] = {
+            "node": node,
+            "scheduler": scheduler,
+            "cores": cores,
+            "is_cpu": not kind,
+            "next_key": -1,
+            "quota": -1,
+            "beside": 1.0,
+            "pace": 1.0,
+            "speed": 1.0,
+            "spare": float(cores),
+        }
+        self.server_row[node, kind] = len(self.rows["servers"])
+        self.rows["servers"].append(row)
         self.server_workers.append(0)
         return row
 
     def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
-        pipeline = problem.pipeline
-        task_0, flow_0, hop_0 = len(self.tasks), len(self.flows), len(self.hops)
-        names = list(pipeline.tasks)
-        row = [0] * k.N_CELL
-        row[k.TASK_0], row[k.N_TASKS] = task_0, len(names)
-        row[k.FLOW_0], row[k.CANDIDATE_0] = flow_0, len(self.site_of)
-        row[k.N_SINKS] = sum(not pipeline.outputs(name) for name in names)
-        row[k.N_CYCLES] = real.cycles
-        row[k.CLOSE_CYCLE] = row[k.WINDOW_CYCLES] = problem.window_cycles
-        row[k.N_CANDIDATES], row[k.PAIR_0] = len(problem.candidates), len(self.shadow_parts)
-        row[k.SHADOW] = row[k.PARENT] = -1
-        self.cell_rows.append(row)
-        release_ns = real.release_ns
-        self.close_ns.append(window_close_ns(problem, release_ns[:-1], release_ns[1:]))
+        pipeline, release_ns = problem.pipeline, real.release_ns
+        names, hop_0 = list(pipeline.tasks), len(self.rows["hops"])
+        close_ns = window_close_ns(problem, release_ns[:-1], release_ns[1:])
+        self.close_ns.append(close_ns)
+        cell = {
+            "release_ns": self._addresses(release_ns[None])[0],
+            "close_ns": self._addresses(close_ns[None])[0],
+            "n_cycles": real.cycles,
+            "close_cycle": problem.window_cycles,
+            "window_cycles": problem.window_cycles,
+            "task_0": len(self.rows["tasks"]),
+            "n_tasks": len(names),
+            "flow_0": len(self.rows["flows"]),
+            "candidate_0": len(self.site_of),
+            "n_candidates": len(problem.candidates),
+            "n_sinks": sum(not pipeline.outputs(name) for name in names),
+            "pair_0": len(self.shadow_parts),
+            "node_0": len(self.cell_nodes),
+            "n_nodes": len(problem.fabric.nodes),
+            "shadow": -1,
+            "parent": -1,
+        }
+        self.rows["cells"].append(cell)
+        self.cell_nodes += [self.node_row[index, name] for name in problem.fabric.nodes]
         flows = ordered_flows(pipeline)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
-        for flow in flows:
-            self.flows.append([names.index(flow.source), names.index(flow.target)])
+        self.rows["flows"] += [
+            {"source": names.index(flow.source), "target": names.index(flow.target)}
+            for flow in flows
+        ]
         for name in names:
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
             self._add_task(pipeline, pipeline.tasks[name], outputs)
         link_row = self._add_links(problem, real)
         self._add_hops(problem, real, link_row)
-        self._add_candidates(index, problem, real, hop_0)
+        self._add_candidates(index, index, problem, real, hop_0)
         if self.shadows is not None:
             self._add_pairs(problem)
         self._add_changes(index, NodeChanges.of(real.node_changes))
 
-    def _add_candidates(self, index: int, problem: Problem, real: Realisation, hop_0: int) -> None:
+    def _add_candidates(
+        self, cell: int, index: int, problem: Problem, real: Realisation, hop_0: int
+    ) -> None:
         """Add where the tasks run and the flows cross under every candidate."""
         names = list(problem.pipeline.tasks)
-        site_row = self._add_sites(index, problem, real, names)
+        site_row = self._add_sites(cell, index, problem, real, names)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
@@ -263,86 +324,100 @@ class _Layout:
 
     def _add_shadow(self, problem: Problem, real: Realisation) -> None:
         """Add the shadow of the only cell: workers and draws of its own, all else shared."""
-        parent = self.cell_rows[0]
-        shadow = list(parent)
-        parent[k.SHADOW], shadow[k.PARENT] = 1, 0
-        shadow[k.CANDIDATE_0] = len(self.site_of)
+        parent = self.rows["cells"][0]
+        parent["shadow"] = 1
         # Its windows never close.
-        shadow[k.CLOSE_CYCLE] = real.cycles + 1
-        self.cell_rows.append(shadow)
-        self.close_ns.append(self.close_ns[0])
+        shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
+        self.rows["cells"].append(parent | shadow | {"shadow": -1, "parent": 0})
         self.reals.append(real)
-        hop_0 = len(self.hops)
+        hop_0 = len(self.rows["hops"])
         self._add_hops(problem, real, {name: i for i, name in enumerate(problem.fabric.links)})
-        self._add_candidates(1, problem, real, hop_0)
+        self._add_candidates(1, 0, problem, real, hop_0)
 
     def _add_changes(self, index: int, changes: NodeChanges) -> None:
         """Add the changes of a cell's nodes; those of a shared node are the first cell's."""
-        own = [index == 0 or name not in self.shared for name in changes.nodes]
-        row = [self.node_row[self._node_key(index, name)] for name in changes.nodes]
-        if row:
-            table = changes.table[np.array(own)[changes.table[:, 1]]].copy()
-            table[:, 1] = np.array(row)[table[:, 1]]
-            self.changes.append(table)
+        row = np.array([self.node_row[index, name] for name in changes.nodes], np.int64)
+        table = changes.table
+        if not np.array_equal(row, np.arange(len(row))):
+            own = [index == 0 or name not in self.shared for name in changes.nodes]
+            table = table[np.array(own)[table[:, 1]]]
+            table[:, 1] = row[table[:, 1]]
+        self.changes.append(_as_rows("changes", table))
 
     def _add_task(self, pipeline: Pipeline, task: Task, outputs: list[int]) -> None:
-        row = [0] * k.N_TASK
-        row[k.N_IN], row[k.N_OUT] = len(pipeline.inputs(task.name)), len(outputs)
-        row[k.OUT_0] = len(self.out_flows)
-        row[k.OFFSET_NS] = round(task.offset_ms * 1e6)
-        self.tasks.append(row)
-        self.out_flows += outputs
+        self.rows["tasks"].append(
+            {
+                "n_in": len(pipeline.inputs(task.name)),
+                "n_out": len(outputs),
+                "out_0": len(self.outputs),
+                "offset_ns": round(task.offset_ms * 1e6),
+            }
+        )
+        self.outputs += outputs
 
     def _add_sites(
-        self, index: int, problem: Problem, real: Realisation, names: list[str]
+        self, cell: int, index: int, problem: Problem, real: Realisation, names: list[str]
     ) -> dict[tuple[str, str], int]:
+        """Add the sites of a cell, or of its shadow, on the nodes of the cell `index`."""
         rows: dict[tuple[str, str], int] = {}
-        for task_name, node_name in real.sites:
+        columns = list(problem.fabric.nodes)
+        for (task_name, node_name), exec_ns in zip(
+            real.sites, self._addresses(real.exec_ns), strict=True
+        ):
             task = problem.pipeline.tasks[task_name]
             execution = task.on[node_name]
-            node = self._node_key(index, node_name)
+            node = self.node_row[index, node_name]
             server = self.server_row[node, execution.accelerator]
-            fair = self.servers[server][k.SCHEDULER] in (k.FAIR, k.TURNS)
-            cores = self.servers[server][k.CORES]
-            row = [0] * k.N_SITE
-            row[k.SITE_CELL], row[k.SITE_TASK] = index, names.index(task_name)
-            # A smaller rank goes first.
-            row[k.DEPTH], row[k.RANK] = task.depth, -task.priority
-            row[k.SERVER], row[k.NODE] = server, self.node_row[node]
-            row[k.WORKERS] = row[k.IDLE] = execution.workers
-            row[k.NEED] = row[k.THREADS] = 1
-            if execution.accelerator is None:
-                row[k.THREADS] = execution.threads
-                row[k.NEED] = execution.threads if fair else min(execution.threads, cores)
-            row[k.START_NS] = round(task.start_ms * 1e6)
-            row[k.BEFORE_NS] = round(execution.before_ms * 1e6)
-            row[k.AFTER_NS] = round(execution.after_ms * 1e6)
+            on = self.rows["servers"][server]
+            fair, cores = on["scheduler"] in (Scheduler.FAIR, Scheduler.TURNS), on["cores"]
+            threads = execution.threads if execution.accelerator is None else 1
             self.server_workers[server] += execution.workers
-            rows[task_name, node_name] = len(self.sites)
-            self.sites.append(row)
+            rows[task_name, node_name] = len(self.rows["sites"])
+            self.rows["sites"].append(
+                {
+                    "cell": cell,
+                    "task": names.index(task_name),
+                    "server": server,
+                    "node": node,
+                    "own": cell * self.max_nodes + columns.index(node_name),
+                    "exec_ns": exec_ns,
+                    "depth": task.depth,
+                    "rank": -task.priority,  # a smaller one goes first
+                    "workers": execution.workers,
+                    "idle": execution.workers,
+                    "threads": threads,
+                    "need": threads if fair else min(threads, cores),
+                    "start_ns": round(task.start_ms * 1e6),
+                    "before_ns": round(execution.before_ms * 1e6),
+                    "after_ns": round(execution.after_ms * 1e6),
+                }
+            )
         return rows
 
     def _add_links(self, problem: Problem, real: Realisation) -> dict[str, int]:
         pieces = LinkSegments.of(real.link_segments)
         link_row: dict[str, int] = {}
         for name, link in problem.fabric.links.items():
-            link_row[name] = len(self.links)
-            row = [0] * k.N_LINK
-            row[k.IN_ORDER] = int(link.in_order)
-            retransmit = link.retransmit_ms
-            row[k.RETRANSMIT_NS] = -1 if retransmit is None else round(retransmit * 1e6)
-            row[k.SEGMENT] = self.n_segments
+            link_row[name] = len(self.rows["links"])
+            first = self.n_segments
             if name in pieces.links:
                 mine = pieces.table[:, 1] == pieces.links.index(name)
-                self.segments.append(pieces.table[mine][:, [0, 2, 3]])
-                self.segments_f.append(pieces.table_f[mine])
+                self.segments.append(_as_rows("segments", pieces.table[mine]))
+                self.rates.append(_as_rows("rates", pieces.table_f[mine]))
                 self.n_segments += int(mine.sum())
-            row[k.SEGMENT_END] = self.n_segments
-            self.links.append(row)
+            retransmit = link.retransmit_ms
+            self.rows["links"].append(
+                {
+                    "in_order": link.in_order,
+                    "retransmit_ns": -1 if retransmit is None else round(retransmit * 1e6),
+                    "segment": first,
+                    "segment_end": self.n_segments,
+                }
+            )
         return link_row
 
     def _add_hops(self, problem: Problem, real: Realisation, link_row: Mapping[str, int]) -> None:
-        hop_0 = len(self.hops)
+        hop_0 = len(self.layers)
         payload = {
             (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
         }
@@ -350,127 +425,126 @@ class _Layout:
         payload |= {
             (task.name, task.name): task.state_bytes for task in problem.pipeline.tasks.values()
         }
-        for source, target, link_name in real.hops:
-            self.hops.append([link_row[link_name], payload[source, target]])
-            self.layer_rows.append({})
-        for i, (hop, layer) in enumerate(real.layers):
-            self.layer_rows[hop_0 + hop][layer] = self.extra_rows + i
-        self.extra_rows += len(real.layers)
+        for (source, target, link_name), delay_ns, loss_key in zip(
+            real.hops, self._addresses(real.delay_ns), real.loss_keys, strict=True
+        ):
+            self.rows["hops"].append(
+                {
+                    "link": link_row[link_name],
+                    "payload_bytes": payload[source, target],
+                    "delay_ns": delay_ns,
+                    "loss_key": loss_key,
+                }
+            )
+            self.layers.append({})
+        for (hop, layer), extra_ns in zip(real.layers, self._addresses(real.extra_ns), strict=True):
+            self.layers[hop_0 + hop][layer] = extra_ns
 
     def _check_keys(self) -> None:
         limits = (
-            ("cells", len(self.cells), k.CELL_MASK),
-            ("tasks of a cell", self.max_tasks, k.ITEM_MASK),
-            ("flows of a cell", self.max_flows, k.LOST_ON_LINK - 1),
-            ("feasible (task, node) pairs", len(self.sites), k.ITEM_MASK),
-            ("nodes and accelerators", len(self.servers), k.ITEM_MASK - 1),
+            ("cells", len(self.cells), codes.CELL_MASK),
+            ("tasks of a cell", self.max_tasks, codes.ITEM_MASK),
+            ("flows of a cell", self.max_flows, codes.MOST_FLOWS),
+            ("feasible (task, node) pairs", len(self.rows["sites"]), codes.ITEM_MASK),
+            ("nodes and accelerators", len(self.rows["servers"]), codes.ITEM_MASK - 1),
         )
         for what, number, limit in limits:
             if number > limit:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
 
-    def _foreign(self, server: list[int], changes: k.Ints) -> int:
+    def _foreign(self, server: Mapping[str, Any], changes: Rows) -> int:
         """Most foreign threads of a server among those that take turns."""
-        of = changes[changes[:, k.CHANGE_NODE] == server[k.NODE_OF], k.CHANGE_STRESS]
-        return int(of.max(initial=0)) if server[k.SCHEDULER] == k.TURNS else 0
+        if server["scheduler"] != Scheduler.TURNS:
+            return 0
+        return int(changes["stress"][changes["node"] == server["node"]].max(initial=0))
 
-    def _tables(self) -> k.Tables:
-        cells, nodes, cycles = len(self.cell_rows), len(self.node_row), self.cycles
-        changes = np.concatenate(self.changes)
-        changes = changes[np.argsort(changes[:, 0], kind="stable")]
-        capacity = [
-            max(workers, 1) + self._foreign(server, changes)
-            for server, workers in zip(self.servers, self.server_workers, strict=True)
-        ]
-        base = np.concatenate(([0], np.cumsum(capacity)[:-1]))
-        servers = _table(self.servers, k.N_SERVER)
-        servers[:, k.BASE] = base
-        room = int(sum(capacity))
-        margin = 64 + len(self.sites) + len(self.flows) + len(self.tasks) + len(servers)
+    def _tables(self) -> Tables:
+        rows, cells, cycles = self.rows, len(self.rows["cells"]), self.cycles
+        if len(self.changes) == 1:
+            (changes,) = self.changes
+        else:
+            changes = np.concatenate(self.changes)
+            changes = changes[np.argsort(changes["at_ns"], kind="stable")]
+        base = 0
+        for server, workers in zip(rows["servers"], self.server_workers, strict=True):
+            server["base"] = base
+            base += max(workers, 1) + self._foreign(server, changes)
         windows = max(real.windows for _, real in self.cells)
-        reals = self.reals
-        jobs_logged = cells * cycles * self.max_tasks if self.log else 0
-        n_layers = 1 + max((layer for rows in self.layer_rows for layer in rows), default=0)
-        layer_rows = np.full((len(self.hops), n_layers), -1, np.int64)
-        for hop, rows in enumerate(self.layer_rows):
-            for layer, row in rows.items():
-                layer_rows[hop, layer] = row
-        clock = np.zeros(k.N_CLOCK, np.int64)
-        clock[k.END] = max(int(close_ns[-1]) for close_ns in self.close_ns)
+        margin = 64 + sum(len(rows[name]) for name in ("sites", "flows", "tasks", "servers"))
+        n_layers = 1 + max((layer for known in self.layers for layer in known), default=0)
+        layers = np.zeros((len(self.layers), n_layers), np.uint64)
+        for hop, known in enumerate(self.layers):
+            for layer, address in known.items():
+                layers[hop, layer] = address
+        clock = {
+            "n_slots": RING_START,
+            "n_tasks": self.max_tasks,
+            "n_flows": self.max_flows,
+            "n_layers": n_layers,
+            "n_nodes": self.max_nodes,
+            "n_cycles": cycles,
+            "n_windows": windows,
+            "margin": margin,
+            "budget": BUDGET,
+            "end_ns": max(int(close_ns[-1]) for close_ns in self.close_ns),
+        }
+        rows["clock"].append(clock)
+        self._announce_first(changes)
         stamps = np.zeros((cells, cycles), np.int16)
-        stamps[[row[k.PARENT] >= 0 for row in self.cell_rows]] = -1
-        tables = k.Tables(
-            ring=RING_START,
-            stride=self.max_tasks,
-            margin=margin,
-            tasks=_table(self.tasks, k.N_TASK),
-            flows=_table(self.flows, k.N_FLOW),
-            out_flows=np.array(self.out_flows, np.int64),
-            site_of=_table(self.site_of, self.max_tasks),
-            route=_table(self.route, self.max_flows),
+        stamps[[row["parent"] >= 0 for row in rows["cells"]]] = -1
+        logged = cells * cycles if self.log else 0
+        # Rows beyond those that are laid out.
+        room = {
+            "events": 4 * margin,
+            "running": base,
+            "waiting": base,
+            "jobs": cells * RING_START * self.max_tasks,
+            "slots": cells * RING_START,
+        }
+        structs = {name: _table(name, rows[name], room.get(name, 0)) for name in rows}
+        structs |= {
+            "segments": np.concatenate([structs["segments"], *self.segments]),
+            "rates": np.concatenate([structs["rates"], *self.rates]),
+            "changes": changes,
+            "log": _as_rows("log", np.full((logged * self.max_tasks, 3), -1)),
+        }
+        return Tables(
+            **structs,
+            outputs=np.array(self.outputs, np.int32),
+            cell_nodes=np.array(self.cell_nodes, np.int32),
+            site_of=np.array(self.site_of, np.int32),
+            route=np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
             back_ns=np.array(self.back_ns, np.int64),
-            shadow_parts=_table(self.shadow_parts, self.max_tasks),
-            hops=_table(self.hops, k.N_HOP),
-            loss_keys=np.concatenate([real.loss_keys for real in reals]),
-            layer_rows=layer_rows,
-            segments=np.concatenate(self.segments),
-            segments_f=np.concatenate(self.segments_f),
-            changes=changes,
-            paces=_table(self.paces, k.N_PACE),
-            paces_f=np.array(self.paces_f, np.float64),
-            release_ns=_stack([real.release_ns[None] for real in reals], cycles + 1),
-            close_ns=_stack([close_ns[None] for close_ns in self.close_ns], cycles),
-            exec_ns=_stack([real.exec_ns for real in reals], cycles),
-            delay_ns=_stack([real.delay_ns for real in reals], cycles),
-            extra_ns=_stack([real.extra_ns for real in reals], cycles),
+            shadow_parts=np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
+            layers=layers,
             stamps=stamps,
-            clock=clock,
-            cells=_table(self.cell_rows, k.N_CELL),
-            sites=_table(self.sites, k.N_SITE),
-            servers=servers,
-            servers_f=np.array(self.servers_f, np.float64),
-            links=_table(self.links, k.N_LINK),
-            run_v=np.zeros(room),
-            run_key=np.zeros(room, np.int64),
-            wait_rank=np.zeros(room, np.int64),
-            wait_ready=np.zeros(room, np.int64),
-            wait_key=np.zeros(room, np.int64),
-            wait_left=np.zeros(room),
-            dirty=np.zeros(len(servers), np.int64),
+            dirty=np.zeros(len(rows["servers"]), np.int32),
             ready=np.zeros(margin, np.int64),
-            event_t=np.zeros(4 * margin, np.int64),
-            event_key=np.zeros(4 * margin, np.int64),
-            jobs=np.zeros((cells * RING_START * self.max_tasks, k.N_JOB), np.int64),
-            slots=np.zeros((cells * RING_START, k.N_SLOT), np.int64),
             attempts=np.zeros((cells * RING_START, max(self.max_flows, 1)), np.int64),
-            own=np.zeros((cells, nodes)),
+            own_ns=np.zeros((cells, self.max_nodes)),
             latency_ns=np.full((cells, cycles), NEVER_NS),
             compute_ns=np.zeros((cells, cycles), np.int64),
             network_ns=np.zeros((cells, cycles), np.int64),
             outcome=np.zeros((cells, cycles), np.int8),
-            opened=np.zeros((cells, windows, 3, nodes)),
-            closed=np.zeros((cells, windows, 3, nodes)),
-            log=np.full((jobs_logged, k.N_LOG), -1, np.int64),
-            log_outcome=np.zeros(jobs_logged, np.int8),
-            log_arrived=np.full((cells * cycles if self.log else 0, self.max_flows), -1, np.int64),
+            opened=np.zeros((cells, windows, 3, self.max_nodes)),
+            closed=np.zeros((cells, windows, 3, self.max_nodes)),
+            log_outcome=np.zeros(logged * self.max_tasks, np.int8),
+            log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )
-        _announce_first(tables)
-        return tables
 
-
-def _announce_first(tables: k.Tables) -> None:
-    """Put the first release of every cell, and the first change of a node, into the heap."""
-    first = [
-        (int(tables.release_ns[cell, 0]), (k.RELEASE << k.KIND_SHIFT) | (cell << k.CELL_SHIFT))
-        for cell in range(len(tables.cells))
-        if tables.cells[cell, k.PARENT] < 0
-    ]
-    if len(tables.changes):
-        first.append((int(tables.changes[0, k.CHANGE_AT]), k.CHANGE << k.KIND_SHIFT))
-    # A sorted array is a heap.
-    for i, (at, key) in enumerate(sorted(first)):
-        tables.event_t[i], tables.event_key[i] = at, key
-    tables.clock[k.N_EVENTS] = len(first)
+    def _announce_first(self, changes: Rows) -> None:
+        """Put the first release of every cell, and the first change of a node, into the queue."""
+        first = [
+            (int(self.reals[cell].release_ns[0]), make_key(Kind.RELEASE, cell))
+            for cell in range(len(self.cells))
+        ]
+        if len(changes):
+            first.append((int(changes[0]["at_ns"]), make_key(Kind.CHANGE)))
+        # The queue is sorted, the first event last.
+        self.rows["events"] = [
+            {"at_ns": at_ns, "key": key} for at_ns, key in sorted(first, reverse=True)
+        ]
+        self.rows["clock"][0]["n_events"] = len(first)
 
 
 def back_ns(problem: Problem, placement: Placement) -> int:
@@ -500,7 +574,7 @@ def ordered_flows(pipeline: Pipeline) -> list[Flow]:
     return sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
 
 
-def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[int]:
+def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[ShadowPart]:
     """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 
     A task is shadowed where it, or any task before it, runs on another node; a sink behind such
@@ -508,7 +582,11 @@ def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> lis
     """
     diverging = pipeline.diverging(active, other)
     return [
-        k.SHARED if name not in diverging else k.SHADOWED if pipeline.outputs(name) else k.DISCARDED
+        ShadowPart.SHARED
+        if name not in diverging
+        else ShadowPart.SHADOWED
+        if pipeline.outputs(name)
+        else ShadowPart.DISCARDED
         for name in pipeline.tasks
     ]
 
@@ -519,18 +597,14 @@ def _counted_ns(node: Node, quota: Quota) -> list[int]:
     return [*budgets, *(node.wall_ns(ms) for ms in (quota.slack_ms, LEAST_MS, DRAWN_MS))]
 
 
-def _table(rows: Sequence[Sequence[int]], columns: int) -> k.Ints:
-    return np.array(rows, np.int64).reshape(len(rows), columns)
+def _table(name: str, rows: Sequence[Mapping[str, Any]], room: int) -> Rows:
+    """Make a table of rows; what a row does not have is 0, as are all rows beyond them."""
+    table = np.zeros(len(rows) + room, row_types()[name])
+    for column in dict.fromkeys(key for row in rows for key in row):
+        table[column][: len(rows)] = [row.get(column, 0) for row in rows]
+    return table
 
 
-def _stack(parts: Sequence[k.Ints], columns: int) -> k.Ints:
-    """Stack rows of cells; one cell's array is used as it is, without a copy."""
-    if len(parts) == 1:
-        return np.ascontiguousarray(parts[0])
-    rows = sum(len(part) for part in parts)
-    out = np.zeros((rows, columns), np.int64)
-    at = 0
-    for part in parts:
-        out[at : at + len(part), : part.shape[1]] = part
-        at += len(part)
-    return out
+def _as_rows(name: str, table: NDArray[Any]) -> Rows:
+    """See a two-dimensional table as one of structs."""
+    return np.ascontiguousarray(table).view(row_types()[name]).reshape(len(table))

@@ -56,7 +56,7 @@ class Phase(NamedTuple):
         was.
     wakes : int
         Stream of the times between two wakes of the background (see
-        `dwell.kernels.streams.attempt_uniform`), 63 bits.
+        ``attempts.h``), 63 bits.
     """
 
     period_ago_ns: int = 0
@@ -193,7 +193,7 @@ class Realisation:
     delay_ns : int64 array, shape (hops, N)
         Propagation delay of each cycle's message, without disturbances.
     loss_keys : uint64 array, shape (hops,)
-        Stream of the attempts of each hop (see `dwell.kernels.streams.attempt_uniform`).
+        Stream of the attempts of each hop (see ``attempts.h``).
     layers : tuple of (hop index, layer)
         Rows of `extra_ns`; `layer` counts per link.
     extra_ns : int64 array, shape (layers, N)

@@ -1,44 +1,11 @@
-"""Random streams inside kernels: functions of a key and counters, without state."""
+"""Random streams inside kernels."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.kernels.compiled import kernel, phase
-
-CYCLE_STEP = np.uint64(0x9E3779B97F4A7C15)
-ATTEMPT_STEP = np.uint64(0xD1B54A32D192ED03)
-MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
-MIX_2 = np.uint64(0x94D049BB133111EB)
-S11, S27, S30, S31 = np.uint64(11), np.uint64(27), np.uint64(30), np.uint64(31)
-
-
-@phase
-def attempt_uniform(key: np.uint64, cycle: int, attempt: int) -> float:
-    """Uniform number of one attempt to send one message.
-
-    The finaliser of splitmix64 (Steele, Lea and Flood 2014, DOI 10.1145/2660193.2660195) over a
-    key and two counters: attempts need no table, and attempt a of cycle k is the same whatever
-    happened before.
-
-    Parameters
-    ----------
-    key : uint64
-        Stream of a flow on a link.
-    cycle, attempt : int
-        From 0.
-
-    Returns
-    -------
-    float
-        In [0, 1), 53 bits.
-    """
-    z = key + np.uint64(cycle + 1) * CYCLE_STEP + np.uint64(attempt + 1) * ATTEMPT_STEP
-    z = (z ^ (z >> S30)) * MIX_1
-    z = (z ^ (z >> S27)) * MIX_2
-    z = z ^ (z >> S31)
-    return float(z >> S11) * 1.1102230246251565e-16
+from dwell.kernels.compiled import kernel
 
 
 @kernel

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dwell.kernels import layout as k
-from dwell.kernels.heaps import post_event
-from dwell.kernels.links import send_state
+from dwell.kernels.arrays import Arrays
+from dwell.kernels.codes import CYCLE_BITS, Kind, cycle_of, item_of, make_key
+from dwell.kernels.event_loop import post_event, send_state
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 
 # The cycle field of an event: number of the migration, attempt, whether it is ready.
 NUMBER_SHIFT = 20
 ATTEMPTS = (1 << (NUMBER_SHIFT - 1)) - 1
-NUMBERS = (1 << (k.CYCLE_BITS - NUMBER_SHIFT)) - 1
+NUMBERS = (1 << (CYCLE_BITS - NUMBER_SHIFT)) - 1
 
 
 class ColdMigration:
     """The one cold migration of a cell that may be under way.
 
-    Its steps are events like any others, which `dwell.kernels.advance` hands back: a worker is
+    Its steps are events like any others, which `dwell.kernels.event_loop` hands back: a worker is
     ready, or state must be sent again, or has arrived. An event's cycle field says which, and
     counts the attempts, and the migrations; its item is the task.
 
@@ -38,7 +38,7 @@ class ColdMigration:
         self.hops: dict[int, int] = {}
 
     def begin(
-        self, tables: k.Tables, incumbent: str, order: str, boundary: int, arrival_ns: int
+        self, arrays: Arrays, incumbent: str, order: str, boundary: int, arrival_ns: int
     ) -> bool:
         """Start a worker of every task that an order moves; False if there is none."""
         self.order, self.boundary, self.number = order, boundary, self.number + 1
@@ -48,13 +48,14 @@ class ColdMigration:
                 link = f"{old[task.name]}->{new[task.name]}"
                 self.hops[row] = self.hop_row.get((task.name, task.name, link), -1)
                 started_ns = arrival_ns + round(task.start_ms * 1e6)
-                self._announce(tables, row, 0, self.hops[row] < 0, started_ns)
+                self._announce(arrays, row, 0, self.hops[row] < 0, started_ns)
         return bool(self.hops)
 
-    def step(self, tables: k.Tables) -> bool:
+    def step(self, arrays: Arrays) -> bool:
         """Take the step that is due; True if the last task is ready now."""
-        key, now = int(tables.clock[k.STEP_KEY]), int(tables.clock[k.STEP_NS])
-        field, row = (key >> k.CYCLE_SHIFT) & k.CYCLE_MASK, key & k.ITEM_MASK
+        clock = arrays.tables.clock[0]
+        key, now = int(clock["step_key"]), int(clock["step_ns"])
+        field, row = cycle_of(key), item_of(key)
         attempt, ready = (field >> 1) & ATTEMPTS, bool(field & 1)
         if not self.hops or field >> NUMBER_SHIFT != self.number & NUMBERS:
             # A step of a migration that the guard has cut short.
@@ -62,16 +63,15 @@ class ColdMigration:
         if ready:
             del self.hops[row]
             return not self.hops
-        t, arrived, attempt = send_state(tables, self.hops[row], self.boundary, attempt, now)
+        t, arrived, attempt = send_state(arrays, self.hops[row], self.boundary, attempt, now)
         if t >= 0:
-            self._announce(tables, row, attempt, arrived, t)
+            self._announce(arrays, row, attempt, arrived, t)
         return False
 
     def stop(self) -> None:
         """Forget the migration that is under way, if there is one: its order is void."""
         self.hops.clear()
 
-    def _announce(self, tables: k.Tables, row: int, attempt: int, ready: bool, t: int) -> None:
+    def _announce(self, arrays: Arrays, row: int, attempt: int, ready: bool, t: int) -> None:
         field = ((self.number & NUMBERS) << NUMBER_SHIFT) | ((attempt & ATTEMPTS) << 1) | ready
-        key = (k.MIGRATE << k.KIND_SHIFT) | (field << k.CYCLE_SHIFT) | row
-        post_event(tables.clock, tables.event_t, tables.event_key, t, key)
+        post_event(arrays, t, make_key(Kind.MIGRATE, cycle=field, item=row))

@@ -5,11 +5,9 @@ from __future__ import annotations
 import bisect
 import platform
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,10 +22,9 @@ from dwell.control import (
     shadow_stamps,
 )
 from dwell.errors import SimulationError
-from dwell.kernels import layout as k
-from dwell.kernels.advance import advance
 from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
-from dwell.kernels.compiled import COMPILED
+from dwell.kernels.codes import Kind, Outcome, Status, kind_of
+from dwell.kernels.event_loop import play
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import Problem
@@ -169,40 +166,21 @@ def _play(
     log_jobs = jobs or controller.learns or shadow
     arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
     sees_all = not _host_changes(problem, realisation)[:, 3].any()
-    with _quiet():
-        if controller.fixed_profile is not None and sees_all and not by_window:
-            # No decision can change anything: one call plays everything.
-            arrays.tables.stamps[:] = list(problem.candidates).index(controller.incumbent)
-            play(arrays)
-            first = np.arange(realisation.windows) * problem.window_cycles
-        else:
-            guarded = guard and controller.guarded
-            stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
-            while (status := play(arrays)) != k.FINISHED:
-                if status == k.STEP:
-                    stamper.step()
-                else:
-                    stamper.close_window()
-            first = np.array(stamper.first, np.int64)
+    if controller.fixed_profile is not None and sees_all and not by_window:
+        # No decision can change anything: one call plays everything.
+        arrays.tables.stamps[:] = list(problem.candidates).index(controller.incumbent)
+        play(arrays)
+        first = np.arange(realisation.windows) * problem.window_cycles
+    else:
+        guarded = guard and controller.guarded
+        stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
+        while (status := play(arrays)) != Status.FINISHED:
+            if status == Status.STEP:
+                stamper.step()
+            else:
+                stamper.close_window()
+        first = np.array(stamper.first, np.int64)
     return PlayedRealisation(problem, realisation, controller, arrays, first)
-
-
-def play(arrays: Arrays) -> int:
-    """Advance to the next pause or to the end, enlarging what has become too small.
-
-    Returns
-    -------
-    int
-        ``PAUSED``, ``STEP`` or ``FINISHED`` (see `dwell.kernels.advance`).
-    """
-    while True:
-        status = advance(*arrays.tables)
-        if status == k.GROW_EVENTS:
-            arrays.grow_events()
-        elif status == k.GROW_RING:
-            arrays.grow_ring()
-        else:
-            return status
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -220,11 +198,6 @@ def _check_fit(problem: Problem, realisation: Realisation) -> None:
             f"the realisation has {realisation.cycles} cycles, but {realisation.windows} windows "
             f"of {problem.window_cycles} cycles need {cycles}"
         )
-
-
-def _quiet() -> AbstractContextManager[object]:
-    """Without compilation, NumPy warns where 64-bit counters wrap, as they are meant to."""
-    return nullcontext() if COMPILED else np.errstate(over="ignore")
 
 
 def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int64]:
@@ -255,7 +228,7 @@ class _Stamper:
         settings = problem.controller
         self.lead = settings.order_lead_cycles
         self.delay_ns = round(settings.order_delay_ms * 1e6)
-        self.close_ns = arrays.tables.close_ns[0]
+        self.close_ns = arrays.close_ns[0]
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.first: list[int] = []
@@ -264,8 +237,8 @@ class _Stamper:
         self.placement = controller.incumbent
         self.next_first = 0
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
-        arrays.tables.clock[k.PAUSE] = 1
-        self.watch = SimulatedGuard(problem, realisation, arrays.tables) if guarded else None
+        arrays.tables.clock[0]["pauses"] = 1
+        self.watch = SimulatedGuard(problem, realisation, arrays) if guarded else None
         self.stamped = self._reach(self.window_cycles)
         self._stamp(0, self.stamped)
 
@@ -278,7 +251,7 @@ class _Stamper:
             plan = shadow_stamps(start, stop, code, len(self.code), self.fraction)
             tables.stamps[1, start:stop] = plan
         if self.watch is not None:
-            self.watch.probes.stamp(tables, start, stop)
+            self.watch.probes.stamp(start, stop)
 
     def _reach(self, boundary: int) -> int:
         """Cycles that may be released before the decision of the window closing at `boundary`."""
@@ -324,7 +297,7 @@ class _Stamper:
         watch, controller, tables = self.watch, self.controller, self.arrays.tables
         if watch is None or not watch.on_fallback:
             return controller.close(window)
-        order = controller.close(window, proven=watch.proven(tables, close_ns))
+        order = controller.close(window, proven=watch.proven(close_ns))
         if controller.wanted is not None and len(tables.cells) < 2:
             raise _ProbesWantedError
         if order == self.placement:
@@ -345,30 +318,30 @@ class _Stamper:
         self._stamp(self.stamped, following)
         self.placement = order
         if self.watch is not None:
-            self.watch.moved(self.arrays.tables, following)
+            self.watch.moved(following)
         cell = self.arrays.tables.cells[0]
-        cell[k.WINDOW_FIRST] = self.next_first = following
-        cell[k.CLOSE_CYCLE] = following + self.window_cycles
+        cell["window_first"] = self.next_first = following
+        cell["close_cycle"] = following + self.window_cycles
         self.stamped = self._reach(following + self.window_cycles)
         self._stamp(following, self.stamped)
 
     def _begin(self, order: str, boundary: int, close_ns: int) -> bool:
         """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
-        tables, arrival_ns = self.arrays.tables, close_ns + self.delay_ns
+        arrival_ns = close_ns + self.delay_ns
         if self.cold is None or not self.cold.begin(
-            tables, self.placement, order, boundary, arrival_ns
+            self.arrays, self.placement, order, boundary, arrival_ns
         ):
             return False
-        cell = tables.cells[0]
+        cell = self.arrays.tables.cells[0]
         # No window closes before the migration is over.
-        cell[k.WINDOW_FIRST] = cell[k.CLOSE_CYCLE] = self.cycles + 1
-        cell[k.MIGRATING] = 1
+        cell["window_first"] = cell["close_cycle"] = self.cycles + 1
+        cell["migrating"] = 1
         self._stamp(self.stamped, self.cycles)
         return True
 
     def step(self) -> None:
         """Take the step that is due: of a cold migration, or of the guard."""
-        if int(self.arrays.tables.clock[k.STEP_KEY]) >> k.KIND_SHIFT == k.GUARD:
+        if kind_of(int(self.arrays.tables.clock[0]["step_key"])) == Kind.GUARD:
             self._fire()
         else:
             self._carry_on()
@@ -378,19 +351,19 @@ class _Stamper:
         tables, watch = self.arrays.tables, self.watch
         if watch is None:
             return
-        now = int(tables.clock[k.STEP_NS])
+        now = int(tables.clock[0]["step_ns"])
         first = int(np.searchsorted(self.release_ns[: self.cycles], now))
         active = self.names[tables.stamps[0, first - 1]]
-        fallback = watch.fire(tables, now, active)
+        fallback = watch.fire(now, active)
         if fallback is None:
             return
         cell = tables.cells[0]
-        watch.fell(tables, now, first, active, fallback)
+        watch.fell(now, first, active, fallback)
         if self.cold is not None:
             self.cold.stop()
-        cell[k.MIGRATING] = cell[k.CLOSE_PENDING] = 0
-        cell[k.WINDOW_FIRST] = self.next_first = first
-        cell[k.CLOSE_CYCLE] = first + self.window_cycles
+        cell["migrating"] = cell["close_pending"] = 0
+        cell["window_first"] = self.next_first = first
+        cell["close_cycle"] = first + self.window_cycles
         if first + self.window_cycles > self.cycles:
             # No window can follow, so that the run ended with the last close.
             return
@@ -402,10 +375,10 @@ class _Stamper:
     def _carry_on(self) -> None:
         """Carry a cold migration on; when its last task is ready, the order takes effect."""
         tables, cold = self.arrays.tables, self.cold
-        if cold is None or not cold.step(tables):
+        if cold is None or not cold.step(self.arrays):
             return
-        tables.cells[0, k.MIGRATING] = 0
-        ready_ns = int(tables.clock[k.STEP_NS])
+        tables.cells[0]["migrating"] = 0
+        ready_ns = int(tables.clock[0]["step_ns"])
         self.stamped = self._takes_effect(cold.boundary, ready_ns - self.delay_ns)
         self._move(cold.order, self.stamped)
 
@@ -428,15 +401,15 @@ def _evidence(
     column = [order.index(flow) for flow in problem.pipeline.flows]
     tables = arrays.tables
     cells = len(tables.cells)
-    log = tables.log.reshape(cells, realisation.cycles, tasks, k.N_LOG)
+    log = tables.log.reshape(cells, realisation.cycles, tasks)
     arrived_ns = tables.log_arrived.reshape(cells, realisation.cycles, -1)
     outcome = tables.log_outcome.reshape(cells, realisation.cycles, tasks)
 
     def instants(cell: int, first: int, last: int) -> Instants:
         jobs = log[cell, first:last]
         return Instants(
-            ready_ns=jobs[:, :, k.LOG_READY].copy(),
-            end_ns=np.where(outcome[cell, first:last] == k.DONE, jobs[:, :, k.LOG_END], -1),
+            ready_ns=jobs["ready_ns"].copy(),
+            end_ns=np.where(outcome[cell, first:last] == Outcome.DONE, jobs["end_ns"], -1),
             arrived_ns=arrived_ns[cell, first:last][:, column],
         )
 
@@ -477,7 +450,6 @@ def _meta(
         "versions": {
             "dwell": __version__,
             "numpy": np.__version__,
-            "numba": numba.__version__,
             "python": platform.python_version(),
         },
     }

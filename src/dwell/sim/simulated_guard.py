@@ -15,34 +15,35 @@ from dwell.control import (
     parts_of,
     rest_cycles,
 )
-from dwell.kernels import layout as k
-from dwell.kernels.far_instants import LAST_NS
-from dwell.kernels.heaps import post_event
+from dwell.kernels.arrays import Arrays
+from dwell.kernels.codes import LAST_NS, Kind, Outcome, ShadowPart, make_key
+from dwell.kernels.event_loop import post_event
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
+from dwell.kernels.tables import Row
 from dwell.model import Problem
 from dwell.model.instants import EVIDENCE_NS, HORIZON_NS
 
 
 class SimulatedGuard:
-    """The guard of one cell: `dwell.kernels.advance` says when it fires, this says what then.
+    """The guard of one cell: the event loop says when it fires, this says what then.
 
     Parameters
     ----------
     problem : Problem
         With fallbacks.
-    tables : Tables
-        Tables of the simulation about to be played; the guard is armed in them.
+    arrays : Arrays
+        The simulation about to be played; the guard is armed in it.
     """
 
-    def __init__(self, problem: Problem, realisation: Realisation, tables: k.Tables) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, realisation: Realisation, arrays: Arrays) -> None:
+        self.problem, self.arrays = problem, arrays
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
         self.names = tuple(problem.candidates)
         period_ns = round(problem.pipeline.period_ms * 1e6)
         self.patience_ns = min(problem.controller.guard_cycles * period_ns, HORIZON_NS)
         self.presence_ns = Presence.of(problem).within_ns
         self.probation = Probation.of(problem)
-        self.probes = _Probes(problem, realisation)
+        self.probes = _Probes(problem, realisation, arrays)
         self.since: int | None = 0
         self._round = FallbackRound(problem.controller.fallbacks)
         # What the guard itself has moved to, with its first cycle, until an order takes effect;
@@ -53,24 +54,29 @@ class SimulatedGuard:
         self._rests = 0
         self._spent_until: int | None = None
         self._outages = _Outages(problem, realisation)
-        self._arm(tables, 0, rest=0)
+        self._arm(0, rest=0)
+
+    @property
+    def _cell(self) -> Row:
+        """The cell's row in the kernel."""
+        return self.arrays.tables.cells[0]
 
     @property
     def on_fallback(self) -> bool:
         """Whether the guard's own move holds."""
         return self.since is None
 
-    def _arm(self, tables: k.Tables, first: int, *, rest: int) -> None:
+    def _arm(self, first: int, *, rest: int) -> None:
         """Wait for the completions of the cycles from `first` on, and of none before.
 
         Once one has completed, of those after the first `rest` cycles alone.
         """
-        cell = tables.cells[0]
-        cell[k.GUARD_NS] = self.patience_ns
-        cell[k.WAITED] = cell[k.MOVED] = min(first, self.cycles)
-        cell[k.RESTED] = min(first + rest, self.cycles)
+        cell = self._cell
+        cell["patience_ns"] = self.patience_ns
+        cell["waited"] = cell["moved"] = min(first, self.cycles)
+        cell["rested"] = min(first + rest, self.cycles)
         if first < self.cycles:
-            self._look_at(tables, self._due_ns(first))
+            self._look_at(self._due_ns(first))
 
     def _due_ns(self, first: int) -> int:
         """Instant at which the guard fires if no cycle from `first` on completes."""
@@ -78,13 +84,12 @@ class SimulatedGuard:
             return LAST_NS
         return min(int(self.release_ns[first]) + self.patience_ns, LAST_NS)
 
-    def _look_at(self, tables: k.Tables, at_ns: int) -> None:
+    def _look_at(self, at_ns: int) -> None:
         """Look at an instant, and not before."""
-        tables.cells[0, k.GUARD_T] = at_ns
-        key = k.GUARD << k.KIND_SHIFT
-        post_event(tables.clock, tables.event_t, tables.event_key, at_ns, key)
+        self._cell["looks_ns"] = at_ns
+        post_event(self.arrays, at_ns, make_key(Kind.GUARD))
 
-    def fire(self, tables: k.Tables, now: int, active: str) -> str | None:
+    def fire(self, now: int, active: str) -> str | None:
         """Return the fallback that the cell moves to now; None where it has to wait for one.
 
         It waits where its own node is down, or was since the release of the cycle it waits for,
@@ -92,8 +97,8 @@ class SimulatedGuard:
         until one is there, or the rest is over.
         """
         first = self._released(now)
-        carrier = self._settle(tables, now, first)
-        if self._waits(tables, now, first):
+        carrier = self._settle(now, first)
+        if self._waits(now, first):
             return None
 
         def there(name: str) -> bool:
@@ -101,22 +106,22 @@ class SimulatedGuard:
             return not any(self._outages.missing(part, since_ns, now) for part in self._parts(name))
 
         def whole(name: str) -> bool:
-            return there(name) and not self._failing(tables, name, now, first)
+            return there(name) and not self._failing(name, now, first)
 
         fallback = self._round.next(active, whole, there, carrier)
         if fallback is None:
-            if self._tries(tables, now, first) and self._round.begun:
+            if self._tries(now, first) and self._round.begun:
                 rest = rest_cycles(self.probation.probe_cycles, self._rests)
                 self._spent_until = min(first + rest, self.cycles)
-                tables.cells[0, k.RESTED] = self._spent_until
-            self._look_later(tables, now, self._round.options(active, carrier))
+                self._cell["rested"] = self._spent_until
+            self._look_later(now, self._round.options(active, carrier))
         return fallback
 
     def _released(self, now: int) -> int:
         """Return how many cycles were released before an instant."""
         return int(np.searchsorted(self.release_ns[: self.cycles], now))
 
-    def _settle(self, tables: k.Tables, now: int, first: int) -> str | None:
+    def _settle(self, now: int, first: int) -> str | None:
         """Begin anew where an order has taken effect; returns what carried the cell before it."""
         since = self.since
         if since is None or since >= first:
@@ -125,71 +130,71 @@ class SimulatedGuard:
         self._rests, self._spent_until = 0, None
         if self._own is not None:
             fallback, begun = self._own
-            carried = self._newest(tables, begun, since, int(self.release_ns[since])) >= 0
+            carried = self._newest(begun, since, int(self.release_ns[since])) >= 0
             self._own, self._carrier = None, fallback if carried else None
-        recent = self._newest(tables, since, first, now) < since + self.probation.probe_cycles
+        recent = self._newest(since, first, now) < since + self.probation.probe_cycles
         return self._carrier if recent else None
 
-    def _waits(self, tables: k.Tables, now: int, first: int) -> bool:
+    def _waits(self, now: int, first: int) -> bool:
         """Whether it is too early to move: the guard rests, or its own node has been away."""
-        cell, own = tables.cells[0], self._outages.of(self.problem.stamper_node)
+        cell, own = self._cell, self._outages.of(self.problem.stamper_node)
         back_ns = max((up for down, up in own if down <= now), default=0)
-        if self._carries(tables, now, first):
+        if self._carries(now, first):
             self._round.over()
             self._spent_until = None
-            cell[k.WAITED] = max(cell[k.WAITED], cell[k.RESTED])
+            cell["waited"] = max(cell["waited"], cell["rested"])
         spent = self._spent_until
-        waited = int(cell[k.WAITED]) if spent is None else spent
+        waited = int(cell["waited"]) if spent is None else spent
         if waited < self.cycles and back_ns > self.release_ns[waited]:
             waited = self._released(back_ns)
         due_ns = self._due_ns(waited)
         if spent is None:
-            cell[k.WAITED] = waited
+            cell["waited"] = waited
             if due_ns > now:
-                self._look_at(tables, due_ns)
+                self._look_at(due_ns)
             return due_ns > now
         self._spent_until = waited
         if back_ns > now:
-            self._look_at(tables, back_ns)
+            self._look_at(back_ns)
             return True
         if due_ns <= now:
             self._round.again()
         return False
 
-    def _look_later(self, tables: k.Tables, now: int, options: Iterable[str]) -> None:
+    def _look_later(self, now: int, options: Iterable[str]) -> None:
         """Look again when what may be tried is back, or a rest is over, or an order was in vain."""
         ends = (
             up for name in options for part in self._parts(name) for _, up in self._outages.of(part)
         )
-        waited = [int(tables.cells[0, k.MOVED]), self._spent_until]
+        waited = [int(self._cell["moved"]), self._spent_until]
         dues = (self._due_ns(cycle) for cycle in waited if cycle is not None)
         again = min((at for at in (*ends, *dues) if at > now), default=LAST_NS)
         if again < LAST_NS:
-            self._look_at(tables, again)
+            self._look_at(again)
 
-    def _heard(self, tables: k.Tables, first: int, stop: int, now: int) -> NDArray[np.bool_]:
+    def _heard(self, first: int, stop: int, now: int) -> NDArray[np.bool_]:
         """Return which of some cycles have been heard to complete by an instant."""
-        cycles = slice(first, stop)
+        tables, cycles = self.arrays.tables, slice(first, stop)
         code = tables.stamps[0, cycles].astype(np.int64)
         ended = self.release_ns[cycles] + tables.latency_ns[0, cycles]
-        done = tables.outcome[0, cycles] == k.DONE
+        done = tables.outcome[0, cycles] == Outcome.DONE
         return np.asarray(done & (ended <= now - tables.back_ns[code]))
 
-    def _newest(self, tables: k.Tables, first: int, stop: int, now: int) -> int:
+    def _newest(self, first: int, stop: int, now: int) -> int:
         """Return the highest of some cycles that has been heard to complete; -1 for none."""
-        heard = np.flatnonzero(self._heard(tables, first, stop, now))
+        heard = np.flatnonzero(self._heard(first, stop, now))
         return first + int(heard[-1]) if len(heard) else -1
 
-    def _carries(self, tables: k.Tables, now: int, first: int) -> bool:
+    def _carries(self, now: int, first: int) -> bool:
         """Whether what the guard has moved to has completed a cycle."""
-        return self._own is not None and self._newest(tables, self._own[1], first, now) >= 0
+        return self._own is not None and self._newest(self._own[1], first, now) >= 0
 
-    def _tries(self, tables: k.Tables, now: int, first: int) -> bool:
+    def _tries(self, now: int, first: int) -> bool:
         """Whether a fallback is being tried, and has not carried the cell yet."""
         spent = self._spent_until is not None
-        return self._own is not None and not spent and not self._carries(tables, now, first)
+        return self._own is not None and not spent and not self._carries(now, first)
 
-    def _failing(self, tables: k.Tables, name: str, now: int, first: int) -> bool:
+    def _failing(self, name: str, now: int, first: int) -> bool:
         """Whether the last k cycles and shadows through a candidate failed, none of them long ago.
 
         As `dwell.control.Failures`.
@@ -197,68 +202,68 @@ class SimulatedGuard:
         code, failed = self.names.index(name), 0
         for cycle in range(first - 1, -1, -1):
             released_ns = int(self.release_ns[cycle])
-            cells = np.flatnonzero(tables.stamps[:, cycle] == code)
+            cells = np.flatnonzero(self.arrays.tables.stamps[:, cycle] == code)
             if released_ns < now - EVIDENCE_NS:
                 break
             if not len(cells):
                 continue
-            if self._completed(tables, int(cells[0]), cycle, now):
+            if self._completed(int(cells[0]), cycle, now):
                 break
             failed += released_ns <= now - self.patience_ns
             if failed == self.problem.controller.failures_in_a_row:
                 return True
         return False
 
-    def _completed(self, tables: k.Tables, cell: int, cycle: int, now: int) -> bool:
+    def _completed(self, cell: int, cycle: int, now: int) -> bool:
         """Whether a cycle, or its shadow, has been heard to complete by an instant."""
         if cell == 0:
-            return bool(self._heard(tables, cycle, cycle + 1, now)[0])
-        heard_ns = self.probes.heard_ns(tables, cycle)
+            return bool(self._heard(cycle, cycle + 1, now)[0])
+        heard_ns = self.probes.heard_ns(cycle)
         return heard_ns is not None and heard_ns <= now
 
     def _parts(self, name: str) -> Iterable[str]:
         return sorted(parts_of(self.problem, name))
 
-    def fell(self, tables: k.Tables, now: int, first: int, left: str, to: str) -> None:
+    def fell(self, now: int, first: int, left: str, to: str) -> None:
         """Note that the cell has moved to a fallback, which is stamped from a cycle on."""
-        self._note_health(tables, now)
+        self._note_health(now)
         self.probation.fell()
-        self._rests += not self._tries(tables, now, first)
+        self._rests += not self._tries(now, first)
         self._round.moved(left, to)
         # An order that has not stamped a cycle yet is void.
         self._own, self._carrier, self.since = (to, first), None, None
         self._spent_until = None
-        self._arm(tables, first, rest=rest_cycles(self.probation.probe_cycles, self._rests))
+        self._arm(first, rest=rest_cycles(self.probation.probe_cycles, self._rests))
 
-    def moved(self, tables: k.Tables, first: int) -> None:
+    def moved(self, first: int) -> None:
         """Take note of an order that takes effect at a cycle."""
         if self.since is None:
             self.probation.left()
             self.probes.end(first)
             self.since = first
-        cell = tables.cells[0]
+        cell = self._cell
         # Cycles before are waited for, but those for which it still rests.
-        cell[k.WAITED] = min(max(cell[k.WAITED], cell[k.MOVED]), first)
-        cell[k.RESTED] = min(cell[k.RESTED], first)
-        cell[k.MOVED] = first
+        cell["waited"] = min(max(cell["waited"], cell["moved"]), first)
+        cell["rested"] = min(cell["rested"], first)
+        cell["moved"] = first
         # Other fallbacks may be open to the new placement than those that were not whole.
-        due_ns, next_ns = self._due_ns(first), int(cell[k.GUARD_T])
+        due_ns, next_ns = self._due_ns(first), int(cell["looks_ns"])
         if due_ns < LAST_NS and not 0 <= next_ns <= due_ns:
-            self._look_at(tables, due_ns)
+            self._look_at(due_ns)
 
-    def _note_health(self, tables: k.Tables, now: int) -> None:
+    def _note_health(self, now: int) -> None:
         """Count what was heard to complete since the cell has been under orders."""
         if self.since is None:
             return
-        heard = self._heard(tables, self.since, self._released(now), now)
+        heard = self._heard(self.since, self._released(now), now)
         self.probation.healthy(int(np.count_nonzero(heard)))
 
-    def proven(self, tables: k.Tables, now: int) -> str | None:
+    def proven(self, now: int) -> str | None:
         """Return the candidate that probes have proven by now."""
         wanted = self.probation.wanted
         if not self.on_fallback or wanted is None:
             return None
-        for at_ns, completed, cycle in self.probes.news(tables, now):
+        for at_ns, completed, cycle in self.probes.news(now):
             if completed:
                 self.probation.completed(cycle, at_ns)
             else:
@@ -343,7 +348,8 @@ class _ProbeRequest:
 class _Probes:
     """Probes: the cycles that are sent as probes, and their completions."""
 
-    def __init__(self, problem: Problem, realisation: Realisation) -> None:
+    def __init__(self, problem: Problem, realisation: Realisation, arrays: Arrays) -> None:
+        self.arrays = arrays
         self.release_ns, self.cycles = realisation.release_ns, realisation.cycles
         names = list(problem.pipeline.tasks)
         flows = sorted(problem.pipeline.flows, key=lambda flow: names.index(flow.target))
@@ -371,16 +377,15 @@ class _Probes:
         if self._requests:
             self.begin(None, first)
 
-    def stamp(self, tables: k.Tables, start: int, stop: int) -> None:
+    def stamp(self, start: int, stop: int) -> None:
         """Stamp the probes among some cycles; the others keep what they have."""
+        stamps = self.arrays.tables.stamps
         for i, request in enumerate(self._requests):
             until = self._requests[i + 1].first if i + 1 < len(self._requests) else self.cycles
             if request.code is not None:
-                tables.stamps[1, max(start, request.first) : min(stop, until, self.cycles)] = (
-                    request.code
-                )
+                stamps[1, max(start, request.first) : min(stop, until, self.cycles)] = request.code
 
-    def news(self, tables: k.Tables, now: int) -> list[tuple[int, bool, int]]:
+    def news(self, now: int) -> list[tuple[int, bool, int]]:
         """Return what has happened to probes: when, whether they completed, and which cycle.
 
         In the order of time, completions first, unless one comes with the release; each once.
@@ -391,10 +396,10 @@ class _Probes:
         unknown = [*self._open, *range(self._next, last)]
         self._next, self._open = max(self._next, last), []
         for cycle in unknown:
-            heard_ns = self.heard_ns(tables, cycle)
+            heard_ns = self.heard_ns(cycle)
             if heard_ns is not None and heard_ns <= now:
                 found.append((heard_ns, True, cycle))
-            elif heard_ns is not None or self._under_way(tables, cycle):
+            elif heard_ns is not None or self._under_way(cycle):
                 self._open.append(cycle)
 
         def order(news: tuple[int, bool, int]) -> tuple[int, int, int]:
@@ -403,19 +408,20 @@ class _Probes:
 
         return sorted(found, key=order)
 
-    def heard_ns(self, tables: k.Tables, cycle: int) -> int | None:
+    def heard_ns(self, cycle: int) -> int | None:
         """Instant at which the completion of a probe is heard: all sinks have their inputs.
 
         A sink that the probe shares with its cycle must have completed.
         """
+        tables = self.arrays.tables
         active, other = (int(code) for code in tables.stamps[:, cycle])
         parts = tables.shadow_parts[active * self.candidates + other]
         at_ns = 0
         for row, inputs in self.sinks:
-            if parts[row] == k.SHARED:
+            if parts[row] == ShadowPart.SHARED:
                 entry = cycle * self.tasks + row
-                done = tables.log_outcome[entry] == k.DONE
-                ends = [int(tables.log[entry, k.LOG_END]) if done else -1]
+                done = tables.log_outcome[entry] == Outcome.DONE
+                ends = [int(tables.log["end_ns"][entry]) if done else -1]
             else:
                 arrived = tables.log_arrived[self.cycles + cycle]
                 ends = [int(arrived[i]) for i in inputs] or [int(self.release_ns[cycle])]
@@ -424,7 +430,9 @@ class _Probes:
             at_ns = max(at_ns, *ends)
         return at_ns + int(tables.back_ns[other])
 
-    def _under_way(self, tables: k.Tables, cycle: int) -> bool:
+    def _under_way(self, cycle: int) -> bool:
         """Whether anything of a cycle or its probe may still happen."""
-        slots = [tables.slots[cell * tables.ring + (cycle & (tables.ring - 1))] for cell in (0, 1)]
-        return any(slot[k.CYCLE] == cycle and slot[k.LIVE] > 0 for slot in slots)
+        tables = self.arrays.tables
+        n_slots = len(tables.slots) // 2
+        slots = tables.slots[[cycle % n_slots, n_slots + cycle % n_slots]]
+        return bool(((slots["cycle"] == cycle) & (slots["live"] > 0)).any())

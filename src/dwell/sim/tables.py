@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control import ClosedWindow, Controller, final_l95_ms, static_columns
-from dwell.kernels import layout as k
 from dwell.kernels.arrays import Arrays
+from dwell.kernels.codes import Outcome, ShadowPart
 from dwell.kernels.realisation import Realisation
+from dwell.kernels.tables import Rows
 from dwell.model import Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.record import OUTCOMES, Feature, frame_of
@@ -78,7 +79,7 @@ class PlayedRealisation:
     def close_ns(self) -> Ints:
         """Instant of every close, shape (windows,)."""
         last = self.first + self.problem.window_cycles - 1
-        close: Ints = self.arrays.tables.close_ns[0, last]
+        close: Ints = self.arrays.close_ns[0][last]
         return close
 
     def closed_windows(self) -> ClosedWindow:
@@ -217,9 +218,9 @@ def _shadow_bytes(played: PlayedRealisation) -> Ints:
     pipeline, cycles = problem.pipeline, played.realisation.cycles
     names = list(pipeline.tasks)
     candidates = list(problem.candidates.values())
-    log = tables.log.reshape(len(tables.cells), cycles, len(names), k.N_LOG)
-    done = tables.log_outcome.reshape(len(tables.cells), cycles, len(names)) == k.DONE
-    done &= log[:, :, :, k.LOG_END] >= 0
+    log = tables.log.reshape(len(tables.cells), cycles, len(names))
+    done = tables.log_outcome.reshape(len(tables.cells), cycles, len(names)) == Outcome.DONE
+    done &= log["end_ns"] >= 0
     active, other = tables.stamps[0].astype(np.int64), tables.stamps[1].astype(np.int64)
     shadowed = other >= 0
     pair = np.where(shadowed, active * len(candidates) + other, 0)
@@ -228,9 +229,9 @@ def _shadow_bytes(played: PlayedRealisation) -> Ints:
     for flow in pipeline.flows:
         source, target = names.index(flow.source), names.index(flow.target)
         crosses = np.array([place[flow.source] != place[flow.target] for place in candidates])
-        own = parts[:, source] != k.SHARED
+        own = parts[:, source] != ShadowPart.SHARED
         ended = np.where(own, done[1, :, source], done[0, :, source])
-        sent = shadowed & (parts[:, target] != k.SHARED) & crosses[other] & ended
+        sent = shadowed & (parts[:, target] != ShadowPart.SHARED) & crosses[other] & ended
         total += sent * flow.payload_bytes
     return total
 
@@ -255,14 +256,14 @@ def _decisions(controller: Controller) -> pl.DataFrame:
     return frame_of("decisions", controller.problem, columns, features)
 
 
-def _log_running(played: PlayedRealisation, log: Ints) -> None:
+def _log_running(played: PlayedRealisation, log: Rows) -> None:
     """Note the start of jobs that were running when the run ended; they have no end."""
     tables = played.arrays.tables
-    jobs = tables.jobs.reshape(len(tables.slots), -1, k.N_JOB)
-    for slot in np.nonzero(tables.slots[:, k.LIVE] > 0)[0]:
-        mine = log[slot // tables.ring, tables.slots[slot, k.CYCLE]]
-        running = (mine[:, k.LOG_READY] >= 0) & (mine[:, k.LOG_END] < 0)
-        mine[running, k.LOG_START] = jobs[slot, : len(mine), k.STARTED][running]
+    jobs = tables.jobs.reshape(len(tables.slots), -1)
+    for slot in np.nonzero(tables.slots["live"] > 0)[0]:
+        mine = log[slot // tables.clock["n_slots"][0], tables.slots["cycle"][slot]]
+        running = (mine["ready_ns"] >= 0) & (mine["end_ns"] < 0)
+        mine["start_ns"][running] = jobs[slot, : len(mine)]["started_ns"][running]
 
 
 def _jobs(played: PlayedRealisation) -> pl.DataFrame:
@@ -272,16 +273,16 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
     cells, cycles = len(tables.cells), played.realisation.cycles
-    log = tables.log.reshape(cells, cycles, len(tasks), k.N_LOG)
+    log = tables.log.reshape(cells, cycles, len(tasks))
     _log_running(played, log)
     outcome = tables.log_outcome.reshape(cells, cycles, len(tasks))
     # Sites of a shadow follow those of its cell in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
     site = tables.site_of[: len(problem.candidates)]
     node = site_node[site[np.maximum(tables.stamps, 0).astype(np.int64)]]
-    cycle, cell, task = np.nonzero(log[:, :, :, k.LOG_READY].transpose(1, 0, 2) >= 0)
+    cycle, cell, task = np.nonzero(log["ready_ns"].transpose(1, 0, 2) >= 0)
     picked = log[cell, cycle, task]
-    ended = picked[:, k.LOG_END] >= 0
+    ended = picked["end_ns"] >= 0
     return frame_of(
         "jobs",
         problem,
@@ -289,9 +290,9 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
             "cycle": cycle,
             "task": _names(task, tasks),
             "node": _names(node[cell, cycle, task], nodes),
-            "ready_ns": picked[:, k.LOG_READY],
-            "start_ns": pl.Series(picked[:, k.LOG_START]),
-            "end_ns": pl.Series(picked[:, k.LOG_END]),
+            "ready_ns": picked["ready_ns"],
+            "start_ns": pl.Series(picked["start_ns"]),
+            "end_ns": pl.Series(picked["end_ns"]),
             "outcome": _names(np.where(ended, outcome[cell, cycle, task], 0), OUTCOMES),
             **({"shadow": cell > 0} if cells > 1 else {}),
         },

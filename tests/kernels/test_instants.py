@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 
 import pytest
 
-from dwell.kernels.compiled import njit
-from dwell.kernels.far_instants import LAST_NS, later, whole_ns
-
-
-@njit
-def sum_of(t: int, duration: int) -> int:
-    """Return the sum as kernels have it, from Python."""
-    return later(t, duration)
-
-
-@njit
-def rounded(duration: float) -> int:
-    """Return the whole nanoseconds as kernels have them, from Python."""
-    return whole_ns(duration)
+from dwell.kernels.codes import LAST_NS
+from tests.kernels.parts import parts, whole
 
 
 def test_the_last_instant_is_exact_as_a_float_and_fits_64_bits() -> None:
     assert int(float(LAST_NS)) == LAST_NS < 1 << 63
+    assert whole("last_ns") == LAST_NS
 
 
 @pytest.mark.parametrize(
@@ -37,12 +27,12 @@ def test_the_last_instant_is_exact_as_a_float_and_fits_64_bits() -> None:
     ],
 )
 def test_sums_end_at_the_last_instant(t: int, duration: int, sum_ns: int) -> None:
-    assert sum_of(t, duration) == sum_ns
+    assert whole("later", t, duration) == sum_ns
 
 
 @pytest.mark.parametrize(
-    ("duration", "whole"),
+    ("duration", "whole_ns"),
     [(0.0, 0), (3.0, 3), (1e18, 10**18), (1e19, LAST_NS), (math.inf, LAST_NS)],
 )
-def test_durations_end_there_too(duration: float, whole: int) -> None:
-    assert rounded(duration) == whole
+def test_durations_end_there_too(duration: float, whole_ns: int) -> None:
+    assert parts().part_whole_ns(ctypes.c_double(duration)) == whole_ns

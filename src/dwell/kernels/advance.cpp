@@ -1,0 +1,50 @@
+// What Python calls of the event loop.
+
+#include "advance.h"
+#include "export.h"
+
+namespace dwell {
+namespace {
+
+template <bool has_quotas, bool has_traces>
+Status advance(const Tables& tables) {
+  Simulation<has_quotas, has_traces> simulation(tables);
+  const Status status = play(simulation);
+  simulation.queue.save(tables.clock[0]);
+  return status;
+}
+
+}  // namespace
+}  // namespace dwell
+
+using namespace dwell;
+
+// Plays a simulation on; returns a Status.
+DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
+  const Tables& t = *tables;
+  bool traces = t.log.size > 0;
+  for (i64 cell = 0; cell < t.cells.size; ++cell) {
+    const Cell& of = t.cells[cell];
+    traces = traces || of.shadow >= 0 || of.parent >= 0;
+  }
+  const bool quotas = t.quotas.size > 0;
+  if (quotas) return traces ? advance<true, true>(t) : advance<true, false>(t);
+  return traces ? advance<false, true>(t) : advance<false, false>(t);
+}
+
+// Adds an event of the caller's; there must be room.
+DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noexcept {
+  Queue queue(tables->events, tables->clock[0]);
+  queue.push(at_ns, key);
+  queue.save(tables->clock[0]);
+}
+
+// Sends the state of a task that moves (see send_state); `out`: at_ns, has_arrived, attempt.
+DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 now,
+                                   i64* out) noexcept {
+  Simulation<true, true> simulation(*tables);
+  const StateSent sent = send_state(simulation, hop, cycle, attempt, now);
+  out[0] = sent.at_ns;
+  out[1] = sent.has_arrived;
+  out[2] = sent.attempt;
+}

@@ -1,0 +1,95 @@
+// The event loop: one call plays a simulation to the next close of a window, or to its end.
+#pragma once
+
+#include "windows.h"
+
+namespace dwell {
+
+// Whether the next event finds room for all it may add; otherwise what must grow.
+template <class S>
+Status room(const S& s) {
+  if (!s.queue.has_room(s.clock[0].margin)) return kGrowEvents;
+  const i64 key = s.queue.first().key;
+  if (kind_of(key) != kRelease) return kPaused;
+  if (s.slot(cell_of(key), cycle_of(key)).live > 0) return kGrowRing;
+  const i64 shadow = s.cells[cell_of(key)].shadow;
+  if (shadow >= 0 && s.slot(shadow, cycle_of(key)).live > 0) return kGrowRing;
+  return kPaused;
+}
+
+template <class S>
+void handle(S& s, i64 key, i64 now) {
+  const i64 cell = cell_of(key), cycle = cycle_of(key), item = item_of(key);
+  switch (kind_of(key)) {
+    case kCompletion:
+      complete(s, key, now);
+      break;
+    case kArrival:
+      arrive(s, cell, cycle, item, now);
+      break;
+    case kStart:
+      note_ready(s, job_key(cell, cycle, item));
+      break;
+    case kRetry:
+      retry(s, cell, cycle, item, now);
+      break;
+    case kChange:
+      if (item == 0) {
+        change_node(s, now);
+      } else if (S::kQuotas) {
+        look_at_quota(s, s.servers[item - 1], now);
+      }
+      break;
+    case kRestart:
+      restart(s, s.sites[item], now);
+      break;
+    case kRelease:
+      open_window(s, cell, cycle, now);
+      release(s, cell, cycle, now);
+      break;
+    case kMigrate:
+    case kClose:
+    case kGuard:
+      break;  // the loop's own
+  }
+}
+
+// Plays events until a window closes (where `pauses` is set), or room runs out, or the budget, or
+// every window has closed.
+template <class S>
+Status play(S& s) {
+  // How many cells wait for a close, or migrate: without any the run is over.
+  i64 waiting = 0;
+  for (i64 cell = 0; cell < s.cells.size; ++cell) waiting += announce_close(s, cell);
+  i64 budget = s.clock[0].budget;
+  while (waiting > 0 && !s.queue.is_empty()) {
+    const Status status = room(s);
+    if (status != kPaused) return status;
+    if (--budget < 0) return kBusy;
+    const Event event = s.queue.first();
+    const i64 now = event.at_ns;
+    s.queue.pop();
+    const Kind kind = kind_of(event.key);
+    const i64 cell = cell_of(event.key);
+    if (kind == kClose) {
+      // A window that the guard has cut short does not close.
+      if (cycle_of(event.key) != s.cells[cell].close_cycle) continue;
+      close_window(s, cell, now);
+      if (s.clock[0].pauses) return kPaused;
+      waiting += announce_close(s, cell) - 1;
+      continue;
+    }
+    if (now > s.clock[0].end_ns) break;
+    if (kind == kMigrate || (kind == kGuard && guard_fires(s, cell, now))) {
+      s.clock[0].step_key = event.key;
+      s.clock[0].step_ns = now;
+      return kStep;
+    }
+    handle(s, event.key, now);
+    settle(s, now);
+    flush(s, now);
+  }
+  return kFinished;
+}
+
+}  // namespace dwell

@@ -1,0 +1,296 @@
+// The life of a cycle: release, inputs, workers, completion, loss.
+#pragma once
+
+#include "links.h"
+#include "turns.h"
+
+namespace dwell {
+
+template <class S>
+void log_job(S& s, i64 cell, i64 cycle, i64 task, const Job& job, Outcome outcome, i64 end_ns) {
+  if (!S::kTraces || s.log.size == 0) return;
+  const i64 entry = s.output(cell, cycle) * s.n_tasks + task;
+  s.log[entry] = Log{job.ready_ns, job.started_ns, end_ns};
+  s.log_outcome[entry] = outcome;
+}
+
+// Loses a ready job, and with it its cycle.
+template <class S>
+void drop_job(S& s, i64 cell, i64 cycle, i64 task, Outcome outcome, i64 now) {
+  log_job(s, cell, cycle, task, s.job(cell, cycle, task), outcome, now);
+  s.slot(cell, cycle).live -= 1;
+  lose(s, cell, cycle, outcome);
+}
+
+template <class S>
+void append_input(S& s, Site& site, i64 cycle, Job& job) {
+  job.next = -1;
+  if (site.waiting == 0) {
+    site.head = cycle;
+  } else {
+    s.job(site.cell, site.tail, site.task).next = cycle;
+  }
+  site.tail = cycle;
+  site.waiting += 1;
+}
+
+// Removes the oldest waiting job of a site and returns its cycle.
+template <class S>
+i64 pop_input(S& s, Site& site) {
+  const i64 cycle = site.head;
+  site.head = s.job(site.cell, cycle, site.task).next;
+  site.waiting -= 1;
+  return cycle;
+}
+
+// Remembers that all inputs of a job are there; the event's end deals with it.
+template <class S>
+void note_ready(S& s, i64 key) {
+  s.ready[s.n_ready++] = key;
+}
+
+// Lets a ready job wait at its site, or loses it; true if an idle worker takes it at once.
+template <class S>
+bool become_ready(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
+  Job& job = s.job(cell, cycle, task);
+  job.ready_ns = now;
+  log_job(s, cell, cycle, task, job, kInFlight, -1);
+  Site& site = s.site(job);
+  if (s.server(site).is_down) {
+    drop_job(s, cell, cycle, task, kNodeDown, now);
+    return false;
+  }
+  if (site.idle > 0 && site.ready_at_ns == 0) {
+    site.idle -= 1;
+    return true;
+  }
+  if (site.depth > 0 && site.waiting >= site.depth) {
+    if (cycle < site.head) {
+      drop_job(s, cell, cycle, task, kReplaced, now);
+      return false;
+    }
+    drop_job(s, cell, pop_input(s, site), task, kReplaced, now);
+  }
+  append_input(s, site, cycle, job);
+  return false;
+}
+
+// Lets a worker that has become free take what waits, or be idle.
+template <class S>
+void free_worker(S& s, Site& site) {
+  if (site.waiting == 0) {
+    site.idle += 1;
+    return;
+  }
+  const i64 cycle = pop_input(s, site);
+  note_ready(s, job_key(site.cell, cycle, site.task) | kTaken);
+}
+
+// Loses everything that waits at a site, because its node went down.
+template <class S>
+void drop_waiting(S& s, Site& site, i64 now) {
+  while (site.waiting > 0) drop_job(s, site.cell, pop_input(s, site), site.task, kNodeDown, now);
+}
+
+// Whether a task is one that the shadow of a cycle stops before.
+template <class S>
+bool is_discarded(const S& s, i64 cell, i64 cycle, i64 task) {
+  if (!S::kTraces || s.cells[cell].parent < 0) return false;
+  return s.shadow_parts[s.slot(cell, cycle).pair * s.n_tasks + task] == kDiscarded;
+}
+
+// Shadow that shares a task with a cycle, -1 for none.
+template <class S>
+i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
+  if (!S::kTraces) return -1;
+  const i64 shadow = s.cells[cell].shadow;
+  if (shadow < 0 || s.stamp(shadow, cycle) < 0) return -1;
+  const i64 pair = s.slot(shadow, cycle).pair;
+  return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
+}
+
+// Counts an input in; the last one makes the job ready and names its critical path.
+template <class S>
+void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
+  const Flow& ends = s.flow(cell, flow);
+  Job& job = s.job(cell, cycle, ends.target);
+  if (S::kTraces && s.log_arrived.size > 0) {
+    s.log_arrived[s.output(cell, cycle) * s.n_flows + flow] = now;
+  }
+  job.missing -= 1;
+  if (job.missing == 0 && !is_discarded(s, cell, cycle, ends.target)) {
+    const Job& sender = s.job(cell, cycle, ends.source);
+    job.compute_ns = sender.compute_ns;
+    job.network_ns = now - sender.network_ns;
+    note_ready(s, job_key(cell, cycle, ends.target));
+  } else {
+    s.slot(cell, cycle).live -= 1;
+  }
+}
+
+// Handles a message that reaches its node, or that is lost on its link.
+template <class S>
+void arrive(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
+  Outcome loss = kDropped;
+  if (!(flow & kLostOnLink)) {
+    const Job& job = s.job(cell, cycle, s.flow(cell, flow).target);
+    if (!s.server(s.site(job)).is_down) {
+      hand_over(s, cell, cycle, flow, now);
+      return;
+    }
+    loss = kNodeDown;
+  }
+  s.slot(cell, cycle).live -= 1;
+  lose(s, cell, cycle, loss);
+}
+
+// A sink has completed; the last one completes the cycle.
+template <class S>
+void finish(S& s, i64 cell, i64 cycle, const Job& job, i64 now) {
+  Slot& slot = s.slot(cell, cycle);
+  slot.live -= 1;
+  slot.sinks_left -= 1;
+  if (slot.sinks_left > 0) return;
+  const i64 row = s.output(cell, cycle);
+  s.outcome[row] = kDone;
+  s.latency_ns[row] = now - s.cells[cell].release_ns[cycle];
+  s.compute_ns[row] = job.compute_ns;
+  s.network_ns[row] = job.network_ns;
+}
+
+// Hands a job's outputs over to tasks on its node, and sends the others.
+template <class S>
+void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
+  const Task& from = s.task(cell, task);
+  if (from.n_out > 1) s.slot(cell, cycle).live += from.n_out - 1;
+  // What a shadow shares is sent to it as well, after the cycle's own outputs.
+  const i64 shadow = shared_by(s, cell, cycle, task);
+  i64 to = cell;
+  while (true) {
+    for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
+      const i64 flow = s.outputs[i];
+      if (to != cell) {
+        if (shared_by(s, cell, cycle, s.flow(cell, flow).target) >= 0) continue;
+        s.slot(shadow, cycle).live += 1;
+      }
+      const i64 hop = s.hop(to, cycle, flow);
+      if (hop < 0) {
+        hand_over(s, to, cycle, flow, now);
+      } else {
+        send(s, to, cycle, flow, hop, 0, now);
+      }
+    }
+    if (shadow < 0 || to != cell) return;
+    to = shadow;
+  }
+}
+
+// Completes a job, unless its announcement has gone stale.
+template <class S>
+void complete(S& s, i64 key, i64 now) {
+  const i64 cell = cell_of(key), cycle = cycle_of(key), task = item_of(key);
+  Job& job = s.job(cell, cycle, task);
+  Site& site = s.site(job);
+  Server& server = s.server(site);
+  if (server.next_key != key || server.next_ns != now) return;
+  if (next_thread(s, server, site, job, key, now)) return;
+  leave(s, server, site, now);
+  if (server.is_cpu) {
+    s.own_ns[site.own] += static_cast<f64>(site.threads) * static_cast<f64>(site.exec_ns[cycle]);
+  }
+  job.compute_ns += now - job.started_ns;
+  log_job(s, cell, cycle, task, job, kDone, now);
+  free_worker(s, site);
+  if (s.task(cell, task).n_out == 0) {
+    finish(s, cell, cycle, job, now);
+  } else {
+    job.network_ns = now - job.network_ns;
+    send_outputs(s, cell, cycle, task, now);
+  }
+}
+
+// Sends a message again after a lost attempt.
+template <class S>
+void retry(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
+  const i64 attempt = s.attempts[s.slot_row(cell, cycle) * s.n_flows + flow] + 1;
+  send(s, cell, cycle, flow, s.hop(cell, cycle, flow), attempt, now);
+}
+
+// Begins a cycle, or the shadow of one: its sources become ready.
+//
+// Of a shadow only sources that it does not share start, as those do that start later.
+template <class S>
+void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now) {
+  const Cell& of = s.cells[cell];
+  const i64 stamp = s.stamp(cell, cycle);
+  const i64 candidate = of.candidate_0 + stamp;
+  const i64 pair = of.pair_0 + active * of.n_candidates + stamp;
+  i32 sources = 0;
+  for (i64 task = 0; task < of.n_tasks; ++task) {
+    const Task& fixed = s.task(cell, task);
+    Job& job = s.job(cell, cycle, task);
+    job.missing = fixed.n_in;
+    job.started_ns = -1;
+    job.site = s.site_of[candidate * s.n_tasks + task];
+    job.compute_ns = 0;
+    job.network_ns = 0;
+    if (fixed.n_in > 0) continue;
+    if (is_shadow && s.shadow_parts[pair * s.n_tasks + task] != kShadowed) continue;
+    ++sources;
+    if (!is_shadow && fixed.offset_ns == 0) {
+      note_ready(s, job_key(cell, cycle, task));
+    } else {
+      s.post(now + fixed.offset_ns, make_key(kStart, cell, cycle, task));
+    }
+  }
+  s.slot(cell, cycle) = Slot{cycle,
+                             static_cast<i32>(candidate),
+                             static_cast<i32>(pair),
+                             sources,
+                             of.n_sinks,
+                             0};
+}
+
+// Releases a cycle, and its shadow if it has one; the next release is announced.
+template <class S>
+void release(S& s, i64 cell, i64 cycle, i64 now) {
+  const i64 active = s.stamp(cell, cycle);
+  begin_cycle(s, cell, cycle, active, false, now);
+  if (S::kTraces) {
+    const i64 shadow = s.cells[cell].shadow;
+    if (shadow >= 0 && s.stamp(shadow, cycle) >= 0) {
+      begin_cycle(s, shadow, cycle, active, true, now);
+    }
+  }
+  const i64 following = cycle + 1;
+  if (following < s.cells[cell].n_cycles) {
+    s.post(s.cells[cell].release_ns[following], make_key(kRelease, cell, following, 0));
+  }
+}
+
+// Deals with the jobs that the event has made ready.
+template <class S>
+void settle(S& s, i64 now) {
+  for (i64 i = 0; i < s.n_ready; ++i) {
+    const i64 key = s.ready[i];
+    const i64 job = key & ~kTaken;
+    if (key & kTaken || become_ready(s, cell_of(job), cycle_of(job), item_of(job), now)) {
+      admit(s, job, now);
+    }
+  }
+  s.n_ready = 0;
+}
+
+// Gives out cores, and announces completions, on every server that the event touched.
+template <class S>
+void flush(S& s, i64 now) {
+  for (i64 i = 0; i < s.n_dirty; ++i) {
+    Server& server = s.servers[s.dirty[i]];
+    server.is_dirty = 0;
+    if (server.scheduler != kFair) dispatch(s, server, now);
+    schedule(s, server, now);
+  }
+  s.n_dirty = 0;
+}
+
+}  // namespace dwell

@@ -1,0 +1,69 @@
+"""The event loop, as Python calls it (see ``advance.h``)."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+from dwell.kernels.arrays import Arrays
+from dwell.kernels.codes import Status
+from dwell.kernels.library import library
+
+I64, TABLES = ctypes.c_int64, ctypes.c_void_p
+
+
+@cache
+def _functions() -> tuple[Any, Any, Any]:
+    """Return the functions of the library, with the types of their arguments."""
+    loaded = library()
+    advance, post, send = loaded.dwell_advance, loaded.dwell_post_event, loaded.dwell_send_state
+    advance.argtypes, advance.restype = (TABLES,), ctypes.c_int32
+    post.argtypes, post.restype = (TABLES, I64, I64), None
+    send.argtypes, send.restype = (TABLES, I64, I64, I64, I64, ctypes.POINTER(I64)), None
+    return advance, post, send
+
+
+def play(arrays: Arrays) -> Status:
+    """Advance to the next pause or to the end, enlarging what has become too small.
+
+    A call of the kernel ends after a counted number of events, so that Python sees Ctrl-C.
+
+    Returns
+    -------
+    Status
+        PAUSED, STEP or FINISHED.
+    """
+    advance = _functions()[0]
+    while True:
+        status = advance(arrays.address)
+        if status == Status.GROW_EVENTS:
+            arrays.grow_events()
+        elif status == Status.GROW_RING:
+            arrays.grow_ring()
+        elif status != Status.BUSY:
+            return Status(status)
+
+
+def post_event(arrays: Arrays, at_ns: int, key: int) -> None:
+    """Add an event of the caller's; there is always room for a few (see `play`)."""
+    _functions()[1](arrays.address, at_ns, key)
+
+
+def send_state(
+    arrays: Arrays, hop: int, cycle: int, attempt: int, now_ns: int
+) -> tuple[int, bool, int]:
+    """Send the state of a task that moves; it is carried reliably, whatever the link does.
+
+    Returns
+    -------
+    at_ns : int
+        Instant of its arrival, or of the next attempt; -1 where the link is down for good.
+    arrived : bool
+        Which of the two.
+    attempt : int
+        Number of the next attempt; waiting for the end of an outage is none.
+    """
+    sent = (I64 * 3)()
+    _functions()[2](arrays.address, hop, cycle, attempt, now_ns, sent)
+    return sent[0], bool(sent[1]), sent[2]

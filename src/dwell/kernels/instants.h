@@ -1,0 +1,21 @@
+// Sums of times that 64 bits may not hold: what is beyond `kLastNs` is at it, and never comes.
+#pragma once
+
+#include <algorithm>
+
+#include "rows.h"
+
+namespace dwell {
+
+// The largest number of nanoseconds that is exact as an integer and as a double.
+constexpr i64 kLastNs = INT64_MAX - 1023;
+
+// The instant a duration after t; both are at least 0 and at most `kLastNs`.
+inline i64 later(i64 t, i64 duration) { return t + std::min(duration, kLastNs - t); }
+
+// A duration of whole nanoseconds, at most `kLastNs`.
+inline i64 whole_ns(f64 duration) {
+  return static_cast<i64>(std::min(duration, static_cast<f64>(kLastNs)));
+}
+
+}  // namespace dwell

@@ -1,0 +1,44 @@
+// Where every field of every row lies, of which Python makes the types of its arrays.
+
+#include <cstddef>
+
+#include "export.h"
+#include "rows.h"
+
+namespace dwell {
+namespace {
+
+struct Field {
+  const char* row;
+  const char* name;
+  const char* type;
+  i64 offset, row_size;
+};
+
+// Writes the fields of all rows, where `out` is given, then every table as a field of `Tables`, with
+// the type of its own rows; returns how many these are.
+i64 describe(Field* out) {
+  i64 n = 0;
+  const auto add = [&](const Field& field) {
+    if (out != nullptr) out[n] = field;
+    ++n;
+  };
+#define DWELL_FIELD(type, name) add({kName, #name, #type, offsetof(Row, name), sizeof(Row)});
+#define DWELL_DESCRIBE(row, fields)    \
+  {                                    \
+    using Row = row;                   \
+    constexpr const char* kName = #row; \
+    fields(DWELL_FIELD)                \
+  }
+#define DWELL_TABLES_FIELDS(field) DWELL_TABLES(field)
+  DWELL_ROWS(DWELL_DESCRIBE)
+  DWELL_DESCRIBE(Tables, DWELL_TABLES_FIELDS)
+  return n;
+}
+
+}  // namespace
+}  // namespace dwell
+
+DWELL_EXPORT dwell::i64 dwell_layout(dwell::Field* out) noexcept {
+  return dwell::describe(out);
+}

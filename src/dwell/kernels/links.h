@@ -1,0 +1,145 @@
+// Links: serialisation at the rate in order of sending, then a delay that may overtake.
+#pragma once
+
+#include <cmath>
+#include <limits>
+
+#include "attempts.h"
+#include "simulation.h"
+
+namespace dwell {
+
+// Where a link has no timeout of its own, state that was lost is sent again after Linux's least TCP
+// retransmission timeout.
+constexpr i64 kStateTimeoutNs = 200'000'000;
+
+// Marks a cycle as one that can never be done; its first loss names the outcome.
+template <class S>
+void lose(S& s, i64 cell, i64 cycle, Outcome outcome) {
+  Slot& slot = s.slot(cell, cycle);
+  if (slot.is_lost) return;
+  slot.is_lost = 1;
+  s.outcome[s.output(cell, cycle)] = outcome;
+}
+
+// When the link can take a message; its current segment becomes the one of that instant.
+//
+// A link that drops takes it at once even while it is down, to lose it; one that retransmits holds
+// it back to the end of the outage, if there is one.
+template <class S>
+i64 begin(const S& s, Link& link, i64 now) {
+  i64 start = std::max(now, link.free_ns);
+  const i64 last = link.segment_end - 1;
+  i64 segment = link.segment;
+  while (segment < last && s.segments[segment + 1].at_ns <= start) ++segment;
+  if (link.retransmit_ns >= 0) {
+    while (segment < last && s.segments[segment].is_down) start = s.segments[++segment].at_ns;
+  }
+  link.segment = segment;
+  return start;
+}
+
+// Time that a message takes at the rate of a link.
+inline i64 transmission_ns(const Hop& hop, const Rate& rate) {
+  if (rate.rate_mbps == std::numeric_limits<f64>::infinity()) return 0;
+  return whole_ns(std::rint(static_cast<f64>(hop.payload_bytes) * 8000.0 / rate.rate_mbps));
+}
+
+// Whether an attempt to send a message is lost.
+inline bool loses(const Hop& hop, const Rate& rate, i64 cycle, i64 attempt) {
+  return rate.loss > 0.0 && attempt_uniform(hop.loss_key, cycle, attempt) < rate.loss;
+}
+
+// Delay of a message, extra delays of what is active included.
+template <class S>
+i64 propagation_ns(const S& s, i64 hop, const Segment& segment, i64 cycle) {
+  i64 delay = s.hops[hop].delay_ns[cycle];
+  const Times* layer = &s.layers[hop * s.clock[0].n_layers];
+  for (i64 on = segment.layers; on != 0; on >>= 1, ++layer) {
+    if (on & 1) delay = later(delay, (*layer)[cycle]);
+  }
+  return delay;
+}
+
+// Instant at which a message arrives whose transmission has ended.
+template <class S>
+i64 arrival_ns(const S& s, Link& link, i64 hop, const Segment& segment, i64 cycle, i64 sent) {
+  i64 arrival = later(sent, propagation_ns(s, hop, segment, cycle));
+  if (link.in_order) {
+    arrival = std::max(arrival, link.last_arrival_ns);
+    link.last_arrival_ns = arrival;
+  }
+  return arrival;
+}
+
+// Loses a message when its transmission begins, or would begin.
+template <class S>
+void lose_message(S& s, i64 cell, i64 cycle, i64 flow, Outcome outcome, i64 at_ns, i64 now) {
+  if (at_ns > now) {
+    s.post(at_ns, make_key(kArrival, cell, cycle, flow | kLostOnLink));
+    return;
+  }
+  s.slot(cell, cycle).live -= 1;
+  lose(s, cell, cycle, outcome);
+}
+
+// Sends one message of a flow for the first time (attempt 0) or once more.
+template <class S>
+void send(S& s, i64 cell, i64 cycle, i64 flow, i64 hop_row, i64 attempt, i64 now) {
+  const Hop& hop = s.hops[hop_row];
+  Link& link = s.links[hop.link];
+  const i64 start = begin(s, link, now);
+  const Segment& segment = s.segments[link.segment];
+  const Rate& rate = s.rates[link.segment];
+  i64 sent = start;
+  bool is_lost = segment.is_down != 0;
+  if (!is_lost) {
+    sent = later(start, transmission_ns(hop, rate));
+    link.free_ns = sent;
+    is_lost = loses(hop, rate, cycle, attempt);
+  }
+  if (!is_lost) {
+    const i64 arrival = arrival_ns(s, link, hop_row, segment, cycle, sent);
+    s.post(arrival, make_key(kArrival, cell, cycle, flow));
+  } else if (link.retransmit_ns < 0) {
+    lose_message(s, cell, cycle, flow, kDropped, start, now);
+  } else if (segment.is_down) {
+    // A link that holds messages back and is down for good: it waits for ever.
+    lose_message(s, cell, cycle, flow, kInFlight, now, now);
+  } else {
+    s.attempts[s.slot_row(cell, cycle) * s.n_flows + flow] = attempt;
+    s.post(later(sent, link.retransmit_ns), make_key(kRetry, cell, cycle, flow));
+  }
+}
+
+// What becomes of an attempt to send the state of a task.
+struct StateSent {
+  i64 at_ns;  // its arrival, or the next attempt; -1 where the link is down for good
+  bool has_arrived;
+  i64 attempt;  // number of the next; waiting for the end of an outage is none
+};
+
+// Sends the state of a task that moves; it is carried reliably, whatever the link does.
+template <class S>
+StateSent send_state(S& s, i64 hop_row, i64 cycle, i64 attempt, i64 now) {
+  const Hop& hop = s.hops[hop_row];
+  Link& link = s.links[hop.link];
+  const i64 start = begin(s, link, now);
+  const Segment& segment = s.segments[link.segment];
+  const Rate& rate = s.rates[link.segment];
+  if (segment.is_down) {
+    for (i64 following = link.segment + 1; following < link.segment_end; ++following) {
+      if (!s.segments[following].is_down) return {s.segments[following].at_ns, false, attempt};
+    }
+    return {-1, false, attempt};
+  }
+  const i64 sent = later(start, transmission_ns(hop, rate));
+  link.free_ns = sent;
+  if (loses(hop, rate, cycle, attempt)) {
+    const i64 timeout = link.retransmit_ns >= 0 ? link.retransmit_ns : kStateTimeoutNs;
+    return {later(sent, timeout), false, attempt + 1};
+  }
+  return {arrival_ns(s, link, hop_row, segment, cycle, sent), true, attempt};
+}
+
+}  // namespace dwell

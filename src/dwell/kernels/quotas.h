@@ -1,0 +1,166 @@
+// Quotas of servers: when they are used up, renewed, and paced by what others take of the core.
+#pragma once
+
+#include <cmath>
+
+#include "attempts.h"
+#include "servers.h"
+
+namespace dwell {
+
+template <class S>
+void notice(S& s, Server& server, Quota& quota, i64 now);
+template <class S>
+void strike(S& s, Server& server, Quota& quota, i64 now);
+template <class S>
+i64 next_look(S& s, Server& server, Quota& quota, i64 now);
+
+// Whether a quota fills a pool, on which is drawn.
+template <class S>
+bool is_pooled(const S& s, const Server& server, const Quota& quota) {
+  return quota.slack_ns > 0 || takes_turns(s, server);
+}
+
+// Fills a server's bucket, or the pool of its quota, if a period has begun.
+template <class S>
+void renew(S& s, Server& server, Quota& quota, i64 now) {
+  const i64 period = (now + quota.period_ago_ns) / quota.period_ns;
+  if (period <= quota.period) return;
+  quota.period = period;
+  i64& filled = is_pooled(s, server, quota) ? quota.pool_ns : quota.left_ns;
+  filled = server.stress > 0 ? quota.stressed_ns : quota.quota_ns;
+}
+
+// Begins the periods that have begun before a server's foreign threads change.
+//
+// Without a pool, what happens at the instant at which a period begins comes before it.
+template <class S>
+void renew_before_stress(S& s, Server& server, i64 now) {
+  if (!has_quota(s, server)) return;
+  Quota& quota = s.quotas[server.quota];
+  if (is_pooled(s, server, quota)) {
+    renew(s, server, quota, now);
+    return;
+  }
+  renew(s, server, quota, now - 1);
+  // One that a job of this instant has begun already begins anew, with nothing used of it.
+  const i64 period = now / quota.period_ns;
+  if (period > 0 && period * quota.period_ns == now) quota.period = period - 1;
+}
+
+// Opens or shuts a server by its quota; its clock must be up to date.
+//
+// While anything runs there is an event at every boundary of a period and wherever the quota is
+// used up, so nothing that was spent belongs to two periods. With a slack the quota fills a pool,
+// and what runs draws all of it whenever it has used up what it had.
+template <class S>
+void refill(S& s, Server& server, i64 now) {
+  Quota& quota = s.quotas[server.quota];
+  renew(s, server, quota, now);
+  server.is_stopped = quota.left_ns <= 0;
+  set_speed(s, server);
+}
+
+// Draws on the pool where what was drawn before is used up; the clock must be up to date.
+//
+// Only after all changes of this instant: what ends now draws nothing.
+template <class S>
+void draw_quota(S& s, Server& server, i64 now) {
+  Quota& quota = s.quotas[server.quota];
+  if (takes_turns(s, server)) {
+    strike(s, server, quota, now);
+    return;
+  }
+  refill(s, server, now);
+  if (quota.left_ns <= 0 && server.used + server.stress > 0 && !server.is_down) {
+    quota.left_ns += quota.pool_ns;
+    quota.pool_ns = 0;
+    refill(s, server, now);
+  }
+}
+
+// Announces when a server's quota is used up or renewed; an older announcement goes stale.
+template <class S>
+void announce_quota(S& s, Server& server, i64 now) {
+  Quota& quota = s.quotas[server.quota];
+  const bool turns = takes_turns(s, server);
+  if (turns) {
+    notice(s, server, quota, now);
+  } else {
+    refill(s, server, now);
+  }
+  const i64 busy = server.used + server.stress;
+  if (busy == 0 || server.is_down) {
+    quota.looks_ns = -1;
+    // Beyond the slack, what was drawn goes back.
+    if (is_pooled(s, server, quota) && quota.left_ns > quota.slack_ns) {
+      const i64 pool_ns = quota.pool_ns + quota.left_ns - quota.slack_ns;
+      quota.pool_ns = std::min(pool_ns, quota.quota_ns);
+      quota.left_ns = quota.slack_ns;
+    }
+    return;
+  }
+  i64 at_ns = (quota.period + 1) * quota.period_ns;
+  if (turns) {
+    at_ns = next_look(s, server, quota, now);
+  } else if (!server.is_stopped) {
+    const i64 rate = std::min(busy, server.cores);
+    at_ns = std::min(at_ns, now + (quota.left_ns + rate - 1) / rate);
+  } else if (quota.pool_ns > 0) {
+    at_ns = now;
+  }
+  if (at_ns == quota.looks_ns) return;
+  quota.looks_ns = at_ns;
+  // The item of a change of a node is 0; that of a server's quota is its row, from 1.
+  s.post(at_ns, make_key(kChange, 0, 0, &server - s.servers.rows + 1));
+}
+
+// A server's quota is used up or renewed, unless the announcement has gone stale.
+template <class S>
+void look_at_quota(S& s, Server& server, i64 now) {
+  Quota& quota = s.quotas[server.quota];
+  if (quota.looks_ns != now) return;
+  quota.looks_ns = -1;
+  tick(s, server, now);
+  draw_quota(s, server, now);
+  mark(s, server);
+}
+
+// Sets what others leave of a server's core by which of them have foreign threads.
+//
+// What it counts is in time of the core: what is left of it is converted, to the nanosecond.
+template <class S>
+void repace(S& s, Server& server, i64 now) {
+  const i64 row = &server - s.servers.rows;
+  const Pace* pace = nullptr;
+  bool is_stressed = false;
+  for (i64 i = 0; i < s.paces.size; ++i) {
+    const Pace& other = s.paces[i];
+    if (other.server != row) continue;
+    if (other.other < 0) {  // comes first
+      pace = &other;
+    } else if (s.servers[other.other].stress > 0 && !s.servers[other.other].is_down) {
+      if (!is_stressed || other.pace < pace->pace) pace = &other;
+      is_stressed = true;
+    }
+  }
+  if (pace->pace == server.pace) return;
+  Quota& quota = s.quotas[server.quota];
+  tick(s, server, now);
+  renew_before_stress(s, server, now);
+  server.behind_ns += server.busy_ns * server.pace;
+  server.busy_ns = 0.0;
+  const f64 ratio = server.pace / pace->pace;
+  quota.left_ns = static_cast<i64>(std::rint(static_cast<f64>(quota.left_ns) * ratio));
+  quota.pool_ns = static_cast<i64>(std::rint(static_cast<f64>(quota.pool_ns) * ratio));
+  quota.quota_ns = pace->quota_ns;
+  quota.stressed_ns = pace->stressed_ns;
+  quota.slack_ns = pace->slack_ns;
+  quota.least_ns = pace->least_ns;
+  quota.drawn_ns = pace->drawn_ns;
+  server.pace = pace->pace;
+  set_speed(s, server);
+  mark(s, server);
+}
+
+}  // namespace dwell

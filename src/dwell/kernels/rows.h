@@ -1,0 +1,196 @@
+// The rows of the kernel's tables, and what it is handed: every table and how many rows it has.
+//
+// Each field is declared here and nowhere else: the lists below make the structs, and library.cpp
+// tells Python where every field lies, of which it makes the types of its arrays.
+//
+// A *site* is a task on one feasible node of one cell; a *server* is what executes jobs: the CPU of
+// a node, or one kind of its accelerators; a *hop* is a flow on a link. A cell may have a *shadow*:
+// another row of `cells`, with sites and hops of its own on the same servers and links, whose
+// cycles are released by those of its parent. A *pair* of candidates (active, other) is row
+// `pair_0 + active * n_candidates + other` of `shadow_parts`. Times are nanoseconds.
+#pragma once
+
+#include <cstdint>
+
+namespace dwell {
+
+using i8 = std::int8_t;
+using i16 = std::int16_t;
+using i32 = std::int32_t;
+using i64 = std::int64_t;
+using u64 = std::uint64_t;
+using f64 = double;
+using Times = const i64*;
+
+// Numbers of the whole simulation. Up to `n_slots` cycles of a cell, a power of two, may be in
+// flight, each of up to `n_tasks` jobs and `n_flows` messages; one event adds `margin` events at
+// most. A call ends after `budget` events.
+#define DWELL_CLOCK(field)                                                                       \
+  field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
+  field(i64, n_nodes) /* of a cell */                                                            \
+  field(i64, n_cycles) field(i64, n_windows) /* columns of the outputs */                        \
+  field(i64, margin) field(i64, budget)                                                          \
+  field(i64, n_events) field(i64, is_heap) /* of the queue */                                    \
+  field(i64, next_change)                                                                        \
+  field(i64, pauses) /* whether a call ends when a window closes */                              \
+  field(i64, closed_cell)                                                                        \
+  field(i64, step_key) field(i64, step_ns)                                                       \
+  field(i64, end_ns) /* of the last close that any cell can have */
+
+// `close_ns` has the close of the window that a cycle is the last of. `looks_ns` is when the guard
+// looks next, -1 for never, and `patience_ns` is g periods; `waited` is the first cycle that no
+// completion has been heard of or after, `moved` the first one of the newest placement that is
+// waited for; once a completion has been heard, no cycle before `rested` is.
+#define DWELL_CELL(field)                                                                        \
+  field(Times, release_ns) field(Times, close_ns)                                                \
+  field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
+  field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
+  field(i64, looks_ns) field(i64, patience_ns) field(i64, waited) field(i64, moved)              \
+  field(i64, rested)                                                                             \
+  field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
+  field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
+  field(i32, node_0) field(i32, n_nodes) /* in `cell_nodes` */                                   \
+  field(i32, shadow) field(i32, parent)
+
+#define DWELL_TASK(field)                                                                        \
+  field(i64, offset_ns)                                                                          \
+  field(i32, n_in) field(i32, n_out) field(i32, out_0) /* in `outputs` */
+
+#define DWELL_FLOW(field) field(i32, source) field(i32, target)
+
+// What a job uses of its server, `need`, is the cores that it holds, the threads that share them
+// where the server is fair, or a place. Its work is done by `threads` threads. `own` is the row of
+// its node in `own_ns`.
+#define DWELL_SITE(field)                                                                        \
+  field(Times, exec_ns)                                                                          \
+  field(i64, need) field(i64, threads)                                                           \
+  field(i64, idle) field(i64, waiting) field(i64, head) field(i64, tail) field(i64, depth)       \
+  field(i64, ready_at_ns)                                                                        \
+  field(i32, cell) field(i32, task) field(i32, server) field(i32, node) field(i32, own)          \
+  field(i32, rank)                                                                               \
+  field(i64, workers) field(i64, start_ns) field(i64, before_ns) field(i64, after_ns)
+
+// `busy_ns` is in core-nanoseconds, of which 64 bits may not hold those of all cores. `quota` is a
+// row of `quotas`, -1 for none.
+#define DWELL_SERVER(field)                                                                      \
+  field(f64, virtual_ns) field(f64, speed)                                                       \
+  field(i64, last_ns) field(i64, next_ns) field(i64, next_key)                                   \
+  field(i64, used) field(i64, stress) field(i64, cores)                                          \
+  field(i32, base) field(i32, n_run) field(i32, n_wait) field(i32, quota) field(i32, node)       \
+  field(i8, scheduler) field(i8, is_down) field(i8, is_dirty) field(i8, is_cpu)                  \
+  field(i8, is_stopped) /* by its quota */                                                       \
+  field(f64, busy_ns) field(f64, behind_ns) field(f64, spare) field(f64, background)             \
+  field(f64, beside) field(f64, pace)
+
+// `tick_ns` is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last
+// tick was `tick_ago_ns` and the last begin of a period `period_ago_ns` ago. `has_turn` says
+// whether a thread has the turn, `turn_begun_ns` what it had received before, and `turn_ns` what
+// since; a turn lasts `least_ns` at least. `drawn_ns` is what is drawn on a pool at a time.
+// `wakes_ns` is when something of the background wakes next, for the `wakes`-th time, and
+// `wake_gap_ns` the mean time between two. All that a quota counts is in time of the core: of that,
+// what runs receives the share `pace`.
+#define DWELL_QUOTA(field)                                                                       \
+  field(i64, looks_ns)                                                                           \
+  field(i64, period_ns) field(i64, period) field(i64, quota_ns) field(i64, stressed_ns)          \
+  field(i64, left_ns) field(i64, pool_ns) field(i64, slack_ns)                                   \
+  field(i64, tick_ns) field(i64, tick_ago_ns) field(i64, period_ago_ns)                          \
+  field(i64, has_turn) field(i64, turn_begun_ns) field(i64, turn_ns)                             \
+  field(i64, least_ns) field(i64, drawn_ns)                                                      \
+  field(i64, wakes_ns) field(i64, wakes) field(u64, wake_key) field(f64, wake_gap_ns)
+
+// What the quota of a server counts, and its pace, while the CPU of a node, server `other`, has
+// foreign threads; -1: while none has of those for which there are rows.
+#define DWELL_PACE(field)                                                                        \
+  field(i32, server) field(i32, other)                                                           \
+  field(i64, quota_ns) field(i64, stressed_ns) field(i64, slack_ns) field(i64, least_ns)         \
+  field(i64, drawn_ns) field(f64, pace)
+
+// Servers of a node: its CPU first.
+#define DWELL_NODE(field) field(i32, server_0) field(i32, n_servers)
+
+// Rows of a realisation's `NodeChanges`, and of its `LinkSegments`, as they are.
+#define DWELL_CHANGE(field)                                                                      \
+  field(i64, at_ns) field(i64, node) field(i64, stress) field(i64, is_down)
+#define DWELL_SEGMENT(field)                                                                     \
+  field(i64, at_ns) field(i64, link) field(i64, is_down) field(i64, layers) /* a bit each */
+#define DWELL_RATE(field) field(f64, rate_mbps) field(f64, loss)
+
+#define DWELL_HOP(field)                                                                         \
+  field(Times, delay_ns) field(u64, loss_key) field(i64, payload_bytes) field(i64, link)
+
+// `retransmit_ns` is -1 where what is lost is lost.
+#define DWELL_LINK(field)                                                                        \
+  field(i64, free_ns) field(i64, last_arrival_ns) field(i64, retransmit_ns)                      \
+  field(i64, in_order) field(i64, segment) field(i64, segment_end)
+
+#define DWELL_EVENT(field) field(i64, at_ns) field(i64, key)
+
+// A job that runs, by the virtual time at which it ends.
+#define DWELL_RUNNING(field) field(f64, finish_ns) field(i64, key)
+
+// A job that waits for cores, or a thread that waits for its turn.
+#define DWELL_WAITING(field)                                                                     \
+  field(i64, rank) field(i64, ready_ns) field(i64, key) field(f64, left_ns)
+
+// A job in flight. `missing` counts the inputs that have not arrived; `rest_ns` is the work of the
+// threads that the one at work hands its job over to.
+#define DWELL_JOB(field)                                                                         \
+  field(i64, ready_ns) field(i64, started_ns) field(i64, compute_ns) field(i64, network_ns)      \
+  field(i64, rest_ns) field(i64, next) field(i32, site) field(i32, missing)
+
+// A cycle in flight. `live` counts its jobs and messages that are under way.
+#define DWELL_SLOT(field)                                                                        \
+  field(i64, cycle) field(i32, candidate) field(i32, pair) field(i32, live)                      \
+  field(i32, sinks_left) field(i32, is_lost)
+
+#define DWELL_LOG(field) field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns)
+
+#define DWELL_ROWS(row)                                                                          \
+  row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
+  row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
+  row(Pace, DWELL_PACE) row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
+  row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
+  row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING) row(Job, DWELL_JOB)                    \
+  row(Slot, DWELL_SLOT) row(Log, DWELL_LOG)
+
+#define DWELL_FIELD(type, name) type name;
+#define DWELL_STRUCT(name, fields) \
+  struct name {                    \
+    fields(DWELL_FIELD)            \
+  };
+DWELL_ROWS(DWELL_STRUCT)
+#undef DWELL_STRUCT
+#undef DWELL_FIELD
+
+// Fixed, then state, then outputs: per cycle, per window, and per job where a log is kept. Shapes
+// are in rows.py.
+#define DWELL_TABLES(table)                                                                      \
+  table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
+  table(i32, outputs) table(i32, cell_nodes) table(Node, nodes)                                  \
+  table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
+  table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates) table(Change, changes)          \
+  table(Pace, paces) table(i16, stamps)                                                          \
+  table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
+  table(Event, events) table(Running, running) table(Waiting, waiting)                           \
+  table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
+  table(f64, own_ns)                                                                             \
+  table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
+  table(f64, opened) table(f64, closed)                                                          \
+  table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
+
+// A table and how many rows, or numbers, it has.
+template <class Row>
+struct Table {
+  Row* rows;
+  i64 size;
+
+  Row& operator[](i64 i) const { return rows[i]; }
+};
+
+#define DWELL_TABLE(type, name) Table<type> name;
+struct Tables {
+  DWELL_TABLES(DWELL_TABLE)
+};
+#undef DWELL_TABLE
+
+}  // namespace dwell

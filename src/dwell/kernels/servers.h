@@ -1,0 +1,268 @@
+// Servers: who runs at what speed, and when the next job completes.
+//
+// All running jobs of a server advance at one common speed, so a virtual clock that advances at
+// that speed turns processor sharing into a heap: a job that starts at virtual time v with c
+// nanoseconds of work ends at virtual time v + c, whoever comes or goes meanwhile. A job that holds
+// fewer cores than it has threads has so much more work. The virtual clock is set back to 0
+// whenever the server runs empty, which keeps its rounding error below a picosecond in practice.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+
+#include "heaps.h"
+#include "simulation.h"
+
+namespace dwell {
+
+// Work left below this many nanoseconds is rounding, not work.
+constexpr f64 kSlackNs = 1e-3;
+
+// Quotas (quotas.h) and turns (turns.h) of servers that have some.
+template <class S>
+void refill(S& s, Server& server, i64 now);
+template <class S>
+void announce_quota(S& s, Server& server, i64 now);
+template <class S>
+void take_turn(S& s, Server& server, i64 now);
+template <class S>
+void admit_threads(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now);
+inline void end_turn(Quota& quota);
+
+template <class S>
+bool takes_turns(const S&, const Server& server) {
+  return S::kQuotas && server.scheduler == kTurns;
+}
+
+template <class S>
+bool has_quota(const S&, const Server& server) {
+  return S::kQuotas && server.quota >= 0;
+}
+
+template <class S>
+Running* running_of(const S& s, const Server& server) {
+  return &s.running[server.base];
+}
+
+template <class S>
+Waiting* waiting_of(const S& s, const Server& server) {
+  return &s.waiting[server.base];
+}
+
+// How long a job of some execution time takes with the cores that it holds, undisturbed.
+inline f64 time_alone(const Site& site, i64 work_ns) {
+  const f64 work = static_cast<f64>(work_ns);
+  if (site.need == site.threads) return work;
+  return work * static_cast<f64>(site.threads) / static_cast<f64>(site.need);
+}
+
+// Remembers that a server must give out cores at the end of the event.
+template <class S>
+void mark(S& s, Server& server) {
+  if (server.is_dirty) return;
+  server.is_dirty = 1;
+  s.dirty[s.n_dirty++] = static_cast<i32>(&server - s.servers.rows);
+}
+
+// Brings a server's busy time up to now; returns the time since it last was.
+template <class S>
+i64 account(S& s, Server& server, i64 now) {
+  const i64 elapsed = now - server.last_ns;
+  const i64 busy = server.used + server.stress;
+  server.last_ns = now;
+  if (elapsed <= 0 || server.is_down) return elapsed;
+  if (server.background > 0.0) {
+    f64 background = server.background;
+    if (!has_quota(s, server)) {
+      background = std::min(background, static_cast<f64>(std::max<i64>(server.cores - busy, 0)));
+    }
+    server.behind_ns += static_cast<f64>(elapsed) * background;
+  }
+  if (busy > 0 && !server.is_stopped) {
+    const i64 taken = std::min(busy, server.cores);
+    server.busy_ns += static_cast<f64>(elapsed) * static_cast<f64>(taken);
+    if (has_quota(s, server)) {
+      Quota& quota = s.quotas[server.quota];
+      quota.left_ns -= elapsed * taken;
+      quota.turn_ns += elapsed * taken;
+    }
+  }
+  return elapsed;
+}
+
+// Brings a server's virtual clock and busy time up to now.
+template <class S>
+void tick(S& s, Server& server, i64 now) {
+  const i64 elapsed = account(s, server, now);
+  if (server.n_run > 0) server.virtual_ns += static_cast<f64>(elapsed) * server.speed;
+}
+
+// Sets the common speed after threads, stress or quota changed; the clock must be up to date.
+//
+// With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
+// c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: less by what
+// others contend for and foreign threads interfere, and 0 while the quota is used up.
+template <class S>
+void set_speed(S& s, Server& server) {
+  f64 speed;
+  if (server.scheduler == kFair) {
+    const f64 load = static_cast<f64>(server.used + server.stress);
+    speed = load <= server.spare ? 1.0 : server.spare / load;
+  } else if (takes_turns(s, server)) {
+    i64 need = 1;
+    if (server.n_run > 0) need = s.site(s.job(running_of(s, server)->key)).need;
+    speed = 1.0 / static_cast<f64>(need);
+  } else {
+    speed = server.spare / static_cast<f64>(server.cores + server.stress);
+  }
+  speed *= server.pace;
+  if (server.stress > 0) speed *= server.beside;
+  server.speed = server.is_stopped ? 0.0 : speed;
+}
+
+// Announces a completion, unless that has been done; an older announcement goes stale.
+template <class S>
+void announce(S& s, Server& server, i64 at_ns, i64 key) {
+  if (key == server.next_key && at_ns == server.next_ns) return;
+  server.next_key = key;
+  server.next_ns = at_ns;
+  s.post(at_ns, key);
+}
+
+// Announces the completion of the job that finishes first.
+template <class S>
+void schedule(S& s, Server& server, i64 now) {
+  if (has_quota(s, server)) announce_quota(s, server, now);
+  if (server.n_run == 0 || server.is_down) {
+    server.next_key = -1;
+    return;
+  }
+  const Running& first = *running_of(s, server);
+  f64 left = first.finish_ns - server.virtual_ns;
+  if (server.speed == 0.0 && left > kSlackNs) {
+    server.next_key = -1;
+    return;
+  }
+  if (server.speed != 1.0 && server.speed != 0.0) left = left / server.speed;
+  const i64 wait = std::max<i64>(whole_ns(std::ceil(left - kSlackNs)), 0);
+  announce(s, server, later(now, wait), first.key);
+}
+
+template <class S>
+void start(S& s, Server& server, const Site& site, i64 key, Job& job, f64 left, i64 now) {
+  if (server.n_run == 0) server.virtual_ns = 0.0;
+  if (job.started_ns < 0) job.started_ns = now;
+  push(running_of(s, server), server.n_run++, Running{server.virtual_ns + left, key});
+  server.used += site.need;
+}
+
+// Adds a job to those that wait for cores, or a thread to those that wait for their turn.
+template <class S>
+void queue_up(S& s, Server& server, const Waiting& row) {
+  push(waiting_of(s, server), server.n_wait++, row);
+}
+
+// Takes the cores of the last running job behind the first waiting one, if there is any.
+template <class S>
+bool preempt(S& s, Server& server) {
+  Running* running = running_of(s, server);
+  Waiting last = *waiting_of(s, server);
+  i64 worst = -1;
+  for (i64 i = 0; i < server.n_run; ++i) {
+    const f64 left = running[i].finish_ns - server.virtual_ns;
+    if (left <= kSlackNs) continue;  // it has all its work and completes at this very instant
+    const Job& job = s.job(running[i].key);
+    const Waiting other{s.site(job).rank, job.ready_ns, running[i].key, left};
+    if (last < other) {
+      last = other;
+      worst = i;
+    }
+  }
+  if (worst < 0) return false;
+  pop(running, server.n_run--, worst);
+  server.used -= s.site(s.job(last.key)).need;
+  queue_up(s, server, last);
+  return true;
+}
+
+// Gives out the cores of a server that is not fair.
+template <class S>
+void dispatch(S& s, Server& server, i64 now) {
+  if (takes_turns(s, server)) {
+    take_turn(s, server, now);
+    return;
+  }
+  if (server.n_wait == 0) return;
+  tick(s, server, now);
+  while (server.n_wait > 0) {
+    const Waiting first = *waiting_of(s, server);
+    Job& job = s.job(first.key);
+    const Site& site = s.site(job);
+    if (server.used + site.need <= server.cores) {
+      pop(waiting_of(s, server), server.n_wait--);
+      start(s, server, site, first.key, job, first.left_ns, now);
+    } else if (server.scheduler != kPriority || !preempt(s, server)) {
+      break;
+    }
+  }
+}
+
+// Takes the job that finishes first off a server.
+template <class S>
+void leave(S& s, Server& server, const Site& site, i64 now) {
+  const i64 elapsed = account(s, server, now);
+  const i64 n = server.n_run;
+  // The virtual clock of an empty server starts anew.
+  if (n > 1) server.virtual_ns += static_cast<f64>(elapsed) * server.speed;
+  pop(running_of(s, server), n);
+  server.n_run -= 1;
+  if (takes_turns(s, server)) {
+    server.used -= 1;
+    end_turn(s.quotas[server.quota]);
+  } else {
+    server.used -= site.need;
+  }
+  server.next_key = -1;
+  if (n > 1 || server.n_wait > 0 || has_quota(s, server)) mark(s, server);
+  if (server.scheduler == kFair) set_speed(s, server);
+}
+
+// Makes a job that a worker has taken runnable.
+template <class S>
+void admit(S& s, i64 key, i64 now) {
+  Job& job = s.job(key);
+  const Site& site = s.site(job);
+  Server& server = s.server(site);
+  if (takes_turns(s, server)) {
+    admit_threads(s, server, site, job, key, now);
+    return;
+  }
+  const i64 work_ns = site.exec_ns[cycle_of(key)];
+  job.rest_ns = 0;
+  const f64 left = time_alone(site, work_ns);
+  // Where nobody else can want the cores now, the job needs no queue.
+  const bool alone = server.n_wait == 0 && s.n_ready == 1;
+  const bool fits = alone && server.used + site.need <= server.cores;
+  if (has_quota(s, server)) {
+    tick(s, server, now);
+    refill(s, server, now);
+  }
+  if (server.scheduler != kFair && !fits) {
+    mark(s, server);
+    const i64 rank = server.scheduler == kFifo ? 0 : site.rank;
+    queue_up(s, server, Waiting{rank, job.ready_ns, key, left});
+    return;
+  }
+  tick(s, server, now);
+  start(s, server, site, key, job, left, now);
+  if (server.scheduler == kFair) set_speed(s, server);
+  if (server.is_dirty) return;
+  const bool lone = server.n_run == 1 && !has_quota(s, server);
+  if (lone && server.speed == 1.0 && left == static_cast<f64>(work_ns)) {
+    announce(s, server, later(now, work_ns), key);
+  } else {
+    schedule(s, server, now);
+  }
+}
+
+}  // namespace dwell

@@ -1,0 +1,139 @@
+"""The kernel's tables: arrays whose rows are the structs of ``rows.h``."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any, NamedTuple, TypeAlias, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.kernels.library import library
+
+#: Rows of structs, whose fields `row_types` has.
+Rows: TypeAlias = NDArray[np.void]
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+Row: TypeAlias = Any
+
+#: Types of rows that are plain numbers; a pointer to times is an address.
+NUMBERS: dict[str, np.dtype[Any]] = {
+    "i8": np.dtype(np.int8),
+    "i16": np.dtype(np.int16),
+    "i32": np.dtype(np.int32),
+    "i64": np.dtype(np.int64),
+    "u64": np.dtype(np.uint64),
+    "f64": np.dtype(np.float64),
+    "Times": np.dtype(np.uint64),
+}
+
+
+class _Field(ctypes.Structure):
+    """Where a field of a row lies."""
+
+    _fields_ = (
+        ("row", ctypes.c_char_p),
+        ("name", ctypes.c_char_p),
+        ("type", ctypes.c_char_p),
+        ("offset", ctypes.c_int64),
+        ("row_size", ctypes.c_int64),
+    )
+
+
+@cache
+def row_types() -> dict[str, np.dtype[Any]]:
+    """Return the type of the rows of every table, by the table's name, in the kernel's order.
+
+    Raises
+    ------
+    KernelError
+        If the library cannot be loaded (see `dwell.kernels.library`).
+    """
+    describe = library().dwell_layout
+    describe.restype = ctypes.c_int64
+    fields = (_Field * describe(None))()
+    describe(fields)
+    layouts: dict[str, dict[str, Any]] = {}
+    for field in fields:
+        layout = layouts.setdefault(
+            field.row.decode(),
+            {"names": [], "formats": [], "offsets": [], "itemsize": field.row_size},
+        )
+        layout["names"].append(field.name.decode())
+        layout["formats"].append(field.type.decode())
+        layout["offsets"].append(field.offset)
+    tables = layouts.pop("Tables")
+    known = dict(NUMBERS)
+    for name, layout in layouts.items():
+        layout["formats"] = [known[kind] for kind in layout["formats"]]
+        known[name] = np.dtype(cast(Any, layout))
+    return dict(zip(tables["names"], map(known.__getitem__, tables["formats"]), strict=True))
+
+
+class Tables(NamedTuple):
+    """Every array of a simulation, in the kernel's order.
+
+    Fixed: what the problem and the realisation say. State: what changes as the clock goes on.
+    Outputs: per cycle, per window, and per job where a log is kept. Columns of a table of structs
+    are those of its row in ``rows.h``. N is the number of cycles, "tasks" and "flows" of a cell are
+    those of the cell with most.
+    """
+
+    clock: Rows  # (1,)
+    cells: Rows  # (cells,)
+    # fixed
+    tasks: Rows  # (tasks,)
+    flows: Rows  # (flows,)
+    outputs: NDArray[np.int32]  # flows out of each task, in the order of the file
+    cell_nodes: NDArray[np.int32]  # nodes of each cell
+    nodes: Rows  # (nodes,)
+    site_of: NDArray[np.int32]  # (candidates, tasks) -> site
+    route: NDArray[np.int32]  # (candidates, flows) -> hop, or -1 on the same node
+    back_ns: Ints  # (candidates,) time from a completion until the guard hears of it
+    shadow_parts: NDArray[np.int8]  # (pairs of candidates, tasks)
+    hops: Rows  # (hops,)
+    layers: NDArray[np.uint64]  # (hops, layers) address of the extra delays, 0 for none
+    segments: Rows  # (segments,)
+    rates: Rows  # (segments,)
+    changes: Rows  # (changes,)
+    paces: Rows  # (paces,)
+    stamps: NDArray[np.int16]  # (cells, N) candidate of each cycle; -1 where a shadow has none
+    # state
+    sites: Rows  # (sites,)
+    servers: Rows  # (servers,)
+    quotas: Rows  # (servers with a quota,)
+    links: Rows  # (links,)
+    events: Rows  # the queue
+    running: Rows  # per server a heap of running jobs by virtual finish
+    waiting: Rows  # per server a heap of jobs that wait for cores
+    dirty: NDArray[np.int32]  # servers to look after at the end of the event
+    ready: Ints  # jobs that the event has made ready
+    jobs: Rows  # (cells * slots * tasks,)
+    slots: Rows  # (cells * slots,)
+    attempts: Ints  # (cells * slots, flows) attempts lost so far, less one
+    own_ns: Floats  # (cells, nodes of a cell) core-nanoseconds of completed own work
+    # outputs
+    latency_ns: Ints  # (cells, N), NEVER_NS until done
+    compute_ns: Ints
+    network_ns: Ints
+    outcome: NDArray[np.int8]
+    opened: Floats  # (cells, windows, 3, nodes of a cell) busy, own and shadow at first releases
+    closed: Floats  # (cells, windows, 3, nodes of a cell) busy, own and shadow at closes
+    log: Rows  # (cells * N * tasks,), or empty
+    log_outcome: NDArray[np.int8]
+    log_arrived: Ints  # (cells * N, flows), or empty
+
+    def addresses(self) -> NDArray[np.uint64]:
+        """Return what the kernel is handed: address and length of every table.
+
+        Raises
+        ------
+        TypeError
+            If a table's rows are not the kernel's, or not one after another.
+        """
+        tables: tuple[NDArray[Any], ...] = self
+        for (name, kind), table in zip(row_types().items(), tables, strict=True):
+            if table.dtype != kind or not table.flags.c_contiguous:
+                raise TypeError(f"{name} has rows of {table.dtype}, not of {kind} in one piece")
+        return np.array([(table.ctypes.data, table.size) for table in tables], np.uint64)

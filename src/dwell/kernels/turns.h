@@ -1,0 +1,204 @@
+// Turns: where a quota is noticed at ticks, one thread at a time has the core.
+//
+// All but the one that has the turn are in the heap of those that wait, foreign threads too, by the
+// core time that each has received.
+#pragma once
+
+#include "quotas.h"
+
+namespace dwell {
+
+// Of those that have received the same, jobs go first.
+constexpr i64 kLate = kLastNs;
+
+inline void end_turn(Quota& quota) {
+  quota.has_turn = 0;
+  quota.turn_ns = 0;
+}
+
+// Core time that the thread that has the turn has received; the clock must be up to date.
+inline i64 received_by_turn(const Quota& quota) { return quota.turn_begun_ns + quota.turn_ns; }
+
+// Has the thread that has the turn wait for another; the clock must be up to date.
+template <class S>
+void put_back(S& s, Server& server, Quota& quota) {
+  const i64 received = received_by_turn(quota);
+  if (server.n_run == 0) {
+    queue_up(s, server, Waiting{received, kLate, kForeign, 0.0});
+  } else {
+    const Running& first = *running_of(s, server);
+    const f64 left = std::max(first.finish_ns - server.virtual_ns, 0.0);
+    queue_up(s, server, Waiting{received, s.job(first.key).ready_ns, first.key, left});
+    server.n_run = 0;
+  }
+  end_turn(quota);
+}
+
+// Passes the turn on, if it has lasted long enough; the clock must be up to date.
+template <class S>
+void pass_on(S& s, Server& server, Quota& quota) {
+  if (quota.turn_ns >= quota.least_ns && !server.is_stopped) put_back(s, server, quota);
+}
+
+// Passes the turn on; the clock must be up to date.
+//
+// At a tick, if it has lasted long enough; at a wake, if another has received less.
+template <class S>
+void strike(S& s, Server& server, Quota& quota, i64 now) {
+  if ((now + quota.tick_ago_ns) % quota.tick_ns == 0) pass_on(s, server, quota);
+  const bool runs = quota.has_turn && !server.is_stopped;
+  if (quota.wakes_ns == now && runs && server.n_wait > 0) {
+    if (waiting_of(s, server)->rank < received_by_turn(quota)) put_back(s, server, quota);
+  }
+}
+
+// Lets the kernel look whether a quota is used up; the server's clock must be up to date.
+//
+// What was overrun is a debt: a server that is stopped goes on when refills have paid it
+// (distribute_cfs_runtime); one that runs draws a slice (assign_cfs_rq_runtime), or stops.
+template <class S>
+void notice(S& s, Server& server, Quota& quota, i64 now) {
+  renew(s, server, quota, now);
+  if (quota.left_ns <= 0) {
+    const i64 wanted = server.is_stopped ? 1 : quota.drawn_ns;
+    const i64 drawn = std::min(quota.pool_ns, wanted - quota.left_ns);
+    quota.pool_ns -= drawn;
+    quota.left_ns += drawn;
+  }
+  const bool stops = quota.left_ns <= 0;
+  if (stops && !server.is_stopped && quota.has_turn) put_back(s, server, quota);
+  server.is_stopped = stops;
+  set_speed(s, server);
+}
+
+// When something of the background wakes next, after now: a Poisson process.
+inline i64 next_wake(Quota& quota, i64 now) {
+  while (quota.wakes_ns <= now) {
+    const f64 drawn = attempt_uniform(quota.wake_key, quota.wakes++, 0);
+    const i64 gap_ns = whole_ns(-std::log(1.0 - drawn) * quota.wake_gap_ns);
+    quota.wakes_ns = later(quota.wakes_ns + 1, gap_ns);
+  }
+  return quota.wakes_ns;
+}
+
+// When the quota of a busy server is looked at next.
+//
+// At the begin of a period if it is stopped, else at a tick or where the background wakes.
+template <class S>
+i64 next_look(S&, Server& server, Quota& quota, i64 now) {
+  if (server.is_stopped) return (quota.period + 1) * quota.period_ns - quota.period_ago_ns;
+  if (quota.looks_ns == now) return now;  // the look of this instant has yet to come
+  const i64 tick_ns = now + quota.tick_ns - (now + quota.tick_ago_ns) % quota.tick_ns;
+  return std::min(tick_ns, next_wake(quota, now));
+}
+
+// Mean core time that the threads of a server have received: where a new one begins.
+template <class S>
+i64 average(const S& s, const Server& server, const Quota& quota) {
+  const Waiting* waiting = waiting_of(s, server);
+  i64 n = server.n_wait;
+  // Counted from one of them: 64 bits may not hold the sum.
+  const i64 origin = n > 0 ? waiting->rank : 0;
+  i64 beyond = 0;
+  for (i64 i = 0; i < n; ++i) beyond += waiting[i].rank - origin;
+  if (quota.has_turn) {
+    beyond += received_by_turn(quota) - origin;
+    ++n;
+  }
+  if (n == 0) return 0;
+  const i64 down = beyond % n < 0 ? 1 : 0;  // rounded down
+  return origin + beyond / n - down;
+}
+
+// Least core time that a thread of a server has received: where one begins that is owed.
+template <class S>
+i64 least(const S& s, const Server& server, const Quota& quota) {
+  const i64 waiting = server.n_wait > 0 ? waiting_of(s, server)->rank : 0;
+  if (!quota.has_turn) return waiting;
+  const i64 received = received_by_turn(quota);
+  return server.n_wait > 0 ? std::min(waiting, received) : received;
+}
+
+// Gives the turn, if nobody has it and the quota lets anybody, to who has received least.
+template <class S>
+void take_turn(S& s, Server& server, i64 now) {
+  Quota& quota = s.quotas[server.quota];
+  tick(s, server, now);
+  notice(s, server, quota, now);
+  if (server.n_wait == 0 || quota.has_turn || server.is_stopped) return;
+  const Waiting first = *waiting_of(s, server);
+  quota.has_turn = 1;
+  quota.turn_begun_ns = first.rank;
+  pop(waiting_of(s, server), server.n_wait--);
+  if (first.key == kForeign) return;
+  server.virtual_ns = 0.0;
+  Job& job = s.job(first.key);
+  if (job.started_ns < 0) job.started_ns = now;
+  push(running_of(s, server), 0, Running{first.left_ns, first.key});
+  server.n_run = 1;
+  set_speed(s, server);
+}
+
+// Replaces the foreign threads that take turns by so many new ones; the clock must be right.
+template <class S>
+void restress(S& s, Server& server, i64 threads) {
+  Quota& quota = s.quotas[server.quota];
+  const i64 received = average(s, server, quota);
+  const i64 n = server.n_wait;
+  server.n_wait = 0;
+  // The heap of the jobs grows no faster than that of all is read.
+  for (i64 i = 0; i < n; ++i) {
+    const Waiting row = waiting_of(s, server)[i];
+    if (row.key != kForeign) queue_up(s, server, row);
+  }
+  if (server.n_run == 0) end_turn(quota);
+  for (i64 i = 0; i < threads; ++i) queue_up(s, server, Waiting{received, kLate, kForeign, 0.0});
+}
+
+// Lets the next thread of a job wait for its turn: one before the stage, its own, one after.
+//
+// The stage's, which has worked for long when it sleeps, begins with the mean. One that does little
+// whenever it wakes is owed: it goes before all others, and takes the turn of one that has had it
+// for long enough. `work_ns` is 0 where what it does follows from what is left.
+template <class S>
+void line_up(S& s, Server& server, const Site& site, Job& job, i64 key, i64 work_ns, i64 mean) {
+  Quota& quota = s.quotas[server.quota];
+  const i64 rest = job.rest_ns;
+  i64 received = mean;
+  if (work_ns == 0 && rest > site.after_ns) {
+    work_ns = rest - site.after_ns;
+  } else {
+    if (work_ns == 0) work_ns = rest;
+    received = least(s, server, quota) - 1;
+    pass_on(s, server, quota);
+  }
+  job.rest_ns = rest - work_ns;
+  queue_up(s, server, Waiting{received, job.ready_ns, key, static_cast<f64>(work_ns)});
+  server.used += 1;
+  mark(s, server);
+}
+
+// Lets the first thread of a job that a worker has taken line up.
+template <class S>
+void admit_threads(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now) {
+  tick(s, server, now);
+  const i64 work_ns = site.exec_ns[cycle_of(key)];
+  job.rest_ns = work_ns;
+  const i64 first_ns = site.before_ns < work_ns ? site.before_ns : 0;
+  line_up(s, server, site, job, key, first_ns, average(s, server, s.quotas[server.quota]));
+}
+
+// Lets the next thread of a job line up, if there is one, where its thread has done its part.
+//
+// It is woken by the one that then sleeps, so that the mean that it begins with is over both.
+template <class S>
+bool next_thread(S& s, Server& server, const Site& site, Job& job, i64 key, i64 now) {
+  if (!S::kQuotas || job.rest_ns == 0) return false;
+  tick(s, server, now);
+  const i64 mean = average(s, server, s.quotas[server.quota]);
+  leave(s, server, site, now);
+  line_up(s, server, site, job, key, 0, mean);
+  return true;
+}
+
+}  // namespace dwell

@@ -1,0 +1,109 @@
+// Windows: what nodes had done when each opened and closed; and when the guard looks.
+#pragma once
+
+#include "changes.h"
+
+namespace dwell {
+
+// Writes the core-nanoseconds of a cell's nodes up to now: busy, the cell's own, its shadow's.
+template <class S>
+void snapshot(S& s, f64* out, i64 cell, i64 now) {
+  const Cell& of = s.cells[cell];
+  const i64 n_nodes = s.clock[0].n_nodes;
+  for (i64 i = 0; i < of.n_nodes; ++i) {
+    Server& server = s.servers[s.nodes[s.cell_nodes[of.node_0 + i]].server_0];
+    tick(s, server, now);
+    f64 own = s.own_ns[cell * n_nodes + i];
+    f64 extra = S::kTraces && of.shadow >= 0 ? s.own_ns[of.shadow * n_nodes + i] : 0.0;
+    for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {
+      const Progress found = progress(s, server, at);
+      if (found.key == kForeign) continue;
+      const i64 whose = cell_of(found.key);
+      if (whose == cell) {
+        own += found.received_ns;
+      } else if (whose == of.shadow) {
+        extra += found.received_ns;
+      }
+    }
+    out[i] = server.busy_ns * server.pace + server.behind_ns;
+    out[n_nodes + i] = own;
+    out[2 * n_nodes + i] = extra;
+  }
+}
+
+// Place of a snapshot in `opened` and `closed`.
+template <class S>
+i64 snapshot_row(const S& s, i64 cell, i64 window) {
+  return (cell * s.clock[0].n_windows + window) * 3 * s.clock[0].n_nodes;
+}
+
+// Window that a cycle is the first of, as far as is known; -1 for none.
+inline i64 opens(const Cell& cell, i64 cycle) {
+  const i64 beyond = cycle - cell.close_cycle;
+  if (beyond < 0) return cycle == cell.window_first ? cell.window : -1;
+  // The window before has not closed yet.
+  return beyond % cell.window_cycles == 0 ? cell.window + 1 + beyond / cell.window_cycles : -1;
+}
+
+// Opens the window that a cycle is the first of, if it is.
+template <class S>
+void open_window(S& s, i64 cell, i64 cycle, i64 now) {
+  const i64 window = opens(s.cells[cell], cycle);
+  if (0 <= window && window < s.clock[0].n_windows) {
+    snapshot(s, &s.opened[snapshot_row(s, cell, window)], cell, now);
+  }
+}
+
+// Closes a window; the next one follows without a gap unless the caller says otherwise.
+template <class S>
+void close_window(S& s, i64 cell, i64 now) {
+  Cell& of = s.cells[cell];
+  snapshot(s, &s.closed[snapshot_row(s, cell, of.window)], cell, now);
+  s.clock[0].closed_cell = cell;
+  of.close_pending = 0;
+  of.window += 1;
+  of.window_first = of.close_cycle;
+  of.close_cycle += of.window_cycles;
+}
+
+// Announces a cell's next close; returns whether the cell waits for one, or migrates.
+template <class S>
+bool announce_close(S& s, i64 cell) {
+  Cell& of = s.cells[cell];
+  if (!of.close_pending && of.close_cycle <= of.n_cycles) {
+    of.close_pending = 1;
+    s.post(of.close_ns[of.close_cycle - 1], make_key(kClose, cell, of.close_cycle, 0));
+  }
+  return of.close_pending || of.migrating;
+}
+
+// Whether the guard fires; if not, it looks again when it would if nothing completed.
+//
+// Nothing has to be done at completions: the guard fires no earlier than g periods after the
+// release of the cycle that it has waited for, and what has completed by then can be seen then.
+template <class S>
+bool guard_fires(S& s, i64 cell, i64 now) {
+  Cell& of = s.cells[cell];
+  // It has been told to look at another time instead.
+  if (of.looks_ns != now) return false;
+  of.looks_ns = -1;
+  i64 waited = of.waited;
+  for (i64 cycle = waited; cycle < of.n_cycles && of.release_ns[cycle] < now; ++cycle) {
+    const i64 row = s.output(cell, cycle);
+    if (s.outcome[row] != kDone) continue;
+    const i64 back_ns = s.back_ns[of.candidate_0 + s.stamps[row]];
+    if (later(of.release_ns[cycle] + s.latency_ns[row], back_ns) <= now) {
+      waited = std::max(cycle + 1, of.rested);
+    }
+  }
+  if (waited < of.moved && of.release_ns[of.moved] < now) waited = of.moved;
+  of.waited = waited;
+  if (waited >= of.n_cycles) return false;
+  const i64 due = later(of.release_ns[waited], of.patience_ns);
+  if (due <= now) return true;
+  of.looks_ns = due;
+  s.post(due, make_key(kGuard, cell, 0, 0));
+  return false;
+}
+
+}  // namespace dwell
