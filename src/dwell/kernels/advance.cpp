@@ -6,9 +6,9 @@
 namespace dwell {
 namespace {
 
-template <bool has_quotas, bool has_traces>
+template <bool has_quotas, bool is_plain>
 Status advance(const Tables& tables) {
-  Simulation<has_quotas, has_traces> simulation(tables);
+  Simulation<has_quotas, is_plain> simulation(tables);
   const Status status = play(simulation);
   simulation.queue.save(tables.clock[0]);
   return status;
@@ -21,15 +21,11 @@ using namespace dwell;
 
 // Plays a simulation on; returns a Status.
 DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
-  const Tables& t = *tables;
-  bool traces = t.log.size > 0;
-  for (i64 cell = 0; cell < t.cells.size; ++cell) {
-    const Cell& of = t.cells[cell];
-    traces = traces || of.shadow >= 0 || of.parent >= 0;
+  const bool is_plain = tables->cells.size == 1 && tables->log.size == 0;
+  if (tables->quotas.size > 0) {
+    return is_plain ? advance<true, true>(*tables) : advance<true, false>(*tables);
   }
-  const bool quotas = t.quotas.size > 0;
-  if (quotas) return traces ? advance<true, true>(t) : advance<true, false>(t);
-  return traces ? advance<false, true>(t) : advance<false, false>(t);
+  return is_plain ? advance<false, true>(*tables) : advance<false, false>(*tables);
 }
 
 // Adds an event of the caller's; there must be room.
@@ -42,7 +38,7 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
 // Sends the state of a task that moves (see send_state); `out`: at_ns, has_arrived, attempt.
 DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 now,
                                    i64* out) noexcept {
-  Simulation<true, true> simulation(*tables);
+  Simulation<true, false> simulation(*tables);
   const StateSent sent = send_state(simulation, hop, cycle, attempt, now);
   out[0] = sent.at_ns;
   out[1] = sent.has_arrived;

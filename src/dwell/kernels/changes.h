@@ -38,7 +38,7 @@ Progress progress(const S& s, const Server& server, i64 at) {
 
 // Loses what runs or waits for cores on a server whose node goes down.
 template <class S>
-void crash(S& s, Server& server, i64 now) {
+[[gnu::noinline]] void crash(S& s, Server& server, i64 now) {
   for (i64 i = 0; i < server.n_run + server.n_wait; ++i) {
     const Progress found = progress(s, server, i);
     if (found.key == kForeign) continue;
@@ -56,13 +56,13 @@ void crash(S& s, Server& server, i64 now) {
 
 // Loses the inputs that wait on a node for the rest of their join.
 template <class S>
-void lose_joins(S& s, i64 node) {
+[[gnu::noinline]] void lose_joins(S& s, i64 node) {
   for (i64 row = 0; row < s.slots.size; ++row) {
     const i64 cell = row / s.n_slots;
     const Slot& slot = s.slots[row];
     // A shadow may have nothing under way and yet wait for what it shares with its parent.
-    if (slot.live == 0 && s.cells[cell].parent < 0) continue;
-    for (i64 task = 0; task < s.cells[cell].n_tasks; ++task) {
+    if (slot.live == 0 && s.cell(cell).parent < 0) continue;
+    for (i64 task = 0; task < s.cell(cell).n_tasks; ++task) {
       Job& job = s.jobs[row * s.n_tasks + task];
       const bool waits = 0 < job.missing && job.missing < s.task(cell, task).n_in;
       if (waits && s.site(job).node == node) {
@@ -75,7 +75,7 @@ void lose_joins(S& s, i64 node) {
 
 // Empties the inputs of a node that went down; restarts its workers when it is up again.
 template <class S>
-void turn_sites(S& s, i64 node, bool is_down, i64 now) {
+[[gnu::noinline]] void turn_sites(S& s, i64 node, bool is_down, i64 now) {
   for (i64 row = 0; row < s.sites.size; ++row) {
     Site& site = s.sites[row];
     if (site.node != node) continue;
@@ -128,7 +128,7 @@ void announce_change(S& s) {
 
 // Applies the next change of a node: foreign threads, down, up.
 template <class S>
-void change_node(S& s, i64 now) {
+[[gnu::noinline]] void change_node(S& s, i64 now) {
   const Change& change = s.changes[s.clock[0].next_change++];
   const Node& node = s.nodes[change.node];
   bool turns = false;

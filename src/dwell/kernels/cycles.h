@@ -8,7 +8,7 @@ namespace dwell {
 
 template <class S>
 void log_job(S& s, i64 cell, i64 cycle, i64 task, const Job& job, Outcome outcome, i64 end_ns) {
-  if (!S::kTraces || s.log.size == 0) return;
+  if (S::kPlain || s.log.size == 0) return;
   const i64 entry = s.output(cell, cycle) * s.n_tasks + task;
   s.log[entry] = Log{job.ready_ns, job.started_ns, end_ns};
   s.log_outcome[entry] = outcome;
@@ -95,15 +95,15 @@ void drop_waiting(S& s, Site& site, i64 now) {
 // Whether a task is one that the shadow of a cycle stops before.
 template <class S>
 bool is_discarded(const S& s, i64 cell, i64 cycle, i64 task) {
-  if (!S::kTraces || s.cells[cell].parent < 0) return false;
+  if (S::kPlain || s.cell(cell).parent < 0) return false;
   return s.shadow_parts[s.slot(cell, cycle).pair * s.n_tasks + task] == kDiscarded;
 }
 
 // Shadow that shares a task with a cycle, -1 for none.
 template <class S>
 i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
-  if (!S::kTraces) return -1;
-  const i64 shadow = s.cells[cell].shadow;
+  if (S::kPlain) return -1;
+  const i64 shadow = s.cell(cell).shadow;
   if (shadow < 0 || s.stamp(shadow, cycle) < 0) return -1;
   const i64 pair = s.slot(shadow, cycle).pair;
   return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
@@ -114,7 +114,7 @@ template <class S>
 void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   const Flow& ends = s.flow(cell, flow);
   Job& job = s.job(cell, cycle, ends.target);
-  if (S::kTraces && s.log_arrived.size > 0) {
+  if (!S::kPlain && s.log_arrived.size > 0) {
     s.log_arrived[s.output(cell, cycle) * s.n_flows + flow] = now;
   }
   job.missing -= 1;
@@ -153,7 +153,7 @@ void finish(S& s, i64 cell, i64 cycle, const Job& job, i64 now) {
   if (slot.sinks_left > 0) return;
   const i64 row = s.output(cell, cycle);
   s.outcome[row] = kDone;
-  s.latency_ns[row] = now - s.cells[cell].release_ns[cycle];
+  s.latency_ns[row] = now - s.cell(cell).release_ns[cycle];
   s.compute_ns[row] = job.compute_ns;
   s.network_ns[row] = job.network_ns;
 }
@@ -221,7 +221,7 @@ void retry(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
 // Of a shadow only sources that it does not share start, as those do that start later.
 template <class S>
 void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now) {
-  const Cell& of = s.cells[cell];
+  const Cell& of = s.cell(cell);
   const i64 stamp = s.stamp(cell, cycle);
   const i64 candidate = of.candidate_0 + stamp;
   const i64 pair = of.pair_0 + active * of.n_candidates + stamp;
@@ -256,15 +256,15 @@ template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
-  if (S::kTraces) {
-    const i64 shadow = s.cells[cell].shadow;
+  if (!S::kPlain) {
+    const i64 shadow = s.cell(cell).shadow;
     if (shadow >= 0 && s.stamp(shadow, cycle) >= 0) {
       begin_cycle(s, shadow, cycle, active, true, now);
     }
   }
   const i64 following = cycle + 1;
-  if (following < s.cells[cell].n_cycles) {
-    s.post(s.cells[cell].release_ns[following], make_key(kRelease, cell, following, 0));
+  if (following < s.cell(cell).n_cycles) {
+    s.post(s.cell(cell).release_ns[following], make_key(kRelease, cell, following, 0));
   }
 }
 

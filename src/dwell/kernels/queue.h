@@ -62,7 +62,7 @@ class Queue {
   static constexpr i64 kLongest = 48, kShort = 16;
 
   // Makes a heap of what is sorted, or sorts a heap.
-  void turn_round() {
+  [[gnu::noinline]] void turn_round() {
     if (heap_) {
       std::sort(events_, events_ + size_, [](const Event& a, const Event& b) { return b < a; });
     } else {

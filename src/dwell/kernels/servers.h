@@ -164,7 +164,7 @@ void queue_up(S& s, Server& server, const Waiting& row) {
 
 // Takes the cores of the last running job behind the first waiting one, if there is any.
 template <class S>
-bool preempt(S& s, Server& server) {
+[[gnu::noinline]] bool preempt(S& s, Server& server) {
   Running* running = running_of(s, server);
   Waiting last = *waiting_of(s, server);
   i64 worst = -1;

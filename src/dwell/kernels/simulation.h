@@ -9,14 +9,15 @@
 namespace dwell {
 
 // What a simulation may need, known when it is compiled: what it does not need costs nothing.
-// `kQuotas`: some node has a quota. `kTraces`: jobs are logged, or there is a shadow.
-template <bool has_quotas, bool has_traces>
+// `kQuotas`: some node has a quota. `kPlain`: it is of one cell, which has no shadow, and no job is
+// logged.
+template <bool has_quotas, bool is_plain>
 struct Simulation : Tables {
   static constexpr bool kQuotas = has_quotas;
-  static constexpr bool kTraces = has_traces;
+  static constexpr bool kPlain = is_plain;
 
   Queue queue;
-  const i64 n_slots, n_tasks, n_flows;
+  const i64 n_slots, n_tasks, n_flows, n_cycles;
   i64 n_dirty = 0;
   i64 n_ready = 0;
 
@@ -25,12 +26,17 @@ struct Simulation : Tables {
         queue(events, clock[0]),
         n_slots(clock[0].n_slots),
         n_tasks(clock[0].n_tasks),
-        n_flows(clock[0].n_flows) {}
+        n_flows(clock[0].n_flows),
+        n_cycles(clock[0].n_cycles) {}
 
   void post(i64 at_ns, i64 key) { queue.push(at_ns, key); }
 
+  Cell& cell(i64 cell) const { return cells[kPlain ? 0 : cell]; }
+
   // Places in the ring of the cycles in flight.
-  i64 slot_row(i64 cell, i64 cycle) const { return cell * n_slots + (cycle & (n_slots - 1)); }
+  i64 slot_row(i64 cell, i64 cycle) const {
+    return (kPlain ? 0 : cell * n_slots) + (cycle & (n_slots - 1));
+  }
   Slot& slot(i64 cell, i64 cycle) const { return slots[slot_row(cell, cycle)]; }
   Job& job(i64 cell, i64 cycle, i64 task) const {
     return jobs[slot_row(cell, cycle) * n_tasks + task];
@@ -38,11 +44,11 @@ struct Simulation : Tables {
   Job& job(i64 key) const { return job(cell_of(key), cycle_of(key), item_of(key)); }
   Site& site(const Job& job) const { return sites[job.site]; }
   Server& server(const Site& site) const { return servers[site.server]; }
-  Task& task(i64 cell, i64 local) const { return tasks[cells[cell].task_0 + local]; }
-  Flow& flow(i64 cell, i64 local) const { return flows[cells[cell].flow_0 + local]; }
+  Task& task(i64 cell, i64 local) const { return tasks[(kPlain ? 0 : cells[cell].task_0) + local]; }
+  Flow& flow(i64 cell, i64 local) const { return flows[(kPlain ? 0 : cells[cell].flow_0) + local]; }
 
   // Place of a cycle in the outputs.
-  i64 output(i64 cell, i64 cycle) const { return cell * clock[0].n_cycles + cycle; }
+  i64 output(i64 cell, i64 cycle) const { return (kPlain ? 0 : cell * n_cycles) + cycle; }
   i16& stamp(i64 cell, i64 cycle) const { return stamps[output(cell, cycle)]; }
 
   // Hop that a flow takes in a cycle, -1 on the same node.

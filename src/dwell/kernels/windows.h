@@ -7,14 +7,14 @@ namespace dwell {
 
 // Writes the core-nanoseconds of a cell's nodes up to now: busy, the cell's own, its shadow's.
 template <class S>
-void snapshot(S& s, f64* out, i64 cell, i64 now) {
-  const Cell& of = s.cells[cell];
+[[gnu::noinline]] void snapshot(S& s, f64* out, i64 cell, i64 now) {
+  const Cell& of = s.cell(cell);
   const i64 n_nodes = s.clock[0].n_nodes;
   for (i64 i = 0; i < of.n_nodes; ++i) {
     Server& server = s.servers[s.nodes[s.cell_nodes[of.node_0 + i]].server_0];
     tick(s, server, now);
     f64 own = s.own_ns[cell * n_nodes + i];
-    f64 extra = S::kTraces && of.shadow >= 0 ? s.own_ns[of.shadow * n_nodes + i] : 0.0;
+    f64 extra = !S::kPlain && of.shadow >= 0 ? s.own_ns[of.shadow * n_nodes + i] : 0.0;
     for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {
       const Progress found = progress(s, server, at);
       if (found.key == kForeign) continue;
@@ -48,7 +48,7 @@ inline i64 opens(const Cell& cell, i64 cycle) {
 // Opens the window that a cycle is the first of, if it is.
 template <class S>
 void open_window(S& s, i64 cell, i64 cycle, i64 now) {
-  const i64 window = opens(s.cells[cell], cycle);
+  const i64 window = opens(s.cell(cell), cycle);
   if (0 <= window && window < s.clock[0].n_windows) {
     snapshot(s, &s.opened[snapshot_row(s, cell, window)], cell, now);
   }
@@ -56,8 +56,8 @@ void open_window(S& s, i64 cell, i64 cycle, i64 now) {
 
 // Closes a window; the next one follows without a gap unless the caller says otherwise.
 template <class S>
-void close_window(S& s, i64 cell, i64 now) {
-  Cell& of = s.cells[cell];
+[[gnu::noinline]] void close_window(S& s, i64 cell, i64 now) {
+  Cell& of = s.cell(cell);
   snapshot(s, &s.closed[snapshot_row(s, cell, of.window)], cell, now);
   s.clock[0].closed_cell = cell;
   of.close_pending = 0;
@@ -69,7 +69,7 @@ void close_window(S& s, i64 cell, i64 now) {
 // Announces a cell's next close; returns whether the cell waits for one, or migrates.
 template <class S>
 bool announce_close(S& s, i64 cell) {
-  Cell& of = s.cells[cell];
+  Cell& of = s.cell(cell);
   if (!of.close_pending && of.close_cycle <= of.n_cycles) {
     of.close_pending = 1;
     s.post(of.close_ns[of.close_cycle - 1], make_key(kClose, cell, of.close_cycle, 0));
@@ -83,7 +83,7 @@ bool announce_close(S& s, i64 cell) {
 // release of the cycle that it has waited for, and what has completed by then can be seen then.
 template <class S>
 bool guard_fires(S& s, i64 cell, i64 now) {
-  Cell& of = s.cells[cell];
+  Cell& of = s.cell(cell);
   // It has been told to look at another time instead.
   if (of.looks_ns != now) return false;
   of.looks_ns = -1;
