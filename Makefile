@@ -62,7 +62,7 @@ test: env ## Run the tests (ARGS="-k name" passes options to pytest)
 check: env ## Lint, formatting, types and the borders between packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy $(CODE)
+	$(BIN)/mypy $(CODE) hatch_build.py
 	$(BIN)/lint-imports --no-logo
 
 bench: env ## Run the benchmarks

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import cmath
+import ctypes
 import itertools
-import json
 import math
-import os
-import subprocess
-import sys
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -269,36 +266,29 @@ def test_parts_of_a_stretch_add_up(law: dict[str, Any]) -> None:
     assert whole[1:] == pytest.approx(np.sum(parts, axis=0)[1:])
 
 
-# ------------------------------------------------------- compiled and interpreted
-
-# Run by this process and, without the compiler, by another.
-CASES = """
-import json
-import numpy as np
-from dwell.kernels.servo_loop import N_STATE, follow
-
-rng = np.random.default_rng(3)
-released = np.arange(200) * 0.03
-late = np.sort(released + rng.exponential(0.04, 200))
-kept = rng.random(200) < 0.8
-found = []
-for double, gain, damping in ((False, 4.0, 0.0), (True, 30.0, 8.0)):
-    states, integrals = np.empty((kept.sum() + 1, N_STATE)), np.empty(2)
-    stretch = released[kept], late[kept], 0.5, 6.5
-    follow(*stretch, double, gain, damping, 0.04, 3.9, states, integrals)
-    found.append([float(value) for value in (*integrals, *states[-1])])
-text = json.dumps(found)
-"""
+# ------------------------------------------------------- arguments
 
 
-def test_compiled_and_interpreted_kernels_agree_to_the_last_bit() -> None:
-    scope: dict[str, Any] = {}
-    exec(CASES, scope)
-    elsewhere = subprocess.run(
-        [sys.executable, "-c", f"{CASES}\nprint(text)"],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert json.loads(elsewhere.stdout) == json.loads(scope["text"])
+@pytest.mark.parametrize(
+    ("measured", "actuated", "states", "integrals"),
+    [
+        (np.zeros(2), np.zeros(3), np.zeros((4, N_STATE)), np.zeros(2)),
+        (np.zeros(3), np.zeros(3), np.zeros((3, N_STATE)), np.zeros(2)),
+        (np.zeros(3), np.zeros(3), np.zeros((4, N_STATE - 1)), np.zeros(2)),
+        (np.zeros(3), np.zeros(3), np.zeros((4, N_STATE)), np.zeros(1)),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(
+    measured: Any, actuated: Any, states: Any, integrals: Any
+) -> None:
+    with pytest.raises(ValueError, match="do not fit"):
+        follow(measured, actuated, 0.0, 1.0, False, 4.0, 0.0, 1.0, 1.0, states, integrals)
+
+
+@pytest.mark.parametrize(
+    "measured", [np.zeros(3, np.float32), np.zeros(3, np.int64), np.zeros(6)[::2]]
+)
+def test_arrays_of_another_type_or_in_pieces_are_refused(measured: Any) -> None:
+    states, integrals = np.zeros((4, N_STATE)), np.zeros(2)
+    with pytest.raises(ctypes.ArgumentError):
+        follow(measured, np.zeros(3), 0.0, 1.0, False, 4.0, 0.0, 1.0, 1.0, states, integrals)

@@ -1,0 +1,14 @@
+// The elementary functions over arrays, for test_elementary.py.
+
+#include "elementary.h"
+
+#include "export.h"
+
+DWELL_EXPORT void sines_and_cosines(const double* angles, int64_t n, double* sines,
+                                    double* cosines) noexcept {
+  for (int64_t i = 0; i < n; ++i) {
+    const dwell::SineCosine both = dwell::sine_cosine(angles[i]);
+    sines[i] = both.sine;
+    cosines[i] = both.cosine;
+  }
+}
