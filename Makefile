@@ -59,11 +59,14 @@ test: env ## Run the tests (ARGS="-k name" passes options to pytest)
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder -m "not alone" $(ARGS) || [ $$? -eq 5 ]
 	$(BIN)/python -m pytest -m alone $(ARGS) || [ $$? -eq 5 ]
 
+# clang-tidy reads the headers of the system's own C++ library.
 check: env ## Lint, formatting, types and the borders between packages
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy $(CODE) hatch_build.py
 	$(BIN)/lint-imports --no-logo
+	$(BIN)/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES)) tests/kernels/*.cpp
+	$(BIN)/clang-tidy --quiet $(filter %.cpp,$(SOURCES))
 
 bench: env ## Run the benchmarks
 	$(BIN)/python -m benchmarks $(ARGS)

@@ -12,13 +12,11 @@ import os
 import re
 import runpy
 import shlex
-import shutil
 import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -71,18 +69,15 @@ def find_compiler() -> list[str]:
     if platform := os.environ.get("DWELL_WHEEL_PLATFORM"):
         _, major, minor, machine = platform.split("_", 3)
         commands = [[*ZIG, "-target", f"{machine}-linux-gnu.{major}.{minor}"]]
-    elif named := os.environ.get("CXX"):
-        commands = [shlex.split(named)]
     else:
-        commands = [["c++"], ["g++"], ["clang++"], [*ZIG, "-mcpu=baseline"]]
+        named = shlex.split(os.environ.get("CXX", ""))
+        system = [named] if named else [["c++"], ["g++"], ["clang++"]]
+        commands = [*system, [*ZIG, "-mcpu=baseline"]]
     with TemporaryDirectory() as folder:
         probe = Path(folder, "probe.cpp")
         probe.write_text(PROBE, encoding="utf-8")
         for command in commands:
-            there = find_spec("ziglang") if "ziglang" in command else shutil.which(command[0])
-            if there and not compile_library(
-                command, [probe], ["-std=c++20"], Path(folder, "made")
-            ):
+            if not compile_library(command, [probe], ["-std=c++20"], Path(folder, "probe.so")):
                 return command
     return []
 
@@ -131,8 +126,11 @@ def compile_library(
 
 def _errors(command: Sequence[str | Path]) -> str:
     """Run a compiler; return what it says where it fails."""
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    return done.stderr or f"{command} failed" if done.returncode else ""
+    try:
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+    except OSError as error:
+        return str(error)
+    return done.stderr or f"{command[0]} failed" if done.returncode else ""
 
 
 if __name__ == "__main__":

@@ -32,28 +32,28 @@ inline SineCosine sine_cosine(double angle) noexcept {
   const double x = left + small;
   const double tail = (left - x) + small;
 
-  // Taylor's series; the first term that is left out is below 2^-57 of the sum.
+  // Taylor's series: the first term that is left out is below 2^-57 of the sum.
   const double z = x * x;
-  const double sine_rest =
-      -1.0 / 6 +
-      z * (1.0 / 120 +
-           z * (-1.0 / 5040 +
-                z * (1.0 / 362880 +
-                     z * (-1.0 / 39916800 +
-                          z * (1.0 / 6227020800 +
-                               z * (-1.0 / 1307674368000 + z * (1.0 / 355687428096000)))))));
-  const double sine = x + (x * z * sine_rest + tail * (1.0 - 0.5 * z));
-  const double cosine_rest =
-      1.0 / 24 +
-      z * (-1.0 / 720 +
-           z * (1.0 / 40320 +
-                z * (-1.0 / 3628800 +
-                     z * (1.0 / 479001600 +
-                          z * (-1.0 / 87178291200 + z * (1.0 / 20922789888000))))));
+  double sine_terms = 1.0 / 355687428096000;
+  sine_terms = sine_terms * z - 1.0 / 1307674368000;
+  sine_terms = sine_terms * z + 1.0 / 6227020800;
+  sine_terms = sine_terms * z - 1.0 / 39916800;
+  sine_terms = sine_terms * z + 1.0 / 362880;
+  sine_terms = sine_terms * z - 1.0 / 5040;
+  sine_terms = sine_terms * z + 1.0 / 120;
+  sine_terms = sine_terms * z - 1.0 / 6;
+  double cosine_terms = 1.0 / 20922789888000;
+  cosine_terms = cosine_terms * z - 1.0 / 87178291200;
+  cosine_terms = cosine_terms * z + 1.0 / 479001600;
+  cosine_terms = cosine_terms * z - 1.0 / 3628800;
+  cosine_terms = cosine_terms * z + 1.0 / 40320;
+  cosine_terms = cosine_terms * z - 1.0 / 720;
+  cosine_terms = cosine_terms * z + 1.0 / 24;
+
   const double half = 0.5 * z;
   const double head = 1.0 - half;
-  const double cosine = head + (((1.0 - head) - half) + (z * z * cosine_rest - x * tail));
-
+  const double sine = x + (x * z * sine_terms + tail * head);
+  const double cosine = head + (((1.0 - head) - half) + (z * z * cosine_terms - x * tail));
   switch (quadrant) {
     case 0:
       return {sine, cosine};
