@@ -101,8 +101,12 @@ def build(compiler: Sequence[str], library: Path, options: Sequence[str] = ()) -
         return
     flags = (KERNELS / FILE["FLAGS"]).read_text(encoding="utf-8").split()
     flags += [*options, f'-DDWELL_DIGEST="{digest}"', f'-DDWELL_COMPILER="{name}"']
-    library.parent.mkdir(parents=True, exist_ok=True)
-    if errors := compile_library(compiler, sorted(KERNELS.glob("*.cpp")), flags, library):
+    try:
+        library.parent.mkdir(parents=True, exist_ok=True)
+        errors = compile_library(compiler, sorted(KERNELS.glob("*.cpp")), flags, library)
+    except OSError as error:
+        errors = f"{library} cannot be written: {error.strerror}"
+    if errors:
         raise SystemExit(errors)
 
 

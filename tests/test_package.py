@@ -15,25 +15,50 @@ from pathlib import Path
 import pytest
 
 import dwell
+from dwell.kernels.library import load
+from dwell.kernels.library_file import NAME
 from tests.cli.live_cell import RealCell
 
 ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder that holds what the wheel holds."""
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder that holds what the source distribution holds."""
+    folder = tmp_path_factory.mktemp("sdist")
+    build("sdist", ROOT, folder)
+    (archive,) = folder.glob("dwell_placement-*.tar.gz")
+    shutil.unpack_archive(archive, folder, filter="data")
+    return folder / archive.name.removesuffix(".tar.gz")
+
+
+@pytest.fixture(scope="module")
+def installed(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder that holds what the wheel holds, built from the source distribution."""
     folder = tmp_path_factory.mktemp("wheel")
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-    )
-    (wheel,) = folder.glob("*.whl")
-    assert wheel.name.startswith("dwell_placement-")
+    build("wheel", source, folder)
+    (wheel,) = folder.glob("dwell_placement-*.whl")
     shutil.unpack_archive(wheel, folder / "site", "zip")
     return folder / "site"
+
+
+def build(what: str, checkout: Path, folder: Path) -> None:
+    command = (sys.executable, "-m", "hatchling", "build", "-t", what, "-d", folder)
+    subprocess.run(command, cwd=checkout, check=True, capture_output=True)
+
+
+def test_the_source_distribution_has_the_kernel_s_sources_and_no_library(source: Path) -> None:
+    assert (source / "hatch_build.py").is_file()
+    ours = {path.name for path in (ROOT / "src" / "dwell" / "kernels").glob("*.[ch]*")}
+    assert ours <= {path.name for path in (source / "src" / "dwell" / "kernels").iterdir()}
+    assert not list(source.rglob("*.so"))
+
+
+def test_the_wheel_is_small_and_has_the_kernel_and_its_sources(installed: Path) -> None:
+    (wheel,) = installed.parent.glob("*.whl")
+    assert wheel.stat().st_size <= 1.2e6
+    # The sources are what the loader holds the library against.
+    load(installed / "dwell" / "kernels")
 
 
 def test_the_wheel_has_the_examples_and_nothing_else(installed: Path) -> None:
@@ -108,6 +133,10 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert set(re.findall(r"`([\w.-]+)`", told[2])) == names
     size = sum(path.stat().st_size for path in python.parents[1].rglob("*") if path.is_file())
     assert size / 1e6 <= int(told[1]) <= 150
+
+    # A cell runs without the kernel.
+    (library,) = python.parents[1].rglob(NAME)
+    library.unlink()
 
     cell = RealCell(tmp_path / "cell", python)
     try:
