@@ -13,7 +13,8 @@ constexpr i64 kTake = -1;
 
 // Adds every step with its number as key, or takes the first event where it is kTake; returns how
 // many were taken, and how many are left.
-DWELL_EXPORT i64 part_events(const i64* steps, i64 n, Event* room, i64 size, Event* taken) noexcept {
+DWELL_EXPORT i64 part_events(const i64* steps, i64 n, Event* room, i64 size,
+                             Event* taken) noexcept {
   Clock clock{};
   Queue queue({room, size}, clock);
   i64 count = 0;

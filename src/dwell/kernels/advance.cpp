@@ -1,6 +1,7 @@
 // What Python calls of the event loop.
 
 #include "advance.h"
+
 #include "export.h"
 
 namespace dwell {

@@ -18,11 +18,11 @@ enum ShadowPart : i8 { kShared, kShadowed, kDiscarded };
 // call again. `kFinished`: no window is left to close. `kGrowEvents`, `kGrowRing`: enlarge the
 // queue, or the ring of cycles in flight, and call again; nothing was lost. `kStep`: the caller's
 // event `step_key` is due at `step_ns`. `kBusy`: the budget of events is spent; call again.
-enum Status : i32 { kPaused, kFinished, kGrowEvents, kGrowRing, kStep, kBusy };
+enum Status : i8 { kPaused, kFinished, kGrowEvents, kGrowRing, kStep, kBusy };
 
 // Kinds of events in the order in which equal times are handled. `kMigrate` and `kGuard` are steps
 // of the caller's: of a cold migration, and of the guard where it fires.
-enum Kind : i64 {
+enum Kind : i8 {
   kCompletion,
   kArrival,
   kStart,

@@ -243,12 +243,8 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
       s.post(now + fixed.offset_ns, make_key(kStart, cell, cycle, task));
     }
   }
-  s.slot(cell, cycle) = Slot{cycle,
-                             static_cast<i32>(candidate),
-                             static_cast<i32>(pair),
-                             sources,
-                             of.n_sinks,
-                             0};
+  s.slot(cell, cycle) =
+      Slot{cycle, static_cast<i32>(candidate), static_cast<i32>(pair), sources, of.n_sinks, 0};
 }
 
 // Releases a cycle, and its shadow if it has one; the next release is announced.

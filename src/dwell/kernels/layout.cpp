@@ -15,8 +15,8 @@ struct Field {
   i64 offset, row_size;
 };
 
-// Writes the fields of all rows, where `out` is given, then every table as a field of `Tables`, with
-// the type of its own rows; returns how many these are.
+// Writes the fields of all rows, where `out` is given, then every table as a field of `Tables`,
+// with the type of its own rows; returns how many these are.
 i64 describe(Field* out) {
   i64 n = 0;
   const auto add = [&](const Field& field) {
@@ -24,11 +24,11 @@ i64 describe(Field* out) {
     ++n;
   };
 #define DWELL_FIELD(type, name) add({kName, #name, #type, offsetof(Row, name), sizeof(Row)});
-#define DWELL_DESCRIBE(row, fields)    \
-  {                                    \
-    using Row = row;                   \
+#define DWELL_DESCRIBE(row, fields)     \
+  {                                     \
+    using Row = row;                    \
     constexpr const char* kName = #row; \
-    fields(DWELL_FIELD)                \
+    fields(DWELL_FIELD)                 \
   }
 #define DWELL_TABLES_FIELDS(field) DWELL_TABLES(field)
   DWELL_ROWS(DWELL_DESCRIBE)
@@ -39,6 +39,4 @@ i64 describe(Field* out) {
 }  // namespace
 }  // namespace dwell
 
-DWELL_EXPORT dwell::i64 dwell_layout(dwell::Field* out) noexcept {
-  return dwell::describe(out);
-}
+DWELL_EXPORT dwell::i64 dwell_layout(dwell::Field* out) noexcept { return dwell::describe(out); }

@@ -74,7 +74,8 @@ i64 arrival_ns(const S& s, Link& link, i64 hop, const Segment& segment, i64 cycl
 
 // Loses a message when its transmission begins, or would begin.
 template <class S>
-[[gnu::noinline]] void lose_message(S& s, i64 cell, i64 cycle, i64 flow, Outcome outcome, i64 at_ns, i64 now) {
+[[gnu::noinline]] void lose_message(S& s, i64 cell, i64 cycle, i64 flow, Outcome outcome, i64 at_ns,
+                                    i64 now) {
   if (at_ns > now) {
     s.post(at_ns, make_key(kArrival, cell, cycle, flow | kLostOnLink));
     return;

@@ -14,7 +14,10 @@ inline bool operator<(const Event& a, const Event& b) {
 class Queue {
  public:
   Queue(Table<Event> events, const Clock& clock)
-      : events_(events.rows), size_(clock.n_events), room_(events.size), heap_(clock.is_heap != 0) {}
+      : events_(events.rows),
+        size_(clock.n_events),
+        room_(events.size),
+        heap_(clock.is_heap != 0) {}
 
   void save(Clock& clock) const {
     clock.n_events = size_;

@@ -144,7 +144,7 @@ void repace(S& s, Server& server, i64 now) {
       is_stressed = true;
     }
   }
-  if (pace->pace == server.pace) return;
+  if (pace == nullptr || pace->pace == server.pace) return;
   Quota& quota = s.quotas[server.quota];
   tick(s, server, now);
   renew_before_stress(s, server, now);

@@ -22,6 +22,9 @@ using u64 = std::uint64_t;
 using f64 = double;
 using Times = const i64*;
 
+// The lists are tables: a row of fields a line.
+// clang-format off
+
 // Numbers of the whole simulation. Up to `n_slots` cycles of a cell, a power of two, may be in
 // flight, each of up to `n_tasks` jobs and `n_flows` messages; one event adds `margin` events at
 // most. A call ends after `budget` events.
@@ -153,6 +156,8 @@ using Times = const i64*;
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING) row(Job, DWELL_JOB)                    \
   row(Slot, DWELL_SLOT) row(Log, DWELL_LOG)
 
+// clang-format on
+
 #define DWELL_FIELD(type, name) type name;
 #define DWELL_STRUCT(name, fields) \
   struct name {                    \
@@ -161,6 +166,8 @@ using Times = const i64*;
 DWELL_ROWS(DWELL_STRUCT)
 #undef DWELL_STRUCT
 #undef DWELL_FIELD
+
+// clang-format off
 
 // Fixed, then state, then outputs: per cycle, per window, and per job where a log is kept. Shapes
 // are in rows.py.
@@ -177,6 +184,8 @@ DWELL_ROWS(DWELL_STRUCT)
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed)                                                          \
   table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
+
+// clang-format on
 
 // A table and how many rows, or numbers, it has.
 template <class Row>
