@@ -165,7 +165,7 @@ def test_the_percentile_of_ages_whose_sum_64_bits_do_not_hold() -> None:
 
 @given(st.lists(st.booleans(), min_size=1, max_size=60), st.integers(1, 70))
 def test_misses_in_every_stretch(missed: list[bool], stretch: int) -> None:
-    counts = misses_in(np.array(missed), stretch)
+    (counts,) = misses_in(np.array(missed), [stretch])
     starts = range(max(len(missed) - stretch, 0) + 1)
     assert counts.tolist() == [sum(missed[at : at + stretch]) for at in starts]
 

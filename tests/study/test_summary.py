@@ -19,8 +19,8 @@ from dwell.model.instants import NEVER_NS
 from dwell.record import OUTCOMES, Run
 from dwell.study.quality import actuations, track
 from dwell.study.summary import (
+    Latencies,
     count_in,
-    count_within,
     latency_grid_ms,
     longest_streak,
     order_statistic,
@@ -210,17 +210,22 @@ def test_a_distribution_counts_what_finished() -> None:
 
 @given(
     st.lists(st.one_of(st.just(NEVER_NS), st.integers(0, 200_000_000)), min_size=1, max_size=50),
-    st.floats(1e-3, 1e3),
+    st.one_of(st.floats(1e-6, 1e-3), st.floats(1e-3, 1e3)),
 )
 def test_a_distribution_is_that_of_comparing_with_every_point(
-    latencies: list[int], deadline_ms: float
+    lengths: list[int], deadline_ms: float
 ) -> None:
     points_ns = np.rint(latency_grid_ms(deadline_ms) * 1e6).astype(np.int64)
     # The points themselves too, and what is beside them.
     near = [int(ns) + offset for ns in points_ns[::37] for offset in (-1, 0, 1)]
-    latency_ns = np.sort(np.array(latencies + near, np.int64))
-    within = count_within(latency_ns, deadline_ms)
-    assert within.tolist() == [int((latency_ns <= ns).sum()) for ns in points_ns]
+    latency_ns = np.array(lengths + near, np.int64)
+    latencies = Latencies.of(latency_ns, deadline_ms)
+    assert latencies.within.tolist() == [int((latency_ns <= ns).sum()) for ns in points_ns]
+    ascending_ns = np.sort(latency_ns)
+    for percent in (1, 50, 95, 100):
+        ns = ascending_ns[-(-percent * len(ascending_ns) // 100) - 1]
+        expected = float(ns) / 1e6 if ns < NEVER_NS else math.inf
+        assert latencies.percentile_ms(percent) == expected
 
 
 def test_tracking_is_shown_where_the_cell_has_a_servo() -> None:

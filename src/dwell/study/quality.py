@@ -14,6 +14,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -103,10 +104,9 @@ def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
     if not done.all():
         release_ns, latency_ns = release_ns[done], latency_ns[done]
     at_ns = release_ns + latency_ns
-    newer_ns = np.minimum.accumulate(at_ns[::-1])[::-1]
-    fresh = np.ones(len(at_ns), np.bool_)
-    np.less(at_ns[:-1], newer_ns[1:], out=fresh[:-1])
-    if not fresh.all():
+    if not (at_ns[:-1] < at_ns[1:]).all():
+        newer_ns = np.minimum.accumulate(at_ns[::-1])[::-1]
+        fresh = np.append(at_ns[:-1] < newer_ns[1:], True)
         release_ns, at_ns = release_ns[fresh], at_ns[fresh]
     return EffectiveCommands(start_ns, release_ns, at_ns)
 
@@ -133,8 +133,10 @@ def age_of_information(actuated: EffectiveCommands, begin_ns: int, end_ns: int) 
     low, high = since_ns[:-1] - known_ns, since_ns[1:] - known_ns
     span = end_ns - begin_ns
     peaks = high[:-1] if len(high) > 1 else high
+    areas = (high - low) * 0.5
+    areas *= high + low
     return Age(
-        mean_ms=float(np.sum((high - low) * 0.5 * (high + low))) / span / 1e6,
+        mean_ms=float(np.sum(areas)) / span / 1e6,
         p95_ms=_age_percentile(low, high, PERCENT) / 1e6,
         peak_ms=int(high.max()) / 1e6,
         mean_peak_ms=float(peaks.mean()) / 1e6,
@@ -154,17 +156,20 @@ def _age_percentile(low: Ints, high: Ints, percent: int) -> int:
     percent : int
         The share, less than 100.
     """
-    # Of differences, because 64 bits may not hold a sum of ages.
     wanted = int((high - low).sum()) * percent / 100
     under, over = int(low.min()), int(high.max())
     age = int(high.mean())
+    sum_low = int(low.sum())
+    reached = np.empty_like(low)
     while over - under > 1:
-        spent = int((np.clip(age, low, high) - low).sum())
+        np.minimum(np.maximum(low, age, out=reached), high, out=reached)
+        # 64 bits may not hold a sum of ages; they hold the difference of two.
+        spent = (int(reached.sum()) - sum_low) % 2**64
         if spent < wanted:
             under = age
         else:
             over = age
-        rate = np.count_nonzero((low <= age) & (age < high))
+        rate = np.count_nonzero(low <= age) - np.count_nonzero(high <= age)
         lacking = wanted - spent
         if abs(lacking) <= rate:  # less than a nanosecond away
             return age + round(lacking / rate) if rate else age
@@ -173,24 +178,25 @@ def _age_percentile(low: Ints, high: Ints, percent: int) -> int:
     return over
 
 
-def misses_in(missed: NDArray[np.bool_], stretch: int) -> NDArray[np.int32]:
-    """Count the misses in every stretch of consecutive cycles.
+def misses_in(missed: NDArray[np.bool_], stretches: Iterable[int]) -> Iterator[NDArray[np.int32]]:
+    """Count the misses in every stretch of K consecutive cycles, for several K.
 
     Parameters
     ----------
     missed : bool array, shape (n,)
-    stretch : int
+    stretches : iterable of int
         K, cycles of a stretch.
 
-    Returns
-    -------
+    Yields
+    ------
     int32 array, shape (n - K + 1,)
         The largest is the m for which the cycles meet "at most m misses in any K". Where there
         are fewer than K cycles, one number: all their misses.
     """
     total = np.zeros(len(missed) + 1, np.int32)
     np.cumsum(missed, dtype=np.int32, out=total[1:])
-    return total[stretch:] - total[:-stretch] if len(missed) > stretch else total[-1:]
+    for stretch in stretches:
+        yield total[stretch:] - total[:-stretch] if len(missed) > stretch else total[-1:]
 
 
 def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int) -> TrackingError:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -88,6 +88,50 @@ def latency_grid_ms(deadline_ms: float) -> Floats:
     return points / GRID_PER_DEADLINE * deadline_ms
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Latencies:
+    """Final latencies of cycles, each at its place on the latency grid.
+
+    An order statistic is sought among the cycles of one place, so that nothing is sorted.
+
+    Parameters
+    ----------
+    latency_ns : int64 array, shape (n,)
+        `NEVER_NS` where the cycle never finished.
+    place : integer array, shape (n,)
+        The first point of the grid that it is within; the number of points where it is in none.
+    within : int64 array
+        Cycles that finished within each point of the grid.
+    """
+
+    latency_ns: Ints
+    place: NDArray[np.integer]
+    within: Ints
+
+    @classmethod
+    def of(cls, latency_ns: Ints, deadline_ms: float) -> Latencies:
+        """Place latencies on the grid, whose points are rounded to ns as the deadline is."""
+        ends_ns = np.rint(latency_grid_ms(deadline_ms) * 1e6).astype(np.int64)
+        points, step_ns = len(ends_ns), deadline_ms * 1e6 / GRID_PER_DEADLINE
+        place: NDArray[np.integer]
+        if step_ns < 1.0:  # several points are one
+            place = np.searchsorted(ends_ns, latency_ns)
+        else:
+            # So many points are below, give or take the one whose rounding decides.
+            below = np.minimum(latency_ns / step_ns, points).astype(np.int16)
+            place = below + (latency_ns > np.append(-1, ends_ns)[below]) - 1
+        within = np.bincount(place, minlength=points + 1)[:points].cumsum()
+        return cls(latency_ns, place, within)
+
+    def percentile_ms(self, percent: int) -> float:
+        """Return the ceil(percent n / 100)-th smallest; infinite of one that never finished."""
+        rank = -(-percent * len(self.latency_ns) // 100)
+        at = int(np.searchsorted(self.within, rank))
+        rank -= int(self.within[at - 1]) if at else 0
+        ns = int(np.partition(self.latency_ns[self.place == at], rank - 1)[rank - 1])
+        return ns / 1e6 if ns < NEVER_NS else np.inf
+
+
 def count_in(run: Run, window_cycles: int) -> Counted:
     """Leave out the warm-up, and the cycles after the last complete window.
 
@@ -96,26 +140,19 @@ def count_in(run: Run, window_cycles: int) -> Counted:
     SimulationError
         If the run has no window after its warm-up.
     """
-    import polars as pl
-
-    windows = run.windows.filter(~pl.col("warmup"))
+    windows, decisions, cycles = run.windows, run.decisions, run.cycles
+    windows = windows.filter(~windows["warmup"])
     if windows.is_empty():
         raise SimulationError(
             f"none of {run.windows.height} windows is left after the warm-up; ask for more windows"
         )
     begin, end = windows["first_cycle"][0], windows["first_cycle"][-1] + window_cycles
-    decisions = run.decisions
+    first, after = np.searchsorted(cycles["cycle"].to_numpy(), (begin, end)).tolist()
     return Counted(
         windows,
         decisions.filter(decisions["window"] >= windows["window"][0]),
-        run.cycles.slice(*_rows(run.cycles, begin, end)),
+        cycles.slice(first, after - first),
     )
-
-
-def _rows(cycles: pl.DataFrame, begin: int, end: int) -> tuple[int, int]:
-    """Return where cycles from begin to before end are in a table, and how many there are."""
-    first, after = (int(cycles["cycle"].search_sorted(number)) for number in (begin, end))
-    return first, after - first
 
 
 def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
@@ -135,45 +172,59 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     """
     windows, decisions, cycles = count_in(run, problem.window_cycles)
     missed = cycles["missed"].to_numpy()
-    ascending_ns = np.sort(cycles["latency_ns"].fill_null(NEVER_NS).to_numpy())
+    # Also those of the warm-up: what took effect in it may last.
+    after = int(np.searchsorted(run.cycles["cycle"].to_numpy(), cycles["cycle"][-1])) + 1
+    release_ns = run.cycles["release_ns"].to_numpy()[:after]
+    latency_ns = _final_ns(run.cycles["latency_ns"])[:after]
+    counted_ns = latency_ns[after - cycles.height :]
+    latencies = Latencies.of(counted_ns, problem.pipeline.deadline_ms)
     row: Row = {
         **labels,
         "windows": windows.height,
         "cycles": cycles.height,
-        "violation_rate": float(missed.mean()),
+        "violation_rate": np.count_nonzero(missed) / len(missed),
         "l95_ms": mean_of(windows["seen_l95_ms"]),
-        **_percentiles(ascending_ns),
+        **_percentiles(latencies),
         **_utilisation(windows, problem),
         **_migrations(decisions),
         **_shares(windows["placement"], tuple(problem.candidates)),
         "cost": mean_of(windows["cost"]),
-        "lost": int((~cycles["outcome"].is_in(["done", "in_flight"])).sum()),
-        "in_flight": int((cycles["outcome"] == "in_flight").sum()),
+        **_unfinished(cycles["outcome"]),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
-        **_actuator(run.cycles, cycles, problem),
+        **_actuator(release_ns, latency_ns, cycles.height, problem),
         "compute_ms": mean_of(cycles["compute_ns"]) / 1e6,
         "queue_ms": mean_of(cycles["queue_ns"]) / 1e6,
         "network_ms": mean_of(cycles["network_ns"]) / 1e6,
-        PLAYED: _played(windows, cycles, problem),
+        PLAYED: _played(windows, cycles["placement"], counted_ns, problem),
     }
-    within = count_within(ascending_ns, problem.pipeline.deadline_ms)
-    return Summary(row, _costs(windows, decisions, problem, labels), within)
+    return Summary(row, _costs(windows, decisions, problem, labels), latencies.within)
 
 
-def _played(windows: pl.DataFrame, cycles: pl.DataFrame, problem: Problem) -> str:
+def _final_ns(latency_ns: pl.Series) -> Ints:
+    """Final latencies, `NEVER_NS` where the cycle never finished."""
+    if latency_ns.null_count():
+        latency_ns = latency_ns.set(latency_ns.is_null(), NEVER_NS)
+    return latency_ns.to_numpy()
+
+
+def _unfinished(outcomes: pl.Series) -> dict[str, int]:
+    """Count the cycles that were lost, and those that were under way at the end."""
+    done, in_flight = (int((outcomes == name).sum()) for name in ("done", "in_flight"))
+    return {"lost": outcomes.count() - done - in_flight, "in_flight": in_flight}
+
+
+def _played(windows: pl.DataFrame, placed: pl.Series, latency_ns: Ints, problem: Problem) -> str:
     """Digest of what was played: of runs on one realisation, equal ones are the same run.
 
     It is that of every cycle's placement and latency, and of the nodes' utilisation, to which
     shadow jobs add where they delay nobody.
     """
-    latencies_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
-    digest = hashlib.blake2b(latencies_ns.tobytes(), digest_size=8)
+    digest = hashlib.blake2b(latency_ns.data, digest_size=8)
     for name in problem.candidates:
-        placed = (cycles["placement"] == name).fill_null(value=False)
-        digest.update(np.packbits(placed.to_numpy()).tobytes())
+        digest.update(np.packbits((placed == name).to_numpy()).data)
     for node in problem.fabric.nodes:
-        digest.update(windows[f"u_{node}"].to_numpy().tobytes())
+        digest.update(windows[f"u_{node}"].to_numpy().data)
     return digest.hexdigest()
 
 
@@ -187,47 +238,32 @@ def longest_streak(missed: NDArray[np.bool_]) -> int:
 def _misses(missed: NDArray[np.bool_]) -> dict[str, float]:
     """Misses in stretches of K cycles: the most, and the share of stretches with more than 5 %."""
     row: dict[str, float] = {}
-    for stretch, aim in STRETCHES.items():
-        counts = misses_in(missed, stretch)
+    every = misses_in(missed, STRETCHES)
+    for (stretch, aim), counts in zip(STRETCHES.items(), every, strict=True):
         row[f"misses_in_{stretch}"] = int(counts.max())
         row[f"over_{aim}_in_{stretch}"] = float((counts > aim).mean())
     return row
 
 
-def _actuator(played: pl.DataFrame, counted: pl.DataFrame, problem: Problem) -> dict[str, float]:
-    """Age at the actuator and tracking error, until a period after the last counted release.
+def _actuator(
+    release_ns: Ints, latency_ns: Ints, counted: int, problem: Problem
+) -> dict[str, float]:
+    """Age at the actuator and tracking error, until a period after the last release.
 
-    What took effect before the first of them may still last, so that every cycle played is needed.
+    Parameters
+    ----------
+    release_ns, latency_ns : int64 array
+        Every cycle from the first on; the last `counted` of them count.
     """
-    cycles = played[: played["cycle"].search_sorted(counted["cycle"][-1]) + 1]
-    actuated = actuations(
-        cycles["release_ns"].to_numpy(), cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
-    )
-    begin_ns = counted["release_ns"][0]
-    end_ns = counted["release_ns"][-1] + round(problem.pipeline.period_ms * 1e6)
+    actuated = actuations(release_ns, latency_ns)
+    begin_ns = int(release_ns[-counted])
+    end_ns = int(release_ns[-1]) + round(problem.pipeline.period_ms * 1e6)
     age = age_of_information(actuated, begin_ns, end_ns)
     row = {f"aoi_{name}": value for name, value in age._asdict().items()}
     if problem.servo is not None:
         tracking = track(problem.servo, actuated, begin_ns, end_ns)
         row |= {"tracking_rms_mm": tracking.rms_mm, "tracking_iae_mm": tracking.mean_mm}
     return row
-
-
-def count_within(ascending_ns: Ints, deadline_ms: float) -> Ints:
-    """Count the cycles that finished within each point of the latency grid.
-
-    Parameters
-    ----------
-    ascending_ns : int64 array, shape (n,)
-        Latencies, `NEVER_NS` where the cycle never finished.
-
-    Returns
-    -------
-    int64 array
-        One a point of `latency_grid_ms`; a point is rounded to nanoseconds as the deadline is.
-    """
-    ends_ns = np.rint(latency_grid_ms(deadline_ms) * 1e6).astype(np.int64)
-    return np.searchsorted(ascending_ns, ends_ns, side="right")
 
 
 def mean_of(values: pl.Series) -> float:
@@ -248,10 +284,9 @@ def order_statistic(values: Floats, percent: int) -> float:
     return float(np.partition(values, rank - 1)[rank - 1])
 
 
-def _percentiles(ascending_ns: Ints) -> dict[str, float]:
+def _percentiles(latencies: Latencies) -> dict[str, float]:
     """Percentiles of all cycles together, and how far the 95th is from the median."""
-    ranks = [-(-percent * len(ascending_ns) // 100) - 1 for percent in (50, 95)]
-    p50, p95 = (float(ns) / 1e6 if ns < NEVER_NS else np.inf for ns in ascending_ns[ranks])
+    p50, p95 = (latencies.percentile_ms(percent) for percent in (50, 95))
     # Infinity less infinity is no number: where half of the cycles are lost, the tail has no end.
     return {"p95_ms": p95, "p50_ms": p50, "spread_ms": p95 - p50 if p50 < np.inf else np.inf}
 
@@ -283,11 +318,13 @@ def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
 
 def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
     """Count migrations, those that undo the one before, and the guard's moves, which are apart."""
-    by_guard = decisions["reason"] == "guard"
-    moves = decisions.filter(decisions["migrated"] & ~by_guard).select("incumbent", "placement")
-    pairs: Sequence[tuple[str, str]] = moves.rows()
+    migrated, by_guard = decisions["migrated"], decisions["reason"] == "guard"
+    moves = migrated & ~by_guard
+    pairs = [
+        *zip(*(decisions[end].filter(moves) for end in ("incumbent", "placement")), strict=True)
+    ]
     undone = sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
-    guard_moves = int((decisions["migrated"] & by_guard).sum())
+    guard_moves = int((migrated & by_guard).sum())
     return {"migrations": len(pairs), "returns": undone, "guard_moves": guard_moves}
 
 
