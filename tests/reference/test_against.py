@@ -498,7 +498,7 @@ def play_stamped(
     assert advance_to_end(arrays) == Status.FINISHED
     controller = Controller(problem, problem.initial)
     first = np.arange(real.windows) * problem.window_cycles
-    tables = make_tables(
+    tables, _ = make_tables(
         sim_tables.PlayedRealisation(problem, real, controller, arrays, first), jobs=True
     )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]

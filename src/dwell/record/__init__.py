@@ -16,6 +16,7 @@ from dwell.record.schema import (
     frame_of,
     row_of,
 )
+from dwell.record.table_arrays import Names, TableArrays, arrays_of
 
 __all__ = [
     "OUTCOMES",
@@ -25,10 +26,13 @@ __all__ = [
     "Columns",
     "Feature",
     "Journal",
+    "Names",
     "Row",
     "Run",
+    "TableArrays",
     "Types",
     "Values",
+    "arrays_of",
     "column_types",
     "frame_of",
     "open_run",

@@ -20,6 +20,7 @@ from dwell.model import Problem, Scenario
 from dwell.model.table_columns import TABLES
 from dwell.record.journal import JOURNAL, Journal, read_journal
 from dwell.record.schema import SCHEMA_VERSION
+from dwell.record.table_arrays import TableArrays, arrays_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -42,11 +43,19 @@ class Run(Displayed):
     tables : mapping of str to DataFrame, or to a function that makes it
         ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs`` and ``processes``; made
         when first asked for.
+    arrays : mapping of str to function that makes `TableArrays`, optional
+        The tables that need not be frames to be computed with.
     """
 
-    def __init__(self, meta: Mapping[str, Any], tables: Mapping[str, Table]) -> None:
+    def __init__(
+        self,
+        meta: Mapping[str, Any],
+        tables: Mapping[str, Table],
+        arrays: Mapping[str, Callable[[], TableArrays]] | None = None,
+    ) -> None:
         self.meta: dict[str, Any] = {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
         self._tables: dict[str, Table] = dict(tables)
+        self._arrays = dict(arrays or {})
 
     def __repr__(self) -> str:
         told = {name: self.meta.get(name) for name in ("scenario", "policy", "seed", "windows")}
@@ -62,7 +71,15 @@ class Run(Displayed):
         if callable(table):
             table = table()
             self._tables[name] = table
+            # What it was made of is let go.
+            self._arrays.pop(name, None)
         return table
+
+    def arrays(self, name: str) -> TableArrays:
+        """Columns of a table as arrays: of ``cycles``, ``windows`` or ``decisions``."""
+        if name in self._arrays:
+            return self._arrays[name]()
+        return arrays_of(self._table(name))
 
     @cached_property
     def problem(self) -> Problem:

@@ -7,11 +7,13 @@ column is a declaration there and a value, of its name, where it is computed.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 from dwell.model import REASONS, Problem, Reason
+from dwell.model.instants import NEVER_NS
 from dwell.model.table_columns import TABLES, Column, Feature, columns_of, those_with
+from dwell.record.table_arrays import Names
 
 if TYPE_CHECKING:
     import polars as pl
@@ -101,13 +103,13 @@ def row_of(types: Types, values: Values) -> Row:
 def frame_of(
     table: str, problem: Problem, values: Mapping[str, object], features: Collection[Feature] = ()
 ) -> pl.DataFrame:
-    """Return a table; NaN of a column that may be null is null.
+    """Return a table; NaN and `NEVER_NS` of a column that may be null are null.
 
     Parameters
     ----------
     table : str
         One of `TABLES`.
-    values : mapping of str to sequence, array or Series
+    values : mapping of str to sequence, array, Series or `Names`
         By column; all of one length.
     features : collection of {"live", "shadows", "support"}
         Features of the run.
@@ -119,18 +121,34 @@ def frame_of(
     """
     import polars as pl
 
-    types, nullable = {}, []
+    types, nullable = {}, set()
     for name, column, kind in _columns(table, problem, features):
         types[name] = kind
-        if kind == "Float64" and column.null:
-            nullable.append(name)
+        if column.null:
+            nullable.add(name)
     _require_columns(types, values)
-    frame = pl.DataFrame({name: values[name] for name in types})
-    had = frame.schema
-    other = {name: dtype for name, dtype in polars_schema(types).items() if had[name] != dtype}
-    if other:
-        frame = frame.with_columns(pl.col(name).cast(dtype) for name, dtype in other.items())
-    return frame.with_columns(pl.col(nullable).fill_nan(None)) if nullable else frame
+    # Column by column: a query over all of them costs more than a short table.
+    made = []
+    for name, dtype in polars_schema(types).items():
+        series = _series(name, values[name], dtype, nullable=name in nullable)
+        made.append(series if series.dtype == dtype else series.cast(dtype))
+    return pl.DataFrame(made)
+
+
+def _series(name: str, values: object, dtype: pl.DataType, *, nullable: bool) -> pl.Series:
+    import numpy as np
+    import polars as pl
+
+    if isinstance(values, Names):
+        return pl.Series(name, values.known, pl.Enum(values.known))[values.places]
+    given = cast("Iterable[object]", values)
+    if nullable and dtype == pl.Float64():
+        return pl.Series(name, np.asarray(given, np.float64), nan_to_null=True)
+    series = pl.Series(name, given)
+    if nullable and isinstance(values, np.ndarray) and dtype == pl.Int64():
+        never = values >= NEVER_NS
+        return series.set(pl.Series(never), None) if never.any() else series
+    return series
 
 
 def polars_schema(types: Types) -> dict[str, pl.DataType]:

@@ -112,7 +112,7 @@ def simulate_realisation(
         windows=realisation.windows,
         guard=guard,
     )
-    return Run(meta, make_tables(played, jobs=jobs))
+    return Run(meta, *make_tables(played, jobs=jobs))
 
 
 def describe(

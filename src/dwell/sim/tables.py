@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from functools import cache, cached_property, partial
+from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dwell.control import ClosedWindow, Controller, final_l95_ms, static_columns
@@ -15,9 +16,9 @@ from dwell.kernels.arrays import Arrays
 from dwell.kernels.codes import Outcome, ShadowPart
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.tables import Rows
-from dwell.model import Problem
+from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
-from dwell.record import OUTCOMES, Feature, frame_of
+from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -27,7 +28,7 @@ Floats: TypeAlias = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
 
-@dataclass(slots=True)
+@dataclass(eq=False)
 class PlayedRealisation:
     """A realisation that has been played to its end.
 
@@ -50,16 +51,12 @@ class PlayedRealisation:
         """Features of the run that not every run has, beside those of its estimator."""
         return ("shadows",) if len(self.arrays.tables.cells) > 1 else ()
 
-    @property
-    def rows(self) -> Ints:
-        """Cycles of every window, shape (windows, W)."""
-        return self.first[:, None] + np.arange(self.problem.window_cycles)
-
     def by_window(self, cycles: NDArray[T]) -> NDArray[T]:
         """Values of cycles as rows of windows, (windows, W); a view where none is left out."""
         if self.whole:
             return cycles[: self.released].reshape(-1, self.problem.window_cycles)
-        return cycles[self.rows]
+        rows: NDArray[T] = sliding_window_view(cycles, self.problem.window_cycles)[self.first]
+        return rows
 
     @property
     def whole(self) -> bool:
@@ -94,6 +91,7 @@ class PlayedRealisation:
             core_ns=used,
         )
 
+    @cached_property
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
@@ -103,112 +101,131 @@ class PlayedRealisation:
         if self.whole:
             missed |= late.ravel()
         else:
-            missed[self.rows] |= late
+            window, place = late.nonzero()
+            missed[self.first[window] + place] = True
         return missed
 
 
 def make_tables(
     played: PlayedRealisation, *, jobs: bool = False
-) -> dict[str, Callable[[], pl.DataFrame]]:
-    """Functions that make each table when it is first asked for; `jobs` asks for that of jobs."""
-    controller = played.controller
+) -> tuple[dict[str, Callable[[], pl.DataFrame]], dict[str, Callable[[], TableArrays]]]:
+    """Functions that make each table when it is first asked for; `jobs` asks for that of jobs.
+
+    Returns
+    -------
+    frames : dict of str to function
+        One a table.
+    arrays : dict of str to function
+        Columns of the tables that need not be frames to be computed with.
+    """
+    problem, controller = played.problem, played.controller
     profile = None if controller.log.seen else controller.fixed_profile
+    support: tuple[Feature, ...] = ("support",) if controller.supports else ()
 
     @cache
     def columns() -> tuple[dict[str, Floats], dict[str, object]]:
         if profile is None:
-            return _seen(played), {}
+            return _seen(played), _decided(controller)
         return static_columns(controller, profile, played.closed_windows())
 
-    tables = {
-        "cycles": lambda: _cycles(played),
-        "windows": lambda: _windows(played, columns()[0]),
-        "decisions": lambda: (
-            _decisions(controller)
-            if profile is None
-            else frame_of("decisions", played.problem, columns()[1])
-        ),
+    arrays: dict[str, Callable[[], TableArrays]] = {
+        "cycles": cache(lambda: _cycles(played)),
+        "windows": cache(lambda: _windows(played, columns()[0])),
+        "decisions": cache(lambda: _decisions(controller, columns()[1])),
     }
+    features = {"windows": played.features, "decisions": support}
+
+    def frame(name: str) -> pl.DataFrame:
+        return frame_of(name, problem, arrays[name]().columns(), features.get(name, ()))
+
+    frames: dict[str, Callable[[], pl.DataFrame]] = {name: partial(frame, name) for name in arrays}
     if jobs:
-        tables["jobs"] = lambda: _jobs(played)
-    return tables
+        frames["jobs"] = lambda: _jobs(played)
+    return frames, arrays
 
 
-def _names(codes: NDArray[np.integer], names: tuple[str, ...]) -> pl.Series:
-    import polars as pl
-
-    return pl.Series(codes.astype(np.uint32)).cat.to(pl.Enum(names))
-
-
-def _cycles(played: PlayedRealisation) -> pl.DataFrame:
-    import polars as pl
-
+def _cycles(played: PlayedRealisation) -> TableArrays:
     tables = played.arrays.tables
     count = played.released
     latency, compute, network = (
         table[0, :count] for table in (tables.latency_ns, tables.compute_ns, tables.network_ns)
     )
-    frame = frame_of(
-        "cycles",
-        played.problem,
+
+    @cache
+    def lost() -> NDArray[np.bool_] | None:
+        lost = latency >= NEVER_NS
+        return lost if lost.any() else None
+
+    def finished(part: Ints) -> Ints:
+        return part if (gone := lost()) is None else np.where(gone, NEVER_NS, part)
+
+    return TableArrays(
         {
-            "cycle": np.arange(count),
+            "cycle": lambda: np.arange(count),
             "release_ns": played.realisation.release_ns[:count],
-            "placement": _names(tables.stamps[0, :count], tuple(played.problem.candidates)),
+            "placement": Names(tables.stamps[0, :count], tuple(played.problem.candidates)),
             "latency_ns": latency,
-            "missed": played.missed(),
-            "outcome": _names(tables.outcome[0, :count], OUTCOMES),
-            "compute_ns": compute,
-            "queue_ns": latency - compute - network,
-            "network_ns": network,
-        },
+            "missed": lambda: played.missed,
+            "outcome": Names(tables.outcome[0, :count], OUTCOMES),
+            "compute_ns": lambda: finished(compute),
+            "queue_ns": lambda: finished(latency - compute - network),
+            "network_ns": lambda: finished(network),
+        }
     )
-    parts = ("latency_ns", "compute_ns", "queue_ns", "network_ns")
-    done = pl.col("latency_ns") < NEVER_NS
-    return frame.with_columns(pl.when(done).then(pl.col(*parts)))
 
 
-def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> pl.DataFrame:
-    problem = played.problem
-    stamps = played.by_window(played.arrays.tables.stamps[0])
+def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
+    problem, stamps = played.problem, played.arrays.tables.stamps[0]
     count = len(played.first)
-    return frame_of(
-        "windows",
-        problem,
+
+    def mixed() -> NDArray[np.bool_]:
+        placed = played.by_window(stamps)
+        different: NDArray[np.bool_] = (placed != placed[:, :1]).any(axis=1)
+        return different
+
+    return TableArrays(
         {
             "window": np.arange(count),
             "first_cycle": played.first,
             "warmup": np.arange(count) < problem.warmup_windows,
-            "placement": _names(stamps[:, 0], tuple(problem.candidates)),
-            "mixed": (stamps != stamps[:, :1]).any(axis=1),
-            "l95_ms": final_l95_ms(played.by_window(played.arrays.tables.latency_ns[0])),
-            "violation_rate": played.by_window(played.missed()).mean(axis=1),
+            "placement": Names(stamps[played.first], tuple(problem.candidates)),
+            "mixed": mixed,
+            "l95_ms": lambda: final_l95_ms(played.by_window(played.arrays.tables.latency_ns[0])),
+            "violation_rate": lambda: played.by_window(played.missed).mean(axis=1),
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
             **_shadow_columns(played),
-        },
-        played.features,
+        }
     )
 
 
-def _shadow_columns(played: PlayedRealisation) -> dict[str, NDArray[np.generic]]:
+def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
     """Cost of shadow jobs in each window: cycles sent twice, bytes, and share of the cores."""
-    tables = played.arrays.tables
     if not played.features:
         return {}
     controller = played.controller
-    used = controller.utilisation(played.closed_windows())[:, 2]
-    other = played.by_window(tables.stamps[1])
-    sent = played.by_window(_shadow_bytes(played))
-    return {
-        "shadow_cycles": (other >= 0).sum(axis=1),
+
+    def sent_bytes() -> Ints:
+        sent = played.by_window(_shadow_bytes(played))
         # What 64 bits do not hold is as good as that.
-        "shadow_bytes": np.where(
-            sent.sum(axis=1, dtype=np.float64) < HORIZON_NS, sent.sum(axis=1), HORIZON_NS
+        held = sent.sum(axis=1, dtype=np.float64) < HORIZON_NS
+        return np.where(held, sent.sum(axis=1), HORIZON_NS)
+
+    @cache
+    def used() -> Floats:
+        return controller.utilisation(played.closed_windows())[:, 2]
+
+    return {
+        "shadow_cycles": lambda: (played.by_window(played.arrays.tables.stamps[1]) >= 0).sum(
+            axis=1
         ),
-        **{f"shadow_{node}": used[:, i] for i, node in enumerate(controller.nodes)},
+        "shadow_bytes": sent_bytes,
+        **{
+            f"shadow_{node}": partial(lambda i: used()[:, i], i)
+            for i, node in enumerate(controller.nodes)
+        },
     }
 
 
@@ -248,12 +265,21 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     }
 
 
-def _decisions(controller: Controller) -> pl.DataFrame:
-    names = controller.decision_columns
-    rows = controller.log.decisions
-    columns = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
-    features: tuple[Feature, ...] = ("support",) if controller.supports else ()
-    return frame_of("decisions", controller.problem, columns, features)
+def _decided(controller: Controller) -> dict[str, object]:
+    """Decisions of the controller's log, by column."""
+    names, rows = controller.decision_columns, controller.log.decisions
+    return dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
+
+
+def _decisions(controller: Controller, decided: dict[str, object]) -> TableArrays:
+    """Return decisions whose names are found among those that there may be."""
+    known = dict.fromkeys(("incumbent", "placement"), tuple(controller.problem.candidates))
+    known["reason"] = REASONS
+    names = {
+        column: partial(Names.of, cast("Sequence[str]", decided[column]), those)
+        for column, those in known.items()
+    }
+    return TableArrays({**decided, **names})
 
 
 def _log_running(played: PlayedRealisation, log: Rows) -> None:
@@ -267,8 +293,6 @@ def _log_running(played: PlayedRealisation, log: Rows) -> None:
 
 
 def _jobs(played: PlayedRealisation) -> pl.DataFrame:
-    import polars as pl
-
     problem, tables = played.problem, played.arrays.tables
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
@@ -282,22 +306,19 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     node = site_node[site[np.maximum(tables.stamps, 0).astype(np.int64)]]
     cycle, cell, task = np.nonzero(log["ready_ns"].transpose(1, 0, 2) >= 0)
     picked = log[cell, cycle, task]
-    ended = picked["end_ns"] >= 0
+    started, ended = picked["start_ns"] >= 0, picked["end_ns"] >= 0
     return frame_of(
         "jobs",
         problem,
         {
             "cycle": cycle,
-            "task": _names(task, tasks),
-            "node": _names(node[cell, cycle, task], nodes),
+            "task": Names(task, tasks),
+            "node": Names(node[cell, cycle, task], nodes),
             "ready_ns": picked["ready_ns"],
-            "start_ns": pl.Series(picked["start_ns"]),
-            "end_ns": pl.Series(picked["end_ns"]),
-            "outcome": _names(np.where(ended, outcome[cell, cycle, task], 0), OUTCOMES),
+            "start_ns": np.where(started, picked["start_ns"], NEVER_NS),
+            "end_ns": np.where(ended, picked["end_ns"], NEVER_NS),
+            "outcome": Names(np.where(ended, outcome[cell, cycle, task], 0), OUTCOMES),
             **({"shadow": cell > 0} if cells > 1 else {}),
         },
         played.features,
-    ).with_columns(
-        pl.when(pl.col("start_ns") >= 0).then(pl.col("start_ns")),
-        pl.when(pl.col("end_ns") >= 0).then(pl.col("end_ns")),
     )

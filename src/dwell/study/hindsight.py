@@ -26,7 +26,6 @@ from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.errors import SimulationError
 from dwell.estimators import Evidence
 from dwell.model import FrozenDict, Problem, QoS
-from dwell.model.instants import NEVER_NS
 
 if TYPE_CHECKING:
     from dwell.record import Run
@@ -135,19 +134,16 @@ class Hindsight:
 
 def _alone(run: Run) -> _Alone:
     """Take what is needed of a static run."""
-    windows, cycles = run.windows, run.cycles
-    release_ns = cycles["release_ns"].to_numpy()
-    first = windows["first_cycle"].to_numpy()
+    windows, cycles = run.arrays("windows"), run.arrays("cycles")
+    release_ns, first = cycles["release_ns"], windows["first_cycle"]
     # The release that closes the last window is in no table: a window is taken to be as long as
     # the one before it.
     opened = release_ns[first]
     last = 2 * opened[-1] - opened[-2] if len(opened) > 1 else release_ns[-1]
     open_ns = np.append(opened, last)
     span_ns = np.diff(open_ns)
-    names = [name.removeprefix("u_") for name in windows.columns if name.startswith("u_")]
-    used = {name: windows[f"u_{name}"].to_numpy() for name in names}
+    used = {name.removeprefix("u_"): windows[name] for name in windows if name.startswith("u_")}
     busy_ns = {
         name: np.concatenate(([0.0], np.cumsum(shares * span_ns))) for name, shares in used.items()
     }
-    latency_ns = cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()
-    return _Alone(release_ns, latency_ns, first, used, open_ns, busy_ns)
+    return _Alone(release_ns, cycles["latency_ns"], first, used, open_ns, busy_ns)

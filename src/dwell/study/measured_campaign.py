@@ -22,7 +22,7 @@ from dwell.study.comparison import Comparison
 from dwell.study.job_times import jobs_of, links_of, profiles_of
 from dwell.study.measured_run import excluded_windows
 from dwell.study.player import Example
-from dwell.study.summary import Row, busiest_nodes, latency_grid_ms, summarise
+from dwell.study.summary import Row, busiest, latency_grid_ms, summarise
 
 if TYPE_CHECKING:
     import polars as pl
@@ -247,12 +247,14 @@ def _windows(run: Run, problem: Problem, scenario: str, policy: str) -> pl.DataF
     """Return the windows that count, with the busiest node of each tier."""
     import polars as pl
 
-    used = busiest_nodes(problem)
-    return run.windows.filter(~pl.col("warmup")).select(
+    windows = run.windows.filter(~pl.col("warmup"))
+    used = {node: windows[f"u_{node}"].to_numpy() for node in problem.fabric.nodes}
+    robot, edge, _ = busiest(used, problem)
+    return windows.select(
         scenario=pl.lit(scenario),
         policy=pl.lit(policy),
         l95_ms="seen_l95_ms",
         violation_rate="seen_violation_rate",
-        u_robot=used["u_robot"],
-        u_edge=used["u_edge"],
+        u_robot=pl.Series(robot, nan_to_null=True),
+        u_edge=pl.Series(edge, nan_to_null=True),
     )

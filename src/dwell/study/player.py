@@ -225,8 +225,8 @@ def judged_cost(run: Run, problem: Problem) -> float:
     float
         Without unit; NaN where the controller saw no window.
     """
-    windows = run.windows
-    counted = (~windows["warmup"] & windows["cost"].is_not_null()).to_numpy()
+    windows = run.arrays("windows")
+    counted = ~windows["warmup"] & ~np.isnan(windows["cost"])
     costs = judged_costs(run, problem)[counted]
     return float(costs.mean()) if len(costs) else float("nan")
 
@@ -244,12 +244,9 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
     float64 array, shape (windows,)
         NaN where the controller did not see the window.
     """
-    windows = run.windows
-    names = [problem.candidates[name] for name in windows["placement"]]
+    windows = run.arrays("windows")
+    names = [problem.candidates[name] for name in windows.names("placement").to_list()]
     moved = [0.0, *(hamming(now, then) for then, now in itertools.pairwise(names))]
-    l95_ms, rate = (
-        windows[name].fill_null(np.nan).to_numpy()
-        for name in ("seen_l95_ms", "seen_violation_rate")
-    )
-    switching = np.array(moved[: windows.height])
+    l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
+    switching = np.array(moved[: len(names)])
     return price(l95_ms, rate, *tier_use(windows, problem), switching, problem.objective)

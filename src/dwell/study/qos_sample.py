@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
-from dwell.study.summary import count_in, latency_ms, mean_of, order_statistic
+from dwell.record import arrays_of
+from dwell.study.summary import PARTS, count_in, latency_ms, mean_of, order_statistic
 
 if TYPE_CHECKING:
     import polars as pl
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 
-PARTS = ("compute", "queue", "network")
 CYCLES = (
     "release_ns",
     "placement",
@@ -147,6 +147,7 @@ class QosSample:
         of_window = np.arange(len(windows)) if by_window else run_of_window
         of_cycle = window_of_cycle if by_window else run_of_cycle
         units = sum(lengths)
+        times = arrays_of(cycles)
         final_ms, missed = latency_ms(cycles), cycles["missed"].to_numpy()
         order = np.argsort(final_ms, kind="stable")
         grid_ms = _grid(final_ms[order])
@@ -165,7 +166,7 @@ class QosSample:
                 **_window_sums(windows, problem, of_window, units),
                 "migrations": _migrations(pieces, of_window, units),
             },
-            parts_ms={part: mean_of(cycles[f"{part}_ns"]) / 1e6 for part in PARTS},
+            parts_ms={part: mean_of(times[f"{part}_ns"]) / 1e6 for part in PARTS},
             placed=dict(cycles["placement"].cast(pl.String).value_counts().rows()),
             windows=len(windows),
         )

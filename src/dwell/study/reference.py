@@ -32,16 +32,13 @@ from dwell.cost import hamming, price
 from dwell.errors import SimulationError
 from dwell.estimators import Profile
 from dwell.model import FrozenDict, Problem
-from dwell.model.instants import NEVER_NS
 from dwell.model.window_close import window_close_ns
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
 from dwell.study.script import Script
-from dwell.study.summary import busiest_nodes, mean_of
+from dwell.study.summary import busiest, mean_of
 
 if TYPE_CHECKING:
-    import polars as pl
-
-    from dwell.record import Run
+    from dwell.record import Run, TableArrays
     from dwell.sim import Realisation
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -151,8 +148,8 @@ def references(problem: Problem, realisation: Realisation) -> References:
     costs = {name: mean_cost(run) for name, run in statics.items()}
     alone = np.stack([window_costs(run, problem, realisation) for run in statics.values()], axis=1)
     switching = _switching(problem)
-    windows = statics[names[0]].windows
-    seen, warmup = windows["cost"].is_not_null().to_numpy(), windows["warmup"].to_numpy()
+    windows = statics[names[0]].arrays("windows")
+    seen, warmup = ~np.isnan(windows["cost"]), windows["warmup"]
     sequences, runs, promised = {}, {}, {}
     for title, dwell in dwells.items():
         plan = clairvoyant(
@@ -211,7 +208,7 @@ def kept(run: Run, references: References, problem: Problem, limit: float = 0.05
         windows begin; 1 where the reference misses more in all of them: nothing was asked.
     """
     width, first = problem.window_cycles, problem.warmup_windows * problem.window_cycles
-    missed = [one.cycles["missed"].to_numpy()[first:] for one in (references.run, run)]
+    missed = [one.arrays("cycles")["missed"][first:] for one in (references.run, run)]
     count = min(map(len, missed)) // width
     theirs, mine = (one[: count * width].reshape(count, width).mean(axis=1) for one in missed)
     asked = theirs <= limit
@@ -226,11 +223,12 @@ def mean_cost(run: Run) -> float:
     SimulationError
         If there is none.
     """
-    windows = run.windows
-    mean = mean_of(windows.filter(~windows["warmup"])["cost"])
+    windows = run.arrays("windows")
+    warmup = windows["warmup"]
+    mean = mean_of(windows["cost"][~warmup])
     if math.isnan(mean):
         raise SimulationError(
-            f"of {windows.height} windows none is left that is after the warm-up and that the "
+            f"of {len(warmup)} windows none is left that is after the warm-up and that the "
             "controller saw; ask for more windows"
         )
     return mean
@@ -251,32 +249,32 @@ def window_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats
     -------
     float64 array, shape (windows,)
     """
-    cost = run.windows["cost"]
-    costs: Floats = cost.to_numpy().copy()
-    unseen = cost.is_null().to_numpy()
+    costs: Floats = run.arrays("windows")["cost"].copy()
+    unseen = np.isnan(costs)
     if unseen.any():
-        costs[unseen] = _unseen_costs(run, problem, realisation)
+        costs[unseen] = _unseen_costs(run, unseen, problem, realisation)
     return costs
 
 
-def _unseen_costs(run: Run, problem: Problem, realisation: Realisation) -> Floats:
+def _unseen_costs(
+    run: Run, unseen: NDArray[np.bool_], problem: Problem, realisation: Realisation
+) -> Floats:
     """J of the windows that the controller did not see, in their order."""
-    windows = run.windows.filter(run.windows["cost"].is_null())
-    first = windows["first_cycle"].to_numpy()
-    rows = first[:, None] + np.arange(problem.window_cycles)
-    latency_ns = run.cycles["latency_ns"].fill_null(NEVER_NS).to_numpy()[rows]
+    windows = run.arrays("windows")
+    rows = windows["first_cycle"][unseen][:, None] + np.arange(problem.window_cycles)
+    latency_ns = run.arrays("cycles")["latency_ns"][rows]
     release_ns = realisation.release_ns
     close_ns = window_close_ns(problem, release_ns[rows[:, -1]], release_ns[rows[:, -1] + 1])
     age_ns = close_ns[:, None] - release_ns[rows]
     l95_ms, _ = seen_l95_ms(latency_ns, age_ns, problem.censor_ms)
-    rate = windows["violation_rate"].to_numpy()
-    return price(l95_ms, rate, *tier_use(windows, problem), 0.0, problem.objective)
+    rate = windows["violation_rate"][unseen]
+    robot, edge, cloud = (share[unseen] for share in tier_use(windows, problem))
+    return price(l95_ms, rate, robot, edge, cloud, 0.0, problem.objective)
 
 
-def tier_use(windows: pl.DataFrame, problem: Problem) -> tuple[Floats, Floats, Floats]:
+def tier_use(windows: TableArrays, problem: Problem) -> tuple[Floats, Floats, Floats]:
     """Utilisation of the busiest node of each tier, robot, edge and cloud, in every window."""
-    robot, edge, cloud = windows.select(**busiest_nodes(problem)).fill_null(0.0)
-    return robot.to_numpy(), edge.to_numpy(), cloud.to_numpy()
+    return busiest({node: windows[f"u_{node}"] for node in problem.fabric.nodes}, problem)
 
 
 def _in_time(problem: Problem) -> Problem:

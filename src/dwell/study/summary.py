@@ -21,9 +21,9 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,15 +38,19 @@ from dwell.study.quality import actuations, age_of_information, misses_in, track
 if TYPE_CHECKING:
     import polars as pl
 
-    from dwell.record import Run
+    from dwell.record import Names, Run, TableArrays
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
+Mask: TypeAlias = NDArray[np.bool_]
 Row: TypeAlias = dict[str, float | int | str]
 
 #: Points of the latency distributions: so many to a deadline, up to four deadlines.
 GRID_PER_DEADLINE = 80
 DEADLINES = 4
+
+#: Parts of a latency.
+PARTS = ("compute", "queue", "network")
 
 #: Column of what tells runs apart that differ in anything but their names.
 PLAYED = "played"
@@ -140,19 +144,23 @@ def count_in(run: Run, window_cycles: int) -> Counted:
     SimulationError
         If the run has no window after its warm-up.
     """
-    windows, decisions, cycles = run.windows, run.decisions, run.cycles
-    windows = windows.filter(~windows["warmup"])
-    if windows.is_empty():
+    windows, decisions, cycles = _counting(run, window_cycles)
+    return Counted(run.windows.filter(windows), run.decisions.filter(decisions), run.cycles[cycles])
+
+
+def _counting(run: Run, window_cycles: int) -> tuple[Mask, Mask, slice]:
+    """Return which windows, decisions and cycles count (see `count_in`)."""
+    windows = run.arrays("windows")
+    counts = ~windows["warmup"]
+    if not counts.any():
         raise SimulationError(
-            f"none of {run.windows.height} windows is left after the warm-up; ask for more windows"
+            f"none of {len(counts)} windows is left after the warm-up; ask for more windows"
         )
-    begin, end = windows["first_cycle"][0], windows["first_cycle"][-1] + window_cycles
-    first, after = np.searchsorted(cycles["cycle"].to_numpy(), (begin, end)).tolist()
-    return Counted(
-        windows,
-        decisions.filter(decisions["window"] >= windows["window"][0]),
-        cycles.slice(first, after - first),
-    )
+    first_cycle = windows["first_cycle"][counts]
+    ends = (first_cycle[0], first_cycle[-1] + window_cycles)
+    begin, end = np.searchsorted(run.arrays("cycles")["cycle"], ends).tolist()
+    decided = run.arrays("decisions")["window"] >= windows["window"][counts][0]
+    return counts, decided, slice(begin, end)
 
 
 def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Summary:
@@ -170,51 +178,52 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     SimulationError
         If the run has no window after its warm-up.
     """
-    windows, decisions, cycles = count_in(run, problem.window_cycles)
-    missed = cycles["missed"].to_numpy()
-    # Also those of the warm-up: what took effect in it may last.
-    after = int(np.searchsorted(run.cycles["cycle"].to_numpy(), cycles["cycle"][-1])) + 1
-    release_ns = run.cycles["release_ns"].to_numpy()[:after]
-    latency_ns = _final_ns(run.cycles["latency_ns"])[:after]
-    counted_ns = latency_ns[after - cycles.height :]
-    latencies = Latencies.of(counted_ns, problem.pipeline.deadline_ms)
+    counts, decided, counted = _counting(run, problem.window_cycles)
+    windows, decisions, cycles = (run.arrays(name) for name in ("windows", "decisions", "cycles"))
+    missed, final_ns = cycles["missed"][counted], cycles["latency_ns"][counted]
+    latencies = Latencies.of(final_ns, problem.pipeline.deadline_ms)
+    placed = windows.names("placement")[counts]
+    active = {name: placed.equal(name) for name in problem.candidates}
+    used = {node: windows[f"u_{node}"][counts] for node in problem.fabric.nodes}
     row: Row = {
         **labels,
-        "windows": windows.height,
-        "cycles": cycles.height,
-        "violation_rate": np.count_nonzero(missed) / len(missed),
-        "l95_ms": mean_of(windows["seen_l95_ms"]),
+        "windows": int(counts.sum()),
+        "cycles": len(missed),
+        "violation_rate": share_of(missed),
+        "l95_ms": mean_of(windows["seen_l95_ms"][counts]),
         **_percentiles(latencies),
-        **_utilisation(windows, problem),
-        **_migrations(decisions),
-        **_shares(windows["placement"], tuple(problem.candidates)),
-        "cost": mean_of(windows["cost"]),
-        **_unfinished(cycles["outcome"]),
+        **_utilisation(used, problem),
+        **_migrations(decisions, decided),
+        **{SHARE_OF.format(candidate=name): share_of(those) for name, those in active.items()},
+        "cost": mean_of(windows["cost"][counts]),
+        **_unfinished(cycles.names("outcome")[counted]),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
-        **_actuator(release_ns, latency_ns, cycles.height, problem),
-        "compute_ms": mean_of(cycles["compute_ns"]) / 1e6,
-        "queue_ms": mean_of(cycles["queue_ns"]) / 1e6,
-        "network_ms": mean_of(cycles["network_ns"]) / 1e6,
-        PLAYED: _played(windows, cycles["placement"], counted_ns, problem),
+        **_actuator(cycles, counted, problem),
+        **{f"{part}_ms": mean_of(cycles[f"{part}_ns"][counted]) / 1e6 for part in PARTS},
+        PLAYED: _played(final_ns, cycles.names("placement")[counted], used, problem),
     }
-    return Summary(row, _costs(windows, decisions, problem, labels), latencies.within)
+    incumbent, cost = decisions.names("incumbent"), windows["cost"][counts]
+    costs: list[Row] = [
+        {
+            **labels,
+            "candidate": name,
+            "estimated": mean_of(decisions[f"j_{name}"][decided & ~incumbent.equal(name)]),
+            "measured": mean_of(cost[those]),
+            "windows": int(those.sum()),
+        }
+        for name, those in active.items()
+    ]
+    return Summary(row, costs, latencies.within)
 
 
-def _final_ns(latency_ns: pl.Series) -> Ints:
-    """Final latencies, `NEVER_NS` where the cycle never finished."""
-    if latency_ns.null_count():
-        latency_ns = latency_ns.set(latency_ns.is_null(), NEVER_NS)
-    return latency_ns.to_numpy()
-
-
-def _unfinished(outcomes: pl.Series) -> dict[str, int]:
+def _unfinished(outcomes: Names) -> dict[str, int]:
     """Count the cycles that were lost, and those that were under way at the end."""
-    done, in_flight = (int((outcomes == name).sum()) for name in ("done", "in_flight"))
-    return {"lost": outcomes.count() - done - in_flight, "in_flight": in_flight}
+    done, in_flight = (int(outcomes.equal(name).sum()) for name in ("done", "in_flight"))
+    return {"lost": len(outcomes.places) - done - in_flight, "in_flight": in_flight}
 
 
-def _played(windows: pl.DataFrame, placed: pl.Series, latency_ns: Ints, problem: Problem) -> str:
+def _played(latency_ns: Ints, placed: Names, used: Mapping[str, Floats], problem: Problem) -> str:
     """Digest of what was played: of runs on one realisation, equal ones are the same run.
 
     It is that of every cycle's placement and latency, and of the nodes' utilisation, to which
@@ -222,20 +231,20 @@ def _played(windows: pl.DataFrame, placed: pl.Series, latency_ns: Ints, problem:
     """
     digest = hashlib.blake2b(latency_ns.data, digest_size=8)
     for name in problem.candidates:
-        digest.update(np.packbits((placed == name).to_numpy()).data)
-    for node in problem.fabric.nodes:
-        digest.update(windows[f"u_{node}"].to_numpy().data)
+        digest.update(np.packbits(placed.equal(name)).data)
+    for share in used.values():
+        digest.update(share.data)
     return digest.hexdigest()
 
 
-def longest_streak(missed: NDArray[np.bool_]) -> int:
+def longest_streak(missed: Mask) -> int:
     """Length of the longest run of consecutive misses."""
     hits = np.flatnonzero(~missed)
     ends = np.concatenate(([-1], hits, [len(missed)]))
     return int(np.diff(ends).max()) - 1
 
 
-def _misses(missed: NDArray[np.bool_]) -> dict[str, float]:
+def _misses(missed: Mask) -> dict[str, float]:
     """Misses in stretches of K cycles: the most, and the share of stretches with more than 5 %."""
     row: dict[str, float] = {}
     every = misses_in(missed, STRETCHES)
@@ -245,18 +254,14 @@ def _misses(missed: NDArray[np.bool_]) -> dict[str, float]:
     return row
 
 
-def _actuator(
-    release_ns: Ints, latency_ns: Ints, counted: int, problem: Problem
-) -> dict[str, float]:
-    """Age at the actuator and tracking error, until a period after the last release.
+def _actuator(cycles: TableArrays, counted: slice, problem: Problem) -> dict[str, float]:
+    """Age at the actuator and tracking error, until a period after the last counted release.
 
-    Parameters
-    ----------
-    release_ns, latency_ns : int64 array
-        Every cycle from the first on; the last `counted` of them count.
+    What took effect before the first of them may still last, so that every cycle played is needed.
     """
-    actuated = actuations(release_ns, latency_ns)
-    begin_ns = int(release_ns[-counted])
+    release_ns = cycles["release_ns"][: counted.stop]
+    actuated = actuations(release_ns, cycles["latency_ns"][: counted.stop])
+    begin_ns = int(release_ns[counted.start])
     end_ns = int(release_ns[-1]) + round(problem.pipeline.period_ms * 1e6)
     age = age_of_information(actuated, begin_ns, end_ns)
     row = {f"aoi_{name}": value for name, value in age._asdict().items()}
@@ -266,10 +271,44 @@ def _actuator(
     return row
 
 
-def mean_of(values: pl.Series) -> float:
-    """Return the mean of what is there; NaN where nothing is."""
-    mean = values.mean()
-    return float(mean) if isinstance(mean, float) else float("nan")
+def mean_of(values: NDArray[Any]) -> float:
+    """Return the mean of what is there; NaN where nothing is.
+
+    Floats are added in Polars' order, so that the mean is that of the same column of a table, to
+    the last bit: rows of 128 in pairs, after those that fill none; in a row, 16 sums side by side.
+
+    Parameters
+    ----------
+    values : float64 array, NaN where there is none; or int64 array, `NEVER_NS` where there is none
+    """
+    if values.dtype == np.int64:
+        there = values if values.max(initial=0) < NEVER_NS else values[values < NEVER_NS]
+        return int(there.sum()) / len(there) if len(there) else float("nan")
+    missing = np.isnan(values)
+    count = len(values) - int(missing.sum())
+    if not count:
+        return float("nan")
+    terms: Floats = np.where(missing, 0.0, values)
+    begin = len(terms) % 128
+    sums: Floats = terms[begin:].reshape(-1, 8, 16).sum(axis=1)
+    for width in (8, 4):
+        sums = sums[:, :width] + sums[:, width:]
+    rows = (sums[:, 0] + sums[:, 2]) + (sums[:, 1] + sums[:, 3])
+    ahead: float = sum(terms[:begin].tolist())
+    return (_sum_of_pairs(rows.tolist()) + ahead) / count
+
+
+def _sum_of_pairs(values: Sequence[float]) -> float:
+    """Add the sums of both halves."""
+    if len(values) < 2:
+        return values[0] if values else 0.0
+    half = len(values) // 2
+    return _sum_of_pairs(values[:half]) + _sum_of_pairs(values[half:])
+
+
+def share_of(those: Mask) -> float:
+    """Return the share of rows of which something is true; at least one."""
+    return float(np.count_nonzero(those) / len(those))
 
 
 def latency_ms(cycles: pl.DataFrame) -> Floats:
@@ -291,66 +330,38 @@ def _percentiles(latencies: Latencies) -> dict[str, float]:
     return {"p95_ms": p95, "p50_ms": p50, "spread_ms": p95 - p50 if p50 < np.inf else np.inf}
 
 
-def busiest_nodes(problem: Problem) -> dict[str, pl.Expr]:
-    """Utilisation of the busiest node of each tier in a window; 0 of a tier without nodes.
+def busiest(used: Mapping[str, Floats], problem: Problem) -> tuple[Floats, Floats, Floats]:
+    """Utilisation of the busiest node of each tier, robot, edge and cloud, in every window.
 
-    Returns
-    -------
-    dict of str to expression
-        ``u_robot``, ``u_edge`` and ``u_cloud``, of the columns of windows.
+    Parameters
+    ----------
+    used : mapping of str to float64 array, shape (windows,)
+        Utilisation of every node. A tier without nodes has 0.
     """
-    import polars as pl
+    none = np.zeros(len(next(iter(used.values()))))
+    robot, edge, cloud = (
+        np.fmax.reduce([used[node] for node in nodes]) if nodes else none
+        for nodes in tier_nodes(problem.objective)
+    )
+    return robot, edge, cloud
 
-    return {
-        f"u_{tier}": pl.max_horizontal([f"u_{node}" for node in nodes]) if nodes else pl.lit(0.0)
-        for tier, nodes in tier_nodes(problem.objective)._asdict().items()
-    }
 
-
-def _utilisation(windows: pl.DataFrame, problem: Problem) -> dict[str, float]:
+def _utilisation(used: Mapping[str, Floats], problem: Problem) -> dict[str, float]:
     """Mean over windows of the busiest node of a tier, and of every node."""
-    busiest = windows.select(**busiest_nodes(problem))
-    used = {name: mean_of(busiest[name]) for name in ("u_robot", "u_edge")}
-    return used | {
-        NODE_OF.format(node=node): mean_of(windows[f"u_{node}"]) for node in problem.fabric.nodes
+    robot, edge, _ = busiest(used, problem)
+    return {
+        "u_robot": mean_of(robot),
+        "u_edge": mean_of(edge),
+        **{NODE_OF.format(node=node): mean_of(share) for node, share in used.items()},
     }
 
 
-def _migrations(decisions: pl.DataFrame) -> dict[str, int]:
+def _migrations(decisions: TableArrays, decided: Mask) -> dict[str, int]:
     """Count migrations, those that undo the one before, and the guard's moves, which are apart."""
-    migrated, by_guard = decisions["migrated"], decisions["reason"] == "guard"
-    moves = migrated & ~by_guard
-    pairs = [
-        *zip(*(decisions[end].filter(moves) for end in ("incumbent", "placement")), strict=True)
-    ]
+    migrated = decided & decisions["migrated"]
+    by_guard = decisions.names("reason").equal("guard")
+    ends = (decisions.names(end)[migrated & ~by_guard] for end in ("incumbent", "placement"))
+    pairs = list(zip(*(end.to_list() for end in ends), strict=True))
     undone = sum(now == before[::-1] for before, now in itertools.pairwise(pairs))
     guard_moves = int((migrated & by_guard).sum())
     return {"migrations": len(pairs), "returns": undone, "guard_moves": guard_moves}
-
-
-def _shares(placements: pl.Series, candidates: tuple[str, ...]) -> dict[str, float]:
-    """Share of windows that began under each candidate."""
-    return {SHARE_OF.format(candidate=name): mean_of(placements == name) for name in candidates}
-
-
-def _costs(
-    windows: pl.DataFrame,
-    decisions: pl.DataFrame,
-    problem: Problem,
-    labels: Mapping[str, str | int],
-) -> list[Row]:
-    """Estimated J of every candidate while another was active, and its measured J."""
-    rows: list[Row] = []
-    for name in problem.candidates:
-        idle = decisions[f"j_{name}"].filter(decisions["incumbent"] != name)
-        active = windows["cost"].filter(windows["placement"] == name)
-        rows.append(
-            {
-                **labels,
-                "candidate": name,
-                "estimated": mean_of(idle),
-                "measured": mean_of(active),
-                "windows": active.len(),
-            }
-        )
-    return rows
