@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -81,19 +82,10 @@ class Profile:
         require(1 <= samples <= 10_000_000, "samples", samples, "from 1 to 10000000")
         require(seed >= 0, "seed", seed, "a whole number of at least 0")
         self._samples, self._seed = samples, seed
-        cycles = SampleCycles(problem, samples, seed)
-        uncut_l95_ms, violation_rate, own = {}, {}, {}
-        for name, placement in problem.candidates.items():
-            latency_ms = cycles.latency_ms(placement)
-            uncut_l95_ms[name] = order_statistic(latency_ms)
-            late = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
-            violation_rate[name] = int(late) / samples
-            own[name] = FrozenDict(cycles.own_work(placement))
+        uncut_l95_ms, violation_rate, own = _sampled(problem, samples, seed)
         l95_ms = {name: min(uncut, problem.censor_ms) for name, uncut in uncut_l95_ms.items()}
         self.l95_ms: Mapping[str, float] = FrozenDict(l95_ms)
-        self.uncut_l95_ms: Mapping[str, float] = FrozenDict(uncut_l95_ms)
-        self.violation_rate: Mapping[str, float] = FrozenDict(violation_rate)
-        self.own: Mapping[str, Mapping[str, float]] = FrozenDict(own)
+        self.uncut_l95_ms, self.violation_rate, self.own = uncut_l95_ms, violation_rate, own
         self._nodes = tuple(problem.fabric.nodes)
         self._table = tuple(
             (name, l95_ms[name], uncut_l95_ms[name], violation_rate[name], tuple(own[name].items()))
@@ -145,6 +137,22 @@ class Profile:
                 utilisation[node] = shown.get(name, 1.0)
             estimates[name] = QoS(l95_ms, violation_rate, FrozenDict(utilisation), uncut_ms)
         return estimates
+
+
+@lru_cache(maxsize=8)
+def _sampled(
+    problem: Problem, samples: int, seed: int
+) -> tuple[Mapping[str, float], Mapping[str, float], Mapping[str, Mapping[str, float]]]:
+    """Return L95 (ms), V_D and own work of every candidate; a study asks once a run."""
+    cycles = SampleCycles(problem, samples, seed)
+    uncut_l95_ms, violation_rate, own = {}, {}, {}
+    for name, placement in problem.candidates.items():
+        latency_ms = cycles.latency_ms(placement)
+        uncut_l95_ms[name] = order_statistic(latency_ms)
+        late = np.count_nonzero(latency_ms > problem.pipeline.deadline_ms)
+        violation_rate[name] = int(late) / samples
+        own[name] = FrozenDict(cycles.own_work(placement))
+    return FrozenDict(uncut_l95_ms), FrozenDict(violation_rate), FrozenDict(own)
 
 
 class SampleCycles:
