@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.errors import Fault, ProblemError
@@ -366,7 +367,8 @@ def find_clashes(nodes: Sequence[str], candidates: Sequence[str]) -> Iterator[Cl
                     yield Clash(table, first, column)
 
 
-def require_apart(nodes: Sequence[str], candidates: Sequence[str]) -> None:
+@cache
+def require_apart(nodes: tuple[str, ...], candidates: tuple[str, ...]) -> None:
     """Refuse names of a cell of which two columns of a table would be called the same.
 
     Raises

@@ -38,7 +38,7 @@ class Run(Displayed):
 
     Parameters
     ----------
-    meta : mapping
+    meta : mapping, or function that makes it
         JSON-able: problem, scenario, policy, seed, versions, schema version.
     tables : mapping of str to DataFrame, or to a function that makes it
         ``cycles``, ``windows``, ``decisions`` and, on request, ``jobs`` and ``processes``; made
@@ -49,11 +49,11 @@ class Run(Displayed):
 
     def __init__(
         self,
-        meta: Mapping[str, Any],
+        meta: Mapping[str, Any] | Callable[[], Mapping[str, Any]],
         tables: Mapping[str, Table],
         arrays: Mapping[str, Callable[[], TableArrays]] | None = None,
     ) -> None:
-        self.meta: dict[str, Any] = {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
+        self._meta = meta if callable(meta) else dict(meta)
         self._tables: dict[str, Table] = dict(tables)
         self._arrays = dict(arrays or {})
 
@@ -65,6 +65,12 @@ class Run(Displayed):
         return (
             f"<Run of {name or 'an unknown cell'}, {self.meta.get('kind', 'simulated')}: {known}>"
         )
+
+    @cached_property
+    def meta(self) -> dict[str, Any]:
+        """What it is the record of, ready for JSON."""
+        meta = self._meta() if callable(self._meta) else self._meta
+        return {**_in_todays_words(meta), "schema_version": SCHEMA_VERSION}
 
     def _table(self, name: str) -> pl.DataFrame:
         table = self._tables[name]

@@ -104,7 +104,8 @@ def simulate_realisation(
         # Until the first probe is sent a shadow changes nothing, so that this repeats what has been
         # played. Drawing shadows for every run that may want probes would cost all runs more.
         played = _play(problem, realisation, policy, estimator, jobs, guard, by_window, shadow=True)
-    meta = _meta(
+    meta = partial(
+        _meta,
         problem,
         played.controller,
         scenario=realisation.scenario,
