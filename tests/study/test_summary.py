@@ -23,6 +23,7 @@ from dwell.study.summary import (
     count_in,
     latency_grid_ms,
     longest_streak,
+    mean_of,
     order_statistic,
     summarise,
 )
@@ -226,6 +227,29 @@ def test_a_distribution_is_that_of_comparing_with_every_point(
         ns = ascending_ns[-(-percent * len(ascending_ns) // 100) - 1]
         expected = float(ns) / 1e6 if ns < NEVER_NS else math.inf
         assert latencies.percentile_ms(percent) == expected
+
+
+@given(
+    st.lists(
+        st.one_of(st.none(), st.floats(-1e12, 1e12), st.just(math.inf)), min_size=0, max_size=700
+    ),
+    st.integers(0, 2000),
+)
+def test_a_mean_is_that_of_the_column_of_a_table_to_the_last_bit(
+    values: list[float | None], more: int
+) -> None:
+    drawn = np.random.default_rng(more).lognormal(size=more)
+    series = pl.Series([*values, *drawn], dtype=pl.Float64)
+    mean = mean_of(series.to_numpy())
+    expected = series.mean()
+    assert mean == expected if expected is not None else math.isnan(mean)
+
+
+@given(st.lists(st.one_of(st.none(), st.integers(0, 10**12)), max_size=300))
+def test_a_mean_of_whole_numbers_is_exact(values: list[int | None]) -> None:
+    mean = mean_of(np.array([NEVER_NS if one is None else one for one in values], np.int64))
+    expected = pl.Series(values, dtype=pl.Int64).mean()
+    assert mean == expected if expected is not None else math.isnan(mean)
 
 
 def test_tracking_is_shown_where_the_cell_has_a_servo() -> None:
