@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -95,3 +98,24 @@ def test_a_realisation_is_drawn_once_for_all_that_share_it(
     assert sorted(whole) == sorted(
         (scenario, seed, 6) for scenario in study.scenarios for seed in (1, 2)
     )
+
+
+ALONE = """
+import pickle, sys
+player, item = pickle.load(sys.stdin.buffer)
+played = player(item)
+assert len(played.summaries) == 4
+print([name for name in ("polars", "pydantic", "typer") if name in sys.modules])
+"""
+
+
+def test_a_worker_plays_and_sums_up_without_tables() -> None:
+    """What it loads besides, every worker of a study pays for."""
+    study = make_study(references=True)
+    sent = pickle.dumps((Player(study), study.items()[0]))
+    # A problem with traces is larger; it is sent once to a worker.
+    assert len(sent) < 10_000
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE], input=sent, stdout=subprocess.PIPE, check=True
+    )
+    assert done.stdout.decode().strip() == "[]"

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from dwell.cli.completion import LINE, answer
 from dwell.cli.exit_codes import ExitCode
 
 if TYPE_CHECKING:
@@ -29,6 +28,9 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
     # Pydantic would look for plugins in all that is installed; Dwell uses none.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     try:
+        # Here, since the workers of a study import this module with the script that they are of.
+        from dwell.cli.completion import LINE, answer
+
         if LINE in os.environ:
             return answer(os.environ[LINE])
         from dwell.cli import first_answer

@@ -1,26 +1,38 @@
 """Studies: many runs, and the statistics over their seeds."""
 
-from dwell.study.comparison import AIM, Comparison, compare
-from dwell.study.demo import (
-    canonical_demo,
-    longest_run,
-    real_demo,
-    stored_deadlines,
-    tenants_demo,
-)
-from dwell.study.family import SAME_RUN, UNTOLD, Family, same_run, untold
-from dwell.study.hindsight import Hindsight
-from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
-from dwell.study.kept_bounds import keeps
-from dwell.study.over_seeds import over_seeds, windows_behind
-from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
-from dwell.study.player import Example
-from dwell.study.predictions import paper_predictions
-from dwell.study.results import StudyRuns
-from dwell.study.runner import StudyResult, run_study
-from dwell.study.study import Contender, Point, Study, load_study
-from dwell.study.study_folder import open_study
-from dwell.study.validation import Validation, validate
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dwell.study.comparison import AIM, Comparison, compare
+    from dwell.study.demo import (
+        canonical_demo,
+        longest_run,
+        real_demo,
+        stored_deadlines,
+        tenants_demo,
+    )
+    from dwell.study.family import SAME_RUN, UNTOLD, Family, same_run, untold
+    from dwell.study.hindsight import Hindsight
+    from dwell.study.intervals import (
+        Interval,
+        mean_interval,
+        median_interval,
+        share_interval,
+        under,
+    )
+    from dwell.study.kept_bounds import keeps
+    from dwell.study.over_seeds import over_seeds, windows_behind
+    from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
+    from dwell.study.player import Example
+    from dwell.study.predictions import paper_predictions
+    from dwell.study.results import StudyRuns
+    from dwell.study.runner import StudyResult, run_study
+    from dwell.study.study import Contender, Point, Study, load_study
+    from dwell.study.study_folder import open_study
+    from dwell.study.validation import Validation, validate
 
 __all__ = [
     "AIM",
@@ -62,3 +74,55 @@ __all__ = [
     "validate",
     "windows_behind",
 ]
+
+_HOME = {
+    "AIM": "dwell.study.comparison",
+    "SAME_RUN": "dwell.study.family",
+    "UNTOLD": "dwell.study.family",
+    "Comparison": "dwell.study.comparison",
+    "Contender": "dwell.study.study",
+    "Example": "dwell.study.player",
+    "Family": "dwell.study.family",
+    "Hindsight": "dwell.study.hindsight",
+    "Interval": "dwell.study.intervals",
+    "PairedDifference": "dwell.study.pairs",
+    "PairedMedian": "dwell.study.pairs",
+    "Point": "dwell.study.study",
+    "Study": "dwell.study.study",
+    "StudyResult": "dwell.study.runner",
+    "StudyRuns": "dwell.study.results",
+    "Validation": "dwell.study.validation",
+    "canonical_demo": "dwell.study.demo",
+    "compare": "dwell.study.comparison",
+    "keeps": "dwell.study.kept_bounds",
+    "load_study": "dwell.study.study",
+    "longest_run": "dwell.study.demo",
+    "mean_interval": "dwell.study.intervals",
+    "median_interval": "dwell.study.intervals",
+    "open_study": "dwell.study.study_folder",
+    "over_seeds": "dwell.study.over_seeds",
+    "paired_difference": "dwell.study.pairs",
+    "paired_median": "dwell.study.pairs",
+    "paper_predictions": "dwell.study.predictions",
+    "real_demo": "dwell.study.demo",
+    "run_study": "dwell.study.runner",
+    "same_run": "dwell.study.family",
+    "share_interval": "dwell.study.intervals",
+    "stored_deadlines": "dwell.study.demo",
+    "tenants_demo": "dwell.study.demo",
+    "under": "dwell.study.intervals",
+    "untold": "dwell.study.family",
+    "validate": "dwell.study.validation",
+    "windows_behind": "dwell.study.over_seeds",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for: a worker plays, and needs no statistics (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'dwell.study' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})
