@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -15,6 +16,9 @@ from typing import Any
 import pytest
 
 from dwell.errors import FURTHER, OPTIONAL, missing_package
+from dwell.kernels.library import INSTALL_AGAIN
+from dwell.kernels.library_file import NAME
+from tests.kernels.compilers import run_with
 
 ROOT = Path(__file__).parents[1]
 DISTRIBUTIONS = packages_distributions()
@@ -122,6 +126,22 @@ def test_a_simulation_without_a_package_says_how_to_get_it(module: str, tmp_path
     assert done.returncode == 1
     assert done.stderr.endswith("is not installed; pip install 'dwell-placement[sim]'\n")
     assert "Traceback" not in done.stderr
+
+
+def test_a_study_without_the_kernel_says_how_to_get_it(tmp_path: Path) -> None:
+    left_out = shutil.ignore_patterns(NAME, "__pycache__")
+    shutil.copytree(ROOT / "src" / "dwell", tmp_path / "dwell", ignore=left_out)
+    study = tmp_path / "study.yaml"
+    study.write_text(
+        f"dwell-study: 1\nname: small\ncell: {ROOT / 'examples' / 'canonical.yaml'}\n"
+        "policies: [LOC, dtp]\nscenarios: [baseline]\nseeds: 1\nwindows: 6\n",
+        encoding="utf-8",
+    )
+    words = ("-m", "dwell", "study", study, "--processes", "2", "--out", tmp_path / "out")
+    done = run_with(tmp_path, *words, NUMBA_DISABLE_JIT="1")
+    file = tmp_path / "dwell" / "kernels" / NAME
+    lacking = f"the compiled kernel {file} is missing; {INSTALL_AGAIN}"
+    assert (done.returncode, done.stderr) == (1, f"error: {lacking}\n")
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dwell.errors import KernelError
+from dwell.kernels import servo_loop
 from dwell.kernels.library import compiler, digest, library, load
 from dwell.kernels.library_file import MACHINES, NAME, source_digest
 
@@ -119,3 +124,54 @@ def test_the_line_that_mends_is_one_for_a_shell(checkout: Path) -> None:
     kernels = spaced / "src" / "dwell" / "kernels"
     (kernels / NAME).write_bytes(b"")
     assert refusal(kernels) == f"is no library; rm '{kernels / NAME}' && make env"
+
+
+# ----------------------------------------------------------------------- threads and processes
+
+
+def test_threads_that_load_it_at_once_share_it(folder: Path) -> None:
+    with ThreadPoolExecutor(8) as threads:
+        loaded = list(threads.map(load, [folder] * 8))
+    assert len({one._handle for one in loaded}) == 1
+
+
+class Loop:
+    """A long servo loop, whose result is known."""
+
+    def __init__(self, n: int) -> None:
+        released = 0.03 * np.arange(n, dtype=np.float64)
+        self.instants = released, released + 0.035
+        self.end = 0.03 * n
+        self.expected = self.play()
+
+    def play(self) -> bytes:
+        states = np.zeros((len(self.instants[0]) + 1, servo_loop.N_STATE))
+        integrals = np.empty(2)
+        stretch = *self.instants, 0.0, self.end
+        servo_loop.follow(*stretch, True, 30.0, 8.0, 40.0, 3.9, states, integrals)
+        return states.tobytes() + integrals.tobytes()
+
+
+def test_two_threads_call_it_at_once() -> None:
+    loop = Loop(300_000)
+    with ThreadPoolExecutor(2) as threads:
+        calls = [threads.submit(loop.play) for _ in range(2)]
+    assert [call.result() == loop.expected for call in calls] == [True, True]
+
+
+def test_python_s_lock_is_not_held_during_a_call() -> None:
+    assert not isinstance(library(), ctypes.PyDLL)
+
+
+def test_a_process_that_forks_during_a_call_has_two_that_can_call() -> None:
+    long, short = Loop(300_000), Loop(1000)
+    with ThreadPoolExecutor(1) as threads:
+        call = threads.submit(long.play)
+        forked = 0
+        while not forked or not call.done():
+            child = os.fork()
+            if not child:
+                os._exit(short.play() != short.expected)
+            assert os.waitpid(child, 0) == (child, 0)
+            forked += 1
+    assert call.result() == long.expected
