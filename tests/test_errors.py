@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dwell import errors
-from dwell.errors import DwellError, Fault, ProblemError, TraceError, missing_package
+from dwell.errors import DwellError, Fault, KernelError, ProblemError, TraceError, missing_package
 
 ROOT = Path(__file__).parents[1]
 KINDS = [
@@ -45,6 +45,12 @@ def test_faults_cross_the_borders_of_processes(kind: type[ProblemError]) -> None
     again = pickle.loads(pickle.dumps(error))
     assert type(again) is kind
     assert (again.faults, again.source, str(again)) == (error.faults, "cell.yaml", str(error))
+
+
+def test_a_flaw_of_the_kernel_crosses_them_too() -> None:
+    error = KernelError("it is missing", "make env")
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.remedy) == ("it is missing; make env", "make env")
 
 
 def test_what_is_missing_is_named_with_an_extra_that_brings_it() -> None:

@@ -125,7 +125,24 @@ class SimulationError(DwellError, RuntimeError):
 
 
 class KernelError(DwellError, RuntimeError):
-    """The compiled kernel is missing, damaged, of other sources or for another processor."""
+    """The compiled kernel is missing, damaged, of other sources or for another processor.
+
+    Parameters
+    ----------
+    flaw : str
+        The file, and what is wrong with it.
+    remedy : str
+        The line that mends it.
+    """
+
+    def __init__(self, flaw: str, remedy: str) -> None:
+        super().__init__(flaw, remedy)
+        self.flaw = flaw
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        """Return ``flaw; remedy``."""
+        return f"{self.flaw}; {self.remedy}"
 
 
 class RunError(DwellError, ValueError):

@@ -18,11 +18,23 @@ import pytest
 from numba.core import config
 
 from dwell.cli.first_answer import find_kernels
+from dwell.kernels import library
+from dwell.kernels.library_file import NAME
 from dwell.live.trust.authority import Authority
 from tests.cli.small_cell import ROOT, call
 
 LIVE = ROOT / "examples" / "live" / "cell.yaml"
-PARTS = ["extras", "cache", "CPU", "clocks", "ports", "certificates", "testbed", "runs here"]
+PARTS = [
+    "extras",
+    "kernel",
+    "cache",
+    "CPU",
+    "clocks",
+    "ports",
+    "certificates",
+    "testbed",
+    "runs here",
+]
 OLD = "advance.advance-1.py311.0123456789abcdef.01234567.nbi"
 
 
@@ -47,6 +59,8 @@ def test_every_part_is_looked_at_and_what_is_not_well_says_what_mends_it() -> No
     extras = {one["name"]: one["found"] for one in of("extras", found) if one["ok"]}
     assert re.search(r"numba \d", extras["sim"])
     assert re.search(r"eclipse-zenoh \d", extras["live"])
+    (kernel,) = of("kernel", found)
+    assert kernel["found"] == f"of the sources {library.digest()[:12]}, by {library.compiler()}"
     assert "7450 to 7499" in of("ports", found)[0]["found"]
 
 
@@ -85,6 +99,28 @@ def test_an_extra_that_cannot_be_imported_is_broken(
     assert "no such symbol" in dask["found"]
     assert dask["remedy"] == "pip install --force-reinstall 'dwell-placement[dask]'"
     assert not [o for o in of("runs here", found) if o["ok"] and o["name"].endswith("--dask")]
+
+
+def test_a_kernel_that_is_missing_is_a_note_and_a_damaged_one_is_broken(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(library, "files", lambda _: tmp_path)
+    monkeypatch.setattr("dwell.cli.doctor.files", lambda _: tmp_path)
+    library.library.cache_clear()
+    try:
+        found = doctor()
+        (lacking,) = of("kernel", found)
+        assert not lacking["ok"]
+        assert lacking["found"].endswith(" is missing")
+        assert lacking["remedy"] == library.INSTALL_AGAIN
+        simulating = of("runs here", found)[0]
+        assert simulating["found"] == "not without compiled kernel"
+        assert simulating["remedy"] == library.INSTALL_AGAIN
+        (tmp_path / NAME).touch()
+        (damaged,) = of("kernel", doctor(code=1))
+        assert damaged["found"].endswith(" is no library")
+    finally:
+        library.library.cache_clear()
 
 
 @pytest.mark.parametrize("clear", [False, True])

@@ -16,6 +16,7 @@ from dataclasses import asdict, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from importlib.resources import files
 from pathlib import Path
 
 import typer
@@ -23,7 +24,9 @@ import typer
 import dwell
 from dwell.calibration.machine_conditions import MachineCounters, processor
 from dwell.cli.output import print_json
-from dwell.errors import DISTRIBUTION, OPTIONAL, LiveError, TrustError, installing
+from dwell.errors import DISTRIBUTION, OPTIONAL, KernelError, LiveError, TrustError, installing
+from dwell.kernels import library
+from dwell.kernels.library_file import NAME
 from dwell.live.local_addresses import is_here, taken_ports
 from dwell.model import Host, Problem
 from dwell.model.bounds import counted
@@ -66,16 +69,18 @@ def consult(
     """
     counters = MachineCounters(os.sched_getaffinity(0))
     extras = [_extra(name) for name in EXTRAS]
+    kernel = _kernel()
     testbed = testbed_doctor.examine([] if problem is None else [problem])
     parts = {
         "extras": extras,
+        "kernel": [kernel],
         "cache": list(_cache(clear=clear_cache)),
         "CPU": list(_cpu(counters)),
         "clocks": [_synchronised(), _clock_source()],
         "ports": [_ports(problem)],
         "certificates": list(_certificates(keys, problem)),
         "testbed": [_optional(row.name, row.ok, row.found, row.remedy) for row in testbed],
-        "runs here": list(_runs(extras, testbed)),
+        "runs here": list(_runs(extras, kernel, testbed)),
     }
     well = all(row.ok or not row.needed for rows in parts.values() for row in rows)
     if as_json:
@@ -115,7 +120,7 @@ def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) ->
             )
 
 
-# ------------------------------------------------------------------------- extras and cache
+# ------------------------------------------------------------------------- extras and kernel
 
 
 @cache
@@ -156,6 +161,17 @@ def _extra(name: str) -> Finding:
         found = f"not installed: {', '.join(missing)}"
         return _optional(name, False, found, installing(name))
     return Finding(name, True, ", ".join(there))
+
+
+def _kernel() -> Finding:
+    """Load the compiled kernel; who does not simulate needs none, but none that is damaged."""
+    name = "compiled kernel"
+    try:
+        found = f"of the sources {library.digest()[:12]}, by {library.compiler()}"
+    except KernelError as error:
+        there = files("dwell.kernels").joinpath(NAME).is_file()
+        return Finding(name, False, error.flaw, error.remedy, needed=there)
+    return Finding(name, True, found)
 
 
 def _cache(*, clear: bool) -> Iterator[Finding]:
@@ -361,11 +377,14 @@ def _certificates(keys: Path | None, problem: Problem | None) -> Iterator[Findin
 # ------------------------------------------------------------------------- what runs here
 
 
-def _runs(extras: Sequence[Finding], testbed: Sequence[Finding]) -> Iterator[Finding]:
+def _runs(
+    extras: Sequence[Finding], kernel: Finding, testbed: Sequence[Finding]
+) -> Iterator[Finding]:
     """Yield what works on this computer, by what was found before."""
     named = {extra.name: replace(extra, name=f"the extra {extra.name}") for extra in extras}
     needs = {
         **{EXTRAS[name]: [extra] for name, extra in named.items()},
+        EXTRAS["sim"]: [named["sim"], kernel],
         "dwell testbed": [named["live"], *(part for part in testbed if part.needed)],
     }
     for commands, needed in needs.items():

@@ -53,18 +53,19 @@ def load(folder: Traversable) -> ctypes.CDLL:
     would end the process.
     """
     file = folder.joinpath(NAME)
-    checkout = folder.joinpath("../../../hatch_build.py").is_file()
+    remedy = f"rm {shlex.quote(str(file))} && make env"
     try:
         content = file.read_bytes()
         flaw = _flaw(content, source_digest(folder))
         if not flaw:
             return ctypes.CDLL(str(file))
-        remedy = f"rm {shlex.quote(str(file))} && make env"
     except FileNotFoundError:
         flaw, remedy = "is missing", BUILD
     except OSError as error:
-        flaw, remedy = f"cannot be opened: {error.strerror or error}", BUILD
-    raise KernelError(f"the compiled kernel {file} {flaw}; {remedy if checkout else INSTALL_AGAIN}")
+        flaw = f"cannot be opened: {error.strerror or error}"
+    if not folder.joinpath("../../../hatch_build.py").is_file():
+        remedy = INSTALL_AGAIN
+    raise KernelError(f"the compiled kernel {file} {flaw}", remedy)
 
 
 def _flaw(content: bytes, digest: str) -> str:
