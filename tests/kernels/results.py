@@ -1,4 +1,4 @@
-"""Prints a digest of what the kernel computes: the same by every compiler.
+"""Prints digests of what the kernel computes: the same by every compiler, on every processor.
 
 ``python -m tests.kernels.results``
 """
@@ -6,15 +6,35 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from random import Random
 
 import numpy as np
+import polars
 
+import dwell
 from dwell.kernels import library, servo_loop
+from dwell.model import QoS
+from tests.cells.generated import Scheduler, random_problem, random_stamps
+
+ROOT = Path(__file__).parents[2]
+EVERY: tuple[Scheduler, ...] = ("fair", "fifo", "priority", "turns")
+
+
+class Stamps:
+    """A policy that names one candidate after another."""
+
+    def __init__(self, names: list[str]) -> None:
+        self.names = names[::-1]
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Return the next name."""
+        return self.names.pop()
 
 
 def servo_loops() -> Iterator[bytes]:
-    """Yield the holds and integrals of random loops."""
+    """Yield holds and integrals of random loops."""
     rng = np.random.default_rng(7)
     for case in range(200):
         n = int(rng.integers(0, 300))
@@ -29,6 +49,44 @@ def servo_loops() -> Iterator[bytes]:
         yield integrals.tobytes()
 
 
+def examples() -> Iterator[bytes]:
+    """Yield the tables of the examples' scenarios, under policies that stay and that move."""
+    for name in ("canonical", "fan-in", "cloud"):
+        problem = dwell.load(ROOT / "examples" / f"{name}.yaml")
+        for scenario in problem.scenarios:
+            for policy, guard in ((problem.initial, False), ("dtp", True), ("cusum", False)):
+                run = dwell.simulate(
+                    problem, scenario=scenario, policy=policy, guard=guard, seed=3, windows=9
+                )
+                yield from map(text, (run.cycles, run.windows, run.decisions))
+
+
+def random_cells() -> Iterator[bytes]:
+    """Yield the tables of random cells that move in every window."""
+    for case in range(40):
+        rng = Random(case)
+        problem = random_problem(rng, schedulers=EVERY, orders=bool(case % 2))
+        policy = Stamps(random_stamps(rng, problem, 13))
+        run = dwell.simulate(
+            problem, scenario="disturbed", policy=policy, seed=case, windows=12, jobs=True
+        )
+        yield from map(text, (run.cycles, run.windows, run.decisions, run.jobs))
+
+
+def text(table: polars.DataFrame) -> bytes:
+    """Return the values of a table, each to its last digit."""
+    return table.write_csv().encode()
+
+
+def digest(parts: Iterator[bytes]) -> str:
+    """Return one digest of all."""
+    made = hashlib.sha256()
+    for part in parts:
+        made.update(part)
+    return made.hexdigest()
+
+
 if __name__ == "__main__":
     print(library.compiler())
-    print(hashlib.sha256(b"".join(servo_loops())).hexdigest())
+    for kind in (servo_loops, examples, random_cells):
+        print(kind.__name__, digest(kind()))
