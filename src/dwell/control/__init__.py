@@ -1,6 +1,6 @@
 """The Controller: windows, estimator, policy and order, the same in both engines."""
 
-from dwell.control.controller import ClosedWindow, Controller, DecisionLog, static_columns
+from dwell.control.controller import ClosedWindow, Controller, DecisionLog
 from dwell.control.guard import (
     Failures,
     FallbackRound,
@@ -10,6 +10,7 @@ from dwell.control.guard import (
     parts_of,
     rest_cycles,
 )
+from dwell.control.plain_rule import plain_rule
 from dwell.control.shadows import shadow_stamps
 from dwell.control.windows import final_l95_ms
 from dwell.estimators import Estimator, Evidence, Instants
@@ -30,7 +31,7 @@ __all__ = [
     "Probation",
     "final_l95_ms",
     "parts_of",
+    "plain_rule",
     "rest_cycles",
     "shadow_stamps",
-    "static_columns",
 ]

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
-from dwell.cost import SATURATED, censored, excess, hamming, price, tier_nodes
+from dwell.cost import excess
 from dwell.errors import Fault, MetricError, PolicyError, ProblemError
-from dwell.estimators import Estimator, Evidence, Learner, Profile, Support
+from dwell.estimators import Estimator, Evidence, Learner, Support
 from dwell.estimators import by_name as estimator_by_name
 from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
 from dwell.model.bounds import SHADOW_FRACTION
@@ -149,7 +149,8 @@ class Controller:
         self._censor_ms = problem.censor_ms
         #: By which caps candidates are eligible: the policy's own, where it has any.
         self.objective: Objective = getattr(self.policy, "objective", None) or problem.objective
-        self._has_caps = self.objective.caps != Caps()
+        #: Whether it has any.
+        self.has_caps = self.objective.caps != Caps()
 
     def __repr__(self) -> str:
         policy, estimator = type(self.policy).__name__, type(self.estimator).__name__
@@ -200,13 +201,6 @@ class Controller:
         moves = type(self.policy) is not Static and getattr(self.policy, "guarded", True)
         return bool(moves and self.problem.controller.fallbacks)
 
-    @property
-    def fixed_profile(self) -> Profile | None:
-        """The profile where nothing decided in a window matters, so that all close at once."""
-        estimator = self.estimator
-        never_moves = type(self.policy) is Static and type(estimator) is Profile
-        return estimator if never_moves and isinstance(estimator, Profile) else None
-
     def close(self, window: ClosedWindow, *, proven: str | None = None) -> str:
         """Look at a closed window and decide the placement of the cycles after it.
 
@@ -230,8 +224,8 @@ class Controller:
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
         used, own, shadow = self.utilisation(window)
-        if self._learner is not None and window.evidence is not None:
-            self._learner.learn(window.evidence())
+        if window.evidence is not None:
+            self.learn(window.evidence)
         return self.decide(
             QoS(
                 float(l95_ms),
@@ -243,6 +237,11 @@ class Controller:
             dict(zip(self.nodes, (own + shadow).tolist(), strict=True)),
             proven=proven,
         )
+
+    def learn(self, evidence: Callable[[], Evidence]) -> None:
+        """Have the estimator learn from a window, if it learns, before it is decided on."""
+        if self._learner is not None:
+            self._learner.learn(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
         """Busy, own and shadow share of every node's cores, shape (..., 3, nodes)."""
@@ -391,7 +390,7 @@ class Controller:
         """Whether candidates are within the caps, then by how much they are over them."""
         excesses = [excess(estimate, self.objective) for estimate in known]
         within = [over <= 0 for over in excesses]
-        return [*within, *(excesses if self._has_caps else [None] * len(excesses))]
+        return [*within, *(excesses if self.has_caps else [None] * len(excesses))]
 
     @property
     def supports(self) -> bool:
@@ -488,98 +487,3 @@ def _shadow_fraction(estimator: Estimator, problem: Problem) -> float:
     if message:
         raise ProblemError([Fault(who, message)])
     return float(fraction)
-
-
-def static_columns(
-    controller: Controller, profile: Profile, window: ClosedWindow
-) -> tuple[dict[str, Floats], dict[str, object]]:
-    """Metrics and decisions of all windows of a run that never moves, in one go.
-
-    Bit for bit what `Controller.close` gives window by window (tested).
-
-    Parameters
-    ----------
-    profile : Profile
-        Its `fixed_profile`.
-    window : ClosedWindow
-        All windows as rows.
-
-    Returns
-    -------
-    seen : dict of str to float64 array, shape (windows,)
-        ``l95_ms``, ``violation_rate``, ``cost`` and ``u_<node>``.
-    decisions : dict of str to list, or array of shape (windows,)
-        By `Controller.decision_columns`; NaN for null.
-    """
-    problem, name = controller.problem, controller.incumbent
-    age_ns = window.close_ns - window.release_ns
-    missed = missed_cycles(window.latency_ns, age_ns, controller._deadline_ns)
-    share = controller.utilisation(window)
-    used, own = share[:, 0], share[:, 1]
-    seen_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, controller._censor_ms)
-    seen: dict[str, Floats] = {"l95_ms": seen_ms, "violation_rate": missed / age_ns.shape[-1]}
-    by_node = {node: used[:, i] for i, node in enumerate(controller.nodes)}
-    seen["cost"] = _priced(problem, seen["l95_ms"], seen["violation_rate"], by_node, 0.0)
-    # No other candidate is ever active, so that none is known to leave a full node less than full.
-    foreign = np.where(censored(used, own), 1.0, np.maximum(used - own, 0.0))
-    count = len(used)
-    null = np.full(count, np.nan)
-    priced = getattr(controller.policy, "objective", None) is not None
-    decisions: dict[str, object] = {
-        "window": np.arange(count),
-        "incumbent": [name] * count,
-        "placement": [name] * count,
-        "migrated": np.zeros(count, np.bool_),
-        "reason": ["hold"] * count,
-        "dwell": np.arange(1, count + 1),
-        "delta_j": null,
-    }
-    for candidate, placement in problem.candidates.items():
-        l95_ms, violation_rate, busy = seen["l95_ms"], seen["violation_rate"], by_node
-        capped_ms = uncut_ms
-        if candidate != name:
-            l95_ms = np.full(count, profile.l95_ms[candidate])
-            capped_ms = np.full(count, profile.uncut_l95_ms[candidate])
-            violation_rate = np.full(count, profile.violation_rate[candidate])
-            work = profile.own[candidate]
-            busy = {
-                node: np.minimum(foreign[:, i] + work[node], 1.0)
-                for i, node in enumerate(controller.nodes)
-            }
-        switching = hamming(placement, problem.candidates[name])
-        over = _excess(controller.objective.caps, capped_ms, busy)
-        j = _priced(problem, l95_ms, violation_rate, busy, switching) if priced else null
-        estimated = {
-            "j": j,
-            "est_l95_ms": l95_ms,
-            "est_violation_rate": violation_rate,
-            **{f"est_u_{node}": values for node, values in busy.items()},
-            "eligible": over <= 0,
-            "excess": over if controller._has_caps else null,
-        }
-        decisions.update({f"{what}_{candidate}": values for what, values in estimated.items()})
-    seen.update({f"u_{node}": values for node, values in by_node.items()})
-    return seen, decisions
-
-
-def _excess(caps: Caps, l95_ms: Floats, by_node: Mapping[str, Floats]) -> Floats:
-    """`dwell.cost.excess` of many windows."""
-    largest: Floats = np.maximum.reduce(list(by_node.values()))
-    largest = np.where(largest < SATURATED, largest, np.maximum(largest, 1.0))
-    latency = l95_ms / caps.latency_ms if caps.latency_ms < np.inf else 0.0
-    excess: Floats = np.maximum(latency, largest / caps.utilisation) - 1.0
-    return excess
-
-
-def _priced(
-    problem: Problem,
-    l95_ms: Floats,
-    violation_rate: Floats,
-    by_node: Mapping[str, Floats],
-    switching: float,
-) -> Floats:
-    tiers = [
-        np.maximum.reduce([by_node[node] for node in nodes]) if nodes else np.zeros_like(l95_ms)
-        for nodes in tier_nodes(problem.objective)
-    ]
-    return price(l95_ms, violation_rate, tiers[0], tiers[1], tiers[2], switching, problem.objective)

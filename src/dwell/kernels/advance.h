@@ -1,7 +1,7 @@
 // The event loop: one call plays a simulation to the next close of a window, or to its end.
 #pragma once
 
-#include "windows.h"
+#include "rules.h"
 
 namespace dwell {
 
@@ -77,8 +77,14 @@ template <class S>
     if (kind == kClose) {
       // A window that the guard has cut short does not close.
       if (cycle_of(event.key) != s.cell(cell).close_cycle) continue;
+      const i64 window = s.cell(cell).window;
       close_window(s, cell, now);
-      if (s.clock[0].pauses) return kPaused;
+      if (s.rule.size > 0) {
+        if (!decide(s, window)) return kPaused;
+        stamp_next(s);
+      } else if (s.clock[0].pauses) {
+        return kPaused;
+      }
       waiting += announce_close(s, cell) - 1;
       continue;
     }

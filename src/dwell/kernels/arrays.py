@@ -62,6 +62,40 @@ class Arrays:
         self._addresses = tables.addresses()
         self.address = self._addresses.ctypes.data
 
+    def use_rule(
+        self,
+        numbers: Mapping[str, float],
+        options: Mapping[str, NDArray[np.float64]],
+        **tables: NDArray[Any],
+    ) -> None:
+        """Have the kernel decide at closes; of a single cell without a shadow.
+
+        Parameters
+        ----------
+        numbers, options : mapping
+            Columns of the tables `rule` and `options`.
+        **tables : array
+            `work`, `switching` and `tiers`.
+        """
+        candidates, nodes = tables["work"].shape
+        windows = self.tables.seen.shape[1]
+        rule = _table("rule", [numbers], 0)
+        rows = np.zeros(candidates, row_types()["options"])
+        for name, values in options.items():
+            rows[name] = values
+        columns = (5 + nodes) * candidates
+        self.tables.clock[0]["n_priced"] = columns
+        self._use(
+            self.tables._replace(
+                rule=rule,
+                options=rows,
+                shown=np.ones((nodes, candidates)),
+                decided=np.zeros(windows, row_types()["decided"]),
+                priced=np.zeros((windows, columns)),
+                **tables,
+            )
+        )
+
     def grow_events(self) -> None:
         """Double the room of the queue of events."""
         events = self.tables.events
@@ -138,6 +172,7 @@ class _Layout:
         self.close_ns: list[Ints] = []
         self.outputs: list[int] = []
         self.cell_nodes: list[int] = []
+        self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
         self.segments: list[Rows] = []
         self.rates: list[Rows] = []
@@ -265,6 +300,8 @@ class _Layout:
             "release_ns": self._addresses(release_ns[None])[0],
             "close_ns": self._addresses(close_ns[None])[0],
             "n_cycles": real.cycles,
+            "deadline_ns": round(pipeline.deadline_ms * 1e6),
+            "longest_ms": round(problem.censor_ms * 1e6) / 1e6,
             "close_cycle": problem.window_cycles,
             "window_cycles": problem.window_cycles,
             "task_0": len(self.rows["tasks"]),
@@ -281,6 +318,7 @@ class _Layout:
         }
         self.rows["cells"].append(cell)
         self.cell_nodes += [self.node_row[index, name] for name in problem.fabric.nodes]
+        self.capacity += [float(node.capacity) for node in problem.fabric.nodes.values()]
         flows = ordered_flows(pipeline)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         self.rows["flows"] += [
@@ -501,17 +539,26 @@ class _Layout:
             "jobs": cells * RING_START * self.max_tasks,
             "slots": cells * RING_START,
         }
-        structs = {name: _table(name, rows[name], room.get(name, 0)) for name in rows}
+        structs: dict[str, Any] = {
+            name: _table(name, rows[name], room.get(name, 0)) for name in rows
+        }
         structs |= {
             "segments": np.concatenate([structs["segments"], *self.segments]),
             "rates": np.concatenate([structs["rates"], *self.rates]),
             "changes": changes,
+            "seen": np.zeros((cells, windows), row_types()["seen"]),
             "log": _as_rows("log", np.full((logged * self.max_tasks, 3), -1)),
         }
         return Tables(
             **structs,
             outputs=np.array(self.outputs, np.int32),
             cell_nodes=np.array(self.cell_nodes, np.int32),
+            capacity=np.array(self.capacity),
+            work=np.zeros(0),
+            switching=np.zeros(0),
+            shown=np.zeros(0),
+            priced=np.zeros(0),
+            tiers=np.zeros(0, np.int8),
             site_of=np.array(self.site_of, np.int32),
             route=np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
             back_ns=np.array(self.back_ns, np.int64),
@@ -522,12 +569,14 @@ class _Layout:
             ready=np.zeros(margin, np.int64),
             attempts=np.zeros((cells * RING_START, max(self.max_flows, 1)), np.int64),
             own_ns=np.zeros((cells, self.max_nodes)),
+            ages=np.zeros(max(problem.window_cycles for problem, _ in self.cells), np.int64),
             latency_ns=np.full((cells, cycles), NEVER_NS),
             compute_ns=np.zeros((cells, cycles), np.int64),
             network_ns=np.zeros((cells, cycles), np.int64),
             outcome=np.zeros((cells, cycles), np.int8),
             opened=np.zeros((cells, windows, 3, self.max_nodes)),
             closed=np.zeros((cells, windows, 3, self.max_nodes)),
+            shares=np.zeros((cells, windows, 3, self.max_nodes)),
             log_outcome=np.zeros(logged * self.max_tasks, np.int8),
             log_arrived=np.full((logged, self.max_flows), -1, np.int64),
         )

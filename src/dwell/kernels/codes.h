@@ -20,6 +20,13 @@ enum ShadowPart : i8 { kShared, kShadowed, kDiscarded };
 // event `step_key` is due at `step_ns`. `kBusy`: the budget of events is spent; call again.
 enum Status : i8 { kPaused, kFinished, kGrowEvents, kGrowRing, kStep, kBusy };
 
+// Built-in policies, and why they decide as they do.
+enum Policy : i8 { kStatic, kDtp, kCusum, kLatencyFirst, kAtp };
+enum Reason : i8 { kDwell, kHold, kMove, kCapped, kInfeasible };
+
+// Tiers of nodes as J has them; of other nodes caps alone take notice.
+enum Tier : i8 { kRobot, kEdge, kCloud, kNoTier };
+
 // Kinds of events in the order in which equal times are handled. `kMigrate` and `kGuard` are steps
 // of the caller's: of a cold migration, and of the guard where it fires.
 enum Kind : i8 {

@@ -37,6 +37,18 @@ class Status(IntEnum):
     PAUSED, FINISHED, GROW_EVENTS, GROW_RING, STEP, BUSY = range(6)
 
 
+class Policy(IntEnum):
+    """Policies that the kernel has a second body of."""
+
+    STATIC, DTP, CUSUM, LATENCY_FIRST, ATP = range(5)
+
+
+class Tier(IntEnum):
+    """Tiers of nodes in J; of a node in none caps alone take notice."""
+
+    ROBOT, EDGE, CLOUD, NONE = range(4)
+
+
 class Kind(IntEnum):
     """Kinds of events, in the order in which equal times are handled."""
 

@@ -31,7 +31,7 @@ using Times = const i64*;
 #define DWELL_CLOCK(field)                                                                       \
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_nodes) /* of a cell */                                                            \
-  field(i64, n_cycles) field(i64, n_windows) /* columns of the outputs */                        \
+  field(i64, n_cycles) field(i64, n_windows) field(i64, n_priced) /* columns of the outputs */    \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, n_events) field(i64, is_heap) /* of the queue */                                    \
   field(i64, next_change)                                                                        \
@@ -48,6 +48,7 @@ using Times = const i64*;
   field(Times, release_ns) field(Times, close_ns)                                                \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
   field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
+  field(i64, deadline_ns) field(f64, longest_ms) /* with which latencies beyond it count */       \
   field(i64, looks_ns) field(i64, patience_ns) field(i64, waited) field(i64, moved)              \
   field(i64, rested)                                                                             \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
@@ -148,13 +149,49 @@ using Times = const i64*;
 
 #define DWELL_LOG(field) field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns)
 
+// A closed window as it could be known then: `uncut_ms` is L95 without the cell's `longest_ms`.
+#define DWELL_SEEN(field)                                                                        \
+  field(i64, first_cycle) field(i64, missed) field(f64, l95_ms) field(f64, uncut_ms)
+
+// What a built-in policy with the estimator `profile` decides by (rules.h): its own numbers, the
+// objective's, where the cell is, and what `ATP` has added up since its last decision. Of two
+// numbers with the same name in `Objective` one is a weight and one a target.
+#define DWELL_RULE(field)                                                                        \
+  field(i64, policy) field(i64, is_priced)                                                       \
+  field(i64, incumbent) field(i64, previous) field(i64, dwell) field(i64, stamped)               \
+  field(i64, order) /* -1 where J of a candidate is no finite number */                          \
+  field(i64, min_dwell) field(i64, escape) field(f64, min_improvement)                           \
+  field(f64, threshold) field(f64, slack) field(f64, memory)                                     \
+  field(i64, local) field(i64, offload) field(i64, every_windows) field(i64, outside_is_cloud)   \
+  field(f64, most_ms) field(f64, most_robot) field(f64, most_outside)                            \
+  field(i64, n_shown) field(f64, shown_ms) field(f64, shown_robot) field(f64, shown_edge)        \
+  field(f64, shown_cloud) field(f64, told_ms) field(f64, told_robot) field(f64, told_edge)       \
+  field(f64, told_cloud)                                                                         \
+  field(f64, weight_latency) field(f64, weight_violations) field(f64, weight_robot)              \
+  field(f64, weight_edge) field(f64, weight_cloud) field(f64, weight_switching)                  \
+  field(f64, target_ms) field(f64, target_robot) field(f64, target_edge)                         \
+  field(f64, target_cloud) /* 0 where clouds are not weighed apart */                            \
+  field(f64, cap_ms) field(f64, cap_utilisation)
+
+// A candidate: what is expected of it, its cumulative sum, and whether its toggled task is on a
+// robot.
+#define DWELL_OPTION(field)                                                                      \
+  field(f64, l95_ms) field(f64, uncut_ms) field(f64, violation_rate) field(f64, sum)             \
+  field(i64, on_robot)
+
+// The decision at the close of a window; `measured` is J of the window itself.
+#define DWELL_DECIDED(field)                                                                     \
+  field(f64, measured) field(f64, delta_j) field(i64, dwell)                                     \
+  field(i32, incumbent) field(i32, placement) field(i32, reason)
+
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Pace, DWELL_PACE) row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)      \
   row(Link, DWELL_LINK) row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                        \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING) row(Job, DWELL_JOB)                    \
-  row(Slot, DWELL_SLOT) row(Log, DWELL_LOG)
+  row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN) row(Rule, DWELL_RULE)          \
+  row(Option, DWELL_OPTION) row(Decided, DWELL_DECIDED)
 
 // clang-format on
 
@@ -173,16 +210,18 @@ DWELL_ROWS(DWELL_STRUCT)
 // are in rows.py.
 #define DWELL_TABLES(table)                                                                      \
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
-  table(i32, outputs) table(i32, cell_nodes) table(Node, nodes)                                  \
+  table(i32, outputs) table(i32, cell_nodes) table(f64, capacity) table(Node, nodes)             \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
   table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates) table(Change, changes)          \
-  table(Pace, paces) table(i16, stamps)                                                          \
+  table(Pace, paces) table(f64, work) table(f64, switching) table(i8, tiers)                      \
+  table(i16, stamps)                                                                             \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
   table(Event, events) table(Running, running) table(Waiting, waiting)                           \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
-  table(f64, own_ns)                                                                             \
+  table(f64, own_ns) table(i64, ages) table(Rule, rule) table(Option, options) table(f64, shown) \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
-  table(f64, opened) table(f64, closed)                                                          \
+  table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
+  table(Decided, decided) table(f64, priced)                                                     \
   table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
 
 // clang-format on

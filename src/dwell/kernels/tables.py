@@ -87,6 +87,7 @@ class Tables(NamedTuple):
     flows: Rows  # (flows,)
     outputs: NDArray[np.int32]  # flows out of each task, in the order of the file
     cell_nodes: NDArray[np.int32]  # nodes of each cell
+    capacity: Floats  # cores of each of them
     nodes: Rows  # (nodes,)
     site_of: NDArray[np.int32]  # (candidates, tasks) -> site
     route: NDArray[np.int32]  # (candidates, flows) -> hop, or -1 on the same node
@@ -98,6 +99,9 @@ class Tables(NamedTuple):
     rates: Rows  # (segments,)
     changes: Rows  # (changes,)
     paces: Rows  # (paces,)
+    work: Floats  # (candidates, nodes) own work, or empty; as all below that a rule needs
+    switching: Floats  # (candidates, candidates) share of tasks moved
+    tiers: NDArray[np.int8]  # (nodes,)
     stamps: NDArray[np.int16]  # (cells, N) candidate of each cycle; -1 where a shadow has none
     # state
     sites: Rows  # (sites,)
@@ -113,6 +117,10 @@ class Tables(NamedTuple):
     slots: Rows  # (cells * slots,)
     attempts: Ints  # (cells * slots, flows) attempts lost so far, less one
     own_ns: Floats  # (cells, nodes of a cell) core-nanoseconds of completed own work
+    ages: Ints  # (W,) of one window
+    rule: Rows  # (1,), or empty where Python decides
+    options: Rows  # (candidates,)
+    shown: Floats  # (nodes, candidates) what a node showed under each since it is full; else 1
     # outputs
     latency_ns: Ints  # (cells, N), NEVER_NS until done
     compute_ns: Ints
@@ -120,6 +128,12 @@ class Tables(NamedTuple):
     outcome: NDArray[np.int8]
     opened: Floats  # (cells, windows, 3, nodes of a cell) busy, own and shadow at first releases
     closed: Floats  # (cells, windows, 3, nodes of a cell) busy, own and shadow at closes
+    seen: Rows  # (cells, windows) metrics as they could be known at closes
+    shares: Floats  # (cells, windows, 3, nodes of a cell) of the cores: busy, own and shadow
+    decided: Rows  # (windows,)
+    priced: (
+        Floats  # (windows, columns) by candidate: J, L95, V_D, U of each node, is within, excess
+    )
     log: Rows  # (cells * N * tasks,), or empty
     log_outcome: NDArray[np.int8]
     log_arrived: Ints  # (cells * N, flows), or empty

@@ -54,18 +54,6 @@ void open_window(S& s, i64 cell, i64 cycle, i64 now) {
   }
 }
 
-// Closes a window; the next one follows without a gap unless the caller says otherwise.
-template <class S>
-[[gnu::noinline]] void close_window(S& s, i64 cell, i64 now) {
-  Cell& of = s.cell(cell);
-  snapshot(s, &s.closed[snapshot_row(s, cell, of.window)], cell, now);
-  s.clock[0].closed_cell = cell;
-  of.close_pending = 0;
-  of.window += 1;
-  of.window_first = of.close_cycle;
-  of.close_cycle += of.window_cycles;
-}
-
 // Announces a cell's next close; returns whether the cell waits for one, or migrates.
 template <class S>
 bool announce_close(S& s, i64 cell) {

@@ -55,9 +55,13 @@ class _Shown(NamedTuple):
 
 
 def _mean(windows: Sequence[_Shown]) -> _Shown:
+    # Added one after another: from Python 3.12 on, `sum` rounds floats otherwise.
+    l95_ms = robot = edge = cloud = 0.0
+    for one in windows:
+        l95_ms += one.l95_ms
+        robot, edge, cloud = robot + one.used.robot, edge + one.used.edge, cloud + one.used.cloud
     count = len(windows)
-    used = [sum(tier) / count for tier in zip(*(one.used for one in windows), strict=True)]
-    return _Shown(sum(one.l95_ms for one in windows) / count, TierUtilisation(*used))
+    return _Shown(l95_ms / count, TierUtilisation(robot / count, edge / count, cloud / count))
 
 
 class ATP(ATPThresholds):

@@ -104,8 +104,9 @@ class ATPThresholds(PricingPolicy):
         self.pair = self._choose(local, offload)
         targets = objective.targets
         outside_tier = objective.tiers[self.candidates[self.pair.offload][self.pair.task]]
-        self._on_cloud = objective.weights.cloud is not None and outside_tier == "cloud"
-        outside = targets.cloud if self._on_cloud and targets.cloud else targets.edge
+        #: Whether the task is offloaded to a cloud node that the objective weighs apart.
+        self.on_cloud = objective.weights.cloud is not None and outside_tier == "cloud"
+        outside = targets.cloud if self.on_cloud and targets.cloud else targets.edge
         self.latency_ms = targets.latency_ms if latency_ms is None else latency_ms
         self.robot = targets.robot if robot is None else robot
         self.edge = outside if edge is None else edge
@@ -215,6 +216,6 @@ class ATPThresholds(PricingPolicy):
         if self.objective.tiers.get(self.candidates[self.incumbent][task]) == "robot":
             other, busy = self.pair.offload, used.robot > self.robot
         else:
-            outside = used.cloud if self._on_cloud else used.edge
+            outside = used.cloud if self.on_cloud else used.edge
             other, busy = self.pair.local, outside > self.edge
         return other, l95_ms > self.latency_ms or busy

@@ -13,27 +13,36 @@ from numpy.typing import NDArray
 
 from dwell import __version__
 from dwell.control import (
-    ClosedWindow,
     Controller,
     Estimator,
     Evidence,
     Instants,
     MinimalPolicy,
+    plain_rule,
     shadow_stamps,
 )
 from dwell.errors import SimulationError
 from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
-from dwell.kernels.codes import Kind, Outcome, Status, kind_of
+from dwell.kernels.codes import Kind, Outcome, Policy, Status, Tier, kind_of
 from dwell.kernels.event_loop import play
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
-from dwell.model import Problem
+from dwell.model import FrozenDict, Problem, QoS
 from dwell.model.document import to_document
 from dwell.model.table_columns import require_apart
 from dwell.record import Run
 from dwell.sim.cold_migration import ColdMigration
 from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
+
+#: Codes of policies by the names of their classes.
+POLICIES = {
+    "Static": Policy.STATIC,
+    "DTP": Policy.DTP,
+    "Cusum": Policy.CUSUM,
+    "LatencyFirst": Policy.LATENCY_FIRST,
+    "ATP": Policy.ATP,
+}
 
 
 def simulate(
@@ -166,22 +175,17 @@ def _play(
     shadows = draw_shadows(problem, realisation) if shadow else None
     log_jobs = jobs or controller.learns or shadow
     arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
-    sees_all = not _host_changes(problem, realisation)[:, 3].any()
-    if controller.fixed_profile is not None and sees_all and not by_window:
-        # No decision can change anything: one call plays everything.
-        arrays.tables.stamps[:] = list(problem.candidates).index(controller.incumbent)
-        play(arrays)
-        first = np.arange(realisation.windows) * problem.window_cycles
-    else:
-        guarded = guard and controller.guarded
-        stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
-        while (status := play(arrays)) != Status.FINISHED:
-            if status == Status.STEP:
-                stamper.step()
-            else:
-                stamper.close_window()
-        first = np.array(stamper.first, np.int64)
-    return PlayedRealisation(problem, realisation, controller, arrays, first)
+    guarded = guard and controller.guarded
+    stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
+    if not (shadow or controller.learns or guarded or by_window or any(stamper.host_down)):
+        stamper.leave_to_kernel()
+    while (status := play(arrays)) != Status.FINISHED:
+        if status == Status.STEP:
+            stamper.step()
+        elif not stamper.close_window():
+            # A number is out of its bounds: the controller says which.
+            return _play(problem, realisation, policy, estimator, jobs, guard, by_window=True)
+    return PlayedRealisation(problem, realisation, controller, arrays)
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -232,11 +236,9 @@ class _Stamper:
         self.close_ns = arrays.close_ns[0]
         table = _host_changes(problem, realisation)
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
-        self.first: list[int] = []
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.fraction = controller.shadow_fraction
         self.placement = controller.incumbent
-        self.next_first = 0
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         arrays.tables.clock[0]["pauses"] = 1
         self.watch = SimulatedGuard(problem, realisation, arrays) if guarded else None
@@ -260,45 +262,70 @@ class _Stamper:
             return boundary
         return int(np.searchsorted(self.release_ns, self.close_ns[boundary - 1], side="right"))
 
-    def close_window(self) -> None:
-        """Hand the window that has just closed to the controller and carry out its order."""
+    def leave_to_kernel(self) -> None:
+        """Have the kernel decide at closes, if it has a second body of the controller's rule."""
+        plain = plain_rule(self.controller)
+        if plain is None:
+            return
+        numbers = {**plain.numbers, "policy": POLICIES[plain.policy], "stamped": self.stamped}
+        tiers = [Tier[tier.upper()] if tier else Tier.NONE for tier in plain.tiers]
+        self.arrays.use_rule(
+            numbers,
+            plain.options,
+            work=plain.work,
+            switching=plain.switching,
+            tiers=np.array(tiers, np.int8),
+        )
+
+    def close_window(self) -> bool:
+        """Carry out what was decided for the window that has just closed, or have it decided.
+
+        Returns
+        -------
+        bool
+            Whether the kernel could decide, where it does.
+        """
         tables = self.arrays.tables
-        index = len(self.first)
-        first = self.next_first
-        boundary = first + self.window_cycles
+        index = int(tables.cells[0]["window"]) - 1
+        boundary = int(tables.seen[0, index]["first_cycle"]) + self.window_cycles
         close_ns = int(self.close_ns[boundary - 1])
-        self.first.append(first)
-        order = self.placement
-        if self._host_down(close_ns):
+        if len(tables.rule):
+            chosen = int(tables.rule[0]["order"])
+            if chosen < 0:
+                return False
+            order = self.names[chosen]
+        elif self._host_down(close_ns):
             self.controller.miss()
+            order = self.placement
         else:
-            used = tables.closed[0, index] - tables.opened[0, index]
-            window = ClosedWindow(
-                latency_ns=tables.latency_ns[0, first:boundary],
-                release_ns=self.release_ns[first:boundary],
-                close_ns=close_ns,
-                open_ns=int(self.release_ns[first]),
-                core_ns=used,
-            )
-            if self.evidence is not None:
-                window.evidence = partial(self.evidence, first, boundary, close_ns)
-            order = self._decide(window, boundary, close_ns)
+            order = self._decide(index, boundary, close_ns)
         if order == self.placement:
             self._go_on(boundary)
-            return
+            return True
         earliest = self._takes_effect(boundary, close_ns)
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
         if earliest + self.window_cycles > self.cycles or not self._begin(
             order, boundary, close_ns
         ):
             self._move(order, earliest)
+        return True
 
-    def _decide(self, window: ClosedWindow, boundary: int, close_ns: int) -> str:
+    def _decide(self, index: int, boundary: int, close_ns: int) -> str:
         """Ask the controller, and send the probes that it wants."""
         watch, controller, tables = self.watch, self.controller, self.arrays.tables
+        if self.evidence is not None:
+            first = boundary - self.window_cycles
+            controller.learn(partial(self.evidence, first, boundary, close_ns))
+        _, missed, l95_ms, uncut_ms = tables.seen[0, index].item()
+        used, own, shadow = tables.shares[0, index]
+        nodes = controller.nodes
+        utilisation = FrozenDict(zip(nodes, used.tolist(), strict=True))
+        observed = QoS(l95_ms, missed / self.window_cycles, utilisation, uncut_ms)
+        # Neither the cell's jobs nor its shadow jobs are foreign.
+        mine = dict(zip(nodes, (own + shadow).tolist(), strict=True))
         if watch is None or not watch.on_fallback:
-            return controller.close(window)
-        order = controller.close(window, proven=watch.proven(close_ns))
+            return controller.decide(observed, mine)
+        order = controller.decide(observed, mine, proven=watch.proven(close_ns))
         if controller.wanted is not None and len(tables.cells) < 2:
             raise _ProbesWantedError
         if order == self.placement:
@@ -310,7 +337,6 @@ class _Stamper:
 
     def _go_on(self, boundary: int) -> None:
         """Stamp the next window with the placement that stays."""
-        self.next_first = boundary
         start, self.stamped = self.stamped, self._reach(boundary + self.window_cycles)
         self._stamp(start, self.stamped)
 
@@ -321,10 +347,11 @@ class _Stamper:
         if self.watch is not None:
             self.watch.moved(following)
         cell = self.arrays.tables.cells[0]
-        cell["window_first"] = self.next_first = following
+        cell["window_first"] = following
         cell["close_cycle"] = following + self.window_cycles
         self.stamped = self._reach(following + self.window_cycles)
         self._stamp(following, self.stamped)
+        self.arrays.tables.rule["stamped"] = self.stamped
 
     def _begin(self, order: str, boundary: int, close_ns: int) -> bool:
         """Begin a cold migration, which ends with `step`; False if no task has to be waited for."""
@@ -363,7 +390,7 @@ class _Stamper:
         if self.cold is not None:
             self.cold.stop()
         cell["migrating"] = cell["close_pending"] = 0
-        cell["window_first"] = self.next_first = first
+        cell["window_first"] = first
         cell["close_cycle"] = first + self.window_cycles
         if first + self.window_cycles > self.cycles:
             # No window can follow, so that the run ended with the last close.

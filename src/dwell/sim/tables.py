@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import ClosedWindow, Controller, final_l95_ms, static_columns
+from dwell.control import Controller, final_l95_ms
 from dwell.kernels.arrays import Arrays
 from dwell.kernels.codes import Outcome, ShadowPart
 from dwell.kernels.realisation import Realisation
@@ -36,15 +36,33 @@ class PlayedRealisation:
     ----------
     problem, realisation, controller, arrays
         As they were used.
-    first : int64 array, shape (windows,)
-        First cycle of every window.
     """
 
     problem: Problem
     realisation: Realisation
     controller: Controller
     arrays: Arrays
-    first: Ints
+
+    @cached_property
+    def seen(self) -> Rows:
+        """Every closed window as it could be known then."""
+        tables = self.arrays.tables
+        return tables.seen[0, : tables.cells[0]["window"]]
+
+    @cached_property
+    def first(self) -> Ints:
+        """First cycle of every window, shape (windows,)."""
+        return np.ascontiguousarray(self.seen["first_cycle"])
+
+    @property
+    def shares(self) -> Floats:
+        """Busy, own and shadow share of every node's cores, shape (windows, 3, nodes)."""
+        return self.arrays.tables.shares[0, : len(self.seen)]
+
+    @property
+    def by_kernel(self) -> bool:
+        """Whether the kernel decided, and not the controller."""
+        return len(self.arrays.tables.rule) > 0
 
     @property
     def features(self) -> tuple[Feature, ...]:
@@ -79,18 +97,6 @@ class PlayedRealisation:
         close: Ints = self.arrays.close_ns[0][last]
         return close
 
-    def closed_windows(self) -> ClosedWindow:
-        """All windows as rows."""
-        tables, count = self.arrays.tables, len(self.first)
-        used = tables.closed[0, :count] - tables.opened[0, :count]
-        return ClosedWindow(
-            latency_ns=self.by_window(tables.latency_ns[0]),
-            release_ns=self.by_window(self.realisation.release_ns),
-            close_ns=self.close_ns[:, None],
-            open_ns=self.realisation.release_ns[self.first][:, None],
-            core_ns=used,
-        )
-
     @cached_property
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
@@ -119,19 +125,13 @@ def make_tables(
         Columns of the tables that need not be frames to be computed with.
     """
     problem, controller = played.problem, played.controller
-    profile = None if controller.log.seen else controller.fixed_profile
     support: tuple[Feature, ...] = ("support",) if controller.supports else ()
-
-    @cache
-    def columns() -> tuple[dict[str, Floats], dict[str, object]]:
-        if profile is None:
-            return _seen(played), _decided(controller)
-        return static_columns(controller, profile, played.closed_windows())
-
     arrays: dict[str, Callable[[], TableArrays]] = {
         "cycles": cache(lambda: _cycles(played)),
-        "windows": cache(lambda: _windows(played, columns()[0])),
-        "decisions": cache(lambda: _decisions(controller, columns()[1])),
+        "windows": cache(lambda: _windows(played, _seen(played))),
+        "decisions": cache(
+            lambda: _decided_by_kernel(played) if played.by_kernel else _decisions(controller)
+        ),
     }
     features = {"windows": played.features, "decisions": support}
 
@@ -205,7 +205,6 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
     """Cost of shadow jobs in each window: cycles sent twice, bytes, and share of the cores."""
     if not played.features:
         return {}
-    controller = played.controller
 
     def sent_bytes() -> Ints:
         sent = played.by_window(_shadow_bytes(played))
@@ -213,18 +212,14 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
         held = sent.sum(axis=1, dtype=np.float64) < HORIZON_NS
         return np.where(held, sent.sum(axis=1), HORIZON_NS)
 
-    @cache
-    def used() -> Floats:
-        return controller.utilisation(played.closed_windows())[:, 2]
-
     return {
         "shadow_cycles": lambda: (played.by_window(played.arrays.tables.stamps[1]) >= 0).sum(
             axis=1
         ),
         "shadow_bytes": sent_bytes,
         **{
-            f"shadow_{node}": partial(lambda i: used()[:, i], i)
-            for i, node in enumerate(controller.nodes)
+            f"shadow_{node}": partial(lambda i: played.shares[:, 2, i], i)
+            for i, node in enumerate(played.problem.fabric.nodes)
         },
     }
 
@@ -254,25 +249,27 @@ def _shadow_bytes(played: PlayedRealisation) -> Ints:
 
 
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:
-    controller = played.controller
-    seen = np.array(controller.log.seen, np.float64).reshape(-1, 3)
-    used = controller.utilisation(played.closed_windows())[:, 0]
-    return {
-        "l95_ms": seen[:, 0],
-        "violation_rate": seen[:, 1],
-        "cost": seen[:, 2],
-        **{f"u_{node}": used[:, i] for i, node in enumerate(controller.nodes)},
-    }
+    """Metrics of windows as they could be known, NaN where the controller's node was down."""
+    tables, window_cycles = played.arrays.tables, played.problem.window_cycles
+    if played.by_kernel:
+        seen = {
+            "l95_ms": played.seen["l95_ms"],
+            "violation_rate": played.seen["missed"] / window_cycles,
+            "cost": tables.decided["measured"][: len(played.seen)],
+        }
+    else:
+        log = np.array(played.controller.log.seen, np.float64).reshape(-1, 3)
+        seen = dict(zip(("l95_ms", "violation_rate", "cost"), log.T, strict=True))
+    used = played.shares[:, 0]
+    return seen | {f"u_{node}": used[:, i] for i, node in enumerate(played.controller.nodes)}
 
 
-def _decided(controller: Controller) -> dict[str, object]:
-    """Decisions of the controller's log, by column."""
-    names, rows = controller.decision_columns, controller.log.decisions
-    return dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
-
-
-def _decisions(controller: Controller, decided: dict[str, object]) -> TableArrays:
-    """Return decisions whose names are found among those that there may be."""
+def _decisions(controller: Controller) -> TableArrays:
+    """Decisions of the controller's log, their names found among those that there may be."""
+    columns, rows = controller.decision_columns, controller.log.decisions
+    decided: dict[str, object] = dict(
+        zip(columns, zip(*rows, strict=True) if rows else [()] * len(columns), strict=True)
+    )
     known = dict.fromkeys(("incumbent", "placement"), tuple(controller.problem.candidates))
     known["reason"] = REASONS
     names = {
@@ -280,6 +277,29 @@ def _decisions(controller: Controller, decided: dict[str, object]) -> TableArray
         for column, those in known.items()
     }
     return TableArrays({**decided, **names})
+
+
+def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
+    """Decisions that the kernel has made."""
+    controller, tables = played.controller, played.arrays.tables
+    count, names = len(played.seen), tuple(played.problem.candidates)
+    decided = tables.decided[:count]
+    columns: dict[str, object] = {
+        "window": np.arange(count),
+        "incumbent": Names(decided["incumbent"], names),
+        "placement": Names(decided["placement"], names),
+        "migrated": decided["incumbent"] != decided["placement"],
+        "reason": Names(decided["reason"], REASONS),
+        "dwell": decided["dwell"],
+        "delta_j": decided["delta_j"],
+    }
+    priced = controller.decision_columns[len(columns) :]
+    columns |= {name: tables.priced[:count, i] for i, name in enumerate(priced)}
+    for name in names:
+        columns[f"eligible_{name}"] = tables.priced[:count, priced.index(f"eligible_{name}")] > 0
+        if not controller.has_caps:
+            columns[f"excess_{name}"] = np.full(count, np.nan)
+    return TableArrays(columns)
 
 
 def _log_running(played: PlayedRealisation, log: Rows) -> None:

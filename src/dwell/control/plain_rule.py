@@ -1,0 +1,155 @@
+"""What our own policies decide by, as plain numbers, for an engine that decides itself.
+
+The classes of `dwell.policies` and `dwell.estimators.profile` define what is right; the kernel of
+the simulator has a second body of some of them, and these are the numbers that it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dwell.control.controller import Controller
+from dwell.cost import tier_nodes
+from dwell.estimators import Profile
+from dwell.model import Objective
+from dwell.policies import ATP, DTP, Cusum, LatencyFirst, Static
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+class PlainRule(NamedTuple):
+    """A policy and an estimator in numbers; candidates and nodes in the problem's order.
+
+    Parameters
+    ----------
+    policy : str
+        Name of the policy's class.
+    numbers : mapping of str to float
+        Numbers of the policy, weights, targets and caps of its objective.
+    options : mapping of str to float64 array, shape (candidates,)
+        What is expected of each candidate, and whether its toggled task is on a robot.
+    work : float64 array, shape (candidates, nodes)
+        Share of each node's cores that the cell's own work takes.
+    switching : float64 array, shape (candidates, candidates)
+        S of a candidate (column) after another (row).
+    tiers : tuple of str
+        Tier of each node in J, ``robot``, ``edge`` or ``cloud``; empty where J has none of it.
+    """
+
+    policy: str
+    numbers: Mapping[str, float]
+    options: Mapping[str, Floats]
+    work: Floats
+    switching: Floats
+    tiers: tuple[str, ...]
+
+
+def plain_rule(controller: Controller) -> PlainRule | None:
+    """Return the rule of a controller that has closed no window; None where it has to be asked.
+
+    That is wherever its policy or its estimator is not exactly one of those that are known here, or
+    has an objective or candidates that are not the problem's.
+    """
+    problem, policy, profile = controller.problem, controller.policy, controller.estimator
+    numbers = _NUMBERS.get(type(policy))
+    if numbers is None or type(profile) is not Profile:
+        return None
+    own: Any = policy
+    if list(own.candidates.items()) != list(problem.candidates.items()):
+        return None
+    if own.objective not in (None, problem.objective):
+        return None
+    names, nodes = list(problem.candidates), list(problem.fabric.nodes)
+    known = {
+        "l95_ms": profile.l95_ms,
+        "uncut_ms": profile.uncut_l95_ms,
+        "violation_rate": profile.violation_rate,
+        "on_robot": _on_robot(own) if isinstance(own, ATP) else dict.fromkeys(names, 0.0),
+    }
+    on = np.array([[nodes.index(node) for node in one.values()] for one in own.candidates.values()])
+    tier_of = {
+        node: tier
+        for tier, members in tier_nodes(problem.objective)._asdict().items()
+        for node in members
+    }
+    return PlainRule(
+        policy=type(policy).__name__,
+        numbers={
+            **numbers(own, names),
+            **_objective(problem.objective),
+            "is_priced": own.objective is not None,
+            "incumbent": names.index(controller.incumbent),
+            "previous": names.index(controller.previous),
+            "dwell": controller.dwell,
+        },
+        options={name: np.array([by[one] for one in names]) for name, by in known.items()},
+        work=np.array([[profile.own[name][node] for node in nodes] for name in names]),
+        switching=(on[:, None] != on).sum(axis=2) / on.shape[1],
+        tiers=tuple(tier_of.get(node, "") for node in nodes),
+    )
+
+
+def _objective(objective: Objective) -> dict[str, float]:
+    weights, targets, caps = objective.weights, objective.targets, objective.caps
+    apart = weights.cloud is not None and targets.cloud is not None
+    return {
+        "weight_latency": weights.latency,
+        "weight_violations": weights.violations,
+        "weight_robot": weights.robot,
+        "weight_edge": weights.edge,
+        "weight_cloud": weights.cloud or 0.0,
+        "weight_switching": weights.switching,
+        "target_ms": targets.latency_ms,
+        "target_robot": targets.robot,
+        "target_edge": targets.edge,
+        # None of it is in J.
+        "target_cloud": (targets.cloud or 0.0) if apart else 0.0,
+        "cap_ms": caps.latency_ms,
+        "cap_utilisation": caps.utilisation,
+    }
+
+
+def _of_dtp(policy: DTP, names: list[str]) -> dict[str, float]:
+    return {
+        "min_dwell": policy.min_dwell,
+        "min_improvement": policy.min_improvement,
+        "escape": policy.escape,
+    }
+
+
+def _of_cusum(policy: Cusum, names: list[str]) -> dict[str, float]:
+    return {"threshold": policy.threshold, "slack": policy.slack, "memory": policy.memory}
+
+
+def _of_atp(policy: ATP, names: list[str]) -> dict[str, float]:
+    return {
+        "min_dwell": policy.min_dwell,
+        "local": names.index(policy.local),
+        "offload": names.index(policy.offload),
+        "every_windows": policy.every_windows,
+        "most_ms": policy.latency_ms,
+        "most_robot": policy.robot,
+        "most_outside": policy.edge,
+        "outside_is_cloud": policy.on_cloud,
+    }
+
+
+def _on_robot(policy: ATP) -> dict[str, float]:
+    tiers, task = policy.objective.tiers, policy.pair.task
+    return {
+        name: float(tiers.get(placement[task]) == "robot")
+        for name, placement in policy.candidates.items()
+    }
+
+
+_NUMBERS: dict[type, Callable[[Any, list[str]], dict[str, float]]] = {
+    Static: lambda policy, names: {},
+    LatencyFirst: lambda policy, names: {},
+    DTP: _of_dtp,
+    Cusum: _of_cusum,
+    ATP: _of_atp,
+}

@@ -1,0 +1,341 @@
+// What built-in policies with the estimator `profile` decide at the close of a window.
+//
+// A second body of the classes of dwell.policies and dwell.estimators.profile, which define what is
+// right; it gives every bit of what they give. It works on the one cell of a simulation.
+#pragma once
+
+#include <cmath>
+
+#include "metrics.h"
+
+namespace dwell {
+
+// From this share on a node is full: what more is asked of it cannot be seen any more.
+constexpr f64 kSaturated = 0.995;
+// Candidates this close to the least relative excess are told apart by J instead.
+constexpr f64 kExcessTolerance = 1e-6;
+
+// U_r, U_e and U_c.
+struct Used {
+  f64 tier[kNoTier];
+};
+
+// The numbers of one window: a column a candidate, in the order of the table of decisions.
+template <class S>
+struct Priced {
+  S& s;
+  const Seen& seen;
+  f64* row;
+  const i64 n, n_nodes;
+
+  Priced(S& simulation, i64 window)
+      : s(simulation),
+        seen(s.seen[window]),
+        row(&s.priced[window * s.clock[0].n_priced]),
+        n(s.options.size),
+        n_nodes(s.cell(0).n_nodes) {}
+
+  f64& j(i64 c) { return row[c]; }
+  f64& l95_ms(i64 c) { return row[n + c]; }
+  f64& violation_rate(i64 c) { return row[2 * n + c]; }
+  f64& used(i64 node, i64 c) { return row[(3 + node) * n + c]; }
+  f64& is_within(i64 c) { return row[(3 + n_nodes) * n + c]; }
+  f64& excess(i64 c) { return row[(4 + n_nodes) * n + c]; }
+
+  f64 uncut_ms(i64 c) const {
+    return c == s.rule[0].incumbent ? seen.uncut_ms : s.options[c].uncut_ms;
+  }
+  // Utilisation of the busiest node, a saturated one counting as full.
+  f64 busiest(i64 c) {
+    f64 largest = 0.0;
+    for (i64 node = 0; node < n_nodes; ++node) largest = std::max(largest, used(node, c));
+    return largest < kSaturated ? largest : std::max(largest, 1.0);
+  }
+};
+
+template <class S>
+f64 price(const S& s, f64 l95_ms, f64 violation_rate, const Used& used, f64 switching) {
+  const Rule& r = s.rule[0];
+  f64 j = r.weight_latency * (l95_ms / r.target_ms) + r.weight_violations * violation_rate +
+          r.weight_robot * (used.tier[kRobot] / r.target_robot) +
+          r.weight_edge * (used.tier[kEdge] / r.target_edge);
+  if (r.target_cloud > 0.0) j = j + r.weight_cloud * (used.tier[kCloud] / r.target_cloud);
+  return j + r.weight_switching * switching;
+}
+
+template <class S>
+Used used_by_tiers(Priced<S>& priced, i64 candidate) {
+  Used used{};
+  for (i64 node = 0; node < priced.n_nodes; ++node) {
+    const i8 tier = priced.s.tiers[node];
+    if (tier == kNoTier) continue;
+    used.tier[tier] = std::max(used.tier[tier], priced.used(node, candidate));
+  }
+  return used;
+}
+
+// Expects of every candidate what its profile says, beside what others were seen to use.
+template <class S>
+void estimate(Priced<S>& priced, const f64* used, const f64* own, const f64* shadow) {
+  S& s = priced.s;
+  const i64 incumbent = s.rule[0].incumbent, n = priced.n;
+  for (i64 c = 0; c < n; ++c) {
+    priced.l95_ms(c) = s.options[c].l95_ms;
+    priced.violation_rate(c) = s.options[c].violation_rate;
+  }
+  for (i64 node = 0; node < priced.n_nodes; ++node) {
+    const f64 busy = used[node], mine = own[node] + shadow[node];
+    f64* shown = &s.shown[node * n];
+    if (busy < kSaturated) {
+      std::fill(shown, shown + n, 1.0);
+      shown[incumbent] = busy;
+    } else {
+      shown[incumbent] = 1.0;
+    }
+    const bool hides = busy >= kSaturated && mine < kSaturated;
+    const f64 foreign = busy - mine > 0.0 ? busy - mine : 0.0;
+    for (i64 c = 0; c < n; ++c) {
+      const f64 expected = std::min(foreign + s.work[c * priced.n_nodes + node], 1.0);
+      priced.used(node, c) = hides ? shown[c] : expected;
+    }
+    priced.used(node, incumbent) = busy;
+  }
+}
+
+// By how much a candidate is over a cap at most, relative to it.
+template <class S>
+f64 excess(Priced<S>& priced, i64 candidate) {
+  const Rule& rule = priced.s.rule[0];
+  const f64 latency = std::isinf(rule.cap_ms) ? 0.0 : priced.uncut_ms(candidate) / rule.cap_ms;
+  return std::max(latency, priced.busiest(candidate) / rule.cap_utilisation) - 1.0;
+}
+
+// Which candidates may be chosen: those within the caps, or, where none is, those that are closest
+// to them.
+template <class S>
+struct Eligible {
+  Priced<S>& priced;
+  bool within_caps = false;
+  f64 most;
+
+  explicit Eligible(Priced<S>& of) : priced(of), most(std::numeric_limits<f64>::infinity()) {
+    for (i64 c = 0; c < priced.n; ++c) {
+      within_caps = within_caps || is_within(c);
+      most = std::min(most, priced.excess(c));
+    }
+    most += kExcessTolerance;
+  }
+
+  bool has(i64 c) const { return within_caps ? is_within(c) : priced.excess(c) <= most; }
+
+ private:
+  bool is_within(i64 c) const {
+    const Rule& rule = priced.s.rule[0];
+    return priced.uncut_ms(c) <= rule.cap_ms && priced.busiest(c) <= rule.cap_utilisation;
+  }
+};
+
+struct Choice {
+  i64 placement;
+  Reason reason;
+  f64 delta_j;
+};
+
+// The cheapest of some candidates; the incumbent wins every tie.
+template <class S, class Among>
+i64 cheapest(Priced<S>& priced, Among is_among) {
+  const i64 incumbent = priced.s.rule[0].incumbent;
+  i64 best = -1;
+  f64 lowest = std::numeric_limits<f64>::infinity();
+  for (i64 c = 0; c < priced.n; ++c) {
+    if (!is_among(c)) continue;
+    const f64 j = priced.j(c);
+    if (j < lowest || (c == incumbent && j == lowest)) {
+      best = c;
+      lowest = j;
+    }
+  }
+  return best;
+}
+
+// Why the cell moves to a candidate.
+template <class S>
+Reason reason_of(Priced<S>& priced, i64 best, const Eligible<S>& eligible) {
+  if (!eligible.within_caps) return kInfeasible;
+  for (i64 c = 0; c < priced.n; ++c) {
+    if (priced.j(c) < priced.j(best) && !eligible.has(c)) return kCapped;
+  }
+  return kMove;
+}
+
+// dwell.policies.dtp.
+template <class S>
+Choice decide_dtp(Priced<S>& priced, f64 measured) {
+  const Rule& rule = priced.s.rule[0];
+  const Eligible<S> eligible(priced);
+  const i64 best = cheapest(priced, [&](i64 c) { return eligible.has(c); });
+  const f64 delta_j = measured - priced.j(best);
+  if (rule.escape && priced.excess(rule.incumbent) > 0.0 && eligible.within_caps) {
+    return {best, reason_of(priced, best, eligible), delta_j};
+  }
+  if (rule.dwell < rule.min_dwell) return {rule.incumbent, kDwell, NAN};
+  if (best != rule.incumbent && delta_j > rule.min_improvement) {
+    return {best, reason_of(priced, best, eligible), delta_j};
+  }
+  return {rule.incumbent, eligible.within_caps ? kHold : kInfeasible, delta_j};
+}
+
+// dwell.policies.cusum; `alone` is J of the window without its switching term.
+template <class S>
+Choice decide_cusum(Priced<S>& priced, f64 alone) {
+  S& s = priced.s;
+  const Rule& rule = s.rule[0];
+  const Eligible<S> eligible(priced);
+  for (i64 c = 0; c < priced.n; ++c) {
+    const f64 gain = alone - priced.j(c) - rule.slack;
+    f64& sum = s.options[c].sum;
+    sum = c == rule.incumbent ? 0.0 : std::max(0.0, rule.memory * sum + gain);
+  }
+  const i64 best = cheapest(priced, [&](i64 c) {
+    return eligible.has(c) && s.options[c].sum > rule.threshold;
+  });
+  const Reason holds = eligible.within_caps ? kHold : kInfeasible;
+  if (best < 0) return {rule.incumbent, holds, 0.0};
+  const f64 delta_j = alone - priced.j(best);
+  if (delta_j <= 0.0) return {rule.incumbent, holds, delta_j};
+  for (i64 c = 0; c < priced.n; ++c) s.options[c].sum = 0.0;
+  return {best, reason_of(priced, best, eligible), delta_j};
+}
+
+// dwell.policies.latency_first.
+template <class S>
+Choice decide_latency_first(Priced<S>& priced) {
+  const i64 incumbent = priced.s.rule[0].incumbent;
+  i64 best = incumbent;
+  for (i64 c = 0; c < priced.n; ++c) {
+    if (priced.l95_ms(c) < priced.l95_ms(best)) best = c;
+  }
+  return {best, best == incumbent ? kHold : kMove, NAN};
+}
+
+// dwell.policies.atp.
+template <class S>
+Choice decide_atp(Priced<S>& priced) {
+  S& s = priced.s;
+  Rule& rule = s.rule[0];
+  const i64 incumbent = rule.incumbent;
+  const bool on_robot = s.options[incumbent].on_robot != 0;
+  const i64 other = on_robot ? rule.offload : rule.local;
+  const Used here = used_by_tiers(priced, incumbent), there = used_by_tiers(priced, other);
+  rule.n_shown += 1;
+  rule.shown_ms += priced.l95_ms(incumbent);
+  rule.shown_robot += here.tier[kRobot];
+  rule.shown_edge += here.tier[kEdge];
+  rule.shown_cloud += here.tier[kCloud];
+  rule.told_ms += priced.l95_ms(other);
+  rule.told_robot += there.tier[kRobot];
+  rule.told_edge += there.tier[kEdge];
+  rule.told_cloud += there.tier[kCloud];
+  const bool dwells = rule.dwell < rule.min_dwell;
+  if (rule.n_shown < rule.every_windows) return {incumbent, dwells ? kDwell : kHold, NAN};
+  const f64 n = static_cast<f64>(rule.n_shown);
+  const f64 ms = rule.shown_ms / n, told_ms = rule.told_ms / n;
+  const Used shown{{rule.shown_robot / n, rule.shown_edge / n, rule.shown_cloud / n}};
+  const Used told{{rule.told_robot / n, rule.told_edge / n, rule.told_cloud / n}};
+  rule.n_shown = 0;
+  rule.shown_ms = rule.shown_robot = rule.shown_edge = rule.shown_cloud = 0.0;
+  rule.told_ms = rule.told_robot = rule.told_edge = rule.told_cloud = 0.0;
+  if (dwells) return {incumbent, kDwell, NAN};
+  const f64 outside = shown.tier[rule.outside_is_cloud ? kCloud : kEdge];
+  const bool is_busy =
+      on_robot ? shown.tier[kRobot] > rule.most_robot : outside > rule.most_outside;
+  if (!(ms > rule.most_ms || is_busy)) return {incumbent, kHold, NAN};
+  const f64 moved = s.switching[incumbent * priced.n + other];
+  const f64 saved = price(s, ms, 0.0, shown, 0.0) - price(s, told_ms, 0.0, told, moved);
+  if (saved > 0.0) return {other, kMove, saved};
+  return {incumbent, kHold, saved};
+}
+
+template <class S>
+Choice choose(Priced<S>& priced, f64 measured, f64 alone) {
+  const i64 incumbent = priced.s.rule[0].incumbent;
+  switch (static_cast<Policy>(priced.s.rule[0].policy)) {
+    case kDtp:
+      return decide_dtp(priced, measured);
+    case kCusum:
+      return decide_cusum(priced, alone);
+    case kLatencyFirst:
+      return decide_latency_first(priced);
+    case kAtp:
+      return decide_atp(priced);
+    case kStatic:
+      break;
+  }
+  return {incumbent, kHold, NAN};
+}
+
+// Decides what follows a window that has closed; false where the caller has to carry it out.
+template <class S>
+bool decide(S& s, i64 window) {
+  Rule& rule = s.rule[0];
+  const i64 incumbent = rule.incumbent, n = s.options.size, n_nodes = s.clock[0].n_nodes;
+  const f64* shares = &s.shares[snapshot_row(s, 0, window)];
+  Priced<S> priced(s, window);
+  estimate(priced, shares, shares + n_nodes, shares + 2 * n_nodes);
+  const f64 n_cycles = static_cast<f64>(s.cell(0).window_cycles);
+  priced.l95_ms(incumbent) = priced.seen.l95_ms;
+  priced.violation_rate(incumbent) = static_cast<f64>(priced.seen.missed) / n_cycles;
+  f64 sum = 0.0;
+  for (i64 c = 0; c < n; ++c) {
+    priced.excess(c) = excess(priced, c);
+    priced.is_within(c) = priced.excess(c) <= 0.0;
+    priced.j(c) = NAN;
+    if (!rule.is_priced) continue;
+    priced.j(c) = price(s, priced.l95_ms(c), priced.violation_rate(c), used_by_tiers(priced, c),
+                        s.switching[incumbent * n + c]);
+    sum += priced.j(c);
+  }
+  const Used used = used_by_tiers(priced, incumbent);
+  const f64 moved = s.switching[rule.previous * n + incumbent];
+  const f64 l95_ms = priced.l95_ms(incumbent), rate = priced.violation_rate(incumbent);
+  const f64 measured = price(s, l95_ms, rate, used, moved);
+  if (!(measured < std::numeric_limits<f64>::infinity()) ||
+      !(sum < std::numeric_limits<f64>::infinity())) {
+    rule.order = -1;
+    return false;
+  }
+  const f64 alone = price(s, l95_ms, rate, used, 0.0);
+  const Choice choice = choose(priced, measured, alone);
+  const bool moves = choice.placement != incumbent;
+  rule.dwell = moves ? 0 : rule.dwell + 1;
+  rule.previous = incumbent;
+  rule.incumbent = rule.order = choice.placement;
+  s.decided[window] = Decided{measured,
+                              choice.delta_j,
+                              rule.dwell,
+                              static_cast<i32>(incumbent),
+                              static_cast<i32>(choice.placement),
+                              choice.reason};
+  return !moves;
+}
+
+// Stamps the cycles that may be released before the decision at the next close.
+template <class S>
+void stamp_next(S& s) {
+  const Cell& cell = s.cell(0);
+  Rule& rule = s.rule[0];
+  i64 reach = cell.close_cycle;
+  if (reach <= cell.n_cycles) {
+    const i64 close_ns = cell.close_ns[reach - 1];
+    if (close_ns > cell.release_ns[reach]) {
+      while (reach <= cell.n_cycles && cell.release_ns[reach] <= close_ns) ++reach;
+    }
+  }
+  const i16 stamp = static_cast<i16>(rule.incumbent);
+  for (i64 cycle = rule.stamped; cycle < std::min(reach, cell.n_cycles); ++cycle) {
+    s.stamps[cycle] = stamp;
+  }
+  rule.stamped = reach;
+}
+
+}  // namespace dwell
