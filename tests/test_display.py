@@ -125,7 +125,10 @@ def shown(canonical: Problem, run: dwell.Run, study: StudyResult) -> dict[str, D
 
 @pytest.fixture(scope="module")
 def objects(
-    canonical: Problem, shown: Mapping[str, Displayed], tmp_path_factory: pytest.TempPathFactory
+    canonical: Problem,
+    run: dwell.Run,
+    shown: Mapping[str, Displayed],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> dict[type, object]:
     """An object of every public class: results, what they are made of, and the rest by hand."""
     ints = np.zeros((100, 4), np.int64)
@@ -150,6 +153,7 @@ def objects(
         Trace(table, "rtt_ms"),
         Hindsight(),
         mean_interval([1.0, 2.0, 3.0]),
+        *(run.arrays("cycles"), run.arrays("cycles").names("placement")),
         Journal(tmp_path_factory.mktemp("journal"), run="r", meta={}, columns={}),
     ]
     seen: dict[type, object] = {}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import dwell.study
 from dwell.study.intervals import mean_interval
-from dwell.study.over_seeds import interval_of
+from dwell.study.over_seeds import interval_of, over_seeds
 
 
 @pytest.mark.parametrize("column", ["migrations", "l95_ms", "cost", "u_edge", "u_R1"])
@@ -15,6 +16,10 @@ def test_what_cannot_be_below_nothing_has_no_limit_there(column: str) -> None:
     mean, low, high = mean_interval(values)
     assert low < 0
     assert interval_of(column)(values) == (mean, 0.0, high)
+
+
+def test_the_package_has_the_function_and_not_the_module_of_its_name() -> None:
+    assert dwell.study.over_seeds is over_seeds
 
 
 def test_a_mean_of_differences_may_be_on_either_side() -> None:

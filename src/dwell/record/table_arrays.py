@@ -33,6 +33,9 @@ class Names:
     places: NDArray[np.integer]
     known: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        return f"<Names: {len(self.places)} of {', '.join(self.known)}>"
+
     @classmethod
     def of(cls, names: Sequence[str], known: Sequence[str]) -> Names:
         """Find names among those that are known."""
@@ -68,6 +71,9 @@ class TableArrays:
 
     def __init__(self, columns: Mapping[str, Made]) -> None:
         self._columns = dict(columns)
+
+    def __repr__(self) -> str:
+        return f"<TableArrays: {', '.join(self)}>"
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._columns)

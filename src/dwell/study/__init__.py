@@ -5,6 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+# Not when it is asked for: the name is that of the module, too.
+from dwell.study.over_seeds import over_seeds, windows_behind
+
 if TYPE_CHECKING:
     from dwell.study.comparison import AIM, Comparison, compare
     from dwell.study.demo import (
@@ -24,7 +27,6 @@ if TYPE_CHECKING:
         under,
     )
     from dwell.study.kept_bounds import keeps
-    from dwell.study.over_seeds import over_seeds, windows_behind
     from dwell.study.pairs import PairedDifference, PairedMedian, paired_difference, paired_median
     from dwell.study.player import Example
     from dwell.study.predictions import paper_predictions
@@ -100,7 +102,6 @@ _HOME = {
     "mean_interval": "dwell.study.intervals",
     "median_interval": "dwell.study.intervals",
     "open_study": "dwell.study.study_folder",
-    "over_seeds": "dwell.study.over_seeds",
     "paired_difference": "dwell.study.pairs",
     "paired_median": "dwell.study.pairs",
     "paper_predictions": "dwell.study.predictions",
@@ -113,7 +114,6 @@ _HOME = {
     "under": "dwell.study.intervals",
     "untold": "dwell.study.family",
     "validate": "dwell.study.validation",
-    "windows_behind": "dwell.study.over_seeds",
 }
 
 
