@@ -10,13 +10,19 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import ROOT, run_module
 
+# A worker of the study imports this module: what it does not need is imported where it is used.
+if TYPE_CHECKING:
+    from dwell.study import Study
+
 STUDY = ROOT / "benchmarks" / "study.yaml"
 CORES = 2
 QUICK = 4
+START = Goal(high=1.3)
 
 
 def measure(quick: bool) -> Section:
@@ -38,6 +44,14 @@ def measure(quick: bool) -> Section:
         ),
         Figure("  of the CPU time: the process that asks", [one["own_s"] for one in said], "s"),
         Figure("again, with all parts there", [one["again_s"] for one in said], "s"),
+        Figure(
+            "a cycle, one process, CPU time",
+            [one["cycle_ns"] for one in said],
+            "ns",
+            None if quick else Goal(high=500),
+        ),
+        Figure("  of it summaries", [100 * one["summed_up"] for one in said], "%"),
+        Figure("start of a worker, CPU time", [one["start_s"] for one in said], "s", START),
     ]
     share = sum(one["cpu_s"] for one in said) / sum(one["wall_s"] for one in said) / CORES
     busy = "" if share > 0.9 else ": others used them, or they waited"
@@ -67,6 +81,7 @@ def _run_alone(seeds: int | None) -> None:
         run_study(study, folder=Path(folder) / "study", processes=CORES)
         end = time.perf_counter()
     own, children = (after - was for after, was in zip(spent, before, strict=True))
+    cycle_ns, summed_up = _in_one_process(study)
     print(
         json.dumps(
             {
@@ -76,9 +91,42 @@ def _run_alone(seeds: int | None) -> None:
                 "cpu_s": own + children,
                 "own_s": own,
                 "again_s": end - middle,
+                "cycle_ns": cycle_ns,
+                "summed_up": summed_up,
+                "start_s": _start_s(study),
             }
         )
     )
+
+
+def _in_one_process(study: Study) -> tuple[float, float]:
+    """CPU time a cycle of the first seed's runs, ns, and the summaries' share of it."""
+    import dwell
+    from dwell.study.summary import summarise
+
+    problem = study.points[0].problem
+    begin, summed_s = time.process_time(), 0.0
+    for scenario in study.scenarios:
+        realisation = dwell.draw(
+            problem, scenario=scenario, seed=study.seeds[0], windows=study.windows
+        )
+        for policy in study.policies:
+            run = dwell.simulate_realisation(problem, realisation, policy=policy)
+            played = time.process_time()
+            summarise(run, problem, {})
+            summed_s += time.process_time() - played
+    took_s = time.process_time() - begin
+    return took_s * 1e9 * len(study.seeds) / study.cycles, summed_s / took_s
+
+
+def _start_s(study: Study) -> float:
+    """CPU time of a worker that has next to nothing to do."""
+    from dwell.study import run_study
+
+    tiny = replace(study, windows=20, seeds=study.seeds[:1])
+    _, before = _spent()
+    run_study(tiny, processes=CORES)
+    return (_spent()[1] - before) / CORES
 
 
 def _spent() -> tuple[float, float]:
