@@ -11,9 +11,10 @@ import pytest
 
 import dwell
 from dwell.errors import SimulationError
+from dwell.kernels import library
 from dwell.model.qos import QoS
 from dwell.study import Contender, Point
-from dwell.study.software import PACKAGES, describe, software, versions
+from dwell.study.software import describe, software, versions
 from tests.cells.small import make_problem
 from tests.study.test_study import make_study, with_delay
 
@@ -32,8 +33,14 @@ class Patient:
 
 def test_versions_are_those_of_what_is_installed() -> None:
     assert versions()["dwell"] == dwell.__version__
-    assert versions().keys() == {"dwell", "python", *PACKAGES}
+    assert versions().keys() == {"dwell", "numpy", "kernel", "python", "polars"}
     assert software().keys() - versions().keys() == {"sources"}
+
+
+def test_the_kernel_is_known_by_its_sources_whoever_compiled_them() -> None:
+    digest = library.digest()[:16]
+    assert versions()["kernel"] == f"{digest} {library.compiler()}"
+    assert software()["kernel"] == digest
 
 
 def known_as(policy: object) -> object:

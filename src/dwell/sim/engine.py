@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import platform
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell import __version__
 from dwell.control import (
     Controller,
     Estimator,
@@ -34,6 +32,7 @@ from dwell.record import Run
 from dwell.sim.cold_migration import ColdMigration
 from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
+from dwell.sim.versions import versions
 
 #: Codes of policies by the names of their classes.
 POLICIES = {
@@ -475,9 +474,5 @@ def _meta(
         "seed": seed,
         "windows": windows,
         "problem": to_document(problem),
-        "versions": {
-            "dwell": __version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
     }

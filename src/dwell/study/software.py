@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
-import platform
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from typing import Any
 
-from dwell import __version__
 from dwell.cellfile.sources import digest_of
 from dwell.errors import SimulationError
 from dwell.model import FrozenDict
@@ -19,9 +17,7 @@ from dwell.model.document import to_document
 from dwell.model.user_classes import is_class_path, source_digest
 from dwell.study.study import Contender, Study
 
-#: Packages whose versions are noted.
-PACKAGES = ("numpy", "numba", "polars")
-#: Parts of this package that make numbers.
+#: Python sources of this package that make numbers; the kernel has a digest of its own.
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
     *(f"study/{name}.py" for name in ("clairvoyant", "hindsight", "player")),
@@ -30,15 +26,32 @@ SOURCES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the software that makes numbers."""
-    packages = {name: version(name) for name in PACKAGES}
-    return {"dwell": __version__, **packages, "python": platform.python_version()}
+    """Return the versions of the software that makes numbers.
+
+    Raises
+    ------
+    KernelError
+        If the compiled kernel cannot be used.
+    """
+    from dwell.sim.versions import versions as simulators
+
+    return {**simulators(), "polars": version("polars")}
 
 
 @cache
 def software() -> Mapping[str, str]:
-    """Return the versions, and a digest of the sources of this package that make numbers."""
-    return FrozenDict({**versions(), "sources": digest_of(SOURCES)})
+    """Return what has to be the same for the same numbers, to the last bit.
+
+    Returns
+    -------
+    mapping of str to str
+        The versions, of the kernel only the digest of its sources, since every compiler makes the
+        same of them; ``sources``, the digest of this package's own.
+    """
+    from dwell.sim.versions import kernel_digest
+
+    own = {"kernel": kernel_digest(), "sources": digest_of(SOURCES)}
+    return FrozenDict({**versions(), **own})
 
 
 def describe(study: Study) -> dict[str, Any]:
