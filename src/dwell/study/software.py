@@ -20,6 +20,7 @@ from dwell.study.study import Contender, Study
 #: Python sources of this package that make numbers; the kernel has a digest of its own.
 SOURCES = (
     *("control", "cost.py", "estimators", "kernels", "model", "policies", "sim"),
+    "record/table_arrays.py",
     *(f"study/{name}.py" for name in ("clairvoyant", "hindsight", "player")),
     *(f"study/{name}.py" for name in ("quality", "reference", "runner", "script", "summary")),
 )
