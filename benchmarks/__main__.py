@@ -23,7 +23,6 @@ BENCHMARKS = {
     "study": ("study", "measure"),
     "memory": ("memory", "measure"),
     "draw": ("drawing", "measure"),
-    "first-use": ("first_use", "measure"),
     "import": ("importing", "measure"),
     "link": ("link", "measure"),
     "testbed-link": ("testbed_link", "measure"),

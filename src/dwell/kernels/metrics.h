@@ -40,8 +40,7 @@ void measure(S& s, i64 cell, i64 window, i64 first, i64 now) {
   std::nth_element(ages, ages + rank - 1, ages + n);
   const i64 l95_ns = ages[rank - 1];
   const f64 l95_ms = static_cast<f64>(l95_ns) / 1e6;
-  const bool lost =
-      unfinished > n - rank && is_age(s, of, row, first, rank, l95_ns, now);
+  const bool lost = unfinished > n - rank && is_age(s, of, row, first, rank, l95_ns, now);
   s.seen[cell * s.clock[0].n_windows + window] =
       Seen{first, missed, std::min(l95_ms, of.longest_ms),
            lost ? std::numeric_limits<f64>::infinity() : l95_ms};

@@ -159,7 +159,6 @@ using Times = const i64*;
 #define DWELL_RULE(field)                                                                        \
   field(i64, policy) field(i64, is_priced)                                                       \
   field(i64, incumbent) field(i64, previous) field(i64, dwell) field(i64, stamped)               \
-  field(i64, order) /* -1 where J of a candidate is no finite number */                          \
   field(i64, min_dwell) field(i64, escape) field(f64, min_improvement)                           \
   field(f64, threshold) field(f64, slack) field(f64, memory)                                     \
   field(i64, local) field(i64, offload) field(i64, every_windows) field(i64, outside_is_cloud)   \

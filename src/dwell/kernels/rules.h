@@ -1,7 +1,8 @@
 // What built-in policies with the estimator `profile` decide at the close of a window.
 //
 // A second body of the classes of dwell.policies and dwell.estimators.profile, which define what is
-// right; it gives every bit of what they give. It works on the one cell of a simulation.
+// right; it gives every bit of what they give. It works on the one cell of a simulation. Bounds of
+// the model keep every J finite.
 #pragma once
 
 #include <cmath>
@@ -196,9 +197,8 @@ Choice decide_cusum(Priced<S>& priced, f64 alone) {
     f64& sum = s.options[c].sum;
     sum = c == rule.incumbent ? 0.0 : std::max(0.0, rule.memory * sum + gain);
   }
-  const i64 best = cheapest(priced, [&](i64 c) {
-    return eligible.has(c) && s.options[c].sum > rule.threshold;
-  });
+  const i64 best =
+      cheapest(priced, [&](i64 c) { return eligible.has(c) && s.options[c].sum > rule.threshold; });
   const Reason holds = eligible.within_caps ? kHold : kInfeasible;
   if (best < 0) return {rule.incumbent, holds, 0.0};
   const f64 delta_j = alone - priced.j(best);
@@ -285,7 +285,6 @@ bool decide(S& s, i64 window) {
   const f64 n_cycles = static_cast<f64>(s.cell(0).window_cycles);
   priced.l95_ms(incumbent) = priced.seen.l95_ms;
   priced.violation_rate(incumbent) = static_cast<f64>(priced.seen.missed) / n_cycles;
-  f64 sum = 0.0;
   for (i64 c = 0; c < n; ++c) {
     priced.excess(c) = excess(priced, c);
     priced.is_within(c) = priced.excess(c) <= 0.0;
@@ -293,23 +292,17 @@ bool decide(S& s, i64 window) {
     if (!rule.is_priced) continue;
     priced.j(c) = price(s, priced.l95_ms(c), priced.violation_rate(c), used_by_tiers(priced, c),
                         s.switching[incumbent * n + c]);
-    sum += priced.j(c);
   }
   const Used used = used_by_tiers(priced, incumbent);
   const f64 moved = s.switching[rule.previous * n + incumbent];
   const f64 l95_ms = priced.l95_ms(incumbent), rate = priced.violation_rate(incumbent);
   const f64 measured = price(s, l95_ms, rate, used, moved);
-  if (!(measured < std::numeric_limits<f64>::infinity()) ||
-      !(sum < std::numeric_limits<f64>::infinity())) {
-    rule.order = -1;
-    return false;
-  }
   const f64 alone = price(s, l95_ms, rate, used, 0.0);
   const Choice choice = choose(priced, measured, alone);
   const bool moves = choice.placement != incumbent;
   rule.dwell = moves ? 0 : rule.dwell + 1;
   rule.previous = incumbent;
-  rule.incumbent = rule.order = choice.placement;
+  rule.incumbent = choice.placement;
   s.decided[window] = Decided{measured,
                               choice.delta_j,
                               rule.dwell,

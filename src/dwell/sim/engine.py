@@ -181,9 +181,8 @@ def _play(
     while (status := play(arrays)) != Status.FINISHED:
         if status == Status.STEP:
             stamper.step()
-        elif not stamper.close_window():
-            # A number is out of its bounds: the controller says which.
-            return _play(problem, realisation, policy, estimator, jobs, guard, by_window=True)
+        else:
+            stamper.close_window()
     return PlayedRealisation(problem, realisation, controller, arrays)
 
 
@@ -276,23 +275,14 @@ class _Stamper:
             tiers=np.array(tiers, np.int8),
         )
 
-    def close_window(self) -> bool:
-        """Carry out what was decided for the window that has just closed, or have it decided.
-
-        Returns
-        -------
-        bool
-            Whether the kernel could decide, where it does.
-        """
+    def close_window(self) -> None:
+        """Carry out what was decided for the window that has just closed, or have it decided."""
         tables = self.arrays.tables
         index = int(tables.cells[0]["window"]) - 1
         boundary = int(tables.seen[0, index]["first_cycle"]) + self.window_cycles
         close_ns = int(self.close_ns[boundary - 1])
         if len(tables.rule):
-            chosen = int(tables.rule[0]["order"])
-            if chosen < 0:
-                return False
-            order = self.names[chosen]
+            order = self.names[tables.rule[0]["incumbent"]]
         elif self._host_down(close_ns):
             self.controller.miss()
             order = self.placement
@@ -300,14 +290,13 @@ class _Stamper:
             order = self._decide(index, boundary, close_ns)
         if order == self.placement:
             self._go_on(boundary)
-            return True
+            return
         earliest = self._takes_effect(boundary, close_ns)
         # Where no window can follow, the run is over, and it does not matter when tasks are ready.
         if earliest + self.window_cycles > self.cycles or not self._begin(
             order, boundary, close_ns
         ):
             self._move(order, earliest)
-        return True
 
     def _decide(self, index: int, boundary: int, close_ns: int) -> str:
         """Ask the controller, and send the probes that it wants."""
