@@ -151,7 +151,6 @@ def test_a_simulation_without_the_kernel_says_how_to_get_it(command: str, tmp_pa
 @pytest.mark.parametrize(
     ("module", "work", "extra"),
     [
-        ("numba", "import dwell; dwell.simulate", "sim"),
         (
             "msgspec",
             "from dwell.cli.process import main; "

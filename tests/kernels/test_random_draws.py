@@ -6,13 +6,14 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from random import Random
 
 import numpy as np
 import pytest
 
 import dwell
 from dwell.errors import ProblemError
-from dwell.kernels.random_draws import drawn_scenario
+from dwell.kernels.random_draws import Drawing, drawn_scenario
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
     Bursts,
@@ -33,7 +34,7 @@ from dwell.model import (
 from dwell.model.scenario import MAX_LAYERS, RAMP_STEPS
 from dwell.sim import draw
 from tests.cells.dynamic import dynamic_problem
-from tests.cells.generated import MS, make_problem
+from tests.cells.generated import MS, make_problem, random_problem
 
 S = 1000 * MS
 LINK = Link("R", "E", Constant(1.0), rate_mbps=100.0, loss=0.1)
@@ -290,3 +291,31 @@ def test_a_drawn_scenario_without_episodes_is_the_same_realisation(name: str) ->
     assert (again.node_changes.table == episodes.node_changes.table).all()  # type: ignore[attr-defined]
     down = [[part.at_ns for part in one.link_segments] for one in (episodes, again)]
     assert down[0] == down[1]
+
+
+# ------------------------------------------------------------------------------ some at a time
+
+
+@pytest.mark.parametrize("taken", [(1, 1, 298), (7,), (150, 150), (299, 1)])
+@pytest.mark.parametrize(
+    "problem", [dynamic_problem(), random_problem(Random(17))], ids=lambda problem: problem.name
+)
+def test_windows_that_are_taken_one_after_another_are_those_of_the_run(
+    problem: Problem, taken: tuple[int, ...]
+) -> None:
+    scenario = list(problem.scenarios)[-1]
+    whole = draw(problem, scenario=scenario, seed=5, windows=300)
+    drawing = Drawing(problem, scenario, seed=5, windows=300)
+    begin = 0
+    for windows in taken:
+        part = drawing.take(windows)
+        end = begin + windows * problem.window_cycles
+        assert (part.windows, part.cycles) == (windows, end - begin)
+        np.testing.assert_array_equal(part.release_ns, whole.release_ns[begin : end + 1])
+        for rows in ("exec_ns", "delay_ns", "extra_ns"):
+            np.testing.assert_array_equal(getattr(part, rows), getattr(whole, rows)[:, begin:end])
+        for table in ("node_changes", "link_segments"):
+            assert list(getattr(part, table)) == list(getattr(whole, table))
+        begin = end
+    with pytest.raises(ValueError, match="more than are left"):
+        drawing.take(301 - sum(taken))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from ctypes import POINTER, c_double, c_int64
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dwell.kernels.drawn_path import BLOCK, path_of
+from dwell.kernels.library import library
 from dwell.model import Process
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
@@ -86,19 +90,38 @@ def drawn_intervals(
     """
     mean_ns = (every.expectation + length.expectation) * unit_ns
     count = 64 + round(1.1 * max(horizon_ns - begin_ns, 0) / mean_ns)
-    begins, ends = [np.empty(0)], [np.empty(0)]
-    now = float(begin_ns)
-    while now < horizon_ns:
-        end = every.marginal(rngs[0], count) * unit_ns
-        on = length.marginal(rngs[1], count) * unit_ns
-        end += on
-        np.cumsum(end, out=end)
-        end += now
-        now = float(end[-1])
-        begins.append(np.subtract(end, on, out=on))
-        ends.append(end)
-    begin = np.concatenate(begins)
-    begun = int(np.searchsorted(begin, horizon_ns))
-    begin, end = begin[:begun], np.minimum(np.concatenate(ends)[:begun], HORIZON_NS)
-    level = np.full(begun, RAMP_STEPS)
-    return OnOffIntervals(np.rint(begin).astype(np.int64), np.rint(end).astype(np.int64), level)
+    times_off = path_of(every, rngs[0], independent=True)
+    times_on = path_of(length, rngs[1], independent=True)
+    parts = [np.empty((2, 0), np.int64)]
+    since_ns = float(begin_ns)
+    while since_ns < horizon_ns:
+        # Times are added up anew every `count` intervals, as many as a run most likely has.
+        part, elapsed_ns, begun = np.empty((2, count), np.int64), c_double(0.0), 0
+        for at in range(0, count, BLOCK):
+            rows = min(BLOCK, count - at)
+            begin, end = part[:, at : at + rows]
+            off, on = times_off.values(rows), times_on.values(rows)
+            begun += _dwell_alternate()(
+                off, on, rows, unit_ns, since_ns, elapsed_ns, horizon_ns, begin, end
+            )
+            if begun < at + rows:
+                break
+        parts.append(part[:, :begun])
+        since_ns += elapsed_ns.value
+    begin, end = parts[-1] if len(parts) == 2 else np.concatenate(parts, axis=1)
+    return OnOffIntervals(begin, end, np.full(len(begin), RAMP_STEPS))
+
+
+@cache
+def _dwell_alternate() -> Any:
+    """Return the library's function; it refuses arrays of another type, or not in one piece."""
+    times = np.ctypeslib.ndpointer(np.float64, ndim=1, flags="C_CONTIGUOUS")
+    instants = np.ctypeslib.ndpointer(np.int64, ndim=1, flags=("C_CONTIGUOUS", "WRITEABLE"))
+    function = library().dwell_alternate
+    function.restype = c_int64
+    function.argtypes = [
+        *(times, times, c_int64),
+        *(c_double, c_double, POINTER(c_double), c_double),
+        *(instants, instants),
+    ]
+    return function

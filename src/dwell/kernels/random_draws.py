@@ -7,23 +7,20 @@ import math
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
-from dwell.kernels.compiled import COMPILED
+from dwell.kernels.drawn_path import BLOCK, Path, ReplayedPath, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
-from dwell.kernels.streams import ar1_path, nanoseconds, standard_normals
 from dwell.model import (
-    AR1,
+    Bursts,
     Constant,
     Disturbance,
-    Link,
     LinkDisturbance,
-    LogNormal,
-    Node,
     NodeDisturbance,
     Problem,
     Process,
@@ -44,8 +41,6 @@ NS_PER_S = 1e9
 OF_A_JOB = ("exec/", "delay/", "extra/", "loss/")
 # Numbers of a cycle beside its draws: release, latency and its parts, and the columns of a Run.
 OF_A_CYCLE = 8
-# Values drawn at a time: a block and its temporaries stay in the second-level cache.
-BLOCK = 16384
 NEVER = OnOffIntervals(*np.empty((3, 0), np.int64))
 
 
@@ -81,14 +76,14 @@ def draw(problem: Problem, *, scenario: str = "baseline", seed: int, windows: in
     SimulationError
         If `seed` or `windows` is out of range, or the memory of this computer too small.
     """
-    disturbances = problem.scenario(scenario)
+    problem.scenario(scenario)
     if isinstance(windows, bool) or windows < 1:
         raise SimulationError(f"windows is {windows!r}; it must be a whole number of at least 1")
     if isinstance(seed, bool) or seed < 0:
         raise SimulationError(f"seed is {seed!r}; it must be a whole number of at least 0")
     _require_memory(problem, windows)
     try:
-        return _Draw(problem, scenario, disturbances, seed, windows).realisation()
+        return Drawing(problem, scenario, seed=seed, windows=windows).take(windows)
     except MemoryError:
         raise SimulationError(
             f"{windows} windows of {scenario!r} need more memory than there is, for their cycles, "
@@ -122,7 +117,7 @@ def drawn_scenario(problem: Problem, *, scenario: str, seed: int, windows: int) 
     TraceError
         If the times of episodes are a trace that is too short or is not there.
     """
-    return _Draw(problem, scenario, problem.scenario(scenario), seed, windows).episodes()
+    return Drawing(problem, scenario, seed=seed, windows=windows).episodes()
 
 
 def draw_changes(
@@ -132,8 +127,8 @@ def draw_changes(
 
     First comes the scenario that they are of, as `drawn_scenario` returns it and with its errors.
     """
-    drawing = _Draw(problem, scenario, problem.scenario(scenario), seed, windows)
-    return drawing.episodes(), *drawing.changes()
+    drawing = Drawing(problem, scenario, seed=seed, windows=windows)
+    return drawing.episodes(), *drawing.changes
 
 
 def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
@@ -142,69 +137,108 @@ def draw_shadows(problem: Problem, realisation: Realisation) -> Realisation:
     Releases, disturbances, scales and the rows of traces are those of the realisation itself: they
     belong to the cycle or to the fabric, not to a job.
     """
-    windows = realisation.windows
-    disturbances = problem.scenario(realisation.scenario)
-    seed = realisation.seed or 0
-    drawing = _Draw(problem, realisation.scenario, disturbances, seed, windows, shadow=True)
+    windows, seed = realisation.windows, realisation.seed or 0
+    drawing = Drawing(problem, realisation.scenario, seed=seed, windows=windows, shadow=True)
     drawing.release_ns = realisation.release_ns
-    return drawing.realisation()
+    return drawing.take(windows)
 
 
-class _Generator(np.random.Generator):
-    """NumPy's generator, with normals drawn by compiled code: the same ones, in half the time."""
+class Drawing:
+    """A realisation that is drawn some windows at a time: every stream goes on where it was left.
 
-    def standard_normal(self, size: int) -> Floats:  # type: ignore[override]
-        if not COMPILED:
-            return super().standard_normal(size)
-        out = np.empty(size)
-        standard_normals(self, out)
-        return out
+    Releases, and what nodes and links go through, are drawn for the whole run.
 
+    Parameters
+    ----------
+    problem : Problem
+    scenario : str
+        Name of one of its scenarios.
+    seed : int
+    windows : int
+        Windows of the whole run.
+    shadow : bool
+        Whether what belongs to one job or message is drawn for shadow jobs.
 
-class _Draw:
-    """One drawing in progress: the seed, the releases and the rows that traces share."""
+    Raises
+    ------
+    ProblemError
+        If there is no such scenario, or the run is too long.
+    """
 
     def __init__(
-        self,
-        problem: Problem,
-        name: str,
-        scenario: Scenario,
-        seed: int,
-        windows: int,
-        shadow: bool = False,
+        self, problem: Problem, scenario: str, *, seed: int, windows: int, shadow: bool = False
     ) -> None:
-        self.problem, self.name, self.scenario = problem, name, scenario
-        self.seed, self.windows = seed, windows
-        self.shadow = shadow
+        self.problem, self.name, self.scenario = problem, scenario, problem.scenario(scenario)
+        self.seed, self.windows, self.shadow = seed, windows, shadow
         self.cycles = problem.cycles_of(windows)
+        self.drawn = 0
+        tasks = problem.pipeline.tasks
+        self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
+        self.hops = _hops(problem)
+        self.paths: dict[str, Path] = {}
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
 
-    def realisation(self) -> Realisation:
-        tasks = self.problem.pipeline.tasks
-        sites = tuple((task, node) for task in tasks for node in tasks[task].on)
-        hops = _hops(self.problem)
-        layers, extra_ns = self._layers(hops)
+    def take(self, windows: int) -> Realisation:
+        """Draw the next windows.
+
+        Returns
+        -------
+        Realisation
+            Of these windows, but for the changes of nodes and the segments of links, which are
+            those of the whole run.
+
+        Raises
+        ------
+        ValueError
+            If fewer are left.
+        """
+        begin, cycles = self.drawn, windows * self.problem.window_cycles
+        if begin + cycles > self.cycles:
+            raise ValueError(
+                f"{windows} windows are more than are left: {self.cycles - begin} cycles"
+            )
+        self.drawn += cycles
+        layers = self._layers()
+        # One piece of memory: the system maps large ones by larger pages.
+        sizes = len(self.sites), len(self.hops), len(layers)
+        ends = np.cumsum(sizes)
+        table = np.empty((ends[-1], cycles), np.int64)
+        exec_ns, delay_ns, extra_ns = np.split(table, ends[:-1])
+        for at in range(0, cycles, BLOCK):
+            block = slice(at, at + BLOCK)
+            self._fill_extra(extra_ns[:, block])
+            self._fill_executions(exec_ns[:, block])
+            self._fill_delays(delay_ns[:, block])
+        node_changes, link_segments = self.changes
         return Realisation(
             scenario=self.name,
             seed=self.seed,
-            windows=self.windows,
-            release_ns=self.release_ns,
-            sites=sites,
-            exec_ns=self._executions(sites),
-            hops=hops,
-            delay_ns=self._delays(hops),
-            loss_keys=np.array([self._key(f"loss/{_hop_name(hop)}") for hop in hops], np.uint64),
+            windows=windows,
+            release_ns=self.release_ns[begin : self.drawn + 1],
+            sites=self.sites,
+            exec_ns=exec_ns,
+            hops=self.hops,
+            delay_ns=delay_ns,
+            loss_keys=np.array(
+                [self._key(f"loss/{_hop_name(hop)}") for hop in self.hops], np.uint64
+            ),
             layers=layers,
             extra_ns=extra_ns,
-            node_changes=self._node_changes(),
-            link_segments=self._link_segments(),
+            node_changes=node_changes,
+            link_segments=link_segments,
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
         )
 
+    @cached_property
     def changes(self) -> tuple[NodeChanges, LinkSegments]:
+        """What nodes and links go through in the whole run."""
         return self._node_changes(), self._link_segments()
+
+    def episodes(self) -> Scenario:
+        """Return the scenario with a disturbance for each of the episodes drawn."""
+        return tuple(one for item in self.scenario for one in self._episodes_of(item))
 
     def _phases(self) -> dict[str, Phase]:
         """Draw where periods and ticks are when the run begins, where a quota is bound to ticks."""
@@ -219,7 +253,7 @@ class _Draw:
         return phases
 
     def _rng(self, name: str) -> np.random.Generator:
-        return _Generator(np.random.SFC64(self._stream(name)))
+        return np.random.Generator(np.random.SFC64(self._stream(name)))
 
     def _key(self, name: str) -> int:
         return int(self._stream(name).generate_state(1, np.uint64)[0])
@@ -228,28 +262,43 @@ class _Draw:
         own = self.shadow and name.startswith(OF_A_JOB)
         return stream(self.seed, f"shadow/{name}" if own else name)
 
+    def _path(self, process: Process, name: str) -> Path:
+        """Return the path of a stream, from where it was left."""
+        if name not in self.paths:
+            self.paths[name] = (
+                ReplayedPath(process.values, self._table_rows(process.table))
+                if isinstance(process, Trace)
+                else path_of(process, self._rng(name))
+            )
+        return self.paths[name]
+
     def _releases(self) -> Ints:
-        pipeline = self.problem.pipeline
-        nominal = np.arange(self.cycles + 1) * (pipeline.period_ms * NS_PER_MS)
-        release: Ints = np.rint(nominal, out=nominal).astype(np.int64)
+        """Draw the instant of every release, and of that of the first cycle beyond the run."""
+        pipeline, count = self.problem.pipeline, self.cycles + 1
+        release = np.empty(count, np.int64)
+        for at in range(0, count, BLOCK):
+            nominal = np.arange(at, min(at + BLOCK, count)) * (pipeline.period_ms * NS_PER_MS)
+            release[at : at + BLOCK] = np.rint(nominal, out=nominal)
         jitter = pipeline.release_jitter_ms
         if jitter == Constant(0.0):
             return release
-        if isinstance(jitter, Trace):
-            # Rows of a trace follow the releases; for its own jitter they follow the nominal ones.
-            self.release_ns = release
-        late = np.zeros(self.cycles + 1, np.int64)
-        self._fill(late[:-1], jitter, "release")
-        if int(release[-1]) + int(late.max()) > HORIZON_NS:
-            late_s, latest_s = short(late.max() / NS_PER_S), short(HORIZON_NS / NS_PER_S)
-            message = (
-                f"moves one of these {self.cycles} cycles by {late_s} s, beyond {latest_s} s, "
-                "where a run ends at the latest: lower it, or ask for fewer windows"
-            )
-            raise ProblemError([Fault("release_jitter_ms", message)])
+        # Rows of a trace follow the releases; for its own jitter they follow the nominal ones.
+        self.release_ns = release
+        path, last_ns = self._path(jitter, "release"), int(release[-1])
+        for at in range(0, self.cycles, BLOCK):
+            block = release[at : min(at + BLOCK, self.cycles)]
+            late = np.empty_like(block)
+            path.fill_ns(late)
+            if last_ns + int(late.max()) > HORIZON_NS:
+                late_s, latest_s = short(late.max() / NS_PER_S), short(HORIZON_NS / NS_PER_S)
+                message = (
+                    f"moves one of these {self.cycles} cycles by {late_s} s, beyond {latest_s} s, "
+                    "where a run ends at the latest: lower it, or ask for fewer windows"
+                )
+                raise ProblemError([Fault("release_jitter_ms", message)])
+            block += late
         # A cycle is never released before the one ahead of it.
-        ordered: Ints = np.maximum.accumulate(release + late)
-        return ordered
+        return np.maximum.accumulate(release, out=release)
 
     def _table_rows(self, table: TraceTable) -> Ints:
         if id(table) not in self.rows:
@@ -263,93 +312,59 @@ class _Draw:
         for table, rows in self.rows.values():
             yield TraceStart(table.file, tuple(table.columns), int(rows[0]) + 1)
 
-    def _fill(self, out: Ints, process: Process, name: str, scale: Floats | None = None) -> None:
-        """Fill `out` with a path of the process in nanoseconds, block by block."""
-        if isinstance(process, Constant) and scale is None:
-            out[:] = round(min(process.value * NS_PER_MS, HORIZON_NS))
-            return
-        for rows, values in self._blocks(process, name, len(out)):
-            if scale is not None:
-                np.multiply(values, scale[rows], out=values)
-            nanoseconds(values, NS_PER_MS, HORIZON_NS, out[rows])
-
-    def _blocks(self, process: Process, name: str, count: int) -> Iterator[tuple[slice, Floats]]:
-        """Draw a path of a process; each block may be changed."""
-        rng, state = self._rng(name), math.nan
-        for begin in range(0, count, BLOCK):
-            rows = slice(begin, min(begin + BLOCK, count))
-            if isinstance(process, Trace):
-                yield rows, process.values[self._table_rows(process.table)[rows]]
-            elif isinstance(process, AR1):
-                noise = rng.standard_normal(rows.stop - begin)
-                state = ar1_path(noise, process.log_correlation, state, begin == 0)
-                mu, sigma = LogNormal(process.mean, process.cv).log_parameters
-                noise *= sigma
-                noise += mu
-                yield rows, np.exp(noise, out=noise)
-            else:
-                yield rows, process.marginal(rng, rows.stop - begin)
-
-    def _executions(self, sites: tuple[tuple[str, str], ...]) -> Ints:
+    def _fill_executions(self, out: Ints) -> None:
+        """Draw the next execution times, a row a site."""
         pipeline = self.problem.pipeline
-        scales: dict[str, Floats] = {}
-        exec_ns = np.empty((len(sites), self.cycles), np.int64)
-        for row, (task, node) in enumerate(sites):
-            name = pipeline.tasks[task].scale
-            if name is not None and name not in scales:
-                scales[name] = self._factors(pipeline.scales[name], name)
-            scale = scales[name] if name is not None else None
+        factors: dict[str, Floats] = {}
+        for row, (task, node) in zip(out, self.sites, strict=True):
+            scale = pipeline.tasks[task].scale
+            if scale is not None and scale not in factors:
+                path = self._path(pipeline.scales[scale], f"scale/{scale}")
+                factors[scale] = path.values(len(row))
             process = pipeline.tasks[task].on[node].exec_ms
-            self._fill(exec_ns[row], process, f"exec/{task}/{node}", scale)
-        return exec_ns
+            path = self._path(process, f"exec/{task}/{node}")
+            path.fill_ns(row, factors[scale] if scale is not None else None)
 
-    def _factors(self, scale: Process, name: str) -> Floats:
-        factors = np.empty(self.cycles)
-        for rows, values in self._blocks(scale, f"scale/{name}", self.cycles):
-            factors[rows] = values
-        return factors
-
-    def _delays(self, hops: tuple[tuple[str, str, str], ...]) -> Ints:
+    def _fill_delays(self, out: Ints) -> None:
+        """Draw the next delays, a row a hop."""
         links = self.problem.fabric.links
-        delay_ns = np.empty((len(hops), self.cycles), np.int64)
-        for row, hop in enumerate(hops):
-            self._fill(delay_ns[row], links[hop[2]].delay_ms, f"delay/{_hop_name(hop)}")
-        return delay_ns
+        for row, hop in zip(out, self.hops, strict=True):
+            self._path(links[hop[2]].delay_ms, f"delay/{_hop_name(hop)}").fill_ns(row)
 
-    def _layers(
-        self, hops: tuple[tuple[str, str, str], ...]
-    ) -> tuple[tuple[tuple[int, int], ...], Ints]:
-        """Extra-delay layers: per link its bursts first, then the scenario's items in order."""
-        added: dict[str, list[tuple[Process, int]]] = {}
-        for name, link in self.problem.fabric.links.items():
-            items = self._on_link(name)
-            added[name] = [(link.bursts.add_delay_ms, 1)] if link.bursts is not None else []
-            added[name] += [(i.add_delay_ms, i.layers) for i in items if i.add_delay_ms is not None]
-        layers = tuple(
-            (hop, layer)
-            for hop, (_, _, link) in enumerate(hops)
-            for layer in range(sum(count for _, count in added[link]))
-        )
-        extra_ns = np.empty((len(layers), self.cycles), np.int64)
+    def _fill_extra(self, out: Ints) -> None:
+        """Draw the next extra delays, a row a layer."""
         row = 0
-        for hop in hops:
-            for ordinal, (process, count) in enumerate(added[hop[2]]):
-                rows = extra_ns[row : row + count]
-                self._fill(rows[-1], process, f"extra/{ordinal}/{_hop_name(hop)}")
-                _split(rows)
+        for hop in self.hops:
+            for ordinal, (process, count) in enumerate(self._added(hop[2])):
+                rows = out[row : row + count]
+                self._path(process, f"extra/{ordinal}/{_hop_name(hop)}").fill_ns(rows[-1])
+                if count > 1:
+                    _split(rows)
                 row += count
-        return layers, extra_ns
+
+    def _layers(self) -> tuple[tuple[int, int], ...]:
+        """Hop and number of each layer of extra delay."""
+        return tuple(
+            (i, layer)
+            for i, hop in enumerate(self.hops)
+            for layer in range(sum(count for _, count in self._added(hop[2])))
+        )
+
+    def _added(self, name: str) -> list[tuple[Process, int]]:
+        """Extra delays of a link and their layers: its bursts first, then the scenario's items."""
+        bursts = self.problem.fabric.links[name].bursts
+        added = [(bursts.add_delay_ms, 1)] if bursts is not None else []
+        items = self._on_link(name)
+        return added + [(i.add_delay_ms, i.layers) for i in items if i.add_delay_ms is not None]
 
     def _on_link(self, link: str) -> list[LinkDisturbance]:
         return [i for i in self.scenario if isinstance(i, LinkDisturbance) and i.link == link]
 
-    def _bursts(self, part: Node | Link) -> OnOffIntervals:
-        """Bursts of a node or link, up to the end of the run."""
-        if part.bursts is None:
-            return NEVER
-        every, length = part.bursts.every_ms, part.bursts.for_ms
-        rngs = self._rng(f"bursts/{part.name}/every"), self._rng(f"bursts/{part.name}/for")
-        return drawn_intervals(every, length, NS_PER_MS, rngs, 0, int(self.release_ns[-1]))
+    def _bursts(self, bursts: Bursts, name: str) -> OnOffIntervals:
+        """Draw the bursts of the node or link of this name, up to the end of the run."""
+        rngs = self._rng(f"bursts/{name}/every"), self._rng(f"bursts/{name}/for")
+        horizon_ns = int(self.release_ns[-1])
+        return drawn_intervals(bursts.every_ms, bursts.for_ms, NS_PER_MS, rngs, 0, horizon_ns)
 
     def _intervals(self, item: Disturbance) -> OnOffIntervals:
         """Return the times at which a disturbance is on, up to the end of the run."""
@@ -366,11 +381,7 @@ class _Draw:
         drawn = drawn_intervals(every, length, NS_PER_S, rngs, begin_ns, horizon_ns)
         return drawn.until(end_ns)
 
-    def episodes(self) -> Scenario:
-        """Return the scenario with a disturbance for each of the episodes drawn."""
-        return tuple(one for item in self.scenario for one in self.episodes_of(item))
-
-    def episodes_of(self, item: Disturbance) -> Iterator[Disturbance]:
+    def _episodes_of(self, item: Disturbance) -> Iterator[Disturbance]:
         """Yield a disturbance for each time that one is on; itself where it has no episodes."""
         if item.episodes is None:
             yield item
@@ -388,7 +399,7 @@ class _Draw:
         for row, node in enumerate(self.problem.fabric.nodes.values()):
             steps = [np.empty((3, 0), np.int64)]
             if node.bursts is not None and node.bursts.threads:
-                steps.append(_steps(self._bursts(node), node.bursts.threads))
+                steps.append(_steps(self._bursts(node.bursts, node.name), node.bursts.threads))
             steps += [
                 _steps(self._intervals(item), item.stress_threads, item.down)
                 for item in self.scenario
@@ -409,7 +420,9 @@ class _Draw:
         tables = [np.empty((0, 4), np.int64)]
         tables_f = [np.empty((0, 2))]
         for row, link in enumerate(self.problem.fabric.links.values()):
-            bursts = self._bursts(link)
+            bursts = NEVER
+            if link.bursts is not None:
+                bursts = self._bursts(link.bursts, link.name)
             active = [(item, self._intervals(item)) for item in self._on_link(link.name)]
             edges = [edge for _, intervals in active for edge in (intervals.begin, intervals.end)]
             start = np.zeros(1, np.int64)

@@ -1,0 +1,130 @@
+// Draws a path of a random process, one value a cycle: independent values, or those of an AR(1)
+// process; as they are, or in whole nanoseconds.
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <cstdint>
+
+#include "export.h"
+#include "nanoseconds.h"
+#include "sfc64.h"
+#include "ziggurat.h"
+
+namespace dwell {
+namespace {
+
+// Kinds of paths.
+constexpr int64_t kConstant = 0;
+constexpr int64_t kUniform = 1;
+constexpr int64_t kNormal = 2;
+constexpr int64_t kLogNormal = 3;
+
+// A path and how far it is drawn; drawn_path.py has the same struct.
+struct DrawnPath {
+  Sfc64 stream;
+  int64_t kind;
+  double location;     // constant: the value; uniform: the lower end; else the normal's mean
+  double spread;       // uniform: length of the interval; else the normal's deviation
+  double least;        // normal: no value is below
+  double correlation;  // lognormal: of a cycle's logarithm with that of the cycle before
+  double gain;         // lognormal: sqrt(1 - correlation^2)
+  double last;         // lognormal: the last standard normal; NaN where the path has not begun
+};
+static_assert(sizeof(DrawnPath) == 88);
+
+// Values at a time: they stay in the first-level cache.
+constexpr int64_t kBlock = 512;
+
+// x[t] = r x[t-1] + sqrt(1 - r^2) e[t]; the first of all is e[0] itself.
+void remember(DrawnPath& path, double* normals, int64_t count) noexcept {
+  const bool begins = std::isnan(path.last);
+  double last = begins ? normals[0] : path.last;
+  for (int64_t i = begins ? 1 : 0; i < count; ++i) {
+    last = path.correlation * last + path.gain * normals[i];
+    normals[i] = last;
+  }
+  path.last = last;
+}
+
+void draw_block(DrawnPath& path, double* values, int64_t count) noexcept {
+  switch (path.kind) {
+    case kConstant:
+      std::fill_n(values, count, path.location);
+      return;
+    case kUniform: {
+      Sfc64 stream = path.stream;
+      for (int64_t i = 0; i < count; ++i) {
+        values[i] = path.location + path.spread * stream.uniform();
+      }
+      path.stream = stream;
+      return;
+    }
+    case kNormal:
+      draw_normals(path.stream, values, count);
+      for (int64_t i = 0; i < count; ++i) {
+        values[i] = std::max(values[i] * path.spread + path.location, path.least);
+      }
+      return;
+    case kLogNormal:
+      draw_normals(path.stream, values, count);
+      if (path.correlation != 0.0) remember(path, values, count);
+      for (int64_t i = 0; i < count; ++i) values[i] = values[i] * path.spread + path.location;
+      return;
+    default:
+      return;
+  }
+}
+
+// Turns milliseconds into whole nanoseconds.
+void round_block(const double* ms, int64_t count, int64_t* ns) noexcept {
+  // The sum's last bits are the whole number, where that is below 2^51: 26 days.
+  constexpr double kRound = 0x1.8p52;
+  bool far = false;
+  for (int64_t i = 0; i < count; ++i) {
+    const double exact = ms[i] * kNsPerMs;
+    far |= exact >= 0x1p51;
+    ns[i] = std::bit_cast<int64_t>(exact + kRound) - std::bit_cast<int64_t>(kRound);
+  }
+  if (!far) return;
+  for (int64_t i = 0; i < count; ++i) ns[i] = round_ns(std::min(ms[i] * kNsPerMs, kHorizonNs));
+}
+
+void scale_block(double* values, const double* factors, int64_t count) noexcept {
+  for (int64_t i = 0; i < count; ++i) values[i] *= factors[i];
+}
+
+}  // namespace
+
+// Draws the next values of a path.
+DWELL_EXPORT void dwell_draw(DrawnPath* path, int64_t count, double* values) noexcept {
+  for (int64_t i = 0; i < count; i += kBlock) {
+    draw_block(*path, values + i, std::min(kBlock, count - i));
+  }
+}
+
+// Draws the next values of a path, ms, times factors where there are any, and rounds them to ns.
+DWELL_EXPORT void dwell_draw_ns(DrawnPath* path, int64_t count, const double* factors,
+                                int64_t* ns) noexcept {
+  double block[kBlock];
+  for (int64_t i = 0; i < count; i += kBlock) {
+    const int64_t n = std::min(kBlock, count - i);
+    draw_block(*path, block, n);
+    if (factors != nullptr) scale_block(block, factors + i, n);
+    round_block(block, n, ns + i);
+  }
+}
+
+// Rounds values in ms, times factors where there are any, to ns.
+DWELL_EXPORT void dwell_round_ns(const double* ms, int64_t count, const double* factors,
+                                 int64_t* ns) noexcept {
+  double block[kBlock];
+  for (int64_t i = 0; i < count; i += kBlock) {
+    const int64_t n = std::min(kBlock, count - i);
+    std::copy_n(ms + i, n, block);
+    if (factors != nullptr) scale_block(block, factors + i, n);
+    round_block(block, n, ns + i);
+  }
+}
+
+}  // namespace dwell

@@ -1,0 +1,19 @@
+#pragma once
+
+// Times in whole nanoseconds.
+
+#include <cstdint>
+
+namespace dwell {
+
+constexpr double kNsPerMs = 1e6;
+// No duration of a realisation is longer (dwell.model.instants.HORIZON_NS).
+constexpr double kHorizonNs = 9.2e18;
+
+// Rounds half to even; from 0 to 2^63.
+inline int64_t round_ns(double ns) noexcept {
+  // The sum has no room for a fraction, and from 2^52 on a double has none.
+  return static_cast<int64_t>(ns < 0x1p52 ? (ns + 0x1p52) - 0x1p52 : ns);
+}
+
+}  // namespace dwell
