@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
+from dwell.kernels.disturbances import LEVELS, LinkFault, NodeLoad, link_segments, node_changes
 from dwell.kernels.drawn_path import BLOCK, Path, ReplayedPath, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
@@ -41,7 +42,9 @@ NS_PER_S = 1e9
 OF_A_JOB = ("exec/", "delay/", "extra/", "loss/")
 # Numbers of a cycle beside its draws: release, latency and its parts, and the columns of a Run.
 OF_A_CYCLE = 8
-NEVER = OnOffIntervals(*np.empty((3, 0), np.int64))
+# By level of a disturbance: its share of the full strength, and whether it is on.
+STRENGTHS = np.arange(LEVELS) / RAMP_STEPS
+ON = np.arange(LEVELS).clip(max=1)
 
 
 def stream(seed: int, name: str) -> np.random.SeedSequence:
@@ -392,62 +395,50 @@ class Drawing:
             yield replace(item, at_s=begin_ns / NS_PER_S, for_s=length_s, episodes=None)
 
     def _node_changes(self) -> NodeChanges:
-        """Fold stress, bursts and outages of each node into the states it goes through."""
-        nodes = tuple(self.problem.fabric.nodes)
-        horizon = int(self.release_ns[-1])
-        tables = [np.empty((0, 4), np.int64)]
-        for row, node in enumerate(self.problem.fabric.nodes.values()):
-            steps = [np.empty((3, 0), np.int64)]
+        """Merge stress, bursts and outages of nodes into the states they go through."""
+        nodes = self.problem.fabric.nodes
+        loads = []
+        for number, node in enumerate(nodes.values()):
             if node.bursts is not None and node.bursts.threads:
-                steps.append(_steps(self._bursts(node.bursts, node.name), node.bursts.threads))
-            steps += [
-                _steps(self._intervals(item), item.stress_threads, item.down)
+                threads = np.rint(node.bursts.threads * STRENGTHS)
+                loads.append(NodeLoad(self._bursts(node.bursts, node.name), number, threads, False))
+            loads += [
+                NodeLoad(
+                    self._intervals(item),
+                    number,
+                    np.rint(item.stress_threads * STRENGTHS),
+                    item.down,
+                )
                 for item in self.scenario
                 if isinstance(item, NodeDisturbance) and item.node == node.name
             ]
-            at, threads, down = _accumulate(np.concatenate(steps, axis=1))
-            count = int(np.searchsorted(at, horizon, side="right"))
-            table = np.empty((count, 4), np.int64)
-            table[:, 0], table[:, 1] = at[:count], row
-            table[:, 2], table[:, 3] = threads[:count], down[:count] > 0
-            tables.append(table)
-        table = np.concatenate(tables)
-        return NodeChanges(nodes, table.take(np.argsort(table[:, 0], kind="stable"), axis=0))
+        return NodeChanges(tuple(nodes), node_changes(loads, len(nodes), int(self.release_ns[-1])))
 
     def _link_segments(self) -> LinkSegments:
-        """Cut each link's time where something begins or ends, and sum up what holds in between."""
-        links = tuple(self.problem.fabric.links)
-        tables = [np.empty((0, 4), np.int64)]
-        tables_f = [np.empty((0, 2))]
-        for row, link in enumerate(self.problem.fabric.links.values()):
-            bursts = NEVER
+        """Merge bursts and faults of each link into the segments of its time."""
+        links = self.problem.fabric.links
+        tables = [(np.empty((0, 4), np.int64), np.empty((0, 2)))]
+        for number, link in enumerate(links.values()):
+            faults, layer = [], 0
             if link.bursts is not None:
-                bursts = self._bursts(link.bursts, link.name)
-            active = [(item, self._intervals(item)) for item in self._on_link(link.name)]
-            edges = [edge for _, intervals in active for edge in (intervals.begin, intervals.end)]
-            start = np.zeros(1, np.int64)
-            cuts = np.unique(np.concatenate((start, *edges, bursts.begin, bursts.end)))
-            table = np.zeros((len(cuts), 4), np.int64)
-            table_f = np.empty((len(cuts), 2))
-            table[:, 0], table[:, 1] = cuts, row
-            survives = np.full(len(cuts), 1 - link.loss)
-            rate = np.full(len(cuts), link.rate_mbps)
-            table[:, 3] = bursts.levels(cuts) > 0
-            layer = int(link.bursts is not None)
-            for item, intervals in active:
-                level = intervals.levels(cuts)
-                on = level > 0
-                table[on, 2] |= int(item.down)
-                survives *= 1 - item.loss * (level / RAMP_STEPS)
-                rate = np.minimum(rate, _rates(link.rate_mbps, item.rate_mbps, level))
+                always, own_rate = np.ones(LEVELS), np.full(LEVELS, math.inf)
+                faults.append(
+                    LinkFault(self._bursts(link.bursts, link.name), ON, always, own_rate, False)
+                )
+                layer = 1
+            for item in self._on_link(link.name):
+                layers = np.zeros(LEVELS, np.int64)
                 if item.layers:
                     # The level of a ramp in binary says which of its layers are on.
-                    table[:, 3] |= (level if item.ramp_s else on.astype(np.int64)) << layer
+                    layers = (np.arange(LEVELS) if item.ramp_s else ON) << layer
                     layer += item.layers
-            table_f[:, 0], table_f[:, 1] = rate, 1 - survives
-            tables.append(table)
-            tables_f.append(table_f)
-        return LinkSegments(links, np.concatenate(tables), np.concatenate(tables_f))
+                arriving = 1 - item.loss * STRENGTHS
+                rates = _rates(link.rate_mbps, item.rate_mbps)
+                intervals = self._intervals(item)
+                faults.append(LinkFault(intervals, layers, arriving, rates, item.down))
+            tables.append(link_segments(faults, number, link.rate_mbps, link.loss))
+        table, table_f = map(np.concatenate, zip(*tables, strict=True))
+        return LinkSegments(tuple(links), table, table_f)
 
 
 def _split(rows: Ints) -> None:
@@ -459,35 +450,13 @@ def _split(rows: Ints) -> None:
     rows[-1] -= rows[:-1].sum(axis=0)
 
 
-def _rates(own_mbps: float, mbps: float, level: Ints) -> Floats:
+def _rates(own_mbps: float, mbps: float) -> Floats:
     """Rate of a link at each level of a disturbance: the time that a bit takes grows evenly."""
-    share = level[level > 0] / RAMP_STEPS
-    rates = np.full(len(level), math.inf)
+    rates = np.full(LEVELS, math.inf)
     if mbps < math.inf:
-        rates[level > 0] = 1 / ((1 - share) / own_mbps + share / mbps)
-        rates[level == RAMP_STEPS] = mbps
+        rates[1:] = 1 / ((1 - STRENGTHS[1:]) / own_mbps + STRENGTHS[1:] / mbps)
+        rates[-1] = mbps
     return rates
-
-
-def _steps(intervals: OnOffIntervals, threads: int, down: bool = False) -> Ints:
-    """Steps at the begins and ends of intervals: rows at, change of threads, change of outages."""
-    steps = np.empty((3, 2 * len(intervals.begin)), np.int64)
-    steps[0, 0::2], steps[0, 1::2] = intervals.begin, intervals.end
-    steps[1, 0::2] = np.rint(threads * (intervals.level / RAMP_STEPS))
-    steps[2, 0::2] = down
-    steps[1:, 1::2] = -steps[1:, 0::2]
-    return steps
-
-
-def _accumulate(steps: Ints) -> Ints:
-    """Sum steps (rows at, change, change) up into the levels that hold from each instant on."""
-    # Take and compress are several times as fast as indexing, and nothing is faster still.
-    if (steps[0, 1:] < steps[0, :-1]).any():
-        steps = steps.take(np.argsort(steps[0], kind="stable"), axis=1)
-    np.cumsum(steps[1:], axis=1, out=steps[1:])
-    last = np.ones(steps.shape[1], np.bool_)
-    np.not_equal(steps[0, 1:], steps[0, :-1], out=last[:-1])
-    return steps if last.all() else steps.compress(last, axis=1)
 
 
 def _hop_name(hop: tuple[str, str, str]) -> str:
