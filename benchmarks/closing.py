@@ -13,8 +13,8 @@ from benchmarks.canonical import CELL
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, shared_core, took
 from dwell.control import ClosedWindow, Controller
+from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
-from dwell.kernels.event_loop import play
 from dwell.model import Problem
 
 COUNTS = (1, 3, 6, 12, 24)

@@ -12,8 +12,8 @@ from benchmarks.canonical import CELL
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, ratios, shared_core, took
 from dwell import Realisation
+from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, lay_out
-from dwell.kernels.event_loop import play
 from dwell.model import Problem
 
 SIZES = (1, 8, 64)

@@ -35,7 +35,7 @@ def describe(cores: list[int]) -> dict[str, str]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
         "dwell": __version__,
-        **{name: version(name) for name in ("numpy", "numba", "polars")},
+        **{name: version(name) for name in ("numpy", "polars")},
     }
 
 

@@ -45,7 +45,6 @@ LONGEST = (
     "live/test_protocol_model.py",
     "reproduction/test_questions.py",
     "live/test_continuity.py",
-    "cli/test_first_answer.py",
     "test_package.py",
     "cli/test_doctor.py",
     "cli/test_new.py",

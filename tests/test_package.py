@@ -85,7 +85,7 @@ def run(
     more : str
         Variables of its environment.
     """
-    ours = ("PYTHONPATH", "VIRTUAL_ENV", "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT")
+    ours = ("PYTHONPATH", "VIRTUAL_ENV")
     kept = {name: value for name, value in os.environ.items() if name not in ours}
     return subprocess.run(
         list(map(str, words)),

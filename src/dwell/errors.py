@@ -36,7 +36,6 @@ OPTIONAL = {
     "distributed": ("distributed", "dask"),
     "jinja2": ("Jinja2", "report"),
     "msgspec": ("msgspec", "live"),
-    "numba": ("Numba", "sim"),
     "polars": ("Polars", "sim"),
     "psutil": ("psutil", "live"),
     "scipy": ("SciPy", "sim"),

@@ -12,7 +12,7 @@ import dwell
 from tests.cli.small_cell import CANONICAL, environment, interrupt_at_first_sign
 
 # Not pydantic: Typer itself may read arguments with it.
-HEAVY = ("polars", "numba", "numpy", "matplotlib", "rich", "yaml", "zenoh")
+HEAVY = ("polars", "numpy", "matplotlib", "rich", "yaml", "zenoh")
 
 
 def call(*arguments: str | Path, folder: Path) -> subprocess.CompletedProcess[str]:

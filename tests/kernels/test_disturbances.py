@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.kernels.disturbances import LEVELS, LinkFault, NodeLoad, link_segments, node_changes
+from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
 from dwell.kernels.on_off_intervals import OnOffIntervals, interval
 from dwell.model.scenario import RAMP_STEPS
 
@@ -27,7 +27,7 @@ def intervals(draw: st.DrawFn) -> OnOffIntervals:
 
 
 node_loads = st.builds(
-    NodeLoad,
+    NodeEffect,
     intervals(),
     node=st.integers(0, NODES - 1),
     threads=st.integers(0, 40).map(lambda threads: np.rint(threads * strengths)),
@@ -44,7 +44,7 @@ link_faults = st.builds(
 
 
 @given(st.lists(node_loads, max_size=6), st.integers(0, 60))
-def test_a_node_has_the_threads_of_all_that_is_on(loads: list[NodeLoad], last_ns: int) -> None:
+def test_a_node_has_the_threads_of_all_that_is_on(loads: list[NodeEffect], last_ns: int) -> None:
     expected = []
     for node in range(NODES):
         on_node = [load for load in loads if load.node == node]
@@ -88,9 +88,9 @@ def test_of_what_happens_at_one_instant_the_state_after_it_counts() -> None:
     """Two on the first node, one that begins where the other ends, and one on the last node."""
     one, two = np.full(LEVELS, 1.0), np.full(LEVELS, 2.0)
     loads = [
-        NodeLoad(interval(10, 20), 2, one, True),
-        NodeLoad(interval(20, 30), 0, two, False),
-        NodeLoad(interval(10, 20), 0, one, False),
+        NodeEffect(interval(10, 20), 2, one, True),
+        NodeEffect(interval(20, 30), 0, two, False),
+        NodeEffect(interval(10, 20), 0, one, False),
     ]
     assert node_changes(loads, NODES, 25).tolist() == [
         [10, 0, 1, 0],

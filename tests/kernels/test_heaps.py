@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dwell.kernels.tables import row_types
+from dwell.kernels.rows import row_types
 from tests.kernels.parts import at, ints, parts
 
 TAKE = -1

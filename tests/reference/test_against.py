@@ -21,9 +21,9 @@ from dwell.control import Controller
 from dwell.control import guard as control_guard
 from dwell.estimators import Evidence, Instants
 from dwell.kernels import arrays as sim_arrays
+from dwell.kernels.advance import play as advance_to_end
 from dwell.kernels.arrays import lay_out, ordered_flows
 from dwell.kernels.codes import Status
-from dwell.kernels.event_loop import play as advance_to_end
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (

@@ -92,10 +92,6 @@ def test_other_processes_make_the_same_run(canonical: Problem) -> None:
     assert digests_elsewhere(8, PYTHONHASHSEED="2") == here
 
 
-def test_compiled_and_interpreted_kernels_make_the_same_run() -> None:
-    assert digests_elsewhere(3, NUMBA_DISABLE_JIT="1") == digests_elsewhere(3)
-
-
 # --------------------------------------------------------------------- common random numbers
 
 

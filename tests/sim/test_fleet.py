@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import dwell
+from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
-from dwell.kernels.codes import Outcome, Status
-from dwell.kernels.event_loop import play
+from dwell.kernels.codes import CycleOutcome, Status
 from dwell.kernels.realisation import Realisation
-from dwell.kernels.tables import Tables
+from dwell.kernels.rows import Tables
 from dwell.model import (
     Execution,
     Exponential,
@@ -95,7 +95,7 @@ def test_cells_that_share_nothing_do_not_notice_each_other() -> None:
         alone = played([cell], set())
         cycles = cell[1].cycles
         # The cell that ends first still sees its last cycles through while the other goes on.
-        settled = alone.outcome[0] != Outcome.IN_FLIGHT
+        settled = alone.outcome[0] != CycleOutcome.IN_FLIGHT
         assert settled.mean() > 0.99
         for table in ("latency_ns", "compute_ns", "network_ns", "outcome"):
             found, expected = getattr(together, table)[i, :cycles], getattr(alone, table)[0]

@@ -33,15 +33,12 @@ def main(arguments: Sequence[str] | None = None, platform: Platform | None = Non
 
         if LINE in os.environ:
             return answer(os.environ[LINE])
-        from dwell.cli import first_answer
         from dwell.cli.commands import app
-
-        first_answer.own_process = True
 
         app(arguments, prog_name="dwell", obj=platform)
     except KeyboardInterrupt:
         sys.exit(ExitCode.INTERRUPTED)
     finally:
-        # CPython notes an interrupt that passes through `exec` of a text, as in Numba, and ends
+        # CPython notes an interrupt that passes through `exec` of a text (a dataclass) and ends
         # `python -m` by SIGINT for it, handled or not. The next `exec` takes the note back.
         exec("")  # noqa: S102

@@ -97,21 +97,17 @@ def doctor(
         typer.Argument(metavar="CELL", help="Cell file whose ports, quotas and keys to look at."),
     ] = None,
     keys: Keys = None,
-    clear_cache: Annotated[
-        bool, typer.Option("--clear-cache", help="Remove the compiled simulator.")
-    ] = False,
     as_json: Json = False,
 ) -> None:
     """Say what this computer has for Dwell and what it lacks, with the line that mends it.
 
-    Compiled simulators of older versions are removed. The exit code is 1 where something is broken;
-    an extra that is not installed is not.
+    The exit code is 1 where something is broken; an extra that is not installed is not.
     """
     import dwell
     from dwell.cli.doctor import consult
 
     problem = None if cell is None else dwell.load(cell)
-    if not consult(problem, keys=keys, clear_cache=clear_cache, as_json=as_json):
+    if not consult(problem, keys=keys, as_json=as_json):
         raise typer.Exit(ExitCode.FAILED)
 
 

@@ -53,7 +53,6 @@ def demo(
 
     Runs are 150 windows long, if neither --windows nor --seconds is given.
     """
-    from dwell.cli.first_answer import compile_first
     from dwell.report import comparison_html, comparison_text
     from dwell.study import canonical_demo, real_demo, stored_deadlines, tenants_demo
     from dwell.study.demo import CANONICAL, REAL, WINDOWS
@@ -64,7 +63,6 @@ def demo(
         cells = (CANONICAL,) if real is None else REAL
         windows = windows_of(seconds, *(dwell.load(folder / name, traces=real) for name in cells))
     windows = windows or WINDOWS
-    compile_first()
     with progress("simulating") as shown:
         comparisons: Sequence[Comparison]
         tenants: StudyResult | None = None

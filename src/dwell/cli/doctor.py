@@ -29,7 +29,6 @@ from dwell.kernels import library
 from dwell.kernels.library_file import NAME
 from dwell.live.local_addresses import is_here, taken_ports
 from dwell.model import Host, Problem
-from dwell.model.bounds import counted
 from dwell.testbed import doctor as testbed_doctor
 from dwell.testbed.cgroups import find_cgroups
 from dwell.testbed.doctor import Finding
@@ -46,21 +45,15 @@ EXTRAS = {
 DEFAULT_PORTS = 50
 #: Clocks that take long to be read.
 SLOW_CLOCKS = ("acpi_pm", "hpet", "jiffies", "refined-jiffies")
-#: Files of compiled kernels, in a folder that has no others.
-CACHED = ("*.nbi", "*.nbc", "compiling.*.lock")
 
 
-def consult(
-    problem: Problem | None, *, keys: Path | None, clear_cache: bool, as_json: bool
-) -> bool:
+def consult(problem: Problem | None, *, keys: Path | None, as_json: bool) -> bool:
     """Look at everything and print it.
 
     Parameters
     ----------
     keys : Path or None
         A keyring, or a folder of keyrings.
-    clear_cache : bool
-        Whether all compiled kernels are removed, not only those of older versions.
 
     Returns
     -------
@@ -74,7 +67,6 @@ def consult(
     parts = {
         "extras": extras,
         "kernel": [kernel],
-        "cache": list(_cache(clear=clear_cache)),
         "CPU": list(_cpu(counters)),
         "clocks": [_synchronised(), _clock_source()],
         "ports": [_ports(problem)],
@@ -172,52 +164,6 @@ def _kernel() -> Finding:
         there = files("dwell.kernels").joinpath(NAME).is_file()
         return Finding(name, False, error.flaw, error.remedy, needed=there)
     return Finding(name, True, found)
-
-
-def _cache(*, clear: bool) -> Iterator[Finding]:
-    """Look at the compiled kernels; those of older versions are removed."""
-    name = "compiled simulator"
-    try:
-        from dwell.cli.first_answer import find_kernels
-
-        kernels = find_kernels()
-    except ImportError:
-        yield Finding(name, True, "none: the extra sim is not installed")
-        return
-    if kernels.folder is None:
-        remedy = "export NUMBA_CACHE_DIR=FOLDER, one that you may write to"
-        found = "no folder can keep it: every command compiles for itself"
-        yield _optional(name, False, found, remedy)
-        return
-    stamp = kernels.suffix.partition(".")[0]
-    files = [file for pattern in CACHED for file in kernels.folder.glob(pattern)]
-    outdated = [file for file in files if clear or f".{stamp}." not in file.name]
-    if outdated:
-        bytes_ = _bytes(outdated)
-        whose = "removed" if clear else "of older versions, removed"
-        try:
-            for file in outdated:
-                file.unlink(missing_ok=True)
-            found = f"{counted(len(outdated), 'file')}, {bytes_ / 1e6:.1f} MB, {whose}"
-            yield Finding("compiled before", True, found)
-        except OSError as error:
-            found = f"{error.filename}: {error.strerror}"
-            remedy = f"rm {kernels.folder}/*.nb[ci]"
-            yield _optional("compiled before", False, found, remedy)
-    if kernels.cached:
-        kept = _bytes(file for file in files if file.exists())
-        yield Finding(name, True, f"of this version, {kept / 1e6:.1f} MB in {kernels.folder}")
-    else:
-        found = f"not yet there: the first run compiles it, into {kernels.folder}"
-        yield Finding(name, True, found)
-
-
-def _bytes(files: Iterable[Path]) -> int:
-    total = 0
-    for file in files:
-        with suppress(FileNotFoundError):
-            total += file.stat().st_size
-    return total
 
 
 # ------------------------------------------------------------------------- CPU and clocks

@@ -79,15 +79,12 @@ def run(
     300 windows, if neither --windows nor --seconds is given.
     """
     from dwell.cellfile.overrides import load_with
-    from dwell.cli.first_answer import prepare
 
     require_one_length(windows, seconds)
     problem = load_with(cell, settings, traces) if settings else dwell.load(cell, traces=traces)
     if seconds is not None:
         windows = windows_of(seconds, problem)
     windows = windows or 300
-    # Before the kernels are imported.
-    how = prepare(windows * problem.window_cycles)
     from dwell.estimators import unplayed
     from dwell.record import require_free
     from dwell.sim import describe
@@ -107,8 +104,7 @@ def run(
     if not force:
         _require_same(folder, describe(problem, **arguments))
     warn(cell, unplayed(problem, scenario, windows))
-    remark = f" ({how})" if how else ""
-    with working(f"simulating {counted(windows, 'window')}{remark}"):
+    with working(f"simulating {counted(windows, 'window')}"):
         realisation = dwell.draw(problem, scenario=scenario, seed=seed, windows=windows)
         result = dwell.simulate_realisation(
             problem, realisation, policy=policy, estimator=estimator, jobs=jobs, guard=guard

@@ -77,7 +77,6 @@ def study(
             "`dwell study paper` is now `make paper`, in the folder of Dwell's sources "
             "(reproduction/README.md)"
         )
-    from dwell.cli.first_answer import compile_first
     from dwell.study import load_study, run_study
 
     require_one_length(windows, seconds)
@@ -90,8 +89,6 @@ def study(
         plan = replace(plan, windows=windows)
     warn(file, {one: None for each in plan.points for one in _unplayed(plan, each.problem)})
     folder = out or Path("studies", file_name(plan.name))
-    if dask is None:
-        compile_first()
     with _interruptible(folder, plan) as shown:
         result = run_study(
             plan,

@@ -48,7 +48,6 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Set what a calibrated cell predicts beside what its runs measured, and judge it."""
-    from dwell.cli.first_answer import compile_first
     from dwell.report.validation_page import validation_html, validation_text
     from dwell.study.validation import validate as validate_cell
 
@@ -56,7 +55,6 @@ def validate(
     opened = _open(runs)
     ids, usual = _sidecar(cell)
     used = [*ids, *(path.resolve().name for path in calibrated_from or ())]
-    compile_first()
     with progress("simulating") as show:
         validation = validate_cell(
             opened,

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
 from dwell.kernels import codes
-from dwell.kernels.codes import LAST_NS, Kind, Scheduler, ShadowPart, make_key
+from dwell.kernels.codes import LAST_NS, EventKind, Scheduler, ShadowPart, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
-from dwell.kernels.tables import Ints, Rows, Tables, row_types
+from dwell.kernels.rows import Ints, Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Task
 from dwell.model.instants import NEVER_NS
 from dwell.model.window_close import window_close_ns
@@ -584,11 +584,11 @@ class _Layout:
     def _announce_first(self, changes: Rows) -> None:
         """Put the first release of every cell, and the first change of a node, into the queue."""
         first = [
-            (int(self.reals[cell].release_ns[0]), make_key(Kind.RELEASE, cell))
+            (int(self.reals[cell].release_ns[0]), make_key(EventKind.RELEASE, cell))
             for cell in range(len(self.cells))
         ]
         if len(changes):
-            first.append((int(changes[0]["at_ns"]), make_key(Kind.CHANGE)))
+            first.append((int(changes[0]["at_ns"]), make_key(EventKind.CHANGE)))
         # The queue is sorted, the first event last.
         self.rows["events"] = [
             {"at_ns": at_ns, "key": key} for at_ns, key in sorted(first, reverse=True)

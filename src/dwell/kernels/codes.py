@@ -8,7 +8,7 @@ from enum import IntEnum
 LAST_NS = (1 << 63) - 1024
 
 
-class Outcome(IntEnum):
+class CycleOutcome(IntEnum):
     """What became of a cycle or a job."""
 
     IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
@@ -37,7 +37,7 @@ class Status(IntEnum):
     PAUSED, FINISHED, GROW_EVENTS, GROW_RING, STEP, BUSY = range(6)
 
 
-class Policy(IntEnum):
+class BuiltInPolicy(IntEnum):
     """Policies that the kernel has a second body of."""
 
     STATIC, DTP, CUSUM, LATENCY_FIRST, ATP = range(5)
@@ -49,7 +49,7 @@ class Tier(IntEnum):
     ROBOT, EDGE, CLOUD, NONE = range(4)
 
 
-class Kind(IntEnum):
+class EventKind(IntEnum):
     """Kinds of events, in the order in which equal times are handled."""
 
     (
@@ -77,14 +77,14 @@ ITEM_MASK, CYCLE_MASK, CELL_MASK = (1 << ITEM_BITS) - 1, (1 << CYCLE_BITS) - 1, 
 MOST_FLOWS = (1 << (ITEM_BITS - 1)) - 1
 
 
-def make_key(kind: Kind, cell: int = 0, cycle: int = 0, item: int = 0) -> int:
+def make_key(kind: EventKind, cell: int = 0, cycle: int = 0, item: int = 0) -> int:
     """Pack the key of an event."""
     return (kind << KIND_SHIFT) | (cell << CELL_SHIFT) | (cycle << CYCLE_SHIFT) | item
 
 
-def kind_of(key: int) -> Kind:
-    """Kind of the event that a key names."""
-    return Kind(key >> KIND_SHIFT)
+def kind_of(key: int) -> EventKind:
+    """EventKind of the event that a key names."""
+    return EventKind(key >> KIND_SHIFT)
 
 
 def cycle_of(key: int) -> int:

@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 LEVELS: Final = RAMP_STEPS + 1
 
 
-class NodeLoad(NamedTuple):
+class NodeEffect(NamedTuple):
     """What one disturbance does to a node.
 
     Parameters
@@ -67,12 +67,12 @@ class LinkFault(NamedTuple):
     down: bool
 
 
-def node_changes(loads: Sequence[NodeLoad], nodes: int, last_ns: int) -> Ints:
+def node_changes(loads: Sequence[NodeEffect], nodes: int, last_ns: int) -> Ints:
     """Sum up what nodes go through, from quiet and up on, to an instant.
 
     Parameters
     ----------
-    loads : sequence of NodeLoad
+    loads : sequence of NodeEffect
     nodes : int
         Number of nodes.
     last_ns : int
@@ -123,7 +123,7 @@ def link_segments(
     return segments[:made], qualities[:made]
 
 
-def _most_changes(disturbances: Sequence[NodeLoad] | Sequence[LinkFault]) -> int:
+def _most_changes(disturbances: Sequence[NodeEffect] | Sequence[LinkFault]) -> int:
     return sum(2 * len(one.intervals.begin) for one in disturbances)
 
 

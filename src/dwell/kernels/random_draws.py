@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.errors import Fault, ProblemError, SimulationError
-from dwell.kernels.disturbances import LEVELS, LinkFault, NodeLoad, link_segments, node_changes
+from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
 from dwell.kernels.drawn_path import BLOCK, Path, ReplayedPath, path_of
 from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, interval, ramp
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation, TraceStart
@@ -401,9 +401,11 @@ class Drawing:
         for number, node in enumerate(nodes.values()):
             if node.bursts is not None and node.bursts.threads:
                 threads = np.rint(node.bursts.threads * STRENGTHS)
-                loads.append(NodeLoad(self._bursts(node.bursts, node.name), number, threads, False))
+                loads.append(
+                    NodeEffect(self._bursts(node.bursts, node.name), number, threads, False)
+                )
             loads += [
-                NodeLoad(
+                NodeEffect(
                     self._intervals(item),
                     number,
                     np.rint(item.stress_threads * STRENGTHS),

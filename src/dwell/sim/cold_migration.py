@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dwell.kernels.advance import post_event, send_state
 from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import CYCLE_BITS, Kind, cycle_of, item_of, make_key
-from dwell.kernels.event_loop import post_event, send_state
+from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of, make_key
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
 
@@ -17,7 +17,7 @@ NUMBERS = (1 << (CYCLE_BITS - NUMBER_SHIFT)) - 1
 class ColdMigration:
     """The one cold migration of a cell that may be under way.
 
-    Its steps are events like any others, which `dwell.kernels.event_loop` hands back: a worker is
+    Its steps are events like any others, which `dwell.kernels.advance` hands back: a worker is
     ready, or state must be sent again, or has arrived. An event's cycle field says which, and
     counts the attempts, and the migrations; its item is the task.
 
@@ -74,4 +74,4 @@ class ColdMigration:
 
     def _announce(self, arrays: Arrays, row: int, attempt: int, ready: bool, t: int) -> None:
         field = ((self.number & NUMBERS) << NUMBER_SHIFT) | ((attempt & ATTEMPTS) << 1) | ready
-        post_event(arrays, t, make_key(Kind.MIGRATE, cycle=field, item=row))
+        post_event(arrays, t, make_key(EventKind.MIGRATE, cycle=field, item=row))

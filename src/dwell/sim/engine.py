@@ -20,9 +20,9 @@ from dwell.control import (
     shadow_stamps,
 )
 from dwell.errors import SimulationError
+from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
-from dwell.kernels.codes import Kind, Outcome, Policy, Status, Tier, kind_of
-from dwell.kernels.event_loop import play
+from dwell.kernels.codes import BuiltInPolicy, CycleOutcome, EventKind, Status, Tier, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
 from dwell.model import FrozenDict, Problem, QoS
@@ -36,11 +36,11 @@ from dwell.sim.versions import versions
 
 #: Codes of policies by the names of their classes.
 POLICIES = {
-    "Static": Policy.STATIC,
-    "DTP": Policy.DTP,
-    "Cusum": Policy.CUSUM,
-    "LatencyFirst": Policy.LATENCY_FIRST,
-    "ATP": Policy.ATP,
+    "Static": BuiltInPolicy.STATIC,
+    "DTP": BuiltInPolicy.DTP,
+    "Cusum": BuiltInPolicy.CUSUM,
+    "LatencyFirst": BuiltInPolicy.LATENCY_FIRST,
+    "ATP": BuiltInPolicy.ATP,
 }
 
 
@@ -357,7 +357,7 @@ class _Stamper:
 
     def step(self) -> None:
         """Take the step that is due: of a cold migration, or of the guard."""
-        if kind_of(int(self.arrays.tables.clock[0]["step_key"])) == Kind.GUARD:
+        if kind_of(int(self.arrays.tables.clock[0]["step_key"])) == EventKind.GUARD:
             self._fire()
         else:
             self._carry_on()
@@ -425,7 +425,7 @@ def _evidence(
         jobs = log[cell, first:last]
         return Instants(
             ready_ns=jobs["ready_ns"].copy(),
-            end_ns=np.where(outcome[cell, first:last] == Outcome.DONE, jobs["end_ns"], -1),
+            end_ns=np.where(outcome[cell, first:last] == CycleOutcome.DONE, jobs["end_ns"], -1),
             arrived_ns=arrived_ns[cell, first:last][:, column],
         )
 

@@ -15,11 +15,11 @@ from dwell.control import (
     parts_of,
     rest_cycles,
 )
+from dwell.kernels.advance import post_event
 from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import LAST_NS, Kind, Outcome, ShadowPart, make_key
-from dwell.kernels.event_loop import post_event
+from dwell.kernels.codes import LAST_NS, CycleOutcome, EventKind, ShadowPart, make_key
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
-from dwell.kernels.tables import Row
+from dwell.kernels.rows import Row
 from dwell.model import Problem
 from dwell.model.instants import EVIDENCE_NS, HORIZON_NS
 
@@ -87,7 +87,7 @@ class SimulatedGuard:
     def _look_at(self, at_ns: int) -> None:
         """Look at an instant, and not before."""
         self._cell["looks_ns"] = at_ns
-        post_event(self.arrays, at_ns, make_key(Kind.GUARD))
+        post_event(self.arrays, at_ns, make_key(EventKind.GUARD))
 
     def fire(self, now: int, active: str) -> str | None:
         """Return the fallback that the cell moves to now; None where it has to wait for one.
@@ -177,7 +177,7 @@ class SimulatedGuard:
         tables, cycles = self.arrays.tables, slice(first, stop)
         code = tables.stamps[0, cycles].astype(np.int64)
         ended = self.release_ns[cycles] + tables.latency_ns[0, cycles]
-        done = tables.outcome[0, cycles] == Outcome.DONE
+        done = tables.outcome[0, cycles] == CycleOutcome.DONE
         return np.asarray(done & (ended <= now - tables.back_ns[code]))
 
     def _newest(self, first: int, stop: int, now: int) -> int:
@@ -420,7 +420,7 @@ class _Probes:
         for row, inputs in self.sinks:
             if parts[row] == ShadowPart.SHARED:
                 entry = cycle * self.tasks + row
-                done = tables.log_outcome[entry] == Outcome.DONE
+                done = tables.log_outcome[entry] == CycleOutcome.DONE
                 ends = [int(tables.log["end_ns"][entry]) if done else -1]
             else:
                 arrived = tables.log_arrived[self.cycles + cycle]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms
 from dwell.kernels.arrays import Arrays
-from dwell.kernels.codes import Outcome, ShadowPart
+from dwell.kernels.codes import CycleOutcome, ShadowPart
 from dwell.kernels.realisation import Realisation
-from dwell.kernels.tables import Rows
+from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
@@ -231,7 +231,7 @@ def _shadow_bytes(played: PlayedRealisation) -> Ints:
     names = list(pipeline.tasks)
     candidates = list(problem.candidates.values())
     log = tables.log.reshape(len(tables.cells), cycles, len(names))
-    done = tables.log_outcome.reshape(len(tables.cells), cycles, len(names)) == Outcome.DONE
+    done = tables.log_outcome.reshape(len(tables.cells), cycles, len(names)) == CycleOutcome.DONE
     done &= log["end_ns"] >= 0
     active, other = tables.stamps[0].astype(np.int64), tables.stamps[1].astype(np.int64)
     shadowed = other >= 0

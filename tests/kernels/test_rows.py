@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import dwell
+from dwell.kernels.advance import play
 from dwell.kernels.arrays import lay_out
-from dwell.kernels.event_loop import play
-from dwell.kernels.tables import Tables, row_types
+from dwell.kernels.rows import Tables, row_types
 
 CELL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
 
