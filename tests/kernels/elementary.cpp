@@ -12,3 +12,11 @@ DWELL_EXPORT void sines_and_cosines(const double* angles, int64_t n, double* sin
     cosines[i] = both.cosine;
   }
 }
+
+DWELL_EXPORT void exponentials(const double* x, int64_t n, double* out) noexcept {
+  for (int64_t i = 0; i < n; ++i) out[i] = dwell::exp(x[i]);
+}
+
+DWELL_EXPORT void logarithms(const double* x, int64_t n, double* out) noexcept {
+  for (int64_t i = 0; i < n; ++i) out[i] = dwell::log(x[i]);
+}

@@ -10,6 +10,8 @@ from pathlib import Path
 
 KERNELS = Path(str(files("dwell.kernels")))
 
+#: Steps from one whole power of two to the next.
+POWERS = 128
 #: Layers of the ziggurat; where its tail begins; the area of each layer, where the first has the
 #: tail and the rectangle beside it.
 LAYERS = 256
@@ -29,7 +31,27 @@ def main() -> None:
 
 def headers() -> dict[str, str]:
     """Return the text of each header by its name."""
-    return {"ziggurat_tables.h": ziggurat_tables()}
+    return {"powers_of_two.h": powers_of_two(), "ziggurat_tables.h": ziggurat_tables()}
+
+
+def powers_of_two() -> str:
+    """Compute 2^(i / 128), and what its rounding has lost."""
+    with localcontext(prec=50):
+        exact = [Decimal(2) ** (Decimal(i) / POWERS) for i in range(POWERS)]
+        powers = [float(power) for power in exact]
+        lost = [
+            float(power / Decimal(found) - 1) for power, found in zip(exact, powers, strict=True)
+        ]
+    return _header(
+        f"Powers of two with exponents between 0 and 1, in {POWERS} steps.",
+        _table(f"2^(i / {POWERS}).", "double", "kPower", map(float.hex, powers)),
+        _table(
+            "What is lost by rounding it, as a share of it.",
+            "double",
+            "kPowerLost",
+            map(float.hex, lost),
+        ),
+    )
 
 
 def ziggurat_tables() -> str:

@@ -44,7 +44,63 @@ def sines_and_cosines(library: Path, angles: Floats) -> tuple[Floats, Floats]:
     return sines, cosines
 
 
-@pytest.mark.skipif(np.finfo(np.longdouble).nmant < 63, reason="no longer float to compare with")
+def some_exponents() -> Floats:
+    rng = np.random.default_rng(2)
+    return np.concatenate(
+        [
+            rng.uniform(-1, 1, 400_000),
+            rng.uniform(-40, 60, 400_000),
+            rng.uniform(-700, 700, 400_000),
+            10.0 ** rng.uniform(-300, 0, 100_000),
+            [0.0, -0.0, 700.0, -700.0],
+        ]
+    )
+
+
+def some_positive_numbers() -> Floats:
+    rng = np.random.default_rng(3)
+    return np.concatenate(
+        [
+            1 - rng.random(400_000),
+            1 + np.arange(-1_000, 1_000) * 2.0**-52,
+            rng.uniform(0.5, 2, 400_000),
+            10.0 ** rng.uniform(-300, 300, 400_000),
+            [2.0**-1022, 1.7e308],
+        ]
+    )
+
+
+def applied(library: Path, name: str, x: Floats) -> Floats:
+    function = getattr(ctypes.CDLL(str(library)), name)
+    doubles = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
+    function.argtypes, function.restype = [doubles, ctypes.c_int64, doubles], None
+    out = np.empty_like(x)
+    function(x, len(x), out)
+    return out
+
+
+needs_longer_floats = pytest.mark.skipif(
+    np.finfo(np.longdouble).nmant < 63, reason="no longer float to compare with"
+)
+
+
+@needs_longer_floats
+@with_every_compiler
+def test_exponential_and_logarithm_are_exact_to_one_ulp(compiler: str, tmp_path: Path) -> None:
+    library = compile_one(compiler, SOURCE, tmp_path / "elementary.so")
+    for name, function, x, most in (
+        ("exponentials", np.exp, some_exponents(), 0.52),
+        ("logarithms", np.log, some_positive_numbers(), 1.0),
+    ):
+        exact = function(x.astype(np.longdouble))
+        found = applied(library, name, x)
+        ulp = np.spacing(np.abs(exact.astype(np.float64)))
+        assert np.abs((found - exact) / ulp).max() < most, name
+    assert applied(library, "exponentials", np.zeros(1)) == 1
+    assert applied(library, "logarithms", np.ones(1)) == 0
+
+
+@needs_longer_floats
 @with_every_compiler
 def test_sine_and_cosine_are_exact_to_one_ulp(compiler: str, tmp_path: Path) -> None:
     library = compile_one(compiler, SOURCE, tmp_path / "elementary.so")
@@ -70,7 +126,8 @@ def test_sine_and_cosine_at_the_ends(compiler: str, tmp_path: Path) -> None:
 def test_the_bits_are_the_same_by_every_compiler(tmp_path: Path) -> None:
     angles = np.concatenate(list(some_angles().values()))
     by_gcc, by_clang = (
-        sines_and_cosines(compile_one(compiler, SOURCE, tmp_path / f"{compiler}.so"), angles)
-        for compiler in ("gcc", "clang")
+        compile_one(compiler, SOURCE, tmp_path / f"{compiler}.so") for compiler in ("gcc", "clang")
     )
-    assert np.array_equal(by_gcc, by_clang)
+    assert np.array_equal(sines_and_cosines(by_gcc, angles), sines_and_cosines(by_clang, angles))
+    for name, x in (("exponentials", some_exponents()), ("logarithms", some_positive_numbers())):
+        assert np.array_equal(applied(by_gcc, name, x), applied(by_clang, name, x))

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "elementary.h"
 #include "export.h"
 #include "nanoseconds.h"
 #include "sfc64.h"
@@ -69,7 +70,7 @@ void draw_block(DrawnPath& path, double* values, int64_t count) noexcept {
     case kLogNormal:
       draw_normals(path.stream, values, count);
       if (path.correlation != 0.0) remember(path, values, count);
-      for (int64_t i = 0; i < count; ++i) values[i] = values[i] * path.spread + path.location;
+      for (int64_t i = 0; i < count; ++i) values[i] = exp(values[i] * path.spread + path.location);
       return;
     default:
       return;

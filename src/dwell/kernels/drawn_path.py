@@ -114,13 +114,10 @@ class DrawnPath(Path):
         """Return the next values, which the caller may change."""
         out = np.empty(count)
         _functions().dwell_draw(self._row, count, out)
-        return np.exp(out, out=out) if self._row.kind == LOGNORMAL else out
+        return out
 
     def fill_ns(self, out: Ints, factors: Floats | None = None) -> None:
         """Fill an array with the next values, milliseconds, in whole nanoseconds (see `Path`)."""
-        if self._row.kind == LOGNORMAL:
-            super().fill_ns(out, factors)
-            return
         _functions().dwell_draw_ns(self._row, len(out), _pointer(factors), out)
 
 
@@ -136,15 +133,19 @@ def _row(process: Process) -> _DrawnPath | None:
                 kind=NORMAL, location=process.mean, spread=process.std, least=process.min
             )
         case LogNormal():
-            mu, sigma = process.log_parameters
-            return _DrawnPath(kind=LOGNORMAL, location=mu, spread=sigma)
+            return _logarithm(process)
         case AR1():
-            mu, sigma = LogNormal(process.mean, process.cv).log_parameters
-            r = process.log_correlation
-            memory = {"correlation": r, "gain": math.sqrt(1 - r * r), "last": math.nan}
-            return _DrawnPath(kind=LOGNORMAL, location=mu, spread=sigma, **memory)
+            row, r = _logarithm(process), process.log_correlation
+            row.correlation, row.gain, row.last = r, math.sqrt(1 - r * r), math.nan
+            return row
         case _:
             return None
+
+
+def _logarithm(process: LogNormal | AR1) -> _DrawnPath:
+    mu, sigma = LogNormal(process.mean, process.cv).log_parameters
+    # All smaller ones are 0 ns, too, and an exponential of ours is exact from -700 on.
+    return _DrawnPath(kind=LOGNORMAL, location=max(mu, -600.0), spread=sigma)
 
 
 def _pointer(factors: Floats | None) -> object:

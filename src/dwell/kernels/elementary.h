@@ -6,7 +6,62 @@
 #include <bit>
 #include <cstdint>
 
+#include "powers_of_two.h"
+
 namespace dwell {
+
+// e^x to within 0.52 ulp, for |x| <= 700.
+inline double exp(double x) noexcept {
+  // The nearest multiple of log(2)/128, n of them: the sum's last bits are n. What is left is below
+  // 0.0028; log(2)/128 in two parts, so that the first product is exact.
+  constexpr double kRound = 0x1.8p52;
+  const double shifted = x * 0x1.71547652b82fep+7 + kRound;
+  const double n = shifted - kRound;
+  const double rest = (x - n * 0x1.62e42fefa0000p-8) - n * 0x1.cf79abc9e3b3ap-47;
+
+  // Taylor's series of e^rest - 1: the first term that is left out is below 2^-59.
+  const double square = rest * rest;
+  const double terms =
+      rest + square * ((1.0 / 2 + rest * (1.0 / 6)) + square * (1.0 / 24 + rest * (1.0 / 120)));
+
+  // 2^(n/128): its fraction from a table, the whole of its exponent into the exponent's bits.
+  const uint64_t bits = std::bit_cast<uint64_t>(shifted);
+  const uint64_t fraction = bits % 128;
+  const double power =
+      std::bit_cast<double>(std::bit_cast<uint64_t>(kPower[fraction]) + ((bits - fraction) << 45));
+  return power + power * (terms + kPowerLost[fraction]);
+}
+
+// Natural logarithm to within 1 ulp, for x from 2^-1022 on that is finite.
+inline double log(double x) noexcept {
+  // x = 2^n (1 + f), where 1 + f is between sqrt(1/2) and sqrt(2).
+  constexpr uint64_t kSqrtHalf = std::bit_cast<uint64_t>(0x1.6a09e667f3bcdp-1);
+  const uint64_t bits = std::bit_cast<uint64_t>(x);
+  const int64_t exponent = static_cast<int64_t>(bits - kSqrtHalf) >> 52;
+  const double n = static_cast<double>(exponent);
+  const double f = std::bit_cast<double>(bits - (static_cast<uint64_t>(exponent) << 52)) - 1.0;
+
+  // With s = f / (2 + f): log(1 + f) = 2 (s + s^3/3 + s^5/5 + ...) = f - s (f - 2 (s^2/3 + ...)),
+  // to the term below 2^-58.
+  const double s = f / (2.0 + f);
+  const double z = s * s;
+  double terms = 2.0 / 23;
+  terms = terms * z + 2.0 / 21;
+  terms = terms * z + 2.0 / 19;
+  terms = terms * z + 2.0 / 17;
+  terms = terms * z + 2.0 / 15;
+  terms = terms * z + 2.0 / 13;
+  terms = terms * z + 2.0 / 11;
+  terms = terms * z + 2.0 / 9;
+  terms = terms * z + 2.0 / 7;
+  terms = terms * z + 2.0 / 5;
+  terms = terms * z + 2.0 / 3;
+  const double half = 0.5 * f * f;
+
+  // log(2) in two parts, so that n times the first is exact.
+  return n * 0x1.62e42fefa0000p-1 -
+         ((half - (s * (half + z * terms) + n * 0x1.cf79abc9e3b3ap-40)) - f);
+}
 
 struct SineCosine {
   double sine;

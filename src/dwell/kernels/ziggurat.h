@@ -1,12 +1,13 @@
 #pragma once
 
 // Standard normals by the ziggurat of Marsaglia and Tsang (2000, DOI 10.18637/jss.v005.i08): those
-// that NumPy draws from the same stream.
+// that NumPy draws from the same stream, but that in the tail the last bit may be another.
 
 #include <array>
-#include <cmath>
+#include <cstddef>
 #include <cstdint>
 
+#include "elementary.h"
 #include "sfc64.h"
 #include "ziggurat_tables.h"
 
@@ -18,7 +19,7 @@ constexpr double kTail = 3.6541528853610088;
 // Width of a step by the last 9 bits of a draw: the layer, and above it the sign.
 inline constexpr std::array<double, 512> kSignedStep = [] {
   std::array<double, 512> steps{};
-  for (size_t layer = 0; layer < 256; ++layer) {
+  for (std::size_t layer = 0; layer < 256; ++layer) {
     steps[layer] = kStep[layer];
     steps[256 + layer] = -kStep[layer];
   }
@@ -28,8 +29,8 @@ inline constexpr std::array<double, 512> kSignedStep = [] {
 // A normal beyond kTail, or its mirror image; `steps` are those of the draw that led here.
 [[gnu::noinline]] inline double normal_in_tail(Sfc64& stream, uint64_t steps) noexcept {
   for (;;) {
-    const double beyond = -(1.0 / kTail) * std::log1p(-stream.uniform());
-    const double height = -std::log1p(-stream.uniform());
+    const double beyond = -(1.0 / kTail) * log(1.0 - stream.uniform());
+    const double height = -log(1.0 - stream.uniform());
     if (height + height > beyond * beyond) {
       return (steps >> 8 & 1) != 0 ? -(kTail + beyond) : kTail + beyond;
     }
@@ -53,7 +54,7 @@ inline void draw_normals(Sfc64& stream, double* normals, int64_t count) noexcept
       // Where the layer sticks out of the density, a height decides whether x counts.
       const double low = kDensity[layer];
       const double height = (kDensity[layer - 1] - low) * state.uniform() + low;
-      i += height < std::exp(-0.5 * x * x);
+      i += height < exp(-0.5 * x * x);
     }
   }
   stream = state;
