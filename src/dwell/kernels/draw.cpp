@@ -79,15 +79,16 @@ void draw_block(DrawnPath& path, double* values, int64_t count) noexcept {
 
 // Turns milliseconds into whole nanoseconds.
 void round_block(const double* ms, int64_t count, int64_t* ns) noexcept {
-  // The sum's last bits are the whole number, where that is below 2^51: 26 days.
-  constexpr double kRound = 0x1.8p52;
-  bool far = false;
+  // Where a number is below 2^51 (26 days), the last bits of the sum are the whole number, and the
+  // others are those of the summand.
+  constexpr uint64_t kRound = std::bit_cast<uint64_t>(0x1.8p52);
+  uint64_t all = 0;
   for (int64_t i = 0; i < count; ++i) {
-    const double exact = ms[i] * kNsPerMs;
-    far |= exact >= 0x1p51;
-    ns[i] = std::bit_cast<int64_t>(exact + kRound) - std::bit_cast<int64_t>(kRound);
+    const uint64_t sum = std::bit_cast<uint64_t>(ms[i] * kNsPerMs + 0x1.8p52);
+    all |= sum;
+    ns[i] = static_cast<int64_t>(sum - kRound);
   }
-  if (!far) return;
+  if (all >> 52 == kRound >> 52) return;
   for (int64_t i = 0; i < count; ++i) ns[i] = round_ns(std::min(ms[i] * kNsPerMs, kHorizonNs));
 }
 

@@ -19,7 +19,7 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
 #: Cycles at a time: what NumPy draws of a path stays in the second-level cache.
-BLOCK: Final = 16384
+BLOCK: Final = 65536
 
 CONSTANT, UNIFORM, NORMAL, LOGNORMAL = range(4)
 

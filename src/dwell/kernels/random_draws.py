@@ -280,7 +280,8 @@ class Drawing:
         pipeline, count = self.problem.pipeline, self.cycles + 1
         release = np.empty(count, np.int64)
         for at in range(0, count, BLOCK):
-            nominal = np.arange(at, min(at + BLOCK, count)) * (pipeline.period_ms * NS_PER_MS)
+            nominal = np.arange(at, min(at + BLOCK, count), dtype=np.float64)
+            nominal *= pipeline.period_ms * NS_PER_MS
             release[at : at + BLOCK] = np.rint(nominal, out=nominal)
         jitter = pipeline.release_jitter_ms
         if jitter == Constant(0.0):
