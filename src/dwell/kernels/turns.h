@@ -4,6 +4,7 @@
 // core time that each has received.
 #pragma once
 
+#include "elementary.h"
 #include "quotas.h"
 
 namespace dwell {
@@ -75,7 +76,7 @@ void notice(S& s, Server& server, Quota& quota, i64 now) {
 inline i64 next_wake(Quota& quota, i64 now) {
   while (quota.wakes_ns <= now) {
     const f64 drawn = attempt_uniform(quota.wake_key, quota.wakes++, 0);
-    const i64 gap_ns = whole_ns(-std::log(1.0 - drawn) * quota.wake_gap_ns);
+    const i64 gap_ns = whole_ns(-log(1.0 - drawn) * quota.wake_gap_ns);
     quota.wakes_ns = later(quota.wakes_ns + 1, gap_ns);
   }
   return quota.wakes_ns;
