@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import subprocess
 import sys
@@ -65,6 +66,17 @@ def test_windows_that_the_controller_did_not_see_are_not_judged() -> None:
     assert unseen.any()
     assert np.isnan(judged_costs(run, problem)).tolist() == unseen.to_list()
     assert judged_cost(run, problem) == pytest.approx(summarise(run, problem, {}).row["cost"])
+
+
+def test_a_run_whose_controller_saw_no_window_is_summed_up() -> None:
+    down = dwell.model.NodeDisturbance("E", at_s=0.0, down=True)
+    problem = replace(PROBLEM, scenarios=FrozenDict({**PROBLEM.scenarios, "crash": (down,)}))
+    run = simulate(problem, scenario="crash", policy="dtp", seed=1, windows=9)
+    row = summarise(run, problem, {}).row
+    assert math.isnan(float(row["cost"]))
+    assert math.isnan(float(row["l95_ms"]))
+    assert (row["windows"], row["migrations"]) == (7, 0)
+    assert run.decisions.is_empty()
 
 
 def test_a_worker_with_other_software_refuses() -> None:

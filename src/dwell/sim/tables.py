@@ -276,7 +276,9 @@ def _decisions(controller: Controller) -> TableArrays:
         column: partial(Names.of, cast("Sequence[str]", decided[column]), those)
         for column, those in known.items()
     }
-    return TableArrays({**decided, **names})
+    # Also where nothing was decided.
+    migrated = np.asarray(decided["migrated"], np.bool_)
+    return TableArrays({**decided, **names, "migrated": migrated})
 
 
 def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
