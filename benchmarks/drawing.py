@@ -1,15 +1,16 @@
-"""Drawing: what a value of each kind of process costs, rounded and stored."""
+"""Drawing: what a value of each kind of process costs, rounded and stored, and a cycle of cells."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 import dwell
 from benchmarks.figures import Figure, Section
-from benchmarks.timing import Took, in_turns, shared_core, took
+from benchmarks.timing import ROOT, Took, in_turns, shared_core, took
 from dwell.model import (
     AR1,
     Constant,
@@ -34,10 +35,16 @@ from dwell.model import (
 )
 
 WINDOW_CYCLES = 100
+#: Cells, and scenarios of theirs.
+CELLS = (
+    ("examples/canonical.yaml", "baseline"),
+    ("examples/canonical.yaml", "edge-cpu-stress"),
+    ("benchmarks/peer-chain.yaml", "baseline"),
+)
 
 
 def measure(quick: bool) -> Section:
-    """Nanoseconds a value over a constant."""
+    """Nanoseconds a value over a constant, and a cycle of some cells."""
     windows, rounds = (1_000, 3) if quick else (5_000, 5)
     recorded = TraceTable("recorded", {"ms": np.linspace(1, 3, 10_007)}, wrap=True)
     processes: dict[str, Process] = {
@@ -53,16 +60,24 @@ def measure(quick: bool) -> Section:
     variants: dict[str, Callable[[], Took]] = {
         name: partial(_draw, _problem(process), windows) for name, process in processes.items()
     }
+    cells = {f"{Path(cell).stem}, {scenario}": (cell, scenario) for cell, scenario in CELLS}
+    variants |= {
+        name: partial(_draw, dwell.load(ROOT / cell), windows, scenario)
+        for name, (cell, scenario) in cells.items()
+    }
     runs = in_turns(variants, rounds)
     values = windows * WINDOW_CYCLES
-    spent = {name: [1e9 * run.cpu_s / values for run in runs[name]] for name in processes}
+    spent = {name: [1e9 * run.cpu_s / values for run in runs[name]] for name in variants}
     constant = spent.pop("constant")
     figures = [Figure("releases and a constant", constant, "ns a cycle")]
     for name, taken in spent.items():
+        if name in cells:
+            figures.append(Figure(name, taken, "ns a cycle"))
+            continue
         over = [one - other for one, other in zip(taken, constant, strict=True)]
         figures.append(Figure(f"{name}, over that", over, "ns a value"))
     notes = shared_core(run for some in runs.values() for run in some)
-    return Section(f"Drawing {values} values", figures, notes)
+    return Section(f"Drawing {values} cycles", figures, notes)
 
 
 def _problem(process: Process) -> Problem:
@@ -80,5 +95,5 @@ def _problem(process: Process) -> Problem:
     )
 
 
-def _draw(problem: Problem, windows: int) -> Took:
-    return took(lambda: dwell.draw(problem, seed=1, windows=windows))
+def _draw(problem: Problem, windows: int, scenario: str = "baseline") -> Took:
+    return took(lambda: dwell.draw(problem, scenario=scenario, seed=1, windows=windows))
