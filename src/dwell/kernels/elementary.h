@@ -41,8 +41,8 @@ inline double log(double x) noexcept {
   const double n = static_cast<double>(exponent);
   const double f = std::bit_cast<double>(bits - (static_cast<uint64_t>(exponent) << 52)) - 1.0;
 
-  // With s = f / (2 + f): log(1 + f) = 2 (s + s^3/3 + s^5/5 + ...) = f - s (f - 2 (s^2/3 + ...)),
-  // to the term below 2^-58.
+  // With s = f / (2 + f): log(1 + f) = 2 (s + s^3/3 + s^5/5 + ...) = f - s (f - 2 (s^2/3 + ...));
+  // the first term that is left out is below 2^-66.
   const double s = f / (2.0 + f);
   const double z = s * s;
   double terms = 2.0 / 23;
