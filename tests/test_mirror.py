@@ -13,9 +13,6 @@ WITHOUT = {
     "live": """
         node
     """,
-    "sim": """
-        arrays
-    """,
     "testbed/chaos": """
         harness
     """,

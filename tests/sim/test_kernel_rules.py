@@ -110,22 +110,3 @@ def test_the_kernel_decides_as_the_classes_do(seed: int) -> None:
         for column in expected.columns:
             # Floats, too: equal and not close.
             assert found[column].equals(expected[column], check_dtypes=True), (name, column)
-
-
-@pytest.mark.parametrize("policy", ["dtp", "cusum", "latency-first", "atp", "LOC"])
-def test_the_examples_are_decided_by_the_kernel(policy: str) -> None:
-    """None of them is silently left to Python."""
-    problem = dwell.load(CELL)
-    assert plain_rule(Controller(problem, policy, "profile")) is not None
-    assert plain_rule(Controller(problem, policy, "scaling")) is None
-
-
-def test_a_policy_that_is_not_exactly_ours_is_asked() -> None:
-    class Mine(DTP):
-        """A policy of a user's."""
-
-    problem = dwell.load(CELL)
-    other = replace(problem.objective, targets=Targets(1.0))
-    assert plain_rule(Controller(problem, Mine.from_problem(problem), "profile")) is None
-    apart = DTP(candidates=problem.candidates, objective=other)
-    assert plain_rule(Controller(problem, apart, "profile")) is None

@@ -106,6 +106,11 @@ class NodeChanges(Sequence[NodeChange]):
         table = [[c.at_ns, nodes.index(c.node), c.threads, c.down] for c in rows]
         return cls(nodes, np.array(table, np.int64).reshape(len(rows), 4))
 
+    def __repr__(self) -> str:
+        return (
+            f"<NodeChanges: {counted(len(self), 'change')} of {counted(len(self.nodes), 'node')}>"
+        )
+
     def __len__(self) -> int:
         return len(self.table)
 
@@ -154,6 +159,10 @@ class LinkSegments(Sequence[LinkSegment]):
             np.array(table, np.int64).reshape(len(rows), 4),
             np.array([[s.rate_mbps, s.loss] for s in rows], np.float64).reshape(len(rows), 2),
         )
+
+    def __repr__(self) -> str:
+        of = counted(len(self.links), "link")
+        return f"<LinkSegments: {counted(len(self), 'segment')} of {of}>"
 
     def __len__(self) -> int:
         return len(self.table)
