@@ -31,6 +31,7 @@ from dwell.model import Execution, Flow, FrozenDict, Link, Node, Problem, QoS, T
 from dwell.model.instants import NEVER_NS
 from dwell.model.process import Constant
 from dwell.record import Journal, Run, seal_run
+from dwell.sim import engine
 from tests.cells.generated import make_problem
 
 MS, S = 1_000_000, 1_000_000_000
@@ -74,18 +75,26 @@ def cell() -> Problem:
 def simulate(problem: Problem, scenario: str, windows: int = 25) -> Played:
     """Simulate a run and keep what its controller was given."""
     kept: list[Seen] = []
-    close = Controller.close
+    decide = engine._Stamper._decide
 
-    def spy(self: Controller, window: ClosedWindow, **more: Any) -> str:
+    def spy(self: engine._Stamper, index: int, boundary: int, close_ns: int) -> str:
         if not kept:
-            kept.append(Seen(self))
+            kept.append(Seen(self.controller))
+        tables, first = self.arrays.tables, boundary - problem.window_cycles
+        window = ClosedWindow(
+            latency_ns=tables.latency_ns[0, first:boundary],
+            release_ns=self.release_ns[first:boundary],
+            close_ns=close_ns,
+            open_ns=int(self.release_ns[first]),
+            core_ns=tables.closed[0, index] - tables.opened[0, index],
+        )
         kept[0].windows.append(window)
-        assert window.evidence is not None
-        kept[0].evidence.append(window.evidence())
-        return close(self, window, **more)
+        assert self.evidence is not None
+        kept[0].evidence.append(self.evidence(first, boundary, close_ns))
+        return decide(self, index, boundary, close_ns)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Controller, "close", spy)
+        patch.setattr(engine._Stamper, "_decide", spy)
         run = dwell.simulate(problem, scenario=scenario, seed=5, windows=windows, jobs=True)
     return Played(problem, run, kept[0])
 
