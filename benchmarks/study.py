@@ -73,7 +73,7 @@ def _run_alone(seeds: int | None) -> None:
     study = load_study(STUDY)
     if seeds is not None:
         study = replace(study, seeds=study.seeds[:seeds])
-    dwell.simulate(study.points[0].problem, policy="dtp", seed=0, windows=1)  # compiles
+    dwell.simulate(study.points[0].problem, policy="dtp", seed=0, windows=1)  # loads all
     with tempfile.TemporaryDirectory() as folder:
         before, begin = _spent(), time.perf_counter()
         result = run_study(study, folder=Path(folder) / "study", processes=CORES)

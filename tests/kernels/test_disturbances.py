@@ -44,17 +44,23 @@ link_faults = st.builds(
 
 
 @given(st.lists(node_loads, max_size=6), st.integers(0, 60))
-def test_a_node_has_the_threads_of_all_that_is_on(loads: list[NodeEffect], last_ns: int) -> None:
+def test_a_node_has_the_threads_of_all_that_is_on(effects: list[NodeEffect], last_ns: int) -> None:
     expected = []
     for node in range(NODES):
-        on_node = [load for load in loads if load.node == node]
-        cuts = {int(at) for load in on_node for at in (*load.intervals.begin, *load.intervals.end)}
+        on_node = [effect for effect in effects if effect.node == node]
+        cuts = {
+            int(at) for effect in on_node for at in (*effect.intervals.begin, *effect.intervals.end)
+        }
         for at in sorted(cut for cut in cuts if cut <= last_ns):
-            levels = [int(load.intervals.levels(np.array([at]))[0]) for load in on_node]
-            threads = sum(load.threads[level] for load, level in zip(on_node, levels, strict=True))
-            down = any(load.down and level > 0 for load, level in zip(on_node, levels, strict=True))
+            levels = [int(effect.intervals.levels(np.array([at]))[0]) for effect in on_node]
+            threads = sum(
+                effect.threads[level] for effect, level in zip(on_node, levels, strict=True)
+            )
+            down = any(
+                effect.down and level > 0 for effect, level in zip(on_node, levels, strict=True)
+            )
             expected.append([at, node, int(threads), int(down)])
-    assert node_changes(loads, NODES, last_ns).tolist() == sorted(expected)
+    assert node_changes(effects, NODES, last_ns).tolist() == sorted(expected)
 
 
 @given(st.lists(link_faults, max_size=6), st.floats(1, 1000), st.floats(0, 0.9))
@@ -87,12 +93,12 @@ def test_a_node_that_nothing_happens_to_has_no_change_and_a_link_one_segment() -
 def test_of_what_happens_at_one_instant_the_state_after_it_counts() -> None:
     """Two on the first node, one that begins where the other ends, and one on the last node."""
     one, two = np.full(LEVELS, 1.0), np.full(LEVELS, 2.0)
-    loads = [
+    effects = [
         NodeEffect(interval(10, 20), 2, one, True),
         NodeEffect(interval(20, 30), 0, two, False),
         NodeEffect(interval(10, 20), 0, one, False),
     ]
-    assert node_changes(loads, NODES, 25).tolist() == [
+    assert node_changes(effects, NODES, 25).tolist() == [
         [10, 0, 1, 0],
         [10, 2, 1, 1],
         [20, 0, 2, 0],

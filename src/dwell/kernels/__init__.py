@@ -1,1 +1,1 @@
-"""The simulator's inner loop: compiled functions over arrays, and nothing else."""
+"""What is random in a scenario, drawn and laid out, and the compiled event loop over it."""

@@ -12,17 +12,17 @@ namespace dwell {
 namespace {
 
 // What one disturbance does to a node; disturbances.py has the same struct.
-struct NodeLoad {
+struct NodeEffect {
   OnOffIntervals intervals;
   int64_t node;
   int64_t down;
   int64_t threads[kLevels];
 };
-static_assert(sizeof(NodeLoad) == 312);
+static_assert(sizeof(NodeEffect) == 312);
 
 struct NodeState {
   int64_t threads;
-  int64_t down;  // loads by which it is down
+  int64_t down;  // effects by which it is down
 };
 
 // What one disturbance does to a link; disturbances.py has the same struct.
@@ -35,14 +35,14 @@ struct LinkFault {
 };
 static_assert(sizeof(LinkFault) == 816);
 
-bool before(const NodeLoad& one, const NodeLoad& other) noexcept {
+bool before(const NodeEffect& one, const NodeEffect& other) noexcept {
   const int64_t at_ns = one.intervals.next_ns();
   const int64_t other_ns = other.intervals.next_ns();
   return at_ns != other_ns ? at_ns < other_ns : one.node < other.node;
 }
 
-// Moves the load at i of a binary heap down until none below it changes sooner.
-void sift_down(NodeLoad** heap, int64_t count, int64_t i) noexcept {
+// Moves the effect at i of a binary heap down until none below it changes sooner.
+void sift_down(NodeEffect** heap, int64_t count, int64_t i) noexcept {
   for (int64_t below = 2 * i + 1; below < count; below = 2 * i + 1) {
     if (below + 1 < count && before(*heap[below + 1], *heap[below])) ++below;
     if (!before(*heap[below], *heap[i])) return;
@@ -53,13 +53,13 @@ void sift_down(NodeLoad** heap, int64_t count, int64_t i) noexcept {
 
 }  // namespace
 
-// Merges the loads of all nodes up to an instant; returns the number of changes.
-DWELL_EXPORT int64_t dwell_node_changes(NodeLoad** loads, int64_t count, int64_t last_ns,
+// Merges the effects of all nodes up to an instant; returns the number of changes.
+DWELL_EXPORT int64_t dwell_node_changes(NodeEffect** effects, int64_t count, int64_t last_ns,
                                         NodeState* nodes, Change* changes) noexcept {
-  for (int64_t i = count / 2; i-- > 0;) sift_down(loads, count, i);
+  for (int64_t i = count / 2; i-- > 0;) sift_down(effects, count, i);
   int64_t made = 0;
-  while (count > 0 && loads[0]->intervals.next_ns() <= last_ns) {
-    NodeLoad& next = *loads[0];
+  while (count > 0 && effects[0]->intervals.next_ns() <= last_ns) {
+    NodeEffect& next = *effects[0];
     const int64_t at_ns = next.intervals.next_ns();
     const int64_t sign = next.intervals.on() ? -1 : 1;
     NodeState& state = nodes[next.node];
@@ -71,7 +71,7 @@ DWELL_EXPORT int64_t dwell_node_changes(NodeLoad** loads, int64_t count, int64_t
     made += again ? 0 : 1;
     changes[made - 1] = {at_ns, next.node, state.threads, state.down > 0 ? 1 : 0};
     ++next.intervals.passed;
-    sift_down(loads, count, 0);
+    sift_down(effects, count, 0);
   }
   return made;
 }

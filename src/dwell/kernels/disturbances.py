@@ -67,12 +67,12 @@ class LinkFault(NamedTuple):
     down: bool
 
 
-def node_changes(loads: Sequence[NodeEffect], nodes: int, last_ns: int) -> Ints:
+def node_changes(effects: Sequence[NodeEffect], nodes: int, last_ns: int) -> Ints:
     """Sum up what nodes go through, from quiet and up on, to an instant.
 
     Parameters
     ----------
-    loads : sequence of NodeEffect
+    effects : sequence of NodeEffect
     nodes : int
         Number of nodes.
     last_ns : int
@@ -83,9 +83,11 @@ def node_changes(loads: Sequence[NodeEffect], nodes: int, last_ns: int) -> Ints:
     int64 array, shape (changes, 4)
         Table of `dwell.kernels.realisation.NodeChanges`.
     """
-    rows = [_NodeLoad(_pointers(i), node, down, _ints(threads)) for i, node, threads, down in loads]
-    heap = (ctypes.POINTER(_NodeLoad) * len(rows))(*map(ctypes.pointer, rows))
-    changes = np.empty((_most_changes(loads), 4), np.int64)
+    rows = [
+        _NodeEffect(_pointers(i), node, down, _ints(threads)) for i, node, threads, down in effects
+    ]
+    heap = (ctypes.POINTER(_NodeEffect) * len(rows))(*map(ctypes.pointer, rows))
+    changes = np.empty((_most_changes(effects), 4), np.int64)
     states = np.zeros((nodes, 2), np.int64)
     made = _functions().dwell_node_changes(heap, len(rows), last_ns, states, changes)
     return changes[:made]
@@ -139,7 +141,7 @@ class _OnOffIntervals(ctypes.Structure):
     )
 
 
-class _NodeLoad(ctypes.Structure):
+class _NodeEffect(ctypes.Structure):
     """``disturbances.cpp`` has the same struct."""
 
     _fields_ = (

@@ -398,14 +398,14 @@ class Drawing:
     def _node_changes(self) -> NodeChanges:
         """Merge stress, bursts and outages of nodes into the states they go through."""
         nodes = self.problem.fabric.nodes
-        loads = []
+        effects = []
         for number, node in enumerate(nodes.values()):
             if node.bursts is not None and node.bursts.threads:
                 threads = np.rint(node.bursts.threads * STRENGTHS)
-                loads.append(
+                effects.append(
                     NodeEffect(self._bursts(node.bursts, node.name), number, threads, False)
                 )
-            loads += [
+            effects += [
                 NodeEffect(
                     self._intervals(item),
                     number,
@@ -415,7 +415,9 @@ class Drawing:
                 for item in self.scenario
                 if isinstance(item, NodeDisturbance) and item.node == node.name
             ]
-        return NodeChanges(tuple(nodes), node_changes(loads, len(nodes), int(self.release_ns[-1])))
+        return NodeChanges(
+            tuple(nodes), node_changes(effects, len(nodes), int(self.release_ns[-1]))
+        )
 
     def _link_segments(self) -> LinkSegments:
         """Merge bursts and faults of each link into the segments of its time."""

@@ -27,7 +27,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import the engine where it is asked for (PEP 562): drawing needs no compiler."""
+    """Import the engine where it is asked for (PEP 562): drawing needs none of it."""
     if name not in __all__:
         raise AttributeError(f"module 'dwell.sim' has no attribute {name!r}")
     return getattr(import_module("dwell.sim.engine"), name)

@@ -115,8 +115,7 @@ class Player:
     def rehearse(self) -> None:
         """Play one window of everything at the first point.
 
-        What is named wrongly is found before the work begins, and the kernels are compiled (or
-        loaded) once and not by every process at the same time.
+        What is named wrongly is found before the work begins.
         """
         from dwell.sim import draw
 

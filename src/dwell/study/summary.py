@@ -294,7 +294,8 @@ def mean_of(values: NDArray[Any]) -> float:
     for width in (8, 4):
         sums = sums[:, :width] + sums[:, width:]
     rows = (sums[:, 0] + sums[:, 2]) + (sums[:, 1] + sums[:, 3])
-    ahead: float = sum(terms[:begin].tolist())
+    # One after another: from Python 3.12 on, `sum` rounds floats otherwise.
+    ahead = float(np.add.accumulate(terms[:begin])[-1]) if begin else 0.0
     return (_sum_of_pairs(rows.tolist()) + ahead) / count
 
 
