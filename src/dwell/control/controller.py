@@ -223,20 +223,36 @@ class Controller:
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
-        used, own, shadow = self.utilisation(window)
+        shares = self.utilisation(window)
         if window.evidence is not None:
             self.learn(window.evidence)
-        return self.decide(
-            QoS(
-                float(l95_ms),
-                missed / len(age_ns),
-                FrozenDict(zip(self.nodes, used.tolist(), strict=True)),
-                float(uncut_ms),
-            ),
-            # Neither the cell's jobs nor its shadow jobs are foreign.
-            dict(zip(self.nodes, (own + shadow).tolist(), strict=True)),
-            proven=proven,
-        )
+        rate = missed / len(age_ns)
+        return self.decide_on(float(l95_ms), rate, float(uncut_ms), shares, proven=proven)
+
+    def decide_on(
+        self,
+        l95_ms: float,
+        violation_rate: float,
+        uncut_ms: float,
+        shares: Floats,
+        *,
+        proven: str | None = None,
+    ) -> str:
+        """Decide on a window that an engine has measured itself (see `close`).
+
+        Parameters
+        ----------
+        l95_ms, violation_rate, uncut_ms : float
+            L95 as it could be known, V_D, and L95 as caps are compared with it.
+        shares : float64 array, shape (3, nodes)
+            Busy, own and shadow share of every node's cores.
+        """
+        used, own, shadow = shares
+        utilisation = FrozenDict(zip(self.nodes, used.tolist(), strict=True))
+        # Neither the cell's jobs nor its shadow jobs are foreign.
+        mine = dict(zip(self.nodes, (own + shadow).tolist(), strict=True))
+        observed = QoS(l95_ms, violation_rate, utilisation, uncut_ms)
+        return self.decide(observed, mine, proven=proven)
 
     def learn(self, evidence: Callable[[], Evidence]) -> None:
         """Have the estimator learn from a window, if it learns, before it is decided on."""

@@ -27,7 +27,7 @@ class PlainRule(NamedTuple):
     Parameters
     ----------
     policy : str
-        Name of the policy's class.
+        ``static``, ``latency_first``, ``dtp``, ``cusum`` or ``atp``.
     numbers : mapping of str to float
         Numbers of the policy, weights, targets and caps of its objective.
     options : mapping of str to float64 array, shape (candidates,)
@@ -55,7 +55,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
     has an objective or candidates that are not the problem's.
     """
     problem, policy, profile = controller.problem, controller.policy, controller.estimator
-    numbers = _NUMBERS.get(type(policy))
+    called, numbers = _KNOWN.get(type(policy), ("", None))
     if numbers is None or type(profile) is not Profile:
         return None
     own: Any = policy
@@ -77,7 +77,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
         for node in members
     }
     return PlainRule(
-        policy=type(policy).__name__,
+        policy=called,
         numbers={
             **numbers(own, names),
             **_objective(problem.objective),
@@ -146,10 +146,11 @@ def _on_robot(policy: ATP) -> dict[str, float]:
     }
 
 
-_NUMBERS: dict[type, Callable[[Any, list[str]], dict[str, float]]] = {
-    Static: lambda policy, names: {},
-    LatencyFirst: lambda policy, names: {},
-    DTP: _of_dtp,
-    Cusum: _of_cusum,
-    ATP: _of_atp,
+#: What a policy is called here, and what makes its numbers.
+_KNOWN: dict[type, tuple[str, Callable[[Any, list[str]], dict[str, float]] | None]] = {
+    Static: ("static", lambda policy, names: {}),
+    LatencyFirst: ("latency_first", lambda policy, names: {}),
+    DTP: ("dtp", _of_dtp),
+    Cusum: ("cusum", _of_cusum),
+    ATP: ("atp", _of_atp),
 }

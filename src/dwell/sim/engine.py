@@ -25,7 +25,7 @@ from dwell.kernels.arrays import Arrays, lay_out, ordered_flows
 from dwell.kernels.codes import BuiltInPolicy, CycleOutcome, EventKind, Status, Tier, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
-from dwell.model import FrozenDict, Problem, QoS
+from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.table_columns import require_apart
 from dwell.record import Run
@@ -33,15 +33,6 @@ from dwell.sim.cold_migration import ColdMigration
 from dwell.sim.simulated_guard import SimulatedGuard
 from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
-
-#: Codes of policies by the names of their classes.
-POLICIES = {
-    "Static": BuiltInPolicy.STATIC,
-    "DTP": BuiltInPolicy.DTP,
-    "Cusum": BuiltInPolicy.CUSUM,
-    "LatencyFirst": BuiltInPolicy.LATENCY_FIRST,
-    "ATP": BuiltInPolicy.ATP,
-}
 
 
 def simulate(
@@ -176,7 +167,7 @@ def _play(
     arrays = lay_out([(problem, realisation)], log_jobs=log_jobs, shadows=shadows)
     guarded = guard and controller.guarded
     stamper = _Stamper(problem, realisation, controller, arrays, guarded=guarded)
-    if not (shadow or controller.learns or guarded or by_window or any(stamper.host_down)):
+    if not (guarded or by_window or any(stamper.host_down)):
         stamper.leave_to_kernel()
     while (status := play(arrays)) != Status.FINISHED:
         if status == Status.STEP:
@@ -265,7 +256,11 @@ class _Stamper:
         plain = plain_rule(self.controller)
         if plain is None:
             return
-        numbers = {**plain.numbers, "policy": POLICIES[plain.policy], "stamped": self.stamped}
+        numbers = {
+            **plain.numbers,
+            "policy": BuiltInPolicy[plain.policy.upper()],
+            "stamped": self.stamped,
+        }
         tiers = [Tier[tier.upper()] if tier else Tier.NONE for tier in plain.tiers]
         self.arrays.use_rule(
             numbers,
@@ -305,15 +300,10 @@ class _Stamper:
             first = boundary - self.window_cycles
             controller.learn(partial(self.evidence, first, boundary, close_ns))
         _, missed, l95_ms, uncut_ms = tables.seen[0, index].item()
-        used, own, shadow = tables.shares[0, index]
-        nodes = controller.nodes
-        utilisation = FrozenDict(zip(nodes, used.tolist(), strict=True))
-        observed = QoS(l95_ms, missed / self.window_cycles, utilisation, uncut_ms)
-        # Neither the cell's jobs nor its shadow jobs are foreign.
-        mine = dict(zip(nodes, (own + shadow).tolist(), strict=True))
+        seen = l95_ms, missed / self.window_cycles, uncut_ms, tables.shares[0, index]
         if watch is None or not watch.on_fallback:
-            return controller.decide(observed, mine)
-        order = controller.decide(observed, mine, proven=watch.proven(close_ns))
+            return controller.decide_on(*seen)
+        order = controller.decide_on(*seen, proven=watch.proven(close_ns))
         if controller.wanted is not None and len(tables.cells) < 2:
             raise _ProbesWantedError
         if order == self.placement:
