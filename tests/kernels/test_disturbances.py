@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from dwell.kernels.disturbances import LEVELS, LinkFault, NodeEffect, link_segments, node_changes
 from dwell.kernels.on_off_intervals import OnOffIntervals, interval
 from dwell.model.scenario import RAMP_STEPS
+from tests.kernels.levels import levels_at
 
 NODES = 3
 strengths = np.arange(LEVELS) / RAMP_STEPS
@@ -52,7 +53,7 @@ def test_a_node_has_the_threads_of_all_that_is_on(effects: list[NodeEffect], las
             int(at) for effect in on_node for at in (*effect.intervals.begin, *effect.intervals.end)
         }
         for at in sorted(cut for cut in cuts if cut <= last_ns):
-            levels = [int(effect.intervals.levels(np.array([at]))[0]) for effect in on_node]
+            levels = [int(levels_at(effect.intervals, np.array([at]))[0]) for effect in on_node]
             threads = sum(
                 effect.threads[level] for effect, level in zip(on_node, levels, strict=True)
             )
@@ -72,7 +73,7 @@ def test_a_link_has_the_worst_of_all_that_is_on(
     assert segments[:, 0].tolist() == sorted({0, *cuts})
     assert set(segments[:, 1]) == {7}
     for (at, _, down, layers), (rate, lost) in zip(segments, qualities, strict=True):
-        levels = [int(fault.intervals.levels(np.array([at]))[0]) for fault in faults]
+        levels = [int(levels_at(fault.intervals, np.array([at]))[0]) for fault in faults]
         active = [(f, level) for f, level in zip(faults, levels, strict=True) if level > 0]
         assert down == any(fault.down for fault, _ in active)
         assert layers == np.bitwise_or.reduce([0, *(f.layers[level] for f, level in active)])

@@ -13,6 +13,7 @@ from dwell.kernels.on_off_intervals import OnOffIntervals, drawn_intervals, inte
 from dwell.model import Constant, Exponential, LogNormal, Process, Uniform
 from dwell.model.instants import HORIZON_NS
 from dwell.model.scenario import RAMP_STEPS
+from tests.kernels.levels import levels_at
 
 S = 1_000_000_000
 
@@ -25,7 +26,7 @@ def drawn(
 
 
 def level(intervals: OnOffIntervals, at_ns: int) -> int:
-    return int(intervals.levels(np.array([at_ns]))[0])
+    return int(levels_at(intervals, np.array([at_ns]))[0])
 
 
 # ------------------------------------------------------------------------------------- ramps
@@ -61,7 +62,7 @@ def test_a_ramp_that_lasts_for_ever_does_not_fall() -> None:
 def test_a_ramp_of_half_its_time_falls_as_soon_as_it_has_grown() -> None:
     intervals = ramp(0, 62 * S, 31 * S)
     assert [level(intervals, at_s * S) for at_s in (30, 31, 32, 33)] == [30, 30, 29, 28]
-    assert intervals.levels(np.arange(0, 62 * S, S // 7)).max() == 30
+    assert levels_at(intervals, np.arange(0, 62 * S, S // 7)).max() == 30
 
 
 @given(
@@ -79,7 +80,7 @@ def test_a_ramp_is_never_a_step_off_the_line(
     at = np.array([begin + round(share * (end - begin)) for share in shares])
     since = np.minimum(at - begin, end - at)
     line = np.ones(len(at)) if ramp_ns == 0 else np.minimum(since / ramp_ns, 1)
-    found = intervals.levels(at) / RAMP_STEPS
+    found = levels_at(intervals, at) / RAMP_STEPS
     near = 1 / max(ramp_ns, 1)  # a nanosecond, as a share of the ramp
     assert (found <= line + near).all()
     if ramp_ns > RAMP_STEPS:
@@ -88,9 +89,9 @@ def test_a_ramp_is_never_a_step_off_the_line(
 
 def test_a_spell_is_on_from_its_begin_until_before_its_end() -> None:
     intervals = interval(3, 5)
-    assert intervals.levels(np.arange(7)).tolist() == [0, 0, 0, RAMP_STEPS, RAMP_STEPS, 0, 0]
+    assert levels_at(intervals, np.arange(7)).tolist() == [0, 0, 0, RAMP_STEPS, RAMP_STEPS, 0, 0]
     none = OnOffIntervals(*np.empty((3, 0), np.int64))
-    assert none.levels(np.arange(3)).tolist() == [0, 0, 0]
+    assert levels_at(none, np.arange(3)).tolist() == [0, 0, 0]
 
 
 # ---------------------------------------------------------------------------------- episodes

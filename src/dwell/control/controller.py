@@ -30,17 +30,17 @@ Floats: TypeAlias = NDArray[np.float64]
 
 @dataclass(slots=True)
 class ClosedWindow:
-    """One window as an engine hands it over, or many of them as rows.
+    """A window as an engine hands it over.
 
     Parameters
     ----------
-    latency_ns, release_ns : int64 array, shape (W,) or (windows, W)
+    latency_ns, release_ns : int64 array, shape (W,)
         Latency as known at the close (`NEVER_NS` where unfinished) and release of its cycles.
-    close_ns : int, or int64 array of shape (windows, 1)
+    close_ns : int
         Instant of the close.
-    open_ns : int, or int64 array of shape (windows, 1)
+    open_ns : int
         Release of its first cycle.
-    core_ns : float64 array, shape (3, nodes) or (windows, 3, nodes)
+    core_ns : float64 array, shape (3, nodes)
         Core-nanoseconds in the window: of all work, of the cell's own jobs, of its shadow jobs.
     evidence : callable, optional
         Makes the window's `Evidence`, for estimators that learn from it.
@@ -48,13 +48,13 @@ class ClosedWindow:
 
     latency_ns: Ints
     release_ns: Ints
-    close_ns: Ints | int
-    open_ns: Ints | int
+    close_ns: int
+    open_ns: int
     core_ns: Floats
     evidence: Callable[[], Evidence] | None = None
 
     def __repr__(self) -> str:
-        return f"<ClosedWindow of {self.latency_ns.shape[-1]} cycles>"
+        return f"<ClosedWindow of {len(self.latency_ns)} cycles>"
 
 
 @dataclass(slots=True)
@@ -260,11 +260,8 @@ class Controller:
             self._learner.learn(evidence())
 
     def utilisation(self, window: ClosedWindow) -> Floats:
-        """Busy, own and shadow share of every node's cores, shape (..., 3, nodes)."""
-        span_ns = window.close_ns - window.open_ns
-        if isinstance(span_ns, np.ndarray):
-            span_ns = span_ns[..., None]
-        return utilisation(window.core_ns, self._cores, span_ns)
+        """Busy, own and shadow share of every node's cores, shape (3, nodes)."""
+        return utilisation(window.core_ns, self._cores, window.close_ns - window.open_ns)
 
     def decide(self, observed: QoS, own: Mapping[str, float], *, proven: str | None = None) -> str:
         """Decide on metrics that are already aggregated (see `close`)."""

@@ -1,8 +1,8 @@
-"""When a window closes, and the metrics that it shows: L95, violation rate, utilisation.
+"""The metrics that a closed window shows: L95, violation rate, utilisation.
 
 Everything works on one window, or on the rows of many at once, with the same arithmetic: a window
-that the live runtime closes, one that the simulator closes, and all windows of a static run closed
-together give the same bits.
+that the live runtime closes and one that a study looks back on give the same bits, and so does the
+simulator's kernel (``metrics.h``).
 """
 
 from __future__ import annotations

@@ -33,13 +33,6 @@ class OnOffIntervals(NamedTuple):
     end: Ints
     level: Ints
 
-    def levels(self, at: Ints) -> Ints:
-        """Return the strength at each instant, 0 where nothing is on."""
-        if len(self.begin) == 0:
-            return np.zeros(len(at), np.int64)
-        last = np.searchsorted(self.begin, at, side="right") - 1
-        return np.where((last >= 0) & (at < self.end[last]), self.level[last], 0)
-
     def until(self, end_ns: int) -> OnOffIntervals:
         """Return what is left if all is off from an instant on."""
         left = int(np.searchsorted(self.begin, end_ns))
