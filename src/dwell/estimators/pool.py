@@ -55,6 +55,7 @@ class Pool:
 
     __slots__ = (
         "_chunks",
+        "_held",
         "_normals",
         "_places",
         "_rows",
@@ -87,7 +88,9 @@ class Pool:
 
     def replace(self, times: Floats, window: int) -> None:
         """Begin again with times that nobody measured."""
-        self._chunks: deque[tuple[int, Floats]] = deque([(window, times)])
+        #: The times in the order in which they came, and how many of them each window brought.
+        self._held = times
+        self._chunks = deque([(window, len(times))])
         self.measured = 0
         self._change(window)
 
@@ -164,23 +167,25 @@ class Pool:
 
     def _add(self, times: Floats, window: int, memory: float) -> None:
         """Add times, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
-        chunks = self._chunks
-        chunks.append((window, times))
-        size = len(self.ordered) + len(times)
-        while chunks[0][0] <= window - memory and size - len(chunks[0][1]) >= ENOUGH:
-            size -= len(chunks.popleft()[1])
+        chunks, held = self._chunks, len(self._held)
+        chunks.append((window, len(times)))
+        size = held + len(times)
+        while chunks[0][0] <= window - memory and size - chunks[0][1] >= ENOUGH:
+            size -= chunks.popleft()[1]
         while size > LARGEST:
-            since, oldest = chunks.popleft()
-            left = oldest[size - LARGEST :]
-            size -= len(oldest) - len(left)
-            if len(left):
+            since, count = chunks.popleft()
+            left = max(count - (size - LARGEST), 0)
+            size -= count - left
+            if left:
                 chunks.appendleft((since, left))
+        # At most `LARGEST` times come at once, so that none of the new ones is dropped.
+        self._held = np.concatenate((self._held[held + len(times) - size :], times))
         self.measured = min(self.measured + len(times), size)
         self._change(window)
 
     def _change(self, window: int) -> None:
         self.touched = window
-        self.ordered = np.concatenate([times for _, times in self._chunks])
+        self.ordered = self._held.copy()
         self.ordered.sort()
         self._widened = math.nan  # nothing is drawn from these times yet
 

@@ -227,6 +227,8 @@ class _Stamper:
         self.host_at_ns, self.host_down = table[:, 0].tolist(), table[:, 3].tolist()
         self.cold = ColdMigration(problem, realisation) if settings.migration == "cold" else None
         self.fraction = controller.shadow_fraction
+        #: Stamps of all shadows, by the candidate that the cycles run under.
+        self.plans: dict[int, NDArray[np.int16]] = {}
         self.placement = controller.incumbent
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         arrays.tables.clock[0]["pauses"] = 1
@@ -239,9 +241,13 @@ class _Stamper:
         tables, code = self.arrays.tables, self.code[self.placement]
         tables.stamps[0, start:stop] = code
         if len(tables.cells) > 1 and start < self.cycles:
+            # A cold migration stamps all that is left: it must not be computed each time.
+            if code not in self.plans:
+                self.plans[code] = shadow_stamps(
+                    0, self.cycles, code, len(self.code), self.fraction
+                )
             stop = min(stop, self.cycles)
-            plan = shadow_stamps(start, stop, code, len(self.code), self.fraction)
-            tables.stamps[1, start:stop] = plan
+            tables.stamps[1, start:stop] = self.plans[code][start:stop]
         if self.watch is not None:
             self.watch.probes.stamp(start, stop)
 
